@@ -70,6 +70,9 @@ def test_what_is_known_clocks_and_distances_are_read(folder):
         ('kind = "toa"', 'kind = "azimuth"', "azimuth"),
         ('sigma = "3 cm"', "", "standard deviation"),
         ('sigma = "3 cm"', 'sigma = "3 kg"', "kg"),
+        ('sigma = "3 cm"', "sigma = 0", "hall.toml, [[measurements]] 1"),
+        ('kind = "toa"', 'kind = "toa"\ncolumns = { a = "epoch" }', "p0"),
+        ('kind = "toa"', 'kind = "tdoa"\ncolumns = { b = "a" }', "one station twice"),
         ('{ name = "A8" }', '{ name = "A7" }', "A7"),
         ('{ name = "A8" }', '{ name = "B8" }', "A8"),
         ("format = 1", "format = 1\nspeed = 3", "speed"),
@@ -82,6 +85,33 @@ def test_broken_files_are_refused_in_a_sentence(folder, old, new, told):
     assert done.exit_code == 2, done.output
     assert told in done.output
     assert "Traceback" not in done.output
+
+
+def test_names_of_outputs_are_asked_for_before_the_search(folder, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("it searched")
+
+    monkeypatch.setattr("optloc.calibration.calibrate", never)
+    done = run("calibrate", folder / "hall.toml", "--out", folder / "surveyed.csv")
+    assert done.exit_code == 2
+    assert ".toml" in done.output
+    assert run("calibrate", folder / "hall.toml", "--plot", folder / "net.xyz").exit_code == 2
+
+
+def test_residuals_are_drawn_beside_the_law_that_is_left_of_the_noise():
+    from optloc.plot.network_map import plot_network
+
+    rng = np.random.default_rng(0)
+    stations, pulses = rng.standard_normal((4, 2)), rng.standard_normal((9, 2))
+    residuals = np.append(0.5 * rng.standard_normal(399), 40.0)
+    figure = plot_network("ABCD", stations, 0.01 * np.eye(8), pulses, np.full((4, 2), np.nan), [], residuals, 100, "t")
+    axes = figure.axes[-1]
+    (law,) = axes.lines
+    x, density = law.get_data()
+    assert np.trapezoid(density, x) == pytest.approx(1.0, abs=1e-3)
+    assert np.sqrt(np.trapezoid(x**2 * density, x)) == pytest.approx(0.5, abs=1e-3)  # sqrt(100 / 400)
+    assert sum(bar.get_height() * bar.get_width() for bar in axes.patches) == pytest.approx(1.0)
+    assert "1 beyond 5" in axes.get_title()
 
 
 def test_a_network_that_is_open_is_no_site(folder):

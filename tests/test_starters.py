@@ -15,7 +15,8 @@ from optloc.models.primitives import distance
 from optloc.problem.epochs import separable
 
 RUN = CliRunner()
-STARTERS = starters()
+EVERY = starters()
+STARTERS = {name: one for name, one in EVERY.items() if "fix" in one.commands}
 
 
 def truth_of(text, problem):
@@ -61,10 +62,22 @@ def test_it_is_fixed_as_it_is(name, tmp_path):
     assert (fix.p_value > 1e-3).all()
 
 
-@pytest.mark.parametrize("name", STARTERS)
+def test_a_network_is_calibrated_as_it_is(tmp_path):
+    path, out = tmp_path / "wood.toml", tmp_path / "surveyed.toml"
+    made = RUN.invoke(app, ["new", "calibration", "--out", str(path)])
+    assert f"optloc calibrate {path}" in made.stdout.replace("\n", "")
+    done = RUN.invoke(app, ["calibrate", str(path), "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "status ok" in done.output
+    # the recorders that the calls were drawn from: R1 and R2 were 38.80 m apart
+    stations = read(out).problem.stations.position.reshape(7, 2)
+    assert np.linalg.norm(stations[0] - stations[1]) == pytest.approx(38.80, abs=0.2)
+
+
+@pytest.mark.parametrize("name", EVERY)
 def test_it_explains_itself(name):
-    lines = STARTERS[name].text.splitlines()
-    assert STARTERS[name].summary.endswith(".")
+    lines = EVERY[name].text.splitlines()
+    assert EVERY[name].summary.endswith(".")
     assert max(map(len, lines)) <= 120
     assert sum("#" in line for line in lines) >= 4
 

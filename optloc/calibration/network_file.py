@@ -99,6 +99,9 @@ def read_network(path: Path) -> Network:
         a = _stations(own, "a", names)
         two = between or MODELS[kind].stations == 2
         b = _stations(own, "b", names) if two else np.full(own.count, -1)
+        if (a == b).any():
+            row = int(np.flatnonzero(a == b)[0])
+            raise InvalidProblem("the row names one station twice", own.where("b", row), "name two stations")
         if between:
             apart.append((a, b, z, sigma))
         else:
@@ -155,10 +158,14 @@ def _values(section: NetworkRows, table: Table, units: Units, where: str) -> tup
     unit = units.conversion(section.unit, where)
     z = table.numbers("z") * unit.factor
     if table.has("sigma"):
-        return z, table.numbers("sigma") * unit.factor
-    if section.sigma is None:
+        sigma = table.numbers("sigma") * unit.factor
+    elif section.sigma is not None:
+        sigma = np.full(table.count, units.plain(section.sigma, section.unit, where))
+    else:
         raise InvalidProblem("the rows have no standard deviation", where, 'write sigma = "5 cm", or a column sigma')
-    return z, np.full(table.count, units.plain(section.sigma, section.unit, where))
+    if not (sigma > 0.0).all():
+        raise InvalidProblem("a standard deviation is not positive", where, "give one above zero")
+    return z, sigma
 
 
 def _stations(table: Table, key: str, names: tuple[str, ...]) -> Array:
@@ -197,16 +204,21 @@ def _by_pulse(
     return tuple(labels), tuple(Slot(kind, a, b) for kind, a, b, _ in slots), table, deviations
 
 
+def check_name(out: Path) -> None:
+    """Refuse a name for what is found that is not that of a problem file, before anything is searched."""
+    if out.suffix.lower() != ".toml":
+        raise InvalidProblem("what was found is written as a problem file", str(out), "let its name end in .toml")
+
+
 def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
     """Write a problem file with the stations that were found, their deviations, and the rows of the pulses.
 
     Raises
     ------
     InvalidProblem
-        Where there is no network to write, or the file is no TOML.
+        Where there is no network to write, or the file's name does not end in .toml.
     """
-    if out.suffix.lower() != ".toml":
-        raise InvalidProblem("what was found is written as a problem file", str(out), "let its name end in .toml")
+    check_name(out)
     if not np.isfinite(found.covariance).all():
         raise InvalidProblem(f"the network is {found.status.label}", str(out), "see its findings")
     claim(out, inputs=[source])

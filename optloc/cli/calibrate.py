@@ -58,10 +58,12 @@ def _run(
 ) -> int:
     from optloc.base.types import Status
     from optloc.calibration import calibrate as find
-    from optloc.calibration.network_file import read_network, write_calibrated
+    from optloc.calibration.network_file import check_name, read_network, write_calibrated
     from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
 
     claim_outputs(out, picture=plot, inputs=[file])
+    if out is not None:
+        check_name(out)
     network = read_network(file)
     named = tuple(name.strip() for name in gauge.split(",")) if gauge else ()
     with line(quiet or as_json) as tell:
@@ -150,5 +152,6 @@ def _picture(found: Calibration, title: str) -> Any:
         known,
         [other.stations for other in found.alternatives[:3]],
         found.residuals,
+        found.dof,
         f"{title}: {found.status.label}",
     )

@@ -143,10 +143,15 @@ def _draw(found: FileFixes, plot: Path | None, quiet: bool) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Starter:
-    """One line on what it is, and the text of its file."""
+    """One line on what it is, the text of its file, and the commands that take it."""
 
     summary: str
     text: str
+    commands: tuple[str, ...] = ("check", "fix")
+
+
+# Files of other commands than fix.
+_OTHERS = {"calibration": ("calibrate",)}
 
 
 def starters() -> dict[str, Starter]:
@@ -156,7 +161,8 @@ def starters() -> dict[str, Starter]:
     for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
         if entry.name.endswith(".toml"):
             text = entry.read_text(encoding="utf-8")
-            found[entry.name.removesuffix(".toml")] = Starter(text.partition("\n")[0].removeprefix("# "), text)
+            name, summary = entry.name.removesuffix(".toml"), text.partition("\n")[0].removeprefix("# ")
+            found[name] = Starter(summary, text, *([_OTHERS[name]] if name in _OTHERS else []))
     # A kind of another package gets a starter, too. One that needs ECEF has no place among stations around an origin.
     for kind, model in MODELS.items():
         if kind not in found and not model.ecef:
@@ -175,7 +181,8 @@ def run_new(kind: str, out: Path | None, *, quiet: bool) -> int:
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("a problem file ends in .toml", str(out), "let the name behind --out end in it")
     write_text(out, known[kind].text.rstrip("\n"))
-    say(Screen(quiet=quiet), f"{out} can be changed and fixed: optloc check {out}, then optloc fix {out}.")
+    commands = ", then ".join(f"optloc {command} {out}" for command in known[kind].commands)
+    say(Screen(quiet=quiet), f"{out} can be changed and used: {commands}.")
     return 0
 
 

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
 
 # Root of the 95 % quantile of chi-square with two degrees of freedom.
 _RADIUS = 2.447746830680816
-# Points of an ellipse, and bars of the residuals' histogram.
-_POINTS, _BARS = 60, 30
+# Points of an ellipse, and width of the bars of the histogram: narrow enough to show the shape of a normal law.
+_POINTS, _BAR = 60, 0.25
+# Residuals beyond so many deviations are in the last bars: a gross one must not make the others one bar.
+_FAR = 5.0
 
 
 def plot_network(
@@ -28,6 +30,7 @@ def plot_network(
     known: Array,
     others: Sequence[Array],
     residuals: Array,
+    dof: int,
     title: str,
 ) -> Figure:
     """Return plan, elevation (in space) and histogram of the residuals of a network.
@@ -48,6 +51,8 @@ def plot_network(
         Stations of other networks that fit the data, in the same frame.
     residuals : array (...)
         Residuals in standard deviations; NaN where there is none.
+    dof : int
+        Degrees of freedom: unknowns that are fitted make residuals smaller than their noise.
     title : str
         Of the picture.
     """
@@ -61,13 +66,25 @@ def plot_network(
         _view(axes, view, names, stations, covariance, pulses, known, others)
         if row == 0:
             axes.legend(fontsize="small", loc="best")
-    axes = figure.add_subplot(grid[:, 1])
-    finite = residuals[np.isfinite(residuals)]
-    axes.hist(finite, bins=_BARS, density=True, color=GREY)
-    width = np.linspace(-4.0, 4.0, 200)
-    axes.plot(width, np.exp(-0.5 * width**2) / np.sqrt(2.0 * np.pi), color=BLACK)
-    axes.set(xlabel="residual, standard deviations", ylabel="share", title="residuals and the normal law")
+    _histogram(figure.add_subplot(grid[:, 1]), residuals[np.isfinite(residuals)], dof)
     return figure
+
+
+def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
+    """Draw residuals (n,), and the normal law that is left of the noise when so many degrees of freedom remain."""
+    edges = np.arange(-_FAR, _FAR + _BAR, _BAR)
+    weights = np.full(residuals.size, 1.0 / (max(residuals.size, 1) * _BAR))
+    axes.hist(np.clip(residuals, -_FAR, _FAR), bins=edges.tolist(), weights=weights, color=GREY)
+    if residuals.size and dof > 0:
+        spread = np.sqrt(min(dof / residuals.size, 1.0))
+        x = np.linspace(-_FAR, _FAR, 200)
+        law = np.exp(-0.5 * (x / spread) ** 2) / (np.sqrt(2.0 * np.pi) * spread)
+        axes.plot(x, law, color=BLACK, label=f"expected, {dof} degrees of freedom")
+        axes.legend(fontsize="small", loc="upper right")
+        axes.margins(y=0.2)
+    beyond = int((np.abs(residuals) > _FAR).sum())
+    title = "residuals" + (f"; {beyond} beyond {_FAR:g} in the last bars" if beyond else "")
+    axes.set(xlabel="residual, standard deviations", ylabel="density", title=title)
 
 
 def _view(

@@ -28,6 +28,9 @@ from optloc.study.draws import Case, draw
 from optloc.study.folder import Manifest, plan_again, read_frame, read_manifest, references
 from optloc.study.plan import Plan
 from optloc.study.profiles import Profiles, profiles
+from optloc.study.folder import Manifest, read_frame, read_manifest
+from optloc.study.networks import NetworkCase
+from optloc.study.plan import Plan
 from optloc.study.summary import case_label, noise_text
 
 if TYPE_CHECKING:
@@ -71,10 +74,12 @@ def scenario_maps(plan: Plan, frame: pd.DataFrame) -> Iterator[Place]:
 
     Cases that have no map are left out.
     """
-    first: dict[str, Case] = {}
+    first: dict[str, Case | NetworkCase] = {}
     for cell in plan.cells:
         first.setdefault(case_label(cell.case.table.name, cell.case.sweep), cell.case)
     for title, case in list(first.items())[:_MOST]:
+        if isinstance(case, NetworkCase):
+            continue
         layout = case.table.layout
         if layout is not None and (layout.placement == "random" or layout.survey is not None):
             continue

@@ -14,10 +14,14 @@ from time import perf_counter
 import numpy as np
 
 from formulations.backend import count
+from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import centre_and_spread
 from optloc.base.registry import Table
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Status
+from optloc.calibration.likelihood import Estimate, likelihood
+from optloc.calibration.network import Network
+from optloc.calibration.rounds import starts_of
 from optloc.compute.sums import equations_at
 from optloc.linear.evaluate import differentiate
 from optloc.linear.normal import depends_on_place, prior_parts, step, weighed
@@ -32,6 +36,7 @@ from optloc.solvers.refine import WEIGHINGS
 from optloc.solvers.starts.position import one_position, spread_of, vectors
 from optloc.solvers.verdict.judge import judge
 from optloc.study.draws import Drawn
+from optloc.study.networks import Found, Networks, each, from_truth, refined
 
 _ASIDE = 0.2
 """Width of the box of guesses in the middle, in radii of the array: off every station by chance, near to all alike."""
@@ -303,6 +308,42 @@ def _linear(one: Problem, scale: float) -> tuple[Array, Array]:
     return white[:, :-1] * scale, white[:, -1] * scale
 
 
+# Networks: from random places, and from the convex start.
+
+
+def at_random(count: int) -> Callable[[Network, int], Found]:
+    """Return what refines so many networks of random places, all in the spread that the arrivals tell."""
+    return lambda network, seed: refined(network, starts_of(likelihood(network), seed).random(count))
+
+
+def by_nuclear_norm(network: Network, seed: int) -> Found:
+    """Return what the times of emission of least truncated nuclear norm lead to; nothing where it does not apply.
+
+    References
+    ----------
+    F. Jiang, Y. Kuang and K. Astrom (2013); see `formulations.nuclear_norm`.
+    """
+    from formulations.metric_upgrade import unknowns, upgrade
+    from formulations.nuclear_norm import affine_network, nuclear_offsets
+
+    m, n, d = network.stations, network.pulses, network.dimension
+    begun = starts_of(likelihood(network), seed)
+    starts = begun.random(0)
+    if network.synchronised and network.given.all() and max(m, n) >= unknowns(d) and m > d + 1:
+        z = (begun.z - begun.shift[:, None]) / begun.spread
+        found = nuclear_offsets(z, d)
+        if np.isfinite(found.value):
+            stations, pulses, which = upgrade(affine_network(z, found.offset, d))
+            emission = np.repeat((begun.shift + begun.spread * found.offset)[None], len(which), axis=0)
+            starts = Estimate(begun.spread * stations, np.zeros((len(which), m)), begun.spread * pulses, emission)
+    return refined(network, starts)
+
+
+def only_networks(drawn: Drawn, start: Array) -> Fix:
+    """Stand for the fixes of a baseline that has none."""
+    raise InvalidProblem("this baseline serves networks alone", "baseline", "give [[network]] tables")
+
+
 # The table.
 
 
@@ -324,6 +365,8 @@ class Baseline:
         Whether it knows the truth: it judges the others, and nobody competes with it.
     method : str
         The method of optloc that it runs from its start, where it is one.
+    networks : callable, optional
+        ``Networks -> tuple of Found``, where it finds networks, too.
     """
 
     run: Callable[[Drawn, Array], Fix]
@@ -332,6 +375,7 @@ class Baseline:
     slow: bool = False
     reference: bool = False
     method: str = ""
+    networks: Callable[[Networks], tuple[Found, ...]] | None = None
 
 
 def _iterate(method: str) -> Callable[[Drawn, Array], Fix]:
@@ -362,9 +406,17 @@ def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[Drawn, Arra
     return lambda drawn, start: claim(drawn.problem, start, steps(drawn.problem, start))
 
 
+def _network(summary: str, refine: Callable[[Network, int], Found]) -> Baseline:
+    return Baseline(only_networks, summary, guess=False, slow=True, networks=each(refine))
+
+
 _OWN = {
     "truth": Baseline(
-        _truth, "damped least squares from the truth: the best that any start can lead to", guess=False, reference=True
+        _truth,
+        "damped least squares from the truth: the best that any start can lead to",
+        guess=False,
+        reference=True,
+        networks=from_truth,
     ),
     "gauss-newton": Baseline(_iterate("lsr"), "damped least squares from a guess", method="lsr"),
     "taylor": Baseline(
@@ -391,6 +443,13 @@ _OWN = {
         guess=False,
         slow=True,
     ),
+    "nuclear-norm": _network(
+        "times of emission by the truncated nuclear norm, metric upgrade, least squares: networks with one clock and "
+        "no missing arrival",
+        by_nuclear_norm,
+    ),
+    "one-random": _network("networks: least squares from one network of random places", at_random(1)),
+    "ten-random": _network("networks: the best of least squares from ten networks of random places", at_random(10)),
 }
 
 BASELINES: Table[Baseline] = Table("optloc.baselines", lambda value: isinstance(value, Baseline), _OWN)

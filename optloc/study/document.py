@@ -131,13 +131,46 @@ class ScenarioTable(_Table):
     """Number of trials, in the place of the study's."""
 
 
+class NetworkTable(_Table):
+    """Stations, clocks and pulses that are unknown together, drawn anew in every trial; lengths are amounts."""
+
+    name: Name
+    """Its name in tables."""
+    stations: int = Field(default=8, ge=2, le=1000)
+    """Number of stations."""
+    pulses: int = Field(default=30, ge=1, le=100_000)
+    """Number of pulses."""
+    dimension: Literal[2, 3] = 3
+    """Of space."""
+    box: list[Amount] = Field(default=["20 m", "20 m", "6 m"], min_length=2, max_length=3)
+    """Widths of the box in which the stations are."""
+    around: list[Amount] | None = Field(default=None, min_length=2, max_length=3)
+    """Widths of the box, with the same centre, in which the pulses are; that of the stations by default."""
+    emission: Amount = "200 m"
+    """Width in which times of emission are, times the speed of propagation."""
+    synchronised: bool = True
+    """Whether the stations share a clock, and methods know it."""
+    clocks: Amount = "10 m"
+    """Width in which the clocks of stations are that do not."""
+    missing: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Share of the arrivals that are missing; each pulse keeps as many as it has unknowns, and two more."""
+    outliers: OutlierTable | None = None
+    """Gross errors of a share of the arrivals, which no method is told."""
+    noise: list[Amount] = Field(default=["3 cm"], min_length=1)
+    """Standard deviations of an arrival."""
+    sweep: dict[str, list[Any]] = Field(default_factory=dict)
+    """Values of other keys of this table, by dotted names such as "pulses": every combination is a case."""
+    trials: int | None = Field(default=None, ge=1, le=100_000_000)
+    """Number of trials, in the place of the study's."""
+
+
 class MethodTable(_Table):
     """How the problems are solved. A list in `method`, `baseline` or `solver` stands for one method each."""
 
     name: Name | None = None
     """Its name in tables; made of the rest by default."""
     method: str | list[str] | None = None
-    """"auto", or stages joined by "+"; see `optloc list methods`."""
+    """"auto", or stages joined by "+", see `optloc list methods`; "calibrate" of networks."""
     baseline: str | list[str] | None = None
     """Something to compare with, in the place of a method; see `optloc list baselines`."""
     solver: str | list[str] | None = None
@@ -169,7 +202,10 @@ class StudyFile(_Table):
     """Decides all draws."""
     trials: int = Field(default=1000, ge=1, le=100_000_000)
     """Trials of each scenario at each noise level."""
-    scenario: list[ScenarioTable] = Field(min_length=1)
+    scenario: list[ScenarioTable] = Field(default_factory=list)
+    """What is fixed from known stations."""
+    network: list[NetworkTable] = Field(default_factory=list)
+    """What is calibrated. A study has either scenarios or networks, as no method serves both."""
     method: list[MethodTable] = Field(min_length=1)
 
 

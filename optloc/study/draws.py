@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -89,6 +89,22 @@ class Case:
         return f"scenario {self.table.name!r}"
 
     @property
+    def numbers(self) -> int:
+        """Return the number of measurements of a trial."""
+        return self.template.count
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Return the columns that all trials share."""
+        problem = self.template
+        sizes = {"dimension": problem.dimension, "stations": problem.stations.count, "rows": problem.count}
+        return {"kinds": "+".join(rows.kind for rows in problem.rows), **sizes, "epochs": problem.epochs}
+
+    def draw(self, first: int, count: int) -> Drawn:
+        """Return trials `first` to ``first + count``."""
+        return draw(self, first, count)
+
+    @property
     def state(self) -> tuple[str, ...]:
         """Return the names of position, velocity and acceleration of the target that is sought."""
         motions = self.template.motions
@@ -138,7 +154,7 @@ class Drawn:
 
 def block_size(case: Case) -> int:
     """Return how many trials one seed decides."""
-    return int(np.clip(_NUMBERS // case.template.count, 1, _MOST))
+    return int(np.clip(_NUMBERS // case.numbers, 1, _MOST))
 
 
 def draw(case: Case, first: int, count: int) -> Drawn:

@@ -18,7 +18,6 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import json_of, read_bytes
 from optloc.base.outputs import written
 from optloc.study.baselines import BASELINES
-from optloc.study.draws import draw
 from optloc.study.methods import version_of
 from optloc.study.plan import Plan, planned
 from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
@@ -339,7 +338,7 @@ def known_data(plan: Plan, folder: Path, done: dict[str, Path]) -> dict[str, str
     for path in done.values():
         note_data(known, read_part(path, ["seed", "data"]), folder)
     for chunk in first.values():
-        drawn = draw(chunk.cell.case, chunk.first, 1)
+        drawn = chunk.cell.case.draw(chunk.first, 1)
         if known.get(drawn.seed[0]) != drawn.digest[0]:
             what = f"its finished trials of {chunk.cell.case.where} hold other data than are drawn here"
             advice = "choose another folder with --out, or go on with the versions that the manifest names"

@@ -20,10 +20,11 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Certificate, Status
 from optloc.files.schema import Units, join
 from optloc.problem.fix import Fix
-from optloc.study.baselines import BASELINES, heard, start_of
+from optloc.study.baselines import BASELINES, heard, only_networks, start_of
 from optloc.study.document import MethodTable
 from optloc.study.draws import Drawn
 from optloc.study.minimizers import baseline_of, code_of, load_minimizer
+from optloc.study.networks import CALIBRATE, Found, Networks, calibrated
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +75,26 @@ class Method:
         """Return whether fixes are solved one by one."""
         if self.baseline is not None:
             return baseline_of(self.baseline).slow
+        if self.method == CALIBRATE:
+            return True
         from optloc.solvers import Method as Pipeline
 
         assert self.method is not None
         return not all(entry.batched for entry in Pipeline.parse(self.method).entries)
+
+    @property
+    def networked(self) -> bool:
+        """Return whether it finds networks."""
+        if self.baseline is not None:
+            return baseline_of(self.baseline).networks is not None
+        return self.method == CALIBRATE
+
+    @property
+    def fixes(self) -> bool:
+        """Return whether it fixes targets."""
+        if self.baseline is not None:
+            return baseline_of(self.baseline).run is not only_networks
+        return self.method != CALIBRATE
 
     @property
     def reference(self) -> bool:
@@ -116,7 +133,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
             from optloc.solvers import Method as Pipeline
 
             try:
-                Pipeline.parse(name)
+                _ = name == CALIBRATE or Pipeline.parse(name)
             except InvalidProblem as error:
                 raise InvalidProblem(error.what, where, error.advice) from None
         elif name not in BASELINES:
@@ -184,8 +201,8 @@ class Run:
 
     Parameters
     ----------
-    fix : Fix
-        Fixes (n,).
+    fix : Fix or tuple of Found
+        Fixes (n,), or networks.
     seconds : float
         Time of the call.
     processor : float
@@ -198,7 +215,7 @@ class Run:
         Whether the back end that was asked for has solved anything; True where none was asked for.
     """
 
-    fix: Fix
+    fix: Fix | tuple[Found, ...]
     seconds: float
     processor: float
     evaluations: Array
@@ -210,7 +227,7 @@ class Nonsense(Exception):  # noqa: N818  (a word for what it is, as all of them
     """What a method returned is no answer to its trials."""
 
 
-def run(method: Method, drawn: Drawn) -> Run:
+def run(method: Method, drawn: Drawn | Networks) -> Run:
     """Return the fixes of trials by a method, with the back end and the settings that it asks for.
 
     Raises
@@ -229,7 +246,8 @@ def run(method: Method, drawn: Drawn) -> Run:
         began, busy = perf_counter(), process_time()
         fix = _solved(method, drawn)
         seconds, busy = perf_counter() - began, process_time() - busy
-    _check(fix, drawn)
+    if not isinstance(drawn, Networks):
+        _check(fix, drawn)
     used = choice is None or choice.name in {name for name, _ in tally}
     iterations = float(sum(n for _, n in tally)) if tally else np.nan
     return Run(fix, seconds, busy, np.where(asked > 0.0, asked, np.nan), iterations, used)
@@ -247,7 +265,11 @@ def require_program(method: Method, found: Run) -> None:
         raise InvalidProblem(what, f"method {method.name!r}", "leave the solver out, or use a stage such as sdp or nlp")
 
 
-def _solved(method: Method, drawn: Drawn) -> Any:
+def _solved(method: Method, drawn: Drawn | Networks) -> Any:
+    if isinstance(drawn, Networks):
+        finds = calibrated if method.baseline is None else baseline_of(method.baseline).networks
+        assert finds is not None  # the plan has asked
+        return finds(drawn)
     if method.baseline is not None:
         return baseline_of(method.baseline).run(drawn, start_of(method.start, method.width, drawn))
     from optloc.solvers import solve

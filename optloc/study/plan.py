@@ -16,7 +16,7 @@ from importlib.resources.abc import Traversable
 from itertools import combinations, product
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -31,9 +31,10 @@ from optloc.problem.build import assemble, measured
 from optloc.problem.epochs import separable
 from optloc.problem.noise import Block, Noise, variances
 from optloc.problem.problem import Problem
-from optloc.study.document import Level, ScenarioTable, StudyFile, sigma_of
+from optloc.study.document import Level, NetworkTable, ScenarioTable, StudyFile, sigma_of
 from optloc.study.draws import Case, add_flaws, check_truth, metres, place_stations
 from optloc.study.methods import Method, methods_of
+from optloc.study.networks import NetworkCase, check_network, noise_of
 
 # Trials of a chunk, whose part should take seconds: less, and files and tasks cost as much as fixes; more, and a run
 # that is stopped loses minutes. A fast fix takes about 0.1 ms with everything beside it (a million in two minutes is
@@ -54,13 +55,13 @@ class Cell:
 
     Parameters
     ----------
-    case : Case
+    case : Case or NetworkCase
         Geometry, truth, noise.
     method : Method
         What solves it.
     """
 
-    case: Case
+    case: Case | NetworkCase
     method: Method
 
     @property
@@ -77,7 +78,7 @@ class Cell:
         longest, numbers, least = (
             (_SLOW, _NUMBERS // _SLOWER, _LEAST) if method.slow else (_FAST, _NUMBERS, _LEAST_FAST)
         )
-        most = max(_LEAST, min(longest, numbers // case.template.count))
+        most = max(_LEAST, min(longest, numbers // case.numbers))
         return int(np.clip(-(-case.trials // _SHARES), min(least, most), most))
 
 
@@ -212,11 +213,14 @@ def planned(
     try:
         methods = [method for i, table in enumerate(study.method) for method in methods_of(table, i + 1)]
         methods += more
-        cases = []
-        for table in study.scenario:
-            # What the command line says holds for scenarios that have a number of their own, too.
-            own = table if trials is None else table.model_copy(update={"trials": None})
-            cases += list(cases_of(own, folder, study.seed, study.trials))
+        _one_kind(study, methods)
+        # What the command line says holds for scenarios that have a number of their own, too.
+        own = {} if trials is None else {"trials": None}
+        cases: list[Case | NetworkCase] = []
+        for scenario in study.scenario:
+            cases += cases_of(scenario.model_copy(update=own), folder, study.seed, study.trials)
+        for network in study.network:
+            cases += network_cases(network.model_copy(update=own), study.seed, study.trials)
     except InvalidProblem as error:
         where = ", ".join(part for part in (source, error.where) if part)
         raise InvalidProblem(error.what, where, error.advice) from None
@@ -228,7 +232,21 @@ def planned(
         raise InvalidProblem(f"the study has {parts} parts, {_PARTS} at most", source, advice)
     _distinct([method.name for method in methods], source, "method")
     _distinct([table.name for table in study.scenario], source, "scenario")
+    _distinct([table.name for table in study.network], source, "network")
     return Plan(study, text, tuple(Cell(case, method) for case in cases for method in methods), str(folder.resolve()))
+
+
+def _one_kind(study: StudyFile, methods: list[Method]) -> None:
+    """Refuse studies of nothing, of scenarios and networks at once, and methods that do not serve what is studied."""
+    if bool(study.scenario) == bool(study.network):
+        what = "there are both scenarios and networks" if study.scenario else "there is nothing to study"
+        raise InvalidProblem(what, "[[scenario]]", "give either [[scenario]] or [[network]] tables")
+    for method in methods:
+        if study.network and not method.networked:
+            advice = 'use method = "calibrate", or a baseline of networks: optloc list baselines'
+            raise InvalidProblem("it finds no networks", f"method {method.name!r}", advice)
+        if study.scenario and not method.fixes:
+            raise InvalidProblem("it serves networks alone", f"method {method.name!r}", "give [[network]] tables")
 
 
 def _distinct(names: list[str], source: str, what: str) -> None:
@@ -257,8 +275,8 @@ def cases_of(table: ScenarioTable, folder: Path, seed: int, trials: int) -> Iter
     InvalidProblem
         Naming the scenario and what cannot be right.
     """
-    for swept, chosen in _sweep(table):
-        where = f"scenario {table.name!r}"
+    where = f"scenario {table.name!r}"
+    for swept, chosen in _sweep(table, where):
         base = _template(chosen, folder, where, seed)
         _check(base, chosen, where)
         for level in chosen.noise:
@@ -269,8 +287,34 @@ def cases_of(table: ScenarioTable, folder: Path, seed: int, trials: int) -> Iter
             yield Case(chosen, *named, replace(base, noise=noise), seed, chosen.trials or trials)
 
 
-def _sweep(table: ScenarioTable) -> Iterator[tuple[dict[str, Any], ScenarioTable]]:
-    where = f"scenario {table.name!r}"
+def network_cases(table: NetworkTable, seed: int, trials: int) -> Iterator[NetworkCase]:
+    """Yield the cases of networks: swept values outside, noise levels inside.
+
+    Parameters
+    ----------
+    table : NetworkTable
+        The networks.
+    seed, trials : int
+        Of the study.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the network and what cannot be right.
+    """
+    where = f"network {table.name!r}"
+    for swept, chosen in _sweep(table, where):
+        check_network(chosen, where)
+        for level in chosen.noise:
+            label = level if isinstance(level, str) else json.dumps(level)
+            value = noise_of(level, join(where, "noise"))
+            yield NetworkCase(chosen, json.dumps(swept, sort_keys=True), label, value, seed, chosen.trials or trials)
+
+
+_Table = TypeVar("_Table", ScenarioTable, NetworkTable)
+
+
+def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]:
     for name, values in table.sweep.items():
         if not values or name in ("name", "sweep", "noise", "trials"):
             what = "has no values" if not values else "cannot be swept"
@@ -290,7 +334,7 @@ def _sweep(table: ScenarioTable) -> Iterator[tuple[dict[str, Any], ScenarioTable
                 if not isinstance(at, dict):
                     raise InvalidProblem(f"{name!r} names no key", join(where, "sweep"), "write table.key")
             at[last] = value
-        yield swept, conform(ScenarioTable, data, where) if swept else table
+        yield swept, conform(type(table), data, where) if swept else table
 
 
 def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Problem:

@@ -23,8 +23,17 @@ from optloc.linear.constraints import TOLERANCE, exact, violation
 from optloc.linear.normal import covariance, eliminated
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.study.draws import Case, Drawn, draw
+from optloc.study.draws import Case, Drawn
 from optloc.study.methods import Nonsense, require_program, run, version_of
+from optloc.study.networks import (
+    Found,
+    KnownNetworks,
+    NetworkCase,
+    Networks,
+    found_columns,
+    known_networks,
+    true_columns,
+)
 from optloc.study.plan import Cell, Chunk
 
 # The long table of a study, one row for each trial of each method: columns, units and meaning in one place.
@@ -85,7 +94,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("answered", "bool", "", "Whether the status has a position with a covariance, whatever stands against it."),
     Column("reason", "category", "", "Sentence that belongs to the status."),
     Column("located", "bool", "", "Whether there is a finite position at all, refined or not."),
-    Column("outliers", "int", "", "Number of stations with a gross error."),
+    Column("outliers", "int", "", "Number of stations, in a network of arrivals, with a gross error."),
     Column("rejected", "int", "", "Number of rows to which the method gives less than half their weight."),
     Column("truth_x", "float", "m", "True position of the target, metres in the frame."),
     Column("truth_y", "float", "m", "As truth_x."),
@@ -93,18 +102,38 @@ COLUMNS: tuple[Column, ...] = (
     Column("error_x", "float", "m", "Estimate less truth; NaN without a position."),
     Column("error_y", "float", "m", "As error_x."),
     Column("error_z", "float", "m", "As error_x; NaN in the plane."),
-    Column("error", "float", "m", "Distance of the estimate from the truth."),
+    Column(
+        "error",
+        "float",
+        "m",
+        "Distance of the estimate from the truth; of a network, rms of its stations after the best rigid motion.",
+    ),
     Column("error_nearest", "float", "m", "The same of the nearest of the estimate and its alternatives."),
     Column("error_velocity", "float", "m/s", "Length of the velocity's error; NaN where the target stands."),
     Column("error_bias", "float", "m", "Root mean square error of the biases in metres; NaN without such."),
-    Column("crlb", "float", "m", "Root of the trace of the position's Cramer-Rao bound at the truth."),
+    Column(
+        "crlb",
+        "float",
+        "m",
+        "Root of the trace of the position's Cramer-Rao bound at the truth; of a network, rms of its stations.",
+    ),
     Column("crlb_velocity", "float", "m/s", "The same of the velocity."),
     Column("crlb_bias", "float", "m", "Root mean square bound of the biases in metres."),
     Column(
         "deviation", "float", "1", "Error in units of the bound: sqrt(e' B^-1 e), B the position's bound at the truth."
     ),
-    Column("sigma", "float", "m", "Root of the trace of the position covariance that the method claims."),
-    Column("nees", "float", "1", "e' C^-1 e with the claimed covariance C; its expectation is `dimension`."),
+    Column(
+        "sigma",
+        "float",
+        "m",
+        "Root of the trace of the position covariance that the method claims; of a network, rms of its stations.",
+    ),
+    Column(
+        "nees",
+        "float",
+        "1",
+        "e' C^-1 e with the claimed covariance C; its expectation is `dimension` (of networks scaled to it).",
+    ),
     Column(
         "cost",
         "float",
@@ -114,8 +143,8 @@ COLUMNS: tuple[Column, ...] = (
     ),
     Column("cost_truth", "float", "1", "The same cost at the truth (unknowns of single epochs at their best)."),
     Column("dof", "int", "", "Degrees of freedom of the cost."),
-    Column("alternatives", "int", "", "Number of other minima that the fix lists."),
-    Column("proof", "category", "", "Proof of the certificate: global, region, local or unknown."),
+    Column("alternatives", "int", "", "Number of other minima, or networks, that the fix lists."),
+    Column("proof", "category", "", "Proof of the certificate: global, region, local, blockwise or unknown."),
     Column("certificate", "category", "", "Method of the certificate."),
     Column("bound", "float", "1", "Certified lower bound of the cost; NaN without one."),
     Column(
@@ -242,7 +271,7 @@ def compute(chunk: Chunk) -> Part:
 
     # Sums of BLAS depend on how many threads share them.
     with threadpool_limits(1):
-        drawn = draw(chunk.cell.case, chunk.first, chunk.count)
+        drawn = chunk.cell.case.draw(chunk.first, chunk.count)
         build = _warm_up(chunk.cell, drawn)
         known = known_of(drawn)
         size = chunk.cell.method.batch or chunk.count
@@ -257,7 +286,7 @@ def compute(chunk: Chunk) -> Part:
     return _part(chunk, known, found, build)
 
 
-def _warm_up(cell: Cell, drawn: Drawn) -> float:
+def _warm_up(cell: Cell, drawn: Drawn | Networks) -> float:
     """Solve one trial where that was not done in this process, and return how long it took."""
     key = (cell.case.key, cell.method.identity)
     if key in _warm:
@@ -273,7 +302,7 @@ def _warm_up(cell: Cell, drawn: Drawn) -> float:
     return perf_counter() - began
 
 
-def _solve_in_halves(cell: Cell, known: Known, first: int, count: int) -> list[tuple[int, Values]]:
+def _solve_in_halves(cell: Cell, known: Known | KnownNetworks, first: int, count: int) -> list[tuple[int, Values]]:
     """Return the values of some trials; where the call fails, halves are tried until the one trial is found."""
     try:
         return [(count, _solve(cell, known.part(first, count)))]
@@ -290,8 +319,8 @@ def _solve_in_halves(cell: Cell, known: Known, first: int, count: int) -> list[t
     return [*_solve_in_halves(cell, known, first, half), *_solve_in_halves(cell, known, first + half, count - half)]
 
 
-def _solve(cell: Cell, known: Known) -> Values:
-    count = len(known.drawn.truth)
+def _solve(cell: Cell, known: Known | KnownNetworks) -> Values:
+    count = len(known.drawn.seed)
     found = run(cell.method, known.drawn)
     values = fix_values(cell.case, known, found.fix)
     work = {"seconds": found.seconds / count, "processor": found.processor / count, "evaluations": found.evaluations}
@@ -309,7 +338,7 @@ def _failure(status: str, reason: str) -> Values:
 def part_of_lost(chunk: Chunk, lost: Lost) -> Part:
     """Return the part of a chunk whose trials all have the status of what came of it."""
     found = {name: _spread(value, chunk.count) for name, value in _failure(lost.status, lost.reason).items()}
-    return _part(chunk, known_of(draw(chunk.cell.case, chunk.first, chunk.count)), found, 0.0)
+    return _part(chunk, known_of(chunk.cell.case.draw(chunk.first, chunk.count)), found, 0.0)
 
 
 def join_parts(chunk: Chunk, parts: list[Part]) -> Part:
@@ -336,12 +365,11 @@ def _spread(value: Any, count: int) -> Any:
     return out
 
 
-def _part(chunk: Chunk, known: Known, found: Values, build: float) -> Part:
+def _part(chunk: Chunk, known: Known | KnownNetworks, found: Values, build: float) -> Part:
     """Return the Arrow table of a chunk, whose fixes have the values found."""
     import pyarrow as pa
 
     case, method, n = chunk.cell.case, chunk.cell.method, chunk.count
-    problem = case.template
     # In this order: a trial that failed has NaN for every number, but its truth and its bound are known.
     values = found | truth_values(case, known)
     values |= {
@@ -354,11 +382,7 @@ def _part(chunk: Chunk, known: Known, found: Values, build: float) -> Part:
         "noise_unit": case.unit,
         "noise_label": case.label,
         "sweep": case.sweep,
-        "kinds": "+".join(rows.kind for rows in problem.rows),
-        "dimension": problem.dimension,
-        "stations": problem.stations.count,
-        "rows": problem.count,
-        "epochs": problem.epochs,
+        **case.facts,
         "trial": chunk.first + np.arange(n),
         "seed": list(known.drawn.seed),
         "build": build,
@@ -418,8 +442,10 @@ class Known:
         return Known(self.drawn.part(first, count), self.bound[kept], self.cost[kept])
 
 
-def known_of(drawn: Drawn) -> Known:
+def known_of(drawn: Drawn | Networks) -> Known | KnownNetworks:
     """Return bound and cost at the truth of trials."""
+    if isinstance(drawn, Networks):
+        return known_networks(drawn)
     problem, size = drawn.problem, len(drawn.truth)
     with np.errstate(all="ignore"):
         equations = equations_at(problem, drawn.truth)
@@ -428,8 +454,11 @@ def known_of(drawn: Drawn) -> Known:
     return Known(drawn, np.broadcast_to(bound, (size, *bound.shape[-2:])), cost)
 
 
-def truth_values(case: Case, known: Known) -> Values:
+def truth_values(case: Case | NetworkCase, known: Known | KnownNetworks) -> Values:
     """Return the columns that do not depend on the method."""
+    if isinstance(case, NetworkCase) or isinstance(known, KnownNetworks):
+        assert isinstance(known, KnownNetworks)
+        return true_columns(known)
     problem, truth = known.drawn.problem, known.drawn.truth
     names = case.state
     place = _take(problem, truth, names[0])
@@ -444,8 +473,12 @@ def truth_values(case: Case, known: Known) -> Values:
     return values
 
 
-def fix_values(case: Case, known: Known, fix: Fix) -> Values:
-    """Return the columns of fixes (n,) of trials."""
+def fix_values(case: Case | NetworkCase, known: Known | KnownNetworks, fix: Fix | tuple[Found, ...]) -> Values:
+    """Return the columns of fixes (n,) of trials, or of networks found."""
+    if isinstance(known, KnownNetworks):
+        assert isinstance(fix, tuple)
+        return found_columns(known, fix)
+    assert isinstance(case, Case) and isinstance(fix, Fix)  # noqa: PT018  (what a case of scenarios has)
     problem, truth, names = known.drawn.problem, known.drawn.truth, case.state
     size = len(truth)
     x = np.where(np.isfinite(fix.x).all(-1, keepdims=True), fix.x, np.nan)
