@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optloc.calibration.blocks import MOVED, blocks, moved
+from optloc.calibration.blocks import MOVED, blocks, elsewhere, moved
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import CLOCKED, Network
 from optloc.calibration.rounds import Ends, rounds, starts_of
@@ -138,7 +138,7 @@ def _swept(
     for _ in range(_SWEEPS):
         places = [
             (gap, block, place)
-            for block in blocks(lik, at, prove=prove)
+            for block in (blocks(lik, at) if prove else elsewhere(lik, at))
             for place, gap in zip(block.places, block.gaps, strict=True)
             if gap <= MOVED
         ]

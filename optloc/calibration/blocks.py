@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array, Prior
+from optloc.calibration.descent import EASE, FIRST, FLOOR, LEAST, MOST, NOTHING, STIFFEN
 from optloc.calibration.likelihood import Estimate, Likelihood
 from optloc.calibration.network import Network
 from optloc.problem.build import assemble, measured
@@ -19,8 +20,11 @@ MOVED = 16.0
 """Cost that a block's other place may have beyond its present one for all to be refined from there: what is dearer by
 four sigma with the others held hardly ends below when they move as well."""
 
-QUICK = "gtrs+lsr"
-"""Method that tells a fix and its likeliest rivals, unproven."""
+# Steps of a block alone from a mirrored place: so many bring nine in ten to their minimum, and the rest is refined with
+# all others anyway.
+_ALONE = 15
+# Share of the spread below which two places are one.
+_APART = 1e-3
 
 # Cost that tells no two places apart: a tenth of a sigma of one number.
 _ALIKE = 0.01
@@ -60,8 +64,8 @@ class Block:
     places: Array
 
 
-def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block, ...]:
-    """Return what is known of each station that is not known exactly, and of each pulse, with all others held.
+def blocks(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
+    """Return what is proven of each station that is not known exactly, and of each pulse, with all others held.
 
     Parameters
     ----------
@@ -69,8 +73,6 @@ def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block,
         The network.
     at : Estimate
         One estimate, S = 1.
-    prove : bool
-        Whether each is proven, or its likeliest other places are looked up alone.
 
     Returns
     -------
@@ -78,15 +80,14 @@ def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block,
         Stations first. The proof is that of a fix from known stations; it does not exclude that several blocks move
         together.
     """
-    net, method = lik.network, "auto" if prove else QUICK
-    stations = [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
+    net = lik.network
     d, cost = net.dimension, float(lik.cost(at)[0])
     found = []
-    for i, fix in _stations(net, at, stations, method):
+    for i, fix in _stations(net, at, _sought(net)):
         at_best = _moved_station(lik, at, i, fix.position[:d])
         above = cost - float(lik.cost(at_best)[0])
         found.append(_block(fix, i, f"station {net.names[i]}", True, at.stations[0, i], above))
-    fix = place_pulses(net, at, np.arange(net.pulses), method)
+    fix = place_pulses(net, at, np.arange(net.pulses))
     # pulses do not know of each other: all are moved at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
     after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
@@ -94,6 +95,137 @@ def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block,
         above = float(before[j] - after[j])
         found.append(_block(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
     return tuple(found)
+
+
+def _sought(net: Network) -> list[int]:
+    return [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
+
+
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """Blocks that see the same partners: B blocks, Q rows ``gain_0 |x - one| + gain_1 |x - two| + offset``."""
+
+    one: Array  # (Q, d)
+    two: Array
+    gains: Array  # (2, Q)
+    offset: Array  # (B, Q) what the block's own clock or emission counts
+    value: Array  # (B, Q)
+    root: Array
+    place: Array  # (B, d) what is known of the place, and its inverse standard deviation
+    prior: Array
+
+    def equations(self, x: Array, t: Array) -> tuple[Array, Array]:
+        """Return whitened residuals (B, K, Q + d) and derivatives (B, K, Q + d, d + 1) at places and offsets."""
+        shape = (*x.shape[:2], self.one.shape[0])
+        predicted = t[..., None] * self.offset[:, None]
+        slope = np.zeros((*shape, x.shape[-1] + 1))
+        for end, gain in zip((self.one, self.two), self.gains, strict=True):
+            line = x[:, :, None] - end
+            length = np.maximum(np.sqrt(np.sum(line * line, axis=-1)), 1e-300)
+            predicted = predicted + gain * length
+            slope[..., :-1] += line * (gain / length)[..., None]
+        slope[..., -1] = self.offset[:, None]
+        root = self.root[:, None]
+        known = np.zeros((*x.shape, x.shape[-1] + 1))
+        every = np.arange(x.shape[-1])
+        known[..., every, every] = self.prior[:, None]
+        residual = np.concatenate([(self.value[:, None] - predicted) * root, (self.place[:, None] - x) * self.prior[:, None]], axis=-1)
+        return residual, np.concatenate([slope * root[..., None], known], axis=-2)
+
+    def mirrored(self, here: Array) -> Array:
+        """Return places (B, K, d) mirrored in the partners' principal planes, and in their centre."""
+        weight = (self.root > 0.0) / np.maximum((self.root > 0.0).sum(axis=1, keepdims=True), 1)
+        middle = weight @ self.one
+        centred = (self.one - middle[:, None]) * np.sqrt(weight)[..., None]
+        axes = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)[1]
+        along = np.einsum("bd,bdk->bk", here - middle, axes)
+        single = here[:, None] - 2.0 * along[..., None] * np.swapaxes(axes, 1, 2)
+        return np.concatenate([single, (2.0 * middle - here)[:, None]], axis=1)
+
+    def settled(self, x: Array) -> tuple[Array, Array]:
+        """Return minima (B, K, d) that places lead to, and their costs (B, K)."""
+        weight = self.root**2 * self.offset**2
+        total = np.maximum(weight.sum(axis=1), 1e-300)[:, None]
+        t = np.zeros(x.shape[:2])
+        residual = self.equations(x, t)[0][..., : self.one.shape[0]]
+        t = np.einsum("bkq,bq->bk", residual, self.root * self.offset) / total
+        damping = np.full(t.shape, FIRST)
+        residual, slope = self.equations(x, t)
+        cost = np.sum(residual**2, axis=-1)
+        for _ in range(_ALONE):
+            normal = np.swapaxes(slope, -1, -2) @ slope
+            diagonal = np.einsum("bkii->bki", normal)
+            diagonal += damping[..., None] * diagonal + FLOOR * diagonal.max(axis=-1, keepdims=True) + NOTHING
+            step = np.linalg.solve(normal, np.einsum("bkqi,bkq->bki", slope, residual)[..., None])[..., 0]
+            there, late = x + step[..., :-1], t + step[..., -1]
+            after, change = self.equations(there, late)
+            new = np.sum(after**2, axis=-1)
+            good = new < cost
+            x, t, cost = np.where(good[..., None], there, x), np.where(good, late, t), np.where(good, new, cost)
+            residual = np.where(good[..., None], after, residual)
+            slope = np.where(good[..., None, None], change, slope)
+            damping = np.clip(np.where(good, damping * EASE, damping * STIFFEN), LEAST, MOST)
+        return x, cost
+
+
+def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
+    """Return the likeliest other places of each station and pulse, the others held: nothing is proven.
+
+    Parameters
+    ----------
+    lik : Likelihood
+        The network.
+    at : Estimate
+        One minimum, S = 1.
+
+    Returns
+    -------
+    tuple of Block
+        Those that have other places, found from mirror images in the principal planes of their partners.
+    """
+    net = lik.network
+    stations = np.array(_sought(net), dtype=int)
+    groups = [(False, np.arange(net.pulses), at.pulses[0], _pulses_alone(lik, at))]
+    if stations.size:
+        groups.append((True, stations, at.stations[0, stations], _stations_alone(lik, at, stations)))
+    near = _APART * float(np.ptp(np.concatenate([at.stations[0], at.pulses[0]]), axis=0).max())
+    found = []
+    for station, which, here, points in groups:
+        x, cost = points.settled(points.mirrored(here))
+        gap = cost - points.settled(here[:, None])[1]
+        for n in np.flatnonzero(gap.min(axis=1) <= MOVED):
+            places: list[Array] = []
+            for k in np.flatnonzero(gap[n] <= MOVED):
+                if all(np.linalg.norm(x[n, k] - other) > near for other in (here[n], *places)):
+                    places.append(x[n, k])
+                    name = f"station {net.names[which[n]]}" if station else f"pulse {net.labels[which[n]]}"
+                    found.append(Block(name, station, int(which[n]), False, gap[n, k] < 0.0, (float(gap[n, k]),), x[n, k][None]))
+    return tuple(found)
+
+
+def _pulses_alone(lik: Likelihood, at: Estimate) -> _Points:
+    stations, clocks, net = at.stations[0], at.clocks[0], lik.network
+    tick = lik.ticks[0] * clocks[lik.first] + lik.ticks[1] * clocks[lik.second]
+    nothing = np.zeros((net.pulses, net.dimension))
+    offset = lik.emits * lik.emission[:, None]
+    return _Points(stations[lik.first], stations[lik.second], lik.gains, offset, net.z - tick, lik.root, nothing, nothing)
+
+
+def _stations_alone(lik: Likelihood, at: Estimate, which: Array) -> _Points:
+    net = lik.network
+    places, groups = _station_rows(net, at)
+    ends = np.concatenate([ends for _, ends, _, _ in groups])
+    timed = np.concatenate([np.full(len(ends), float(kind == "toa")) for kind, ends, _, _ in groups])
+    value = np.concatenate([z[which] for _, _, _, z in groups], axis=1)
+    with np.errstate(divide="ignore"):
+        root = 1.0 / np.concatenate([sigma[which] for _, _, sigma, _ in groups], axis=1)
+    gains = np.array([np.ones(len(ends)), np.zeros(len(ends))])
+    offset = np.broadcast_to(timed, value.shape)
+    one = places[ends]
+    # a coordinate that is known exactly does not move
+    exact = 1.0 / (_EXACT * (float(np.ptp(places)) or 1.0))
+    prior = np.where(net.place_sigma[which] <= 0.0, exact, lik.prior[which])
+    return _Points(one, one, gains, offset, value, root, net.place[which], prior)
 
 
 def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> Block:
@@ -113,7 +245,7 @@ def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: f
     return Block(name, station, index, proven, refuted, tuple(gaps[others] - above), x[others])
 
 
-def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto") -> Fix:
+def place_pulses(net: Network, at: Estimate, which: Array) -> Fix:
     """Return fixes of some pulses from stations that are held.
 
     Parameters
@@ -124,8 +256,6 @@ def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto")
         One estimate, S = 1; that of the pulses is not used.
     which : int array (n,)
         The pulses.
-    method : str
-        Of `optloc.solve`.
 
     Returns
     -------
@@ -150,13 +280,11 @@ def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto")
                 weight=given.astype(float),
             )
         )
-    return solve(assemble(stations, *kinds), method)
+    return solve(assemble(stations, *kinds))
 
 
-def _stations(net: Network, at: Estimate, which: list[int], method: str) -> list[tuple[int, Fix]]:
-    """Return fixes of some stations from pulses and stations that are held."""
-    if not which:
-        return []
+def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
+    """Return places of all, and rows of stations: kind, which place, deviations and values (M, q)."""
     timed, ranged = _ranges(net, at)
     near = np.full((net.stations, net.stations), np.inf), np.zeros((net.stations, net.stations))
     for (i, k), distance, sigma in zip(net.between, net.distance, net.distance_sigma, strict=True):
@@ -166,7 +294,14 @@ def _stations(net: Network, at: Estimate, which: list[int], method: str) -> list
     kinds = [("range" if net.synchronised else "toa", np.arange(net.pulses), *timed)]
     kinds.append(("range", np.arange(net.pulses), *ranged))
     kinds.append(("range", net.pulses + np.arange(net.stations), *near))
-    places = np.concatenate([at.pulses[0], at.stations[0]])
+    return np.concatenate([at.pulses[0], at.stations[0]]), kinds
+
+
+def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, Fix]]:
+    """Return fixes of some stations from pulses and stations that are held."""
+    if not which:
+        return []
+    places, kinds = _station_rows(net, at)
     rows = []
     for kind, ends, sigma, z in kinds:
         given = np.isfinite(sigma[which])
@@ -184,14 +319,14 @@ def _stations(net: Network, at: Estimate, which: list[int], method: str) -> list
     out, soft = [], np.asarray(np.isfinite(net.place_sigma[which]).any(axis=1))
     plain = [i for i, known in zip(which, soft, strict=True) if not known]
     problem = assemble(places, *rows)
-    free = solve(problem.take(np.flatnonzero(~soft)), method) if plain else None
+    free = solve(problem.take(np.flatnonzero(~soft))) if plain else None
     out += [(i, free[n]) for n, i in enumerate(plain) if free is not None]
     for n in np.flatnonzero(soft):
         i = which[n]
         # a coordinate of which nothing is known has a prior that says nothing, too
         sigma = np.clip(net.place_sigma[i], _EXACT * spread, 1e6 * spread)
         prior = Prior("position", net.place[i], np.diag(sigma**2))
-        out.append((i, solve(replace(problem.take(np.array([n])), priors=(prior,)), method)[0]))
+        out.append((i, solve(replace(problem.take(np.array([n])), priors=(prior,)))[0]))
     return out
 
 
