@@ -55,8 +55,8 @@ class Rows(NamedTuple):
         Pairs of stations whose distance is known.
     distance, near : array (q,)
         That distance and its inverse standard deviation.
-    hold : array (0 or S, P)
-        Linear functions of the station unknowns that keep their values.
+    hold : array (0 or S, h, P)
+        Linear functions of the station unknowns, of length one, that keep their values.
     """
 
     z: Array
@@ -260,7 +260,8 @@ def _step(rows: Rows, root: Array, s: int, at: State, damping: float, room: Room
     if rows.hold.shape[0]:
         for i in range(p):
             for k in range(i + 1):
-                room.normal[i, k] += HELD * largest * rows.hold[s, i] * rows.hold[s, k]
+                for h in range(rows.hold.shape[1]):
+                    room.normal[i, k] += HELD * largest * rows.hold[s, h, i] * rows.hold[s, h, k]
     if not _factor(room.normal):
         return False
     _solve(room.normal, room.gradient)

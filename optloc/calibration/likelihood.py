@@ -94,7 +94,7 @@ class Likelihood:
     prior: Array  # (M, d) the same of what is known of places; zero where exact
     free: Array  # (P,) which station unknowns move
     emission: Array  # (N,)
-    hold: Array  # (0, P), or (S, P) linear functions of station unknowns that keep their values
+    hold: Array  # (0, 0, P), or (S, h, P) linear functions of station unknowns that keep their values
 
     def residual(self, at: Estimate) -> Array:
         """Return whitened residuals (S, N, R) of the measurements of pulses."""
@@ -228,7 +228,7 @@ class Likelihood:
         right = right - np.einsum("sqp,sq->sp", coupled, gradient.reshape(s, -1))
         normal -= np.swapaxes(coupled, 1, 2) @ coupled
         if len(self.hold):
-            normal += (HELD * largest)[:, None, None] * self.hold[:, :, None] * self.hold[:, None]
+            normal += (HELD * largest)[:, None, None] * (np.swapaxes(self.hold, 1, 2) @ self.hold)
         step = _solved(normal, right)
         local = gradient - (coupled @ step[..., None]).reshape(gradient.shape)
         found = np.linalg.solve(np.swapaxes(inner, -1, -2), local[..., None])[..., 0]
@@ -274,7 +274,7 @@ def likelihood(network: Network) -> Likelihood:
         prior,
         np.concatenate([~exact.ravel(), clocks]),
         network.emission,
-        np.zeros((0, exact.size + clocks.size)),
+        np.zeros((0, 0, exact.size + clocks.size)),
     )
 
 
