@@ -47,6 +47,8 @@ class Block:
         Which.
     proven : bool
         That no other place costs less, and none within `AMBIGUOUS_GAP` but those listed.
+    cheapest : bool
+        That no other place costs less.
     refuted : bool
         That another place costs less.
     gaps : tuple of float
@@ -59,6 +61,7 @@ class Block:
     station: bool
     index: int
     proven: bool
+    cheapest: bool
     refuted: bool
     gaps: tuple[float, ...]
     places: Array
@@ -129,7 +132,8 @@ class _Points:
         known = np.zeros((*x.shape, x.shape[-1] + 1))
         every = np.arange(x.shape[-1])
         known[..., every, every] = self.prior[:, None]
-        residual = np.concatenate([(self.value[:, None] - predicted) * root, (self.place[:, None] - x) * self.prior[:, None]], axis=-1)
+        off = (self.place[:, None] - x) * self.prior[:, None]
+        residual = np.concatenate([(self.value[:, None] - predicted) * root, off], axis=-1)
         return residual, np.concatenate([slope * root[..., None], known], axis=-2)
 
     def mirrored(self, here: Array) -> Array:
@@ -199,7 +203,8 @@ def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
                 if all(np.linalg.norm(x[n, k] - other) > near for other in (here[n], *places)):
                     places.append(x[n, k])
                     name = f"station {net.names[which[n]]}" if station else f"pulse {net.labels[which[n]]}"
-                    found.append(Block(name, station, int(which[n]), False, gap[n, k] < 0.0, (float(gap[n, k]),), x[n, k][None]))
+                    lower, gaps = bool(gap[n, k] < 0.0), (float(gap[n, k]),)
+                    found.append(Block(name, station, int(which[n]), False, False, lower, gaps, x[n, k][None]))
     return tuple(found)
 
 
@@ -208,7 +213,8 @@ def _pulses_alone(lik: Likelihood, at: Estimate) -> _Points:
     tick = lik.ticks[0] * clocks[lik.first] + lik.ticks[1] * clocks[lik.second]
     nothing = np.zeros((net.pulses, net.dimension))
     offset = lik.emits * lik.emission[:, None]
-    return _Points(stations[lik.first], stations[lik.second], lik.gains, offset, net.z - tick, lik.root, nothing, nothing)
+    one, two = stations[lik.first], stations[lik.second]
+    return _Points(one, two, lik.gains, offset, net.z - tick, lik.root, nothing, nothing)
 
 
 def _stations_alone(lik: Likelihood, at: Estimate, which: Array) -> _Points:
@@ -241,8 +247,9 @@ def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: f
     apart = np.where(alike, np.linalg.norm(x - here, axis=1), np.inf)
     others = np.arange(len(x)) != (apart.argmin() if alike.any() else -1)
     refuted = above > _ALIKE + equal_cost(float(fix.cost))
-    proven = claim.proof == "global" and claim.unique and claim.margin >= AMBIGUOUS_GAP and not refuted
-    return Block(name, station, index, proven, refuted, tuple(gaps[others] - above), x[others])
+    cheapest = claim.proof == "global" and not refuted
+    proven = cheapest and claim.unique and claim.margin >= AMBIGUOUS_GAP
+    return Block(name, station, index, proven, cheapest, refuted, tuple(gaps[others] - above), x[others])
 
 
 def place_pulses(net: Network, at: Estimate, which: Array) -> Fix:

@@ -18,7 +18,7 @@ FIRST, EASE, STIFFEN = 1e-3, 0.2, 6.0
 LEAST, MOST = 1e-12, 1e12
 """Limits of the damping."""
 SHORT = 10.0
-"""Damping from which a step that does not lower the cost speaks of a minimum: it is then a tenth of Newton's or less."""
+"""Damping from which a step that does not lower the cost speaks of a minimum: a tenth of Newton's or less."""
 SETTLED = 1e-12
 """Relative decrease of the cost below which a start has arrived: three decades above rounding, and far below what any
 verdict asks for."""

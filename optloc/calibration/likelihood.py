@@ -114,9 +114,10 @@ class Likelihood:
 
     def cost(self, at: Estimate) -> Array:
         """Return the weighted sum of squared residuals, (S,)."""
-        return self._total(at, self.residual(at))
+        return self.total(at, self.residual(at))
 
-    def _total(self, at: Estimate, residual: Array) -> Array:
+    def total(self, at: Estimate, residual: Array) -> Array:
+        """Return the cost, the whitened residuals given."""
         known = (at.stations - self.network.place) * self.prior
         apart = self.spans(at)[0]
         return np.asarray((residual**2).sum(axis=(1, 2)) + (known**2).sum(axis=(1, 2)) + (apart**2).sum(axis=1))
@@ -197,9 +198,9 @@ class Likelihood:
         for _ in range(steps):
             here, own = out.take(left), self.of(left)
             residual = own.residual(here)
-            before = own._total(here, residual)
-            there = own._step(here, residual, damping[left])
-            after = own._total(there, own.residual(there))
+            before = own.total(here, residual)
+            there = own.step(here, residual, damping[left])
+            after = own.total(there, own.residual(there))
             good = after < before
             now = there.where(good, here)
             out = _put(out, left, now)
@@ -213,7 +214,8 @@ class Likelihood:
                 break
         return out, cost
 
-    def _step(self, at: Estimate, residual: Array, damping: Array) -> Estimate:
+    def step(self, at: Estimate, residual: Array, damping: Array) -> Estimate:
+        """Return where a damped step of Gauss and Newton leads."""
         by_station, by_pulse = self.jacobian(at)
         extra, rows = self.known(at)
         s, n, r, p = by_station.shape
