@@ -13,6 +13,7 @@ from optloc.calibration.likelihood import Estimate, Likelihood
 from optloc.calibration.network import Network
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.policy import AMBIGUOUS_GAP, equal_cost
 
@@ -23,6 +24,8 @@ four sigma with the others held hardly ends below when they move as well."""
 # Steps of a block alone from a mirrored place: so many bring nine in ten to their minimum, and the rest is refined with
 # all others anyway.
 _ALONE = 15
+# Rows above which a station's proof begins where it is.
+_MANY = 100
 # Share of the spread below which two places are one.
 _APART = 1e-3
 
@@ -287,7 +290,7 @@ def place_pulses(net: Network, at: Estimate, which: Array) -> Fix:
                 weight=given.astype(float),
             )
         )
-    return solve(assemble(stations, *kinds))
+    return _fixes(assemble(stations, *kinds), None)
 
 
 def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
@@ -326,7 +329,7 @@ def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, F
     out, soft = [], np.asarray(np.isfinite(net.place_sigma[which]).any(axis=1))
     plain = [i for i, known in zip(which, soft, strict=True) if not known]
     problem = assemble(places, *rows)
-    free = solve(problem.take(np.flatnonzero(~soft))) if plain else None
+    free = _fixes(problem.take(np.flatnonzero(~soft)), at.stations[0, plain]) if plain else None
     out += [(i, free[n]) for n, i in enumerate(plain) if free is not None]
     for n in np.flatnonzero(soft):
         i = which[n]
@@ -335,6 +338,15 @@ def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, F
         prior = Prior("position", net.place[i], np.diag(sigma**2))
         out.append((i, solve(replace(problem.take(np.array([n])), priors=(prior,)))[0]))
     return out
+
+
+def _fixes(problem: Problem, here: Array | None) -> Fix:
+    """Return fixes with their proof: of many rows from where they are now, as other starts take matrices of all rows."""
+    if here is None or problem.count <= _MANY:
+        return solve(problem)
+    start = np.zeros((len(here), problem.layout.size))
+    start[:, : here.shape[1]] = here
+    return solve(problem, "lsr+certify", start=start)
 
 
 def _ranges(net: Network, at: Estimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

@@ -255,8 +255,9 @@ def _step(rows: Rows, root: Array, s: int, at: State, damping: float, room: Room
             return False
         _forward(room.block[j], room.coupling[j], room.local[j])
     coupling = room.coupling.reshape(n * (d + 1), p)
-    room.normal[:] -= coupling.T @ coupling
-    room.gradient[:] -= coupling.T @ room.local.reshape(n * (d + 1))
+    if rows.free.any():
+        room.normal[:] -= coupling.T @ coupling
+        room.gradient[:] -= coupling.T @ room.local.reshape(n * (d + 1))
     if rows.hold.shape[0]:
         for i in range(p):
             for k in range(i + 1):
