@@ -108,7 +108,7 @@ def _sought(net: Network) -> list[int]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Points:
+class Points:
     """Blocks that see the same partners: B blocks, Q rows ``gain_0 |x - one| + gain_1 |x - two| + offset``."""
 
     one: Array  # (Q, d)
@@ -139,6 +139,11 @@ class _Points:
         residual = np.concatenate([(self.value[:, None] - predicted) * root, off], axis=-1)
         return residual, np.concatenate([slope * root[..., None], known], axis=-2)
 
+    def repeated(self, count: int) -> Points:
+        """Return each block `count` times in a row."""
+        names = ("offset", "value", "root", "place", "prior")
+        return replace(self, **{name: np.repeat(getattr(self, name), count, axis=0) for name in names})
+
     def mirrored(self, here: Array) -> Array:
         """Return places (B, K, d) mirrored in the partners' principal planes, and in their centre."""
         weight = (self.root > 0.0) / np.maximum((self.root > 0.0).sum(axis=1, keepdims=True), 1)
@@ -149,13 +154,13 @@ class _Points:
         single = here[:, None] - 2.0 * along[..., None] * np.swapaxes(axes, 1, 2)
         return np.concatenate([single, (2.0 * middle - here)[:, None]], axis=1)
 
-    def settled(self, x: Array) -> tuple[Array, Array]:
-        """Return minima (B, K, d) that places lead to, and their costs (B, K)."""
-        weight = self.root**2 * self.offset**2
-        total = np.maximum(weight.sum(axis=1), 1e-300)[:, None]
-        t = np.zeros(x.shape[:2])
-        residual = self.equations(x, t)[0][..., : self.one.shape[0]]
-        t = np.einsum("bkq,bq->bk", residual, self.root * self.offset) / total
+    def settled(self, x: Array, t: Array | None = None) -> tuple[Array, Array, Array]:
+        """Return minima (B, K, d) that places lead to, their offsets and costs (B, K)."""
+        if t is None:
+            weight = self.root**2 * self.offset
+            residual = self.equations(x, np.zeros(x.shape[:2]))[0][..., : self.one.shape[0]]
+            total = np.maximum((weight * self.offset).sum(axis=1), 1e-300)[:, None]
+            t = np.einsum("bkq,bq->bk", residual, self.root * self.offset) / total
         damping = np.full(t.shape, FIRST)
         residual, slope = self.equations(x, t)
         cost = np.sum(residual**2, axis=-1)
@@ -172,7 +177,7 @@ class _Points:
             residual = np.where(good[..., None], after, residual)
             slope = np.where(good[..., None, None], change, slope)
             damping = np.clip(np.where(good, damping * EASE, damping * STIFFEN), LEAST, MOST)
-        return x, cost
+        return x, t, cost
 
 
 def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
@@ -192,14 +197,14 @@ def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
     """
     net = lik.network
     stations = np.array(_sought(net), dtype=int)
-    groups = [(False, np.arange(net.pulses), at.pulses[0], _pulses_alone(lik, at))]
+    groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(lik, at))]
     if stations.size:
-        groups.append((True, stations, at.stations[0, stations], _stations_alone(lik, at, stations)))
+        groups.append((True, stations, at.stations[0, stations], stations_alone(lik, at, stations)))
     near = _APART * float(np.ptp(np.concatenate([at.stations[0], at.pulses[0]]), axis=0).max())
     found = []
     for station, which, here, points in groups:
-        x, cost = points.settled(points.mirrored(here))
-        gap = cost - points.settled(here[:, None])[1]
+        x, _, cost = points.settled(points.mirrored(here))
+        gap = cost - points.settled(here[:, None])[2]
         for n in np.flatnonzero(gap.min(axis=1) <= MOVED):
             places: list[Array] = []
             for k in np.flatnonzero(gap[n] <= MOVED):
@@ -211,16 +216,18 @@ def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
     return tuple(found)
 
 
-def _pulses_alone(lik: Likelihood, at: Estimate) -> _Points:
+def pulses_alone(lik: Likelihood, at: Estimate) -> Points:
+    """Return the pulses as blocks whose stations are held."""
     stations, clocks, net = at.stations[0], at.clocks[0], lik.network
     tick = lik.ticks[0] * clocks[lik.first] + lik.ticks[1] * clocks[lik.second]
     nothing = np.zeros((net.pulses, net.dimension))
     offset = lik.emits * lik.emission[:, None]
     one, two = stations[lik.first], stations[lik.second]
-    return _Points(one, two, lik.gains, offset, net.z - tick, lik.root, nothing, nothing)
+    return Points(one, two, lik.gains, offset, net.z - tick, lik.root, nothing, nothing)
 
 
-def _stations_alone(lik: Likelihood, at: Estimate, which: Array) -> _Points:
+def stations_alone(lik: Likelihood, at: Estimate, which: Array) -> Points:
+    """Return some stations as blocks, with pulses and the other stations held."""
     net = lik.network
     places, groups = _station_rows(net, at)
     ends = np.concatenate([ends for _, ends, _, _ in groups])
@@ -234,7 +241,7 @@ def _stations_alone(lik: Likelihood, at: Estimate, which: Array) -> _Points:
     # a coordinate that is known exactly does not move
     exact = 1.0 / (_EXACT * (float(np.ptp(places)) or 1.0))
     prior = np.where(net.place_sigma[which] <= 0.0, exact, lik.prior[which])
-    return _Points(one, one, gains, offset, value, root, net.place[which], prior)
+    return Points(one, one, gains, offset, value, root, net.place[which], prior)
 
 
 def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> Block:
@@ -255,7 +262,7 @@ def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: f
     return Block(name, station, index, proven, cheapest, refuted, tuple(gaps[others] - above), x[others])
 
 
-def place_pulses(net: Network, at: Estimate, which: Array) -> Fix:
+def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto") -> Fix:
     """Return fixes of some pulses from stations that are held.
 
     Parameters
@@ -266,6 +273,8 @@ def place_pulses(net: Network, at: Estimate, which: Array) -> Fix:
         One estimate, S = 1; that of the pulses is not used.
     which : int array (n,)
         The pulses.
+    method : str
+        Of `optloc.solve`.
 
     Returns
     -------
@@ -290,7 +299,7 @@ def place_pulses(net: Network, at: Estimate, which: Array) -> Fix:
                 weight=given.astype(float),
             )
         )
-    return _fixes(assemble(stations, *kinds), None)
+    return solve(assemble(stations, *kinds), method)
 
 
 def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
@@ -340,9 +349,9 @@ def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, F
     return out
 
 
-def _fixes(problem: Problem, here: Array | None) -> Fix:
-    """Return fixes with their proof: of many rows from where they are now, as other starts take matrices of all rows."""
-    if here is None or problem.count <= _MANY:
+def _fixes(problem: Problem, here: Array) -> Fix:
+    """Return fixes with their proof; of many rows from where they are, as other starts take matrices of all rows."""
+    if problem.count <= _MANY:
         return solve(problem)
     start = np.zeros((len(here), problem.layout.size))
     start[:, : here.shape[1]] = here
@@ -381,16 +390,36 @@ def moved(lik: Likelihood, at: Estimate, block: Block, place: Array) -> Estimate
     return moved_pulses(lik, at, np.array([block.index]), place[None])
 
 
-def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array) -> Estimate:
-    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it."""
+def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array, most: float = np.inf) -> Estimate:
+    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it.
+
+    With `most`, a square beyond which rows are gross, it is the median of what they want.
+    """
     pulses, emission = at.pulses.copy(), at.emission.copy()
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
     there = replace(at, pulses=pulses)
     weight = lik.root[which] * lik.emits
+    residual = lik.residual(there)[0, which]
     total = np.maximum((weight**2).sum(axis=1), 1e-300)
-    shift = (lik.residual(there)[0, which] * weight).sum(axis=1) / total
+    shift = (residual * weight).sum(axis=1) / total
+    if np.isfinite(most):
+        wanted = np.where(weight > 0.0, residual / np.where(weight > 0.0, weight, 1.0), np.nan)
+        shift = np.where(np.isnan(wanted).all(axis=1), 0.0, _median(wanted))
     emission[0, which] += np.where(lik.emission[which], shift, 0.0)
     return replace(there, emission=emission)
+
+
+def _median(values: Array) -> Array:
+    """Return medians of lines; those of nothing are zero."""
+    some = np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values)
+    return np.asarray(np.nanmedian(some, axis=1))
+
+
+def moved_stations(at: Estimate, which: Array, places: Array) -> Estimate:
+    """Return an estimate with some stations (n,) at other places (n, d)."""
+    stations = at.stations.copy()
+    stations[0, which] = places
+    return replace(at, stations=stations)
 
 
 def _moved_station(lik: Likelihood, at: Estimate, i: int, place: Array) -> Estimate:

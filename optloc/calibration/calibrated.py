@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,12 +14,15 @@ from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
 from optloc.calibration.gauge import Determined, determined, excess, fixed_by, in_frame, over, with_mean_clock
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
+from optloc.calibration.outliers import PRICE, outliers
 from optloc.calibration.rounds import laid
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 
 # Pulses that starts are made from: those with most rows. More find nothing that so many do not.
 _CORE = 60
+# Method that places the other pulses; their proof comes with that of all.
+_QUICK = "gtrs+lsr"
 # Singular value of stations about their centre, in its standard deviations, below which they are flat.
 _FLAT = 3.0
 # Share of the size by which distances differ in networks that are not the same.
@@ -95,6 +98,8 @@ class Calibration:
         Other networks within 25 of the cost, cheapest first.
     residuals : array (N, R)
         Whitened residuals; NaN where nothing was measured.
+    left_out : int array (k, 2)
+        Pulse and column of `network.z` of each row that was left out as gross, with `robust`.
     """
 
     network: Network
@@ -114,6 +119,7 @@ class Calibration:
     starts: int
     alternatives: tuple[Alternative, ...]
     residuals: Array
+    left_out: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
     @property
     def sigma(self) -> Array:
@@ -169,6 +175,7 @@ def calibrate(
     gauge: tuple[str, ...] = (),
     seed: int = 0,
     starts: int | None = None,
+    robust: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Calibration:
     """Find stations, clocks and pulses together, without a guess.
@@ -183,6 +190,9 @@ def calibrate(
         Decides the starts.
     starts : int, optional
         Starts after which the search ends, agreed or not.
+    robust : bool
+        Whether rows that most others contradict are left out first: they are named, and the network is `unproven` at
+        best, as no proof says that these are the wrong ones.
     tell : callable, optional
         Called with a sentence on each round.
 
@@ -197,6 +207,8 @@ def calibrate(
         For stations of `gauge` that are not there, or where known places define the frame.
     """
     named = _named(network, gauge)
+    if robust:
+        return _without_gross(network, gauge, seed, starts, tell)
     enough = _placeable(network)
     if network.rows - network.unknowns + frame_size(network) < 0 or enough.sum() < 1:
         return _refused(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
@@ -215,6 +227,43 @@ def calibrate(
     return _whole(made, network, enough)
 
 
+def _without_gross(
+    network: Network, gauge: tuple[str, ...], seed: int, starts: int | None, tell: Callable[[str], None] | None
+) -> Calibration:
+    """Return the network of the rows that agree, and name those that do not."""
+    core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
+    gross = np.zeros(network.z.shape, dtype=bool)
+    gross[core] = outliers(network.take(core), seed)
+    found = calibrate(
+        replace(network, sigma=np.where(gross, np.inf, network.sigma)), gauge=gauge, seed=seed, starts=starts, tell=tell
+    )
+    # all rows are asked again, those of pulses that the search did not have too
+    residual = _all_residuals(network, found)
+    again = network.given & (residual**2 > PRICE)
+    if (again != gross).any() and np.isfinite(found.stations).all():
+        gross = again
+        found = calibrate(
+            replace(network, sigma=np.where(gross, np.inf, network.sigma)),
+            gauge=gauge,
+            seed=seed,
+            starts=starts,
+            tell=tell,
+        )
+    left = np.argwhere(gross)
+    if not len(left):
+        return found
+    names = [f"{network.names[network.slots[r].a]} of pulse {network.labels[j]}" for j, r in left]
+    words = f"Left out as gross, which no proof confirms: {_few(names)}."
+    status = min(found.status, Status.UNPROVEN, key=PRECEDENCE.index) if found.status in PRECEDENCE else found.status
+    return replace(found, network=network, status=status, findings=(*found.findings, words), left_out=left)
+
+
+def _all_residuals(network: Network, found: Calibration) -> Array:
+    """Return whitened residuals (N, R) of all rows; zeros of pulses without a place."""
+    at = Estimate(found.stations[None], found.clocks[None], found.pulses[None], found.emission[None])
+    return np.asarray(np.nan_to_num(likelihood(network).residual(at)[0]))
+
+
 def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Estimate:
     """Return an estimate of all pulses that can be placed: the core's, and fixes of the others."""
     n, d = network.pulses, network.dimension
@@ -222,7 +271,7 @@ def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Esti
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
     pulses[0, rest] = at.stations[0].mean(axis=0)
     there = Estimate(at.stations, at.clocks, pulses, emission)
-    whole = moved_pulses(likelihood(network), there, rest, place_pulses(network, at, rest).position)
+    whole = moved_pulses(likelihood(network), there, rest, place_pulses(network, at, rest, _QUICK).position)
     every = np.sort(np.concatenate([core, rest]))
     return Estimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
 
@@ -319,7 +368,9 @@ def _curved_findings(lik: Likelihood, at: Estimate, told: Determined) -> list[tu
     share = excess(lik, at, told)
     if share <= _COVERS:
         return []
-    words = f"The covariance is too small: where the measurement is repeated, squared errors exceed it by up to {share:.0%}."
+    words = (
+        f"The covariance is too small: squared errors exceed it by up to {share:.0%} where the measurement is repeated."
+    )
     return [(Status.CURVED, words)]
 
 

@@ -64,7 +64,9 @@ def counted(seed, m, n, sigma, box, clocks):
     random = float(lik.refine(starts_of(lik, 0).random(10))[1].min())
     _, distance, covariance = found.distances()
     error = distances(truth.stations[0]) - distance
-    width, axes = np.linalg.eigh(covariance) if np.isfinite(covariance).all() else (np.ones(len(error)), np.eye(len(error)))
+    width, axes = (
+        np.linalg.eigh(covariance) if np.isfinite(covariance).all() else (np.ones(len(error)), np.eye(len(error)))
+    )
     told = width > 1e-9 * width[-1]
     nees = float((((axes.T @ error)[told]) ** 2 / width[told]).sum())
     dof = int(told.sum())
