@@ -8,8 +8,9 @@ from calibration_scenes import HALL, hall
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
 from optloc.calibration.calibrated import refuted_blocks
-from optloc.calibration.gauge import determined
+from optloc.calibration.gauge import determined, excess
 from optloc.calibration.likelihood import likelihood
+from optloc.calibration.rounds import starts_of
 
 EXACT = 1e-6
 
@@ -70,6 +71,59 @@ def test_derivatives_are_those_of_automatic_differentiation():
     pulses = -2.0 * np.einsum("nrq,nr->nq", by_pulse[0], residual)
     ours = np.concatenate([stations, pulses[:, :3].ravel(), pulses[:, 3]])
     assert ours == pytest.approx(np.asarray(gradient).ravel(), rel=1e-9, abs=1e-7)
+
+
+def test_machine_code_takes_the_steps_of_numpy():
+    truth, z = hall(5, 7, 12, 0.1, clocks=True)
+    z[2, 3] = np.nan
+    distances = [(0, 2, 7.0, 0.2)]
+    lik = likelihood(
+        network_of(z, 0.1, synchronised=False, distances=distances, place=truth.stations[0], place_sigma=0.5)
+    )
+    at = starts_of(lik, 0).random(3)
+    (one, first), (two, second) = lik.refine_together(at, 30), lik.refine(at, 30)
+    assert first == pytest.approx(second, rel=1e-6)
+    assert one.stations == pytest.approx(two.stations, abs=1e-4)
+
+
+def test_random_places_lead_to_the_minimum():
+    truth, z = hall(3, 12, 20, 0.03)
+    lik = likelihood(network_of(z, 0.03))
+    cost = lik.refine(starts_of(lik, 0).random(8))[1]
+    assert cost.min() == pytest.approx(lik.refine(truth)[1][0], abs=0.01)
+
+
+def test_errors_exceed_a_covariance_where_noise_is_large():
+    shares = []
+    for sigma in (0.003, 0.6):
+        truth, z = hall(4, 7, 20, sigma)
+        lik = likelihood(network_of(z, sigma))
+        at = lik.refine(truth)[0]
+        shares.append(excess(lik, at, determined(lik, at)))
+    assert abs(shares[0]) < 0.02
+    assert shares[1] > 0.2
+
+
+def test_gross_rows_are_named_and_the_network_is_unproven_at_best():
+    truth, z = hall(9, 10, 20, 0.03)
+    rng = np.random.default_rng(9)
+    wrong = np.argwhere(rng.random(z.shape) < 0.04)
+    z[tuple(wrong.T)] += rng.uniform(1.0, 5.0, len(wrong))
+    found = calibrate(network_of(z, 0.03), robust=True)
+    assert {tuple(row) for row in wrong} <= {tuple(row) for row in found.left_out}
+    assert len(found.left_out) <= len(wrong) + 2
+    assert found.status is Status.UNPROVEN
+    assert np.sqrt(np.mean(errors(found, truth)[0] ** 2)) < 0.15
+
+
+def test_a_pulse_at_two_places_has_none_and_leaves_the_stations_as_they_are():
+    _, z = hall(1021, 6, 20, 0.03)
+    found = calibrate(network_of(z, 0.03))
+    assert found.alternatives[0].what == "Pulse 6 elsewhere"
+    assert found.alternatives[0].gap < 9
+    assert found.status is not Status.AMBIGUOUS
+    assert np.isnan(found.pulses[6]).all()
+    assert np.isfinite(found.pulses).all(axis=1).sum() >= 18
 
 
 def calibrated_near(truth):

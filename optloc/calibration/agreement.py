@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optloc.calibration.blocks import MOVED, blocks, moved
+from optloc.calibration.blocks import MOVED, Block, blocks, elsewhere, moved
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import CLOCKED, Network
 from optloc.calibration.rounds import Ends, rounds, starts_of
@@ -33,15 +33,13 @@ _SAME = 0.01
 class Found:
     """What a search has arrived at so far.
 
-    `ends` are the minima of starts; `onward` tells where moves of blocks lead from the cost of one, and `others` are
-    networks with one block of the best elsewhere, by name.
+    `ends` are the minima of starts; `onward` tells where moves of blocks lead from the cost of one.
     """
 
     ends: Ends
     best: Estimate
     cost: float
     made: int
-    others: list[tuple[str, Estimate, float]] = field(default_factory=list)
     onward: dict[float, float] = field(default_factory=dict)
 
     @property
@@ -80,21 +78,11 @@ def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], Non
             if tell is not None:
                 tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
             agreed = found.agreeing >= AGREEING and _fits(net, found.cost)
-            if (agreed or made >= limit) and not _lowered(lik, found):
+            if agreed or made >= limit:
                 return found
         if made >= 2 * limit:
             return found
     return found
-
-
-def _lowered(lik: Likelihood, found: Found) -> bool:
-    """Move blocks to all places that a proof leaves, and return whether the best network became cheaper."""
-    at, cost, found.others = _swept(lik, found.best, found.cost, prove=True)
-    if cost >= found.cost - _SAME:
-        return False
-    found.onward[_key(found.cost)] = cost
-    found.best, found.cost = at, cost
-    return True
 
 
 def _joined(found: Found | None, ends: Ends, made: int) -> Found:
@@ -124,37 +112,63 @@ def _move_on(lik: Likelihood, found: Found) -> None:
         if _key(ends.cost[i]) in found.onward:
             continue
         tried += 1
-        at, cost = _swept(lik, ends.at.take(np.array([i])), float(ends.cost[i]))[:2]
+        at, cost = _swept(lik, ends.at.take(np.array([i])), float(ends.cost[i]))
         found.onward[_key(ends.cost[i])] = cost
         if cost < found.cost - _SAME:
             found.best, found.cost = at, cost
 
 
-def _swept(
-    lik: Likelihood, at: Estimate, cost: float, prove: bool = False
-) -> tuple[Estimate, float, list[tuple[str, Estimate, float]]]:
-    """Return where moves of blocks lead from a minimum, and the networks with one block elsewhere."""
-    others: list[tuple[str, Estimate, float]] = []
+def _swept(lik: Likelihood, at: Estimate, cost: float) -> tuple[Estimate, float]:
+    """Return where moves of blocks lead from a minimum."""
     for _ in range(_SWEEPS):
+        found = sorted(elsewhere(lik, at), key=lambda block: block.gaps[0])[:_MOVES]
+        if not found:
+            break
+        there, costs = lik.refine(together(*(moved(lik, at, block, block.places[0]) for block in found)))
+        i = int(np.argmin(costs))
+        if costs[i] >= cost - _SAME - equal_cost(cost):
+            break
+        at, cost = there.take(np.array([i])), float(costs[i])
+    return at, cost
+
+
+def proven(lik: Likelihood, at: Estimate) -> tuple[Estimate, tuple[Block, ...], list[tuple[str, Estimate]]]:
+    """Move blocks to all places that a proof leaves, until none lowers the cost.
+
+    Parameters
+    ----------
+    lik : Likelihood
+        The network.
+    at : Estimate
+        A minimum, S = 1.
+
+    Returns
+    -------
+    at : Estimate
+        The cheapest network.
+    blocks : tuple of Block
+        What is proven of it.
+    others : list of (str, Estimate)
+        Networks with one block elsewhere, refined.
+    """
+    cost, others = float(lik.cost(at)[0]), list[tuple[str, Estimate]]()
+    for _ in range(_SWEEPS):
+        found = blocks(lik, at)
         places = [
-            (gap, block, place)
-            for block in blocks(lik, at, prove=prove)
+            (block, place)
+            for block in found
             for place, gap in zip(block.places, block.gaps, strict=True)
             if gap <= MOVED
         ]
         if not places:
-            break
-        if not prove:
-            places = sorted(places, key=lambda one: one[0])[:_MOVES]
-        names = [block.name for _, block, _ in places]
-        starts = [moved(lik, at, block, place) for _, block, place in places]
-        ends, costs = lik.refine(together(*starts))
+            return at, found, []
+        ends, costs = lik.refine(together(*(moved(lik, at, block, place) for block, place in places)))
+        others = [(f"{block.name} elsewhere", ends.take(np.array([n]))) for n, (block, _) in enumerate(places)]
         i = int(np.argmin(costs))
-        others = [(f"{name} elsewhere", ends.take(np.array([n])), float(costs[n])) for n, name in enumerate(names)]
         if costs[i] >= cost - _SAME - equal_cost(cost):
             break
         at, cost = ends.take(np.array([i])), float(costs[i])
-    return at, cost, others
+    return at, found, others
 
 
 def _fits(net: Network, cost: float) -> bool:

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array, Prior
+from optloc.calibration.descent import EASE, FIRST, FLOOR, LEAST, MOST, NOTHING, STIFFEN
 from optloc.calibration.likelihood import Estimate, Likelihood
 from optloc.calibration.network import Network
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.policy import AMBIGUOUS_GAP, equal_cost
 
@@ -19,8 +21,13 @@ MOVED = 16.0
 """Cost that a block's other place may have beyond its present one for all to be refined from there: what is dearer by
 four sigma with the others held hardly ends below when they move as well."""
 
-QUICK = "gtrs+lsr"
-"""Method that tells a fix and its likeliest rivals, unproven."""
+# Steps of a block alone from a mirrored place: so many bring nine in ten to their minimum, and the rest is refined with
+# all others anyway.
+_ALONE = 15
+# Rows above which a station's proof begins where it is.
+_MANY = 100
+# Share of the spread below which two places are one.
+_APART = 1e-3
 
 # Cost that tells no two places apart: a tenth of a sigma of one number.
 _ALIKE = 0.01
@@ -43,6 +50,8 @@ class Block:
         Which.
     proven : bool
         That no other place costs less, and none within `AMBIGUOUS_GAP` but those listed.
+    cheapest : bool
+        That no other place costs less.
     refuted : bool
         That another place costs less.
     gaps : tuple of float
@@ -55,13 +64,14 @@ class Block:
     station: bool
     index: int
     proven: bool
+    cheapest: bool
     refuted: bool
     gaps: tuple[float, ...]
     places: Array
 
 
-def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block, ...]:
-    """Return what is known of each station that is not known exactly, and of each pulse, with all others held.
+def blocks(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
+    """Return what is proven of each station that is not known exactly, and of each pulse, with all others held.
 
     Parameters
     ----------
@@ -69,8 +79,6 @@ def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block,
         The network.
     at : Estimate
         One estimate, S = 1.
-    prove : bool
-        Whether each is proven, or its likeliest other places are looked up alone.
 
     Returns
     -------
@@ -78,15 +86,14 @@ def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block,
         Stations first. The proof is that of a fix from known stations; it does not exclude that several blocks move
         together.
     """
-    net, method = lik.network, "auto" if prove else QUICK
-    stations = [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
+    net = lik.network
     d, cost = net.dimension, float(lik.cost(at)[0])
     found = []
-    for i, fix in _stations(net, at, stations, method):
+    for i, fix in _stations(net, at, _sought(net)):
         at_best = _moved_station(lik, at, i, fix.position[:d])
         above = cost - float(lik.cost(at_best)[0])
         found.append(_block(fix, i, f"station {net.names[i]}", True, at.stations[0, i], above))
-    fix = place_pulses(net, at, np.arange(net.pulses), method)
+    fix = place_pulses(net, at, np.arange(net.pulses))
     # pulses do not know of each other: all are moved at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
     after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
@@ -94,6 +101,147 @@ def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block,
         above = float(before[j] - after[j])
         found.append(_block(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
     return tuple(found)
+
+
+def _sought(net: Network) -> list[int]:
+    return [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Blocks that see the same partners: B blocks, Q rows ``gain_0 |x - one| + gain_1 |x - two| + offset``."""
+
+    one: Array  # (Q, d)
+    two: Array
+    gains: Array  # (2, Q)
+    offset: Array  # (B, Q) what the block's own clock or emission counts
+    value: Array  # (B, Q)
+    root: Array
+    place: Array  # (B, d) what is known of the place, and its inverse standard deviation
+    prior: Array
+
+    def equations(self, x: Array, t: Array) -> tuple[Array, Array]:
+        """Return whitened residuals (B, K, Q + d) and derivatives (B, K, Q + d, d + 1) at places and offsets."""
+        shape = (*x.shape[:2], self.one.shape[0])
+        predicted = t[..., None] * self.offset[:, None]
+        slope = np.zeros((*shape, x.shape[-1] + 1))
+        for end, gain in zip((self.one, self.two), self.gains, strict=True):
+            line = x[:, :, None] - end
+            length = np.maximum(np.sqrt(np.sum(line * line, axis=-1)), 1e-300)
+            predicted = predicted + gain * length
+            slope[..., :-1] += line * (gain / length)[..., None]
+        slope[..., -1] = self.offset[:, None]
+        root = self.root[:, None]
+        known = np.zeros((*x.shape, x.shape[-1] + 1))
+        every = np.arange(x.shape[-1])
+        known[..., every, every] = self.prior[:, None]
+        off = (self.place[:, None] - x) * self.prior[:, None]
+        residual = np.concatenate([(self.value[:, None] - predicted) * root, off], axis=-1)
+        return residual, np.concatenate([slope * root[..., None], known], axis=-2)
+
+    def repeated(self, count: int) -> Points:
+        """Return each block `count` times in a row."""
+        names = ("offset", "value", "root", "place", "prior")
+        return replace(self, **{name: np.repeat(getattr(self, name), count, axis=0) for name in names})
+
+    def mirrored(self, here: Array) -> Array:
+        """Return places (B, K, d) mirrored in the partners' principal planes, and in their centre."""
+        weight = (self.root > 0.0) / np.maximum((self.root > 0.0).sum(axis=1, keepdims=True), 1)
+        middle = weight @ self.one
+        centred = (self.one - middle[:, None]) * np.sqrt(weight)[..., None]
+        axes = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)[1]
+        along = np.einsum("bd,bdk->bk", here - middle, axes)
+        single = here[:, None] - 2.0 * along[..., None] * np.swapaxes(axes, 1, 2)
+        return np.concatenate([single, (2.0 * middle - here)[:, None]], axis=1)
+
+    def settled(self, x: Array, t: Array | None = None) -> tuple[Array, Array, Array]:
+        """Return minima (B, K, d) that places lead to, their offsets and costs (B, K)."""
+        if t is None:
+            weight = self.root**2 * self.offset
+            residual = self.equations(x, np.zeros(x.shape[:2]))[0][..., : self.one.shape[0]]
+            total = np.maximum((weight * self.offset).sum(axis=1), 1e-300)[:, None]
+            t = np.einsum("bkq,bq->bk", residual, self.root * self.offset) / total
+        damping = np.full(t.shape, FIRST)
+        residual, slope = self.equations(x, t)
+        cost = np.sum(residual**2, axis=-1)
+        for _ in range(_ALONE):
+            normal = np.swapaxes(slope, -1, -2) @ slope
+            diagonal = np.einsum("bkii->bki", normal)
+            diagonal += damping[..., None] * diagonal + FLOOR * diagonal.max(axis=-1, keepdims=True) + NOTHING
+            step = np.linalg.solve(normal, np.einsum("bkqi,bkq->bki", slope, residual)[..., None])[..., 0]
+            there, late = x + step[..., :-1], t + step[..., -1]
+            after, change = self.equations(there, late)
+            new = np.sum(after**2, axis=-1)
+            good = new < cost
+            x, t, cost = np.where(good[..., None], there, x), np.where(good, late, t), np.where(good, new, cost)
+            residual = np.where(good[..., None], after, residual)
+            slope = np.where(good[..., None, None], change, slope)
+            damping = np.clip(np.where(good, damping * EASE, damping * STIFFEN), LEAST, MOST)
+        return x, t, cost
+
+
+def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
+    """Return the likeliest other places of each station and pulse, the others held: nothing is proven.
+
+    Parameters
+    ----------
+    lik : Likelihood
+        The network.
+    at : Estimate
+        One minimum, S = 1.
+
+    Returns
+    -------
+    tuple of Block
+        Those that have other places, found from mirror images in the principal planes of their partners.
+    """
+    net = lik.network
+    stations = np.array(_sought(net), dtype=int)
+    groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(lik, at))]
+    if stations.size:
+        groups.append((True, stations, at.stations[0, stations], stations_alone(lik, at, stations)))
+    near = _APART * float(np.ptp(np.concatenate([at.stations[0], at.pulses[0]]), axis=0).max())
+    found = []
+    for station, which, here, points in groups:
+        x, _, cost = points.settled(points.mirrored(here))
+        gap = cost - points.settled(here[:, None])[2]
+        for n in np.flatnonzero(gap.min(axis=1) <= MOVED):
+            places: list[Array] = []
+            for k in np.flatnonzero(gap[n] <= MOVED):
+                if all(np.linalg.norm(x[n, k] - other) > near for other in (here[n], *places)):
+                    places.append(x[n, k])
+                    name = f"station {net.names[which[n]]}" if station else f"pulse {net.labels[which[n]]}"
+                    lower, gaps = bool(gap[n, k] < 0.0), (float(gap[n, k]),)
+                    found.append(Block(name, station, int(which[n]), False, False, lower, gaps, x[n, k][None]))
+    return tuple(found)
+
+
+def pulses_alone(lik: Likelihood, at: Estimate) -> Points:
+    """Return the pulses as blocks whose stations are held."""
+    stations, clocks, net = at.stations[0], at.clocks[0], lik.network
+    tick = lik.ticks[0] * clocks[lik.first] + lik.ticks[1] * clocks[lik.second]
+    nothing = np.zeros((net.pulses, net.dimension))
+    offset = lik.emits * lik.emission[:, None]
+    one, two = stations[lik.first], stations[lik.second]
+    return Points(one, two, lik.gains, offset, net.z - tick, lik.root, nothing, nothing)
+
+
+def stations_alone(lik: Likelihood, at: Estimate, which: Array) -> Points:
+    """Return some stations as blocks, with pulses and the other stations held."""
+    net = lik.network
+    places, groups = _station_rows(net, at)
+    ends = np.concatenate([ends for _, ends, _, _ in groups])
+    timed = np.concatenate([np.full(len(ends), float(kind == "toa")) for kind, ends, _, _ in groups])
+    value = np.concatenate([z[which] for _, _, _, z in groups], axis=1)
+    with np.errstate(divide="ignore"):
+        root = 1.0 / np.concatenate([sigma[which] for _, _, sigma, _ in groups], axis=1)
+    gains = np.array([np.ones(len(ends)), np.zeros(len(ends))])
+    offset = np.broadcast_to(timed, value.shape)
+    one = places[ends]
+    # a coordinate that is known exactly does not move
+    exact = 1.0 / (_EXACT * (float(np.ptp(places)) or 1.0))
+    prior = np.where(net.place_sigma[which] <= 0.0, exact, lik.prior[which])
+    return Points(one, one, gains, offset, value, root, net.place[which], prior)
 
 
 def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> Block:
@@ -109,8 +257,9 @@ def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: f
     apart = np.where(alike, np.linalg.norm(x - here, axis=1), np.inf)
     others = np.arange(len(x)) != (apart.argmin() if alike.any() else -1)
     refuted = above > _ALIKE + equal_cost(float(fix.cost))
-    proven = claim.proof == "global" and claim.unique and claim.margin >= AMBIGUOUS_GAP and not refuted
-    return Block(name, station, index, proven, refuted, tuple(gaps[others] - above), x[others])
+    cheapest = claim.proof == "global" and not refuted
+    proven = cheapest and claim.unique and claim.margin >= AMBIGUOUS_GAP
+    return Block(name, station, index, proven, cheapest, refuted, tuple(gaps[others] - above), x[others])
 
 
 def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto") -> Fix:
@@ -153,10 +302,8 @@ def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto")
     return solve(assemble(stations, *kinds), method)
 
 
-def _stations(net: Network, at: Estimate, which: list[int], method: str) -> list[tuple[int, Fix]]:
-    """Return fixes of some stations from pulses and stations that are held."""
-    if not which:
-        return []
+def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
+    """Return places of all, and rows of stations: kind, which place, deviations and values (M, q)."""
     timed, ranged = _ranges(net, at)
     near = np.full((net.stations, net.stations), np.inf), np.zeros((net.stations, net.stations))
     for (i, k), distance, sigma in zip(net.between, net.distance, net.distance_sigma, strict=True):
@@ -166,7 +313,14 @@ def _stations(net: Network, at: Estimate, which: list[int], method: str) -> list
     kinds = [("range" if net.synchronised else "toa", np.arange(net.pulses), *timed)]
     kinds.append(("range", np.arange(net.pulses), *ranged))
     kinds.append(("range", net.pulses + np.arange(net.stations), *near))
-    places = np.concatenate([at.pulses[0], at.stations[0]])
+    return np.concatenate([at.pulses[0], at.stations[0]]), kinds
+
+
+def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, Fix]]:
+    """Return fixes of some stations from pulses and stations that are held."""
+    if not which:
+        return []
+    places, kinds = _station_rows(net, at)
     rows = []
     for kind, ends, sigma, z in kinds:
         given = np.isfinite(sigma[which])
@@ -184,15 +338,24 @@ def _stations(net: Network, at: Estimate, which: list[int], method: str) -> list
     out, soft = [], np.asarray(np.isfinite(net.place_sigma[which]).any(axis=1))
     plain = [i for i, known in zip(which, soft, strict=True) if not known]
     problem = assemble(places, *rows)
-    free = solve(problem.take(np.flatnonzero(~soft)), method) if plain else None
+    free = _fixes(problem.take(np.flatnonzero(~soft)), at.stations[0, plain]) if plain else None
     out += [(i, free[n]) for n, i in enumerate(plain) if free is not None]
     for n in np.flatnonzero(soft):
         i = which[n]
         # a coordinate of which nothing is known has a prior that says nothing, too
         sigma = np.clip(net.place_sigma[i], _EXACT * spread, 1e6 * spread)
         prior = Prior("position", net.place[i], np.diag(sigma**2))
-        out.append((i, solve(replace(problem.take(np.array([n])), priors=(prior,)), method)[0]))
+        out.append((i, solve(replace(problem.take(np.array([n])), priors=(prior,)))[0]))
     return out
+
+
+def _fixes(problem: Problem, here: Array) -> Fix:
+    """Return fixes with their proof; of many rows from where they are, as other starts take matrices of all rows."""
+    if problem.count <= _MANY:
+        return solve(problem)
+    start = np.zeros((len(here), problem.layout.size))
+    start[:, : here.shape[1]] = here
+    return solve(problem, "lsr+certify", start=start)
 
 
 def _ranges(net: Network, at: Estimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -227,16 +390,36 @@ def moved(lik: Likelihood, at: Estimate, block: Block, place: Array) -> Estimate
     return moved_pulses(lik, at, np.array([block.index]), place[None])
 
 
-def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array) -> Estimate:
-    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it."""
+def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array, most: float = np.inf) -> Estimate:
+    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it.
+
+    With `most`, a square beyond which rows are gross, it is the median of what they want.
+    """
     pulses, emission = at.pulses.copy(), at.emission.copy()
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
     there = replace(at, pulses=pulses)
     weight = lik.root[which] * lik.emits
+    residual = lik.residual(there)[0, which]
     total = np.maximum((weight**2).sum(axis=1), 1e-300)
-    shift = (lik.residual(there)[0, which] * weight).sum(axis=1) / total
+    shift = (residual * weight).sum(axis=1) / total
+    if np.isfinite(most):
+        wanted = np.where(weight > 0.0, residual / np.where(weight > 0.0, weight, 1.0), np.nan)
+        shift = np.where(np.isnan(wanted).all(axis=1), 0.0, _median(wanted))
     emission[0, which] += np.where(lik.emission[which], shift, 0.0)
     return replace(there, emission=emission)
+
+
+def _median(values: Array) -> Array:
+    """Return medians of lines; those of nothing are zero."""
+    some = np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values)
+    return np.asarray(np.nanmedian(some, axis=1))
+
+
+def moved_stations(at: Estimate, which: Array, places: Array) -> Estimate:
+    """Return an estimate with some stations (n,) at other places (n, d)."""
+    stations = at.stations.copy()
+    stations[0, which] = places
+    return replace(at, stations=stations)
 
 
 def _moved_station(lik: Likelihood, at: Estimate, i: int, place: Array) -> Estimate:

@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.types import PRECEDENCE, Array, Status
-from optloc.calibration.agreement import AGREEING, Found, frame_size, search
+from optloc.calibration.agreement import AGREEING, Found, frame_size, proven, search
 from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
-from optloc.calibration.gauge import Determined, determined, fixed_by, in_frame, with_mean_clock
+from optloc.calibration.gauge import Determined, determined, excess, fixed_by, in_frame, over, with_mean_clock
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
+from optloc.calibration.outliers import PRICE, outliers
 from optloc.calibration.rounds import laid
-from optloc.compute.range_shape import STRAIGHT
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 
 # Pulses that starts are made from: those with most rows. More find nothing that so many do not.
 _CORE = 60
+# Method that places the other pulses; their proof comes with that of all.
+_QUICK = "gtrs+lsr"
 # Singular value of stations about their centre, in its standard deviations, below which they are flat.
 _FLAT = 3.0
-# The weakest directions along which the cost is looked at three sigma out: where it bends, it bends there first.
-_WEAKEST = 6
+# Share of the size by which distances differ in networks that are not the same.
+_ALIKE = 1e-3
+# Probability beyond the ellipsoid in which two networks are one answer.
+_WITHIN = 0.05
+# Share of the largest variance below which a change of distances is none that stations can make.
+_ZERO = 1e-9
+# Share of the largest move of a pulse above which others are elsewhere, too, and do not just follow the stations.
+_GIVES_WAY = 0.1
+# Share by which squared errors may exceed the covariance: 10 % of a deviation.
+_COVERS = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +49,14 @@ class Alternative:
         Its cost beyond that of the network found.
     stations : array (M, d)
         Where it has the stations, metres, in the same frame.
+    pulses : array (N, d)
+        Where it has the pulses that can be placed.
     """
 
     what: str
     gap: float
     stations: Array
+    pulses: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +72,7 @@ class Calibration:
     clocks : array (M,)
         Offsets times the speed of propagation, metres; zeros where stations share a clock.
     pulses : array (N, d)
-        Places, metres; NaN where a pulse has too few rows to be placed.
+        Places, metres; NaN where a pulse has too few rows, or is not proven to fit at one place alone.
     emission : array (N,)
         Times of emission times the speed of propagation, metres.
     covariance : array (P, P)
@@ -71,8 +84,8 @@ class Calibration:
     findings : tuple of str
         All that speaks against the network, a sentence each; empty for `ok`.
     proof : "blockwise" or "unknown"
-        "blockwise": with the others held, no other place of any one station or pulse costs less, and none costs up to 9
-        more, proven. It does not exclude that several move together.
+        "blockwise": with the others held, no other place of any one station or pulse costs less, and none of a station
+        costs up to 9 more, proven. It does not exclude that several move together.
     cost : float
         Weighted sum of squared residuals.
     dof : int
@@ -85,6 +98,8 @@ class Calibration:
         Other networks within 25 of the cost, cheapest first.
     residuals : array (N, R)
         Whitened residuals; NaN where nothing was measured.
+    left_out : int array (k, 2)
+        Pulse and column of `network.z` of each row that was left out as gross, with `robust`.
     """
 
     network: Network
@@ -104,6 +119,7 @@ class Calibration:
     starts: int
     alternatives: tuple[Alternative, ...]
     residuals: Array
+    left_out: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
     @property
     def sigma(self) -> Array:
@@ -123,16 +139,9 @@ class Calibration:
         covariance : array (q, q)
             Square metres.
         """
-        m, d = self.stations.shape
-        pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
-        line = self.stations[pairs[:, 0]] - self.stations[pairs[:, 1]]
-        length = np.linalg.norm(line, axis=1)
-        unit = line / np.maximum(length, 1e-300)[:, None]
-        jacobian = np.zeros((len(pairs), m, d))
-        every = np.arange(len(pairs))
-        jacobian[every, pairs[:, 0]], jacobian[every, pairs[:, 1]] = unit, -unit
-        flat = jacobian.reshape(len(pairs), m * d)
-        return pairs, length, flat @ self.covariance[: m * d, : m * d] @ flat.T
+        pairs, length, flat = spans(self.stations)
+        size = flat.shape[1]
+        return pairs, length, flat @ self.covariance[:size, :size] @ flat.T
 
     def require(self, allow: tuple[str, ...] = ()) -> Calibration:
         """Return this where its status is `ok` or one that is allowed.
@@ -147,12 +156,26 @@ class Calibration:
         return self
 
 
+def spans(stations: Array) -> tuple[Array, Array, Array]:
+    """Return all pairs of stations (q, 2), their distances (q,) and the derivatives of these (q, M d)."""
+    m, d = stations.shape
+    pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
+    line = stations[pairs[:, 0]] - stations[pairs[:, 1]]
+    length = np.linalg.norm(line, axis=1)
+    unit = line / np.maximum(length, 1e-300)[:, None]
+    jacobian = np.zeros((len(pairs), m, d))
+    every = np.arange(len(pairs))
+    jacobian[every, pairs[:, 0]], jacobian[every, pairs[:, 1]] = unit, -unit
+    return pairs, length, jacobian.reshape(len(pairs), m * d)
+
+
 def calibrate(
     network: Network,
     *,
     gauge: tuple[str, ...] = (),
     seed: int = 0,
     starts: int | None = None,
+    robust: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Calibration:
     """Find stations, clocks and pulses together, without a guess.
@@ -167,6 +190,9 @@ def calibrate(
         Decides the starts.
     starts : int, optional
         Starts after which the search ends, agreed or not.
+    robust : bool
+        Whether rows that most others contradict are left out first: they are named, and the network is `unproven` at
+        best, as no proof says that these are the wrong ones.
     tell : callable, optional
         Called with a sentence on each round.
 
@@ -181,6 +207,8 @@ def calibrate(
         For stations of `gauge` that are not there, or where known places define the frame.
     """
     named = _named(network, gauge)
+    if robust:
+        return _without_gross(network, gauge, seed, starts, tell)
     enough = _placeable(network)
     if network.rows - network.unknowns + frame_size(network) < 0 or enough.sum() < 1:
         return _refused(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
@@ -195,9 +223,45 @@ def calibrate(
     if rest.any():
         at = _with_rest(network, at, core, np.flatnonzero(rest))
     lik = likelihood(network.take(enough))
-    at, _ = lik.refine(at)
-    made = _judged(lik, at, found, named)
+    made = _judged(lik, lik.refine(at)[0], found, named)
     return _whole(made, network, enough)
+
+
+def _without_gross(
+    network: Network, gauge: tuple[str, ...], seed: int, starts: int | None, tell: Callable[[str], None] | None
+) -> Calibration:
+    """Return the network of the rows that agree, and name those that do not."""
+    core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
+    gross = np.zeros(network.z.shape, dtype=bool)
+    gross[core] = outliers(network.take(core), seed)
+    found = calibrate(
+        replace(network, sigma=np.where(gross, np.inf, network.sigma)), gauge=gauge, seed=seed, starts=starts, tell=tell
+    )
+    # all rows are asked again, those of pulses that the search did not have too
+    residual = _all_residuals(network, found)
+    again = network.given & (residual**2 > PRICE)
+    if (again != gross).any() and np.isfinite(found.stations).all():
+        gross = again
+        found = calibrate(
+            replace(network, sigma=np.where(gross, np.inf, network.sigma)),
+            gauge=gauge,
+            seed=seed,
+            starts=starts,
+            tell=tell,
+        )
+    left = np.argwhere(gross)
+    if not len(left):
+        return found
+    names = [f"{network.names[network.slots[r].a]} of pulse {network.labels[j]}" for j, r in left]
+    words = f"Left out as gross, which no proof confirms: {_few(names)}."
+    status = min(found.status, Status.UNPROVEN, key=PRECEDENCE.index) if found.status in PRECEDENCE else found.status
+    return replace(found, network=network, status=status, findings=(*found.findings, words), left_out=left)
+
+
+def _all_residuals(network: Network, found: Calibration) -> Array:
+    """Return whitened residuals (N, R) of all rows; zeros of pulses without a place."""
+    at = Estimate(found.stations[None], found.clocks[None], found.pulses[None], found.emission[None])
+    return np.asarray(np.nan_to_num(likelihood(network).residual(at)[0]))
 
 
 def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Estimate:
@@ -207,7 +271,7 @@ def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Esti
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
     pulses[0, rest] = at.stations[0].mean(axis=0)
     there = Estimate(at.stations, at.clocks, pulses, emission)
-    whole = moved_pulses(likelihood(network), there, rest, place_pulses(network, at, rest).position)
+    whole = moved_pulses(likelihood(network), there, rest, place_pulses(network, at, rest, _QUICK).position)
     every = np.sort(np.concatenate([core, rest]))
     return Estimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
 
@@ -217,7 +281,8 @@ def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Esti
 
 def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...]) -> Calibration:
     net = lik.network
-    soft = np.isfinite(net.place_sigma).any()
+    soft = bool(np.isfinite(net.place_sigma).any())
+    at, checked, others = proven(lik, at)
     at = with_mean_clock(net, at) if soft else in_frame(net, at, named)
     told = determined(lik, at)
     cost = float(lik.cost(at)[0])
@@ -230,14 +295,18 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
     else:
         covariance = told.covariance(fixed_by(net, named) if named else told.free.T)
         findings += _flat_findings(net, at, covariance)
-        findings += _curved_findings(lik, at, cost, told)
+        findings += _curved_findings(lik, at, told)
     if p < REFUTED:
         findings.append((Status.MISFIT, f"The residuals are larger than the stated noise allows: p = {p:.2g}."))
-    proof, block_findings = _proof(lik, at)
-    alternatives = _alternatives(lik, at, cost, found, bool(soft))
-    close = [one for one in alternatives if one.gap < AMBIGUOUS_GAP]
-    if close:
-        findings.append((Status.AMBIGUOUS, f"{close[0].what} costs {close[0].gap:.2g} more: both fit the data."))
+    proof, block_findings = _proof(checked)
+    alternatives = _alternatives(lik, at, cost, found, others)
+    pulses = at.pulses[0].copy()
+    pulses[[block.index for block in checked if not block.station and not block.proven]] = np.nan
+    for other in alternatives:
+        if other.gap < AMBIGUOUS_GAP and _same_stations(at, other, covariance):
+            pulses[_moved_pulses(at, other)] = np.nan
+        elif other.gap < AMBIGUOUS_GAP:
+            findings.append((Status.AMBIGUOUS, f"{other.what} costs {other.gap:.2g} more: both fit the data."))
     findings += block_findings
     if found.agreeing < AGREEING:
         words = f"{found.agreeing} of {found.made} starts arrived at this network; {AGREEING} must agree."
@@ -248,7 +317,7 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
         net,
         at.stations[0],
         at.clocks[0],
-        at.pulses[0],
+        pulses,
         at.emission[0],
         covariance,
         gauge or "centre and main axes of the stations",
@@ -295,34 +364,20 @@ def _flat_findings(net: Network, at: Estimate, covariance: Array) -> list[tuple[
     return out
 
 
-def _curved_findings(lik: Likelihood, at: Estimate, cost: float, told: Determined) -> list[tuple[Status, str]]:
-    """Compare the cost three sigma out along the weakest directions, pulses following, with nine."""
-    p = told.jacobian.shape[1]
-    basis = np.eye(p)[:, np.flatnonzero(lik.free)]
-    if told.free.shape[1]:
-        within = np.linalg.svd(told.free[lik.free].T)[2][told.free.shape[1] :]
-        basis = basis @ within.T
-    _, s, turn = np.linalg.svd(told.jacobian @ basis, full_matrices=False)
-    steps = (basis @ turn[::-1][:_WEAKEST].T) * (3.0 / s[::-1][:_WEAKEST])
-    m, d = lik.network.stations, lik.network.dimension
-    shift = np.concatenate([steps, -steps], axis=1).T
-    count = len(shift)
-    every = np.zeros(count, dtype=int)
-    clocks = at.clocks[every] if lik.network.synchronised else at.clocks + shift[:, m * d :]
-    there = replace(at.take(every), stations=at.stations + shift[:, : m * d].reshape(count, m, d), clocks=clocks)
-    held = replace(lik, free=np.zeros_like(lik.free))
-    ratio = np.maximum((held.refine(there)[1] - cost) / 9.0, 1e-9)
-    kappa = float(np.abs(np.log(ratio)).max())
-    if kappa <= STRAIGHT:
+def _curved_findings(lik: Likelihood, at: Estimate, told: Determined) -> list[tuple[Status, str]]:
+    share = excess(lik, at, told)
+    if share <= _COVERS:
         return []
-    words = f"The covariance does not cover: three sigma out the cost is {9 * np.exp(kappa):.3g} or less than it says."
+    words = (
+        f"The covariance is too small: squared errors exceed it by up to {share:.0%} where the measurement is repeated."
+    )
     return [(Status.CURVED, words)]
 
 
-def _proof(lik: Likelihood, at: Estimate) -> tuple[str, list[tuple[Status, str]]]:
-    found = blocks(lik, at)
+def _proof(found: tuple[Block, ...]) -> tuple[str, list[tuple[Status, str]]]:
+    """Return the claim that blocks allow; that a pulse may be elsewhere at no less cost is between it and its place."""
     refuted = [block.name for block in found if block.refuted]
-    open_ = [block.name for block in found if not block.proven and not block.refuted]
+    open_ = [block.name for block in found if not (block.proven if block.station else block.cheapest)]
     if refuted:
         return "unknown", [(Status.UNPROVEN, f"Another place costs less for {_few(refuted)}, the others held.")]
     if open_:
@@ -353,56 +408,67 @@ def refuted_blocks(network: Network, at: Estimate) -> tuple[Block, ...]:
     return tuple(block for block in blocks(likelihood(network), at) if block.refuted)
 
 
-def _alternatives(lik: Likelihood, at: Estimate, cost: float, found: Found, soft: bool) -> tuple[Alternative, ...]:
-    """Return other minima within `LISTED_GAP`: ends of other starts, blocks elsewhere, and the mirror image."""
+def _alternatives(
+    lik: Likelihood, at: Estimate, cost: float, found: Found, others: list[tuple[str, Estimate]]
+) -> tuple[Alternative, ...]:
+    """Return other minima within `LISTED_GAP`: blocks elsewhere, ends of other starts, and the mirror image."""
     net = lik.network
-    others: list[tuple[str, Estimate]] = []
-    near = found.ends.cost < found.cost + LISTED_GAP
-    _, first = np.unique(np.round(found.ends.cost[near], 3), return_index=True)
-    others += [("Another network", found.ends.at.take(np.flatnonzero(near)[[i]])) for i in first]
-    others += [(name, one) for name, one, value in found.others if value < found.cost + LISTED_GAP]
-    same = at.pulses.shape[1] == found.best.pulses.shape[1]
-    if not same:  # starts are of the core alone; all pulses are refined for the network found
-        others = []
+    soft = bool(np.isfinite(net.place_sigma).any())
+    if at.pulses.shape[1] == found.best.pulses.shape[1]:  # else starts are of the core alone
+        near = found.ends.cost < found.cost + LISTED_GAP
+        _, first = np.unique(np.round(found.ends.cost[near], 3), return_index=True)
+        others = others + [("another network", found.ends.at.take(np.flatnonzero(near)[[i]])) for i in first]
     if soft:
         both = laid(at, net, np.random.default_rng(0))
-        others.append(("The mirror image", both.take(np.array([1]))))
+        others = [*others, ("the mirror image", both.take(np.array([1])))]
     if not others:
         return ()
     ends, costs = lik.refine(together(*(one for _, one in others)))
     out: list[Alternative] = []
-    shapes = [_shape(at)]
+    shapes = [_shape(at, soft)]
+    scale = max(float(np.abs(shapes[0]).max()), 1e-300)
     for i in np.argsort(costs, kind="stable"):
         one, gap = ends.take(np.array([i])), float(costs[i] - cost)
-        shape = _shape(one) if not soft else np.concatenate([one.stations.ravel(), _shape(one)])
-        reference = [np.concatenate([at.stations.ravel(), shapes[0]]), *shapes[1:]] if soft else shapes
-        scale = max(float(np.abs(shape).max()), 1e-300)
+        shape = _shape(one, soft)
         # a thousandth of the size, or where costs agree to what is left of the digits, is the same network
-        distinct = all(np.abs(shape - s).max() > 1e-3 * scale for s in reference)
-        if gap < LISTED_GAP and distinct:
+        if gap < LISTED_GAP and all(np.abs(shape - other).max() > _ALIKE * scale for other in shapes):
             shapes.append(shape)
             words = others[i][0]
-            placed = one if soft else _over(one, at)
-            out.append(Alternative(words[0].upper() + words[1:], max(gap, 0.0), placed.stations[0]))
+            placed = one if soft else over(one, at)
+            what = words[0].upper() + words[1:]
+            out.append(Alternative(what, max(gap, 0.0), placed.stations[0], placed.pulses[0]))
     return tuple(out)
 
 
-def _shape(at: Estimate) -> Array:
-    """Return distances between stations and to the pulses: what no frame changes."""
+def _same_stations(at: Estimate, other: Alternative, covariance: Array) -> bool:
+    """Return whether another network has the stations where this one has them, as far as its covariance tells.
+
+    They are within its 95 % ellipsoid, and what the other's share of the likelihood adds to squared errors is covered.
+    """
+    if not np.isfinite(covariance).all():
+        return False
+    _, _, gradient = spans(at.stations[0])
+    apart = spans(other.stations)[1] - spans(at.stations[0])[1]
+    size = gradient.shape[1]
+    width, axes = np.linalg.eigh(gradient @ covariance[:size, :size] @ gradient.T)
+    told = width > _ZERO * width[-1]
+    shift, dof = float((((axes.T @ apart)[told]) ** 2 / width[told]).sum()), int(told.sum())
+    share = 1.0 / (1.0 + np.exp(0.5 * other.gap))
+    within = float(tail_probability(np.array(shift), np.array(dof))) > _WITHIN
+    return within and share * shift <= _COVERS * dof
+
+
+def _moved_pulses(at: Estimate, other: Alternative) -> Array:
+    """Return which pulses another network has elsewhere (N,): the rest gives way a little."""
+    apart = np.linalg.norm(other.pulses - at.pulses[0], axis=1)
+    return np.asarray(apart > _GIVES_WAY * apart.max())
+
+
+def _shape(at: Estimate, soft: bool) -> Array:
+    """Return distances between stations and to the pulses, which no frame changes; places too where these are known."""
     points = np.concatenate([at.stations[0], at.pulses[0]])
-    return np.asarray(np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel())
-
-
-def _over(one: Estimate, at: Estimate) -> Estimate:
-    """Return a network turned, and mirrored if need be, onto another's stations (Procrustes)."""
-    a, b = one.stations[0], at.stations[0]
-    u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
-    turn = u @ v
-    return replace(
-        one,
-        stations=(one.stations - a.mean(axis=0)) @ turn + b.mean(axis=0),
-        pulses=(one.pulses - a.mean(axis=0)) @ turn + b.mean(axis=0),
-    )
+    apart = np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel()
+    return np.concatenate([apart, at.stations.ravel()]) if soft else apart
 
 
 # What surrounds a search.

@@ -47,15 +47,7 @@ class Determined:
 
 def determined(lik: Likelihood, at: Estimate) -> Determined:
     """Return what the rows determine at an estimate (S = 1)."""
-    by_station, by_pulse = (one[0] for one in lik.jacobian(at))
-    n, r, p = by_station.shape
-    # a pulse far away has columns of very different lengths
-    length = np.sqrt((by_pulse**2).sum(axis=1, keepdims=True))
-    q, triangle = np.linalg.qr(by_pulse / np.where(length > 0.0, length, 1.0))
-    pivot = np.abs(np.einsum("nii->ni", triangle))
-    q = q * (pivot > _ZERO)[:, None]
-    reduced = (by_station - q @ (np.swapaxes(q, 1, 2) @ by_station)).reshape(n * r, p)
-    jacobian = np.linalg.qr(np.concatenate([reduced, lik.known(at)[1][0]]))[1]
+    p, jacobian = lik.free.size, without_pulses(lik, at)
     motions = frame_moves(lik.network, at)
     motions[~lik.free] = 0.0
     size = float(np.linalg.norm(jacobian, 2))
@@ -65,6 +57,94 @@ def determined(lik: Likelihood, at: Estimate) -> Determined:
     held = np.flatnonzero(~lik.free)
     rest = _span(rest - np.isin(np.arange(p), held)[:, None] * rest)
     return Determined(jacobian, free, _unseen(jacobian, rest, size))
+
+
+def without_pulses(lik: Likelihood, at: Estimate) -> Array:
+    """Return a triangle (q, P) with the derivatives of an estimate (S = 1), what pulses explain taken away."""
+    by_station, by_pulse = (one[0] for one in lik.jacobian(at))
+    n, r, p = by_station.shape
+    # a pulse far away has columns of very different lengths
+    length = np.sqrt((by_pulse**2).sum(axis=1, keepdims=True))
+    q, triangle = np.linalg.qr(by_pulse / np.where(length > 0.0, length, 1.0))
+    pivot = np.abs(np.einsum("nii->ni", triangle))
+    q = q * (pivot > _ZERO)[:, None]
+    reduced = (by_station - q @ (np.swapaxes(q, 1, 2) @ by_station)).reshape(n * r, p)
+    return np.asarray(np.linalg.qr(np.concatenate([reduced, lik.known(at)[1][0]]), mode="r"))
+
+
+# Repetitions of the measurement that a covariance is checked by: they tell an excess of 5 % to 3 %.
+_REPEATED = 10
+# After how many they end where no more than this excess is possible: most networks of many stations have none.
+_FEW, _NONE = 4, 0.05
+
+
+def excess(lik: Likelihood, at: Estimate, told: Determined) -> float:
+    """Return by what share squared errors, in the covariance that comes with them, exceed what it promises.
+
+    The measurement is repeated, as if the network were the one found. Each repetition has an estimate and a covariance
+    of its own; the squared error of the estimate in it (NEES) is compared with the cost of the network found, which is
+    chi-square however curved the coordinates are. So the noise of few repetitions cancels, and what is left is what
+    curvature does: places that the ellipsoid leaves out, and information that errors of the places feign.
+
+    Parameters
+    ----------
+    lik : Likelihood
+        The network.
+    at : Estimate
+        The one found, S = 1.
+    told : Determined
+        What is determined there, nothing left open.
+
+    Returns
+    -------
+    float
+        Mean of (NEES - chi-square), and two deviations of that mean, over the number of station unknowns: zero where
+        all is linear.
+    """
+    net, rng = lik.network, np.random.default_rng(0)
+    size = int(lik.free.sum()) - told.free.shape[1]
+    sigma = np.where(net.given, net.sigma, 0.0)
+    exact = np.where(net.given, net.z - lik.residual(at)[0] * sigma, 0.0)
+    soft = np.where(np.isfinite(net.place_sigma) & (net.place_sigma > 0.0), net.place_sigma, 0.0)
+    place = np.where(soft > 0.0, at.stations[0], net.place)
+    apart = net.distance - lik.spans(at)[0][0] * net.distance_sigma
+    over_by: list[float] = []
+    for _ in range(_REPEATED):
+        again = replace(
+            net,
+            z=exact + sigma * rng.standard_normal(sigma.shape),
+            place=place + soft * rng.standard_normal(soft.shape),
+            distance=apart + net.distance_sigma * rng.standard_normal(apart.shape),
+        )
+        own = replace(lik, network=again)
+        found, cost = own.refine(at)
+        truth = at if np.isfinite(net.place_sigma).any() else over(at, found)
+        off = (truth.stations[0] - found.stations[0]).ravel()
+        if not net.synchronised:
+            off = np.concatenate([off, truth.clocks[0] - found.clocks[0]])
+        held = replace(own, free=np.zeros_like(lik.free))
+        squared = float(((without_pulses(own, found) @ off) ** 2).sum())
+        over_by.append((squared - float((held.refine(at)[1] - cost)[0])) / max(size, 1))
+        if len(over_by) == _FEW and _above(over_by) <= _NONE:
+            break
+    return _above(over_by)
+
+
+def _above(values: list[float]) -> float:
+    """Return a mean and two of its deviations."""
+    return float(np.mean(values) + 2.0 * np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def over(one: Estimate, at: Estimate) -> Estimate:
+    """Return a network turned, and mirrored if need be, onto another's stations (Procrustes)."""
+    a, b = one.stations[0], at.stations[0]
+    u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
+    turn = u @ v
+    return replace(
+        one,
+        stations=(one.stations - a.mean(axis=0)) @ turn + b.mean(axis=0),
+        pulses=(one.pulses - a.mean(axis=0)) @ turn + b.mean(axis=0),
+    )
 
 
 def _span(columns: Array) -> Array:

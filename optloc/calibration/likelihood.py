@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optloc.base.types import Array
+from optloc.calibration.descent import (
+    EASE,
+    FINAL,
+    FIRST,
+    FLOOR,
+    HELD,
+    LEAST,
+    MOST,
+    NOTHING,
+    SETTLED,
+    SHORT,
+    STIFFEN,
+    Rows,
+    State,
+    descend,
+)
 from optloc.calibration.network import CLOCKED, Network
+from optloc.compute.jit import usable
 from optloc.models import MODELS
 
-# Marquardt's damping: at first, and its factors after a good and a bad step.
-_DAMPING, _EASE, _STIFFEN = 1e-3, 0.2, 6.0
-_LEAST, _MOST = 1e-12, 1e12
-# Steps of a refinement, and the relative decrease of the cost below which a start has arrived: three decades above
-# rounding, and far below what any verdict asks for.
-_STEPS, _SETTLED = 100, 1e-12
+# Steps of a refinement.
+_STEPS = 100
 # Numbers that the table of derivatives holds at a time: 64 MB.
 _HELD = 8_000_000
 
@@ -77,10 +90,11 @@ class Likelihood:
     gains: Array
     ticks: Array
     emits: Array
-    root: Array  # (N, R) inverse standard deviations
+    root: Array  # (N, R) inverse standard deviations, or (S, N, R) of each estimate
     prior: Array  # (M, d) the same of what is known of places; zero where exact
     free: Array  # (P,) which station unknowns move
     emission: Array  # (N,)
+    hold: Array  # (0, 0, P), or (S, h, P) linear functions of station unknowns that keep their values
 
     def residual(self, at: Estimate) -> Array:
         """Return whitened residuals (S, N, R) of the measurements of pulses."""
@@ -100,9 +114,10 @@ class Likelihood:
 
     def cost(self, at: Estimate) -> Array:
         """Return the weighted sum of squared residuals, (S,)."""
-        return self._total(at, self.residual(at))
+        return self.total(at, self.residual(at))
 
-    def _total(self, at: Estimate, residual: Array) -> Array:
+    def total(self, at: Estimate, residual: Array) -> Array:
+        """Return the cost, the whitened residuals given."""
         known = (at.stations - self.network.place) * self.prior
         apart = self.spans(at)[0]
         return np.asarray((residual**2).sum(axis=(1, 2)) + (known**2).sum(axis=(1, 2)) + (apart**2).sum(axis=1))
@@ -153,46 +168,70 @@ class Likelihood:
         Levenberg and Marquardt with the pulses eliminated: each is a block of d + 1 unknowns of its own.
         """
         n, r = self.network.z.shape
+        if usable(descend, at.count * n):
+            return self._descended(at, steps)
         size = max(1, _HELD // (n * r * self.free.size))
-        parts = [self._refine(at.take(slice(i, i + size)), steps) for i in range(0, at.count, size)]
-        return together(*(p[0] for p in parts)), np.concatenate([p[1] for p in parts])
+        parts = [np.arange(i, min(i + size, at.count)) for i in range(0, at.count, size)]
+        found = [self.of(part).refine_together(at.take(part), steps) for part in parts]
+        return together(*(one[0] for one in found)), np.concatenate([one[1] for one in found])
 
-    def _refine(self, at: Estimate, steps: int) -> tuple[Estimate, Array]:
+    def _descended(self, at: Estimate, steps: int) -> tuple[Estimate, Array]:
+        net = self.network
+        root = np.ascontiguousarray(self.root.reshape(-1, *net.z.shape))
+        known = (net.place, self.prior, self.free, net.between, net.distance, 1.0 / net.distance_sigma, self.hold)
+        slots = (self.first, self.second, self.gains, self.ticks, self.emits, self.emission)
+        made = [np.array(getattr(at, name), order="C") for name in State._fields]
+        cost = np.zeros(at.count)
+        descend(Rows(net.z, root, *slots, *known), State(*made), cost, steps)
+        return Estimate(*made), cost
+
+    def of(self, which: Array) -> Likelihood:
+        """Return this for some of the estimates, where each has weights or a held function of its own."""
+        root = self.root[which] if self.root.ndim == 3 else self.root
+        return replace(self, root=root, hold=self.hold[which] if len(self.hold) else self.hold)
+
+    def refine_together(self, at: Estimate, steps: int = _STEPS) -> tuple[Estimate, Array]:
+        """Refine estimates side by side in numpy: what `refine` does where there is no machine code."""
         out, cost = at.take(np.arange(at.count)), np.full(at.count, np.inf)
         left = np.arange(at.count)
-        damping, stuck = np.full(at.count, _DAMPING), np.zeros(at.count, dtype=int)
+        damping, settled = np.full(at.count, FIRST), np.zeros(at.count, dtype=int)
         for _ in range(steps):
-            here = out.take(left)
-            residual = self.residual(here)
-            before = self._total(here, residual)
-            there = self._step(here, residual, damping[left])
-            after = self._total(there, self.residual(there))
+            here, own = out.take(left), self.of(left)
+            residual = own.residual(here)
+            before = own.total(here, residual)
+            there = own.step(here, residual, damping[left])
+            after = own.total(there, own.residual(there))
             good = after < before
             now = there.where(good, here)
             out = _put(out, left, now)
             cost[left] = np.where(good, after, before)
-            damping[left] = np.clip(damping[left] * np.where(good, _EASE, _STIFFEN), _LEAST, _MOST)
-            small = before - cost[left] <= _SETTLED * (1.0 + before)
-            stuck[left] = np.where(small, stuck[left] + 1, 0)
-            # a bad step with little damping says nothing yet: three of them do
-            left = left[(stuck[left] < 3) & np.isfinite(cost[left])]
+            damping[left] = np.clip(damping[left] * np.where(good, EASE, STIFFEN), LEAST, MOST)
+            # a bad step says nothing before damping has made it short
+            small = (before - cost[left] <= SETTLED * (1.0 + before)) & (good | (damping[left] > SHORT))
+            settled[left] = np.where(small, settled[left] + 1, 0)
+            left = left[(settled[left] < FINAL) & np.isfinite(cost[left])]
             if not left.size:
                 break
         return out, cost
 
-    def _step(self, at: Estimate, residual: Array, damping: Array) -> Estimate:
+    def step(self, at: Estimate, residual: Array, damping: Array) -> Estimate:
+        """Return where a damped step of Gauss and Newton leads."""
         by_station, by_pulse = self.jacobian(at)
         extra, rows = self.known(at)
         s, n, r, p = by_station.shape
         inner, coupling, gradient = eliminated(by_station, by_pulse, residual, damping, self.emission)
         flat = by_station.reshape(s, n * r, p)
         normal = np.swapaxes(flat, 1, 2) @ flat + np.swapaxes(rows, 1, 2) @ rows
+        largest = np.einsum("sii->si", normal).max(axis=1)
         _damp(normal, damping)
         _hold(normal, self.free)
         coupled = coupling.reshape(s, -1, p)
         right = np.einsum("sqp,sq->sp", flat, residual.reshape(s, -1)) + np.einsum("sqp,sq->sp", rows, extra)
         right = right - np.einsum("sqp,sq->sp", coupled, gradient.reshape(s, -1))
-        step = _solved(normal - np.swapaxes(coupled, 1, 2) @ coupled, right)
+        normal -= np.swapaxes(coupled, 1, 2) @ coupled
+        if len(self.hold):
+            normal += (HELD * largest)[:, None, None] * (np.swapaxes(self.hold, 1, 2) @ self.hold)
+        step = _solved(normal, right)
         local = gradient - (coupled @ step[..., None]).reshape(gradient.shape)
         found = np.linalg.solve(np.swapaxes(inner, -1, -2), local[..., None])[..., 0]
         m, d = self.network.stations, self.network.dimension
@@ -237,6 +276,7 @@ def likelihood(network: Network) -> Likelihood:
         prior,
         np.concatenate([~exact.ravel(), clocks]),
         network.emission,
+        np.zeros((0, 0, exact.size + clocks.size)),
     )
 
 
@@ -280,7 +320,7 @@ def eliminated(
 def _damp(normal: Array, damping: Array) -> None:
     """Add shares of the diagonal, and a little of its largest entry, which alone holds what no row sees."""
     diagonal = np.einsum("sii->si", normal)
-    diagonal += damping[:, None] * diagonal + 1e-13 * diagonal.max(axis=1, keepdims=True) + 1e-290
+    diagonal += damping[:, None] * diagonal + FLOOR * diagonal.max(axis=1, keepdims=True) + NOTHING
 
 
 def _hold(normal: Array, free: Array) -> None:

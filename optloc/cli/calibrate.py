@@ -22,6 +22,7 @@ _LINES = 40
 
 Gauge = Annotated[str | None, typer.Option(metavar="A1,A2,A3", help="Stations that define the frame.")]
 Seed = Annotated[int, typer.Option(min=0, help="Decides the starts.")]
+Robust = Annotated[bool, typer.Option("--robust", help="Leave out rows that most others contradict, and name them.")]
 Out = Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the stations found.")]
 Picture = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw plan, elevation and residuals.")]
 
@@ -30,6 +31,7 @@ def calibrate(
     file: ProblemPath,
     gauge: Gauge = None,
     seed: Seed = 0,
+    robust: Robust = False,
     out: Out = None,
     plot: Picture = None,
     as_json: Json = False,
@@ -43,7 +45,7 @@ def calibrate(
 
     FILE lists stations, with the coordinates that are known and no others, and what they measured of each pulse.
     """
-    raise typer.Exit(_run(file, gauge, seed, out, plot, as_json=as_json, quiet=quiet))
+    raise typer.Exit(_run(file, gauge, seed, out, plot, robust=robust, as_json=as_json, quiet=quiet))
 
 
 def _run(
@@ -53,6 +55,7 @@ def _run(
     out: Path | None,
     plot: Path | None,
     *,
+    robust: bool,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -68,7 +71,7 @@ def _run(
     named = tuple(name.strip() for name in gauge.split(",")) if gauge else ()
     with line(quiet or as_json) as tell:
         tell("searching")
-        found = find(network, gauge=named, seed=seed, tell=tell)
+        found = find(network, gauge=named, seed=seed, robust=robust, tell=tell)
     if out is not None:
         write_calibrated(found, file.stem, out, file)
     if plot is not None:
@@ -129,6 +132,7 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
             {"name": name, "position": place, "sigma": sigma, "clock": clock}
             for name, place, sigma, clock in zip(net.names, found.stations, found.sigma, found.clocks, strict=True)
         ],
+        "left_out": [{"pulse": net.labels[j], "station": net.names[net.slots[r].a]} for j, r in found.left_out],
         "covariance": found.covariance,
         "pulses": [
             {"name": name, "position": place, "emission": emission}

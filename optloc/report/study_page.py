@@ -26,11 +26,9 @@ from optloc.report.sheets import Sheet, latex, sheets
 from optloc.study import summary
 from optloc.study.draws import Case, draw
 from optloc.study.folder import Manifest, plan_again, read_frame, read_manifest, references
-from optloc.study.plan import Plan
-from optloc.study.profiles import Profiles, profiles
-from optloc.study.folder import Manifest, read_frame, read_manifest
 from optloc.study.networks import NetworkCase
 from optloc.study.plan import Plan
+from optloc.study.profiles import Profiles, profiles
 from optloc.study.summary import case_label, noise_text
 
 if TYPE_CHECKING:

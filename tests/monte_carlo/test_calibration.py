@@ -1,0 +1,129 @@
+"""Networks from nothing, counted: at the optimum, ok, wrong though ok, and what the covariance covers."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+from calibration_scenes import HALL, distances, hall
+from monte_carlo.tables import FOLDER, code_digest, ledger
+from scipy.stats import chi2
+
+from optloc import Status, calibrate, network_of
+from optloc.calibration.likelihood import likelihood
+from optloc.calibration.rounds import starts_of
+
+KEPT = FOLDER.parents[1] / "build" / "full"  # ignored by git
+SEED, COUNT = 100_000, 500
+FIELD = np.array([5000.0, 5000.0])
+CASES = {
+    f"{m} x {n}, {words}": (m, n, sigma, box, clocks)
+    for words, sigma, box, clocks, sizes in (
+        ("hall, 3 cm", 0.03, HALL, False, ((6, 20), (8, 30), (10, 12), (12, 20), (20, 50))),
+        ("hall, 0.3 m", 0.3, HALL, False, ((6, 20), (8, 30), (10, 12), (12, 20), (20, 50))),
+        ("field, 20 m", 20.0, FIELD, False, ((8, 30),)),
+        ("field, 20 m, clocks", 20.0, FIELD, True, ((8, 30),)),
+    )
+    for m, n in sizes
+}
+HEADER = (
+    "network",
+    "counted",
+    "at the optimum",
+    "of 10 random starts",
+    "ok",
+    "curved, ambiguous, unproven, searched",
+    "wrong though ok",
+    "distances of ok within 95 / 99.9 %",
+    "NEES of ok",
+    "median s",
+)
+
+
+def scene(seed, m, n, sigma, box, clocks):
+    truth, z = hall(seed, m, n, sigma, clocks=clocks, box=box)
+    if len(box) == 3:
+        return truth, z
+    # transmitters stand around the receivers, four times as far
+    rng = np.random.default_rng(seed)
+    pulses = rng.uniform(-1.5, 2.5, (n, 2)) * box
+    apart = np.linalg.norm(pulses[:, None] - truth.stations, axis=-1)
+    z = apart + truth.emission[0][:, None] + truth.clocks[0] + sigma * rng.standard_normal(apart.shape)
+    return type(truth)(truth.stations, truth.clocks, pulses[None], truth.emission), z
+
+
+def counted(seed, m, n, sigma, box, clocks):
+    """Return what became of one network."""
+    truth, z = scene(seed, m, n, sigma, box, clocks)
+    net = network_of(z, sigma, dimension=len(box), synchronised=not clocks)
+    lik = likelihood(net)
+    judge = float(lik.refine(truth)[1][0])
+    begun = time.process_time()
+    found = calibrate(net)
+    seconds = time.process_time() - begun
+    random = float(lik.refine(starts_of(lik, 0).random(10))[1].min())
+    _, distance, covariance = found.distances()
+    error = distances(truth.stations[0]) - distance
+    width, axes = (
+        np.linalg.eigh(covariance) if np.isfinite(covariance).all() else (np.ones(len(error)), np.eye(len(error)))
+    )
+    told = width > 1e-9 * width[-1]
+    nees = float((((axes.T @ error)[told]) ** 2 / width[told]).sum())
+    dof = int(told.sum())
+    each = error**2 / np.maximum(np.diag(covariance), 1e-300)
+    dear = found.cost > judge + 1.0 or nees > chi2.ppf(0.9999, dof)
+    return {
+        "status": found.status.label,
+        "optimum": found.cost <= judge + 0.01,
+        "random": random <= min(judge, found.cost) + 0.01,
+        "wrong": bool(found.status is Status.OK and dear and not found.alternatives),
+        "nees": nees / dof,
+        "inside": [float(np.mean(each < chi2.ppf(level, 1))) for level in (0.95, 0.999)],
+        "seconds": seconds,
+    }
+
+
+def networks(name, count=COUNT):
+    """Return what became of the networks of a case, those of an earlier run of the same code included."""
+    file = KEPT / f"calibration-{code_digest()}.jsonl"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    lines = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    done = {line["seed"]: line for line in lines if line["case"] == name}
+    for seed in range(SEED, SEED + count):
+        if seed not in done:
+            done[seed] = {"case": name, "seed": seed} | counted(seed, *CASES[name])
+            with file.open("a") as out:
+                out.write(json.dumps(done[seed]) + "\n")
+    return [done[seed] for seed in range(SEED, SEED + count)]
+
+
+def cells(some):
+    """Return the cells of a line of the table."""
+    ok = [one for one in some if one["status"] == "ok"]
+    others = [sum(one["status"] == label for one in some) for label in ("curved", "ambiguous", "unproven", "searched")]
+    inside = np.mean([one["inside"] for one in ok], axis=0) if ok else np.full(2, np.nan)
+    return (
+        len(some),
+        sum(one["optimum"] for one in some),
+        sum(one["random"] for one in some),
+        len(ok),
+        " / ".join(map(str, others)),
+        sum(one["wrong"] for one in some),
+        f"{100 * inside[0]:.1f} / {100 * inside[1]:.2f}",
+        f"{np.mean([one['nees'] for one in ok]):.3f}" if ok else "-",
+        f"{np.median([one['seconds'] for one in some]):.2f}",
+    )
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", CASES)
+def test_networks_are_at_the_optimum_and_never_wrong_though_ok(name):
+    some = networks(name)
+    with ledger("calibration", HEADER, list(CASES), f"seeds {SEED} to {SEED + COUNT - 1}", kept=KEPT) as book:
+        book.add(name, *cells(some))
+    m, _, sigma, box, _ = CASES[name]
+    share = 0.99 if sigma < 0.1 else 0.95
+    if m >= 8 or sigma < 0.1 or len(box) == 2:
+        assert np.mean([one["optimum"] for one in some]) >= share
+    assert not any(one["wrong"] for one in some)
+    assert not any(one["status"] == "ok" and not one["optimum"] and one["wrong"] for one in some)
