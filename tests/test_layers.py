@@ -134,7 +134,7 @@ def test_no_loose_module():
 # what inequalities admit, and the edges of it; media, and rays through them; which of many sites to take: plans as
 # numbers and as files, criteria, relaxation, branching and completions as machine code, the search, what became of it,
 # refinement, areas, its command and its map; files of navigation and of receivers, and satellites by what they say;
-# formats in which others take fixes: their table, marks, what is XML, and what is lines; what an installation is and lacks;
+# formats in which others take fixes: their table, marks, what is XML, and what is lines; what an installation lacks;
 # minimizers of others in studies, methods on the same trials, and the leaderboard; networks of unknown places:
 # fits of low rank and their upgrade, the network, its likelihood, starts, blocks, search, frame and verdict, its files,
 # its command and its map; chains of Stone Soup's detections; what methods of a study solve within how much work, and
