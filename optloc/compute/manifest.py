@@ -21,6 +21,7 @@ SOURCES = (
     "base/linalg.py",
     "linear/normal.py",
     "models/primitives.py",
+    "calibration/descent.py",
     *(f"placement/{name}.py" for name in ("criteria", "relaxation", "branching", "completions")),
 )
 

@@ -241,7 +241,7 @@ def run(method: Method, drawn: Drawn | Networks) -> Run:
     if method.solver:
         choice = Choice(backend_kind(method.solver, "solver"), method.solver, method.settings)
     # What a method does about rounding and division is its own affair, and ends with it.
-    asked = np.zeros(len(drawn.truth))
+    asked = np.zeros(len(drawn.seed))
     with using(choice), counting() as tally, heard(lambda trial, _: _add(asked, trial)), np.errstate():
         began, busy = perf_counter(), process_time()
         fix = _solved(method, drawn)
