@@ -21,7 +21,7 @@ MOVED = 16.0
 """Cost that a block's other place may have beyond its present one for all to be refined from there: what is dearer by
 four sigma with the others held hardly ends below when they move as well."""
 
-# Steps of a block alone from a mirrored place: so many bring nine in ten to their minimum, and the rest is refined with
+# Steps of a block alone from a mirrored place: most are near their minimum then, and the rest is refined with
 # all others anyway.
 _ALONE = 15
 # Rows above which a station's proof begins where it is.

@@ -22,8 +22,8 @@ from optloc.calibration.rounds import Starts, starts_of
 PRICE = 16.0
 """Cost of a row that is left out: beyond four sigma it is cheaper than what it says, as with suspects of a fix."""
 
-# Starts, and how many of the cheapest are gone on with: of 12 x 20 halls with one row in ten wrong, ten in twelve have
-# their network among thirty.
+# Starts, and how many of the cheapest are gone on with: a prototype had the network of ten in twelve 12 x 20 halls
+# with one row in ten wrong among thirty starts.
 _STARTS, _BEST = 40, 3
 # Rounds of weights, of a start and of one that goes on, and the steps of each.
 _ROUNDS, _MORE, _STEPS = 14, 5, 10
@@ -31,7 +31,7 @@ _ROUNDS, _MORE, _STEPS = 14, 5, 10
 _MEDIANS, _LEAST = 2.0, 3.0
 # Sweeps in which blocks are placed anew, places that each is begun at, and rounds of weights of these.
 _SWEEPS, _PLACES, _ALONE = 2, 6, 3
-# Rounds of truncation: the rows that are left out settle in three to five.
+# Rounds of truncation: far more than it takes the rows that are left out to settle.
 _SETTLING = 8
 
 

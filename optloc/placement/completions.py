@@ -337,7 +337,7 @@ def is_counted(asked: Asked, order: Array) -> bool:
     for j in order:
         if asked.rules[0, j] != asked.rules[0, order[0]]:
             return False
-    return asked.rules.shape[0] == 1
+    return bool(asked.rules.shape[0] == 1)
 
 
 @compiled
