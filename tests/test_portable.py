@@ -28,6 +28,7 @@ from cases import CASES
 from optloc import Stations, assemble, measured, simulate
 from optloc.files import read
 from optloc.study.draws import draw
+from optloc.study.networks import NetworkCase
 from optloc.study.plan import plan_of, planned, shipped
 
 
@@ -50,7 +51,11 @@ spread = Stations(place[None], tuple("ABCDEFG"), covariance=np.tile(np.eye(3) + 
 note("station errors", simulate(assemble(spread, measured("range", a=np.arange(7), sigma=1.0)), place[0] + 1, 7, 50).z)
 for name in shipped():
     for cell in {cell.case.key: cell for cell in plan_of(Path(name), trials=20).cells}.values():
-        drawn = draw(cell.case, 0, 20)
+        drawn = cell.case.draw(0, 20)
+        if isinstance(cell.case, NetworkCase):
+            truth = drawn.truth.stations, drawn.truth.pulses, drawn.truth.emission
+            note(f"study {name} {cell.case.key}", *(one.z for one in drawn.networks), *truth)
+            continue
         note(f"study {name} {cell.case.key}", drawn.problem.z, drawn.truth, drawn.problem.stations.position)
 EARTH = '''
 format = 1

@@ -16,6 +16,7 @@ from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, toge
 from optloc.calibration.network import Network
 from optloc.calibration.outliers import PRICE, outliers
 from optloc.calibration.rounds import laid
+from optloc.problem.chart import quantile
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 
@@ -23,8 +24,8 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 _CORE = 60
 # Method that places the other pulses; their proof comes with that of all.
 _QUICK = "gtrs+lsr"
-# Singular value of stations about their centre, in its standard deviations, below which they are flat.
-_FLAT = 3.0
+# Level at which stations refute that they are in one plane: that of three sigma of a single number.
+_FLAT = 0.9973
 # Share of the size by which distances differ in networks that are not the same.
 _ALIKE = 1e-3
 # Probability beyond the ellipsoid in which two networks are one answer.
@@ -354,11 +355,13 @@ def _flat_findings(net: Network, at: Estimate, covariance: Array) -> list[tuple[
     if np.isfinite(net.place_sigma).all():
         return out
     centred = at.stations[0] - at.stations[0].mean(axis=0)
-    s, normal = np.linalg.svd(centred)[1:]
-    along = centred @ normal[-1]
-    gradient = (along[:, None] * normal[-1] / max(s[-1], 1e-300)).ravel()
-    sigma = np.sqrt(max(float(gradient @ covariance[: m * d, : m * d] @ gradient), 0.0))
-    if s[-1] < _FLAT * sigma:
+    turn = np.linalg.svd(centred)[2]
+    # of heights above the best plane what no other plane explains: its covariance is the same in every frame
+    left = np.linalg.svd(np.column_stack([np.ones(m), centred @ turn[:-1].T]).T)[2][d:]
+    height = left @ (centred @ turn[-1])
+    design = np.einsum("km,c->kmc", left, turn[-1]).reshape(len(left), m * d)
+    spread = design @ covariance[: m * d, : m * d] @ design.T
+    if not len(left) or height @ np.linalg.pinv(spread, hermitian=True) @ height < quantile(_FLAT, len(left)):
         words = "The stations are in one plane as far as the data tell: which side of it pulses are on is open."
         out.append((Status.AMBIGUOUS, words))
     return out

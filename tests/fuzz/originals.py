@@ -217,7 +217,7 @@ def studies():
     found = {}
     for path in [path for path in shipped if path.name.endswith(".toml")]:
         study = tomllib.loads(path.read_text(encoding="utf-8"))
-        for number, scenario in enumerate(study["scenario"]):
+        for number, scenario in enumerate(study.get("scenario", ())):
             one = scenario | {"noise": scenario["noise"][:1]}
             one |= {"sweep": {key: values[:1] for key, values in scenario.get("sweep", {}).items()}}
             method = study["method"][number % len(study["method"])]
