@@ -26,6 +26,9 @@ _CORE = 60
 _QUICK = "gtrs+lsr"
 # Level at which stations refute that they are in one plane: that of three sigma of a single number.
 _FLAT = 0.9973
+# Share of pulses with two places that the others outvote: of more, the cheapest combination of their sides is chosen
+# among so many that it feigns a shape of the stations (flat ones come out 0.1 to 0.3 m thick at 3 cm).
+_TWOFOLD = 0.5
 # Share of the size by which distances differ in networks that are not the same.
 _ALIKE = 1e-3
 # Probability beyond the ellipsoid in which two networks are one answer.
@@ -308,6 +311,12 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
             pulses[_moved_pulses(at, other)] = np.nan
         elif other.gap < AMBIGUOUS_GAP:
             findings.append((Status.AMBIGUOUS, f"{other.what} costs {other.gap:.2g} more: both fit the data."))
+    twofold = np.isnan(pulses).any(axis=1)
+    if twofold.mean() > _TWOFOLD:
+        words = (
+            f"{twofold.sum()} of {len(pulses)} pulses have no single place, as where stations are nearly in one plane."
+        )
+        findings.append((Status.AMBIGUOUS, words))
     findings += block_findings
     if found.agreeing < AGREEING:
         words = f"{found.agreeing} of {found.made} starts arrived at this network; {AGREEING} must agree."
