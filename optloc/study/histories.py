@@ -8,7 +8,7 @@ proofs and machine code that does all in one call have no cost on their way, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,7 @@ from optloc.study.draws import Case, Drawn, draw
 from optloc.study.folder import plan_again, read_frame, read_manifest
 from optloc.study.methods import SETTINGS, Method, added
 from optloc.study.minimizers import baseline_of
+from optloc.study.networks import NetworkCase
 from optloc.study.profiles import check_accuracy
 from optloc.study.summary import case_label, noise_text
 
@@ -424,13 +425,15 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
     plan = plan_again(manifest)
     if plan is None:
         raise InvalidProblem("a problem file of the study cannot be read any more", str(folder), "put it back")
-    cells: dict[str, dict[str, Case]] = {}
+    cells: dict[str, dict[str, Case | NetworkCase]] = {}
     for cell in plan.cells:
         own = cells.setdefault(case_label(cell.case.table.name, cell.case.sweep), {})
         own.setdefault(noise_text(cell.case.label), cell.case)
     title = _chosen(case, cells, "case")
     level = _chosen(noise, cells[title], "noise")
     wanted = cells[title][level]
+    if isinstance(wanted, NetworkCase):
+        raise InvalidProblem(f"{title} is of networks, which have no histories", str(folder), "name a case of fixes")
     drawn, least = _known(folder, wanted, count)
     methods = {cell.method.name: cell.method for cell in plan.cells if not cell.method.reference}
     methods |= {method.name: method for method in added(names)}
@@ -443,9 +446,7 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
     return Question(f"{title}, {level}", drawn, tuple(methods.values()), least, missing)
 
 
-def _chosen(
-    word: str | None, known: dict[str, object] | dict[str, Case] | dict[str, dict[str, Case]], what: str
-) -> str:
+def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
     names = list(known)
     if word is None:
         return names[0]
