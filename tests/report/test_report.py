@@ -69,7 +69,7 @@ def made(site):
 def shipped(tmp_path_factory):
     """The report of a shipped study, with few trials."""
     folder = tmp_path_factory.mktemp("report") / "divergence"
-    run_plan(plan_of(folder.relative_to(folder.parent), trials=4), folder, executor("processes", 1))
+    run_plan(plan_of(folder.relative_to(folder.parent), trials=2), folder, executor("processes", 1))
     return write_report(folder)
 
 
