@@ -264,7 +264,7 @@ def _describe(problem: Problem, x: Array, cost: Array) -> str:
     lines = (
         f"{len(kept)} minima, the best of cost {cost[kept[0]]:.3g}, lie"
         if len(kept) > 1
-        else (f"the only minimum, of cost {cost[kept[0]]:.3g}, lies")
+        else (f"the only minimum found, of cost {cost[kept[0]]:.3g}, lies")
     )
     text = f"{lines} behind the Earth as a satellite sees it"
     if len(slots) != 1:

@@ -236,7 +236,9 @@ def _answer(
 ) -> Pool:
     """Return a pool whose unanswered problems begin anew, and keep what they had where that answers nothing either."""
     fix = judge(problem, pool)
-    lost = ~fix.answered & ~np.isin(fix.code, _SETTLED)
+    # where all that is known is hidden by the Earth, another minimum may be in sight
+    hidden = np.zeros(len(fix.code), dtype=bool) if pool.hidden is None else pool.hidden != ""
+    lost = ~fix.answered & (hidden | ~np.isin(fix.code, _SETTLED))
     # unlinked groups have fewer equations than the count says: without redundancy any place would fit
     lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
     items = np.flatnonzero(lost)

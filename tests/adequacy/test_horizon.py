@@ -26,7 +26,7 @@ def test_a_hidden_minimum_is_told_with_cost_and_place(bounds):
     reason = str(fix.reason)
     # without a bound the mirror image in the plane of the satellites is left, out in space, and fits nothing
     assert fix.status == (Status.INFEASIBLE if bounds else Status.MISFIT)
-    assert "the only minimum, of cost 0." in reason
+    assert "the only minimum found, of cost 0." in reason
     assert "behind the Earth" in reason
     assert "1.00" in reason  # its latitude
     assert "178.00" in reason
@@ -59,3 +59,32 @@ def test_without_earth_and_constraint_nothing_is_said_to_forbid():
     for seed in range(5):
         fix = optloc.solve(optloc.simulate(template, truth=[4e3, 3e3], seed=seed))
         assert "forbids" not in fix.certificate.reason
+
+
+def orbit(longitude, inclination, phase, times):
+    """Return places (k, 3) of a satellite on an inclined geosynchronous circle; degrees, hours."""
+    along, tilt = 2.0 * np.pi / 23.934 * times + np.radians(phase), np.radians(inclination)
+    x, y, z = np.cos(along), np.sin(along) * np.cos(tilt), np.sin(along) * np.sin(tilt)
+    turned = np.radians(longitude) - along
+    return 42164.2e3 * np.stack(
+        [np.cos(turned) * x - np.sin(turned) * y, np.sin(turned) * x + np.cos(turned) * y, z], -1
+    )
+
+
+def test_where_all_that_starts_lead_to_is_hidden_a_search_finds_what_is_in_sight():
+    """Four time differences of two satellites and a height: the cheaper of two places lies behind the Earth."""
+    hours, truth = 0.5 * np.arange(4), np.array(ECEF.from_geodetic(*np.radians([50.45, 30.52]), 180.0))
+    place = np.stack([orbit(10.0, 0.08, 40.0, hours), orbit(13.0, 1.9, 250.0, hours)], axis=1)
+    template = optloc.assemble(
+        place,
+        optloc.measured("tdoa", sigma=30.0, a=[0] * 4, b=[1] * 4, epoch=np.arange(4)),
+        times=3600.0 * hours,
+        motions=[optloc.Motion()],
+        constraints=optloc.constraints.height(exactly=180.0),
+        frame=ECEF,
+    )
+    for seed in range(4):
+        one = optloc.simulate(template, truth=truth, seed=seed)
+        fix, best = optloc.solve(one), optloc.solve(one, start=truth)
+        assert fix.answered
+        assert fix.cost <= best.cost + 1e-6
