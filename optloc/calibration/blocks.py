@@ -390,36 +390,16 @@ def moved(lik: Likelihood, at: Estimate, block: Block, place: Array) -> Estimate
     return moved_pulses(lik, at, np.array([block.index]), place[None])
 
 
-def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array, most: float = np.inf) -> Estimate:
-    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it.
-
-    With `most`, a square beyond which rows are gross, it is the median of what they want.
-    """
+def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array) -> Estimate:
+    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it."""
     pulses, emission = at.pulses.copy(), at.emission.copy()
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
     there = replace(at, pulses=pulses)
     weight = lik.root[which] * lik.emits
-    residual = lik.residual(there)[0, which]
     total = np.maximum((weight**2).sum(axis=1), 1e-300)
-    shift = (residual * weight).sum(axis=1) / total
-    if np.isfinite(most):
-        wanted = np.where(weight > 0.0, residual / np.where(weight > 0.0, weight, 1.0), np.nan)
-        shift = np.where(np.isnan(wanted).all(axis=1), 0.0, _median(wanted))
+    shift = (lik.residual(there)[0, which] * weight).sum(axis=1) / total
     emission[0, which] += np.where(lik.emission[which], shift, 0.0)
     return replace(there, emission=emission)
-
-
-def _median(values: Array) -> Array:
-    """Return medians of lines; those of nothing are zero."""
-    some = np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values)
-    return np.asarray(np.nanmedian(some, axis=1))
-
-
-def moved_stations(at: Estimate, which: Array, places: Array) -> Estimate:
-    """Return an estimate with some stations (n,) at other places (n, d)."""
-    stations = at.stations.copy()
-    stations[0, which] = places
-    return replace(at, stations=stations)
 
 
 def _moved_station(lik: Likelihood, at: Estimate, i: int, place: Array) -> Estimate:

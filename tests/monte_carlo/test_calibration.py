@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.stats import chi2
 
 from optloc import Status, calibrate, network_of
 from optloc.calibration.likelihood import likelihood
+from optloc.calibration.outliers import truncated
 from optloc.calibration.rounds import starts_of
 
 KEPT = FOLDER.parents[1] / "build" / "full"  # ignored by git
@@ -127,3 +129,58 @@ def test_networks_are_at_the_optimum_and_never_wrong_though_ok(name):
         assert np.mean([one["optimum"] for one in some]) >= share
     assert not any(one["wrong"] for one in some)
     assert not any(one["status"] == "ok" and not one["optimum"] and one["wrong"] for one in some)
+
+
+GROSS, NEAR = 100, 3.0
+GROSS_HEADER = (
+    "network",
+    "counted",
+    "rows left out as from the truth",
+    "distances as good as from the truth",
+    "wrong though ok",
+    "unproven, curved, misfit",
+    "median s",
+)
+
+
+def with_gross_rows(seed, m, n):
+    """Return a hall of 3 cm, its arrivals of which one in ten is 0.5 to 8 m late, and which."""
+    truth, z = hall(seed, m, n, 0.03)
+    rng = np.random.default_rng(seed)
+    wrong = rng.random(z.shape) < 0.1
+    return truth, z + wrong * rng.uniform(0.5, 8.0, z.shape), wrong
+
+
+def told_gross(seed, m, n):
+    """Return what became of one network with gross rows, beside what the true network and rows lead to."""
+    truth, z, wrong = with_gross_rows(seed, m, n)
+    net = network_of(z, 0.03)
+    lik = likelihood(net)
+    judge = truncated(lik, replace(lik, root=lik.root * ~wrong).refine(truth)[0])[0]
+    begun = time.process_time()
+    found = calibrate(net, robust=True)
+    seconds = time.process_time() - begun
+    out = np.zeros(z.shape, dtype=bool)
+    out[tuple(np.array(found.left_out, dtype=int).reshape(-1, 2).T)] = True
+
+    def error(stations):
+        return np.sqrt(np.mean((distances(stations) - distances(truth.stations[0])) ** 2))
+
+    near = bool(error(found.stations) <= NEAR * error(judge.stations[0]))
+    same = bool((out == (lik.residual(judge)[0] ** 2 > 16.0)).all())
+    wrong_ok = found.status is Status.OK and not near
+    return {"status": found.status.label, "same": same, "near": near, "wrong": wrong_ok, "seconds": seconds}
+
+
+@pytest.mark.full
+def test_one_row_in_ten_is_gross():
+    sizes = {f"{m} x {n}, hall, 3 cm, one row in ten late": (m, n) for m, n in ((12, 20),)}
+    for name, size in sizes.items():
+        some = [told_gross(seed, *size) for seed in range(SEED, SEED + GROSS)]
+        with ledger("calibration_gross", GROSS_HEADER, list(sizes), f"seeds {SEED} to {SEED + GROSS - 1}") as book:
+            counts = [sum(one[what] for one in some) for what in ("same", "near", "wrong")]
+            labels = [sum(one["status"] == label for one in some) for label in ("unproven", "curved", "misfit")]
+            seconds = f"{np.median([one['seconds'] for one in some]):.2f}"
+            book.add(name, GROSS, *counts, " / ".join(map(str, labels)), seconds)
+        assert counts[1] >= 0.9 * GROSS
+        assert counts[2] == 0

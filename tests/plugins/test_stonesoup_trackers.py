@@ -191,7 +191,7 @@ def test_several_frames_of_hypotheses(seed):
 
 
 def several_frames(seed):
-    """Follow with the host's multi-hypothesis tracker: a mixture a track, whose tags are the detections of each scan."""
+    """Follow with the host's multi-hypothesis tracker: a mixture a track, tagged with the detections of each scan."""
     from stonesoup.dataassociator.mfa import MFADataAssociator
     from stonesoup.hypothesiser.mfa import MFAHypothesiser
 
