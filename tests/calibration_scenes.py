@@ -23,3 +23,29 @@ def distances(points):
     """Return distances between all pairs of points."""
     i, k = np.tril_indices(len(points), -1)
     return np.linalg.norm(points[i] - points[k], axis=1)
+
+
+DEGENERATE = ("stations flat", "pulses flat", "one plane", "parallel planes", "in line", "few")
+
+
+def degenerate(case, seed):
+    """Return arrivals (N, M) to 3 cm of a hall whose stations or pulses do not determine it."""
+    truth, _ = hall(seed, 5 if case == "few" else 9, 6 if case == "few" else 20, 0.0)
+    stations, pulses = truth.stations[0].copy(), truth.pulses[0].copy()
+    if case in ("stations flat", "one plane", "parallel planes"):
+        stations[:, 2] = 0.0
+    if case in ("pulses flat", "one plane", "parallel planes"):
+        pulses[:, 2] = 3.0 if case == "parallel planes" else 0.0
+    if case == "in line":
+        stations[:, 1:] = 0.0
+    z = np.linalg.norm(pulses[:, None] - stations, axis=-1) + truth.emission[0][:, None]
+    return z + 0.03 * np.random.default_rng(seed + 50).standard_normal(z.shape)
+
+
+def reflected(truth):
+    """Return an estimate with the station that is farthest from the pulses' best plane on its other side, and which."""
+    stations, centre = truth.stations.copy(), truth.pulses[0].mean(axis=0)
+    normal = np.linalg.svd(truth.pulses[0] - centre)[2][-1]
+    i = int(np.abs((stations[0] - centre) @ normal).argmax())
+    stations[0, i] -= 2.0 * ((stations[0, i] - centre) @ normal) * normal
+    return Estimate(stations, truth.clocks, truth.pulses, truth.emission), i

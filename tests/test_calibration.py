@@ -3,7 +3,7 @@
 import casadi
 import numpy as np
 import pytest
-from calibration_scenes import HALL, hall
+from calibration_scenes import HALL, degenerate, hall, reflected
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
@@ -177,39 +177,16 @@ def test_differences_and_two_way_ranges():
 
 
 def test_a_station_on_the_wrong_side_is_refuted():
-    refuted = 0
     for seed in range(5):
         truth, z = hall(seed, 12, 20, 0.03)
-        net = network_of(z, 0.03)
-        stations = truth.stations.copy()
-        centre = truth.pulses[0].mean(axis=0)
-        normal = np.linalg.svd(truth.pulses[0] - centre)[2][-1]
-        i = int(np.abs((stations[0] - centre) @ normal).argmax())
-        stations[0, i] -= 2.0 * ((stations[0, i] - centre) @ normal) * normal
-        wrong = type(truth)(stations, truth.clocks, truth.pulses, truth.emission)
-        refuted += f"station A{i + 1}" in [block.name for block in refuted_blocks(net, wrong)]
-    assert refuted == 5
+        wrong, i = reflected(truth)
+        assert f"station A{i + 1}" in [block.name for block in refuted_blocks(network_of(z, 0.03), wrong)]
 
 
-FLAT = ["pulses flat", "one plane", "in line", "parallel planes"]
-
-
-@pytest.mark.parametrize(
-    "case", ["stations flat", "few", *(pytest.param(name, marks=pytest.mark.full) for name in FLAT)]
-)
+@pytest.mark.parametrize("case", ["stations flat", "few"])
 def test_degenerate_networks_are_named(case):
     for seed in range(2):
-        truth, _ = hall(seed, 5 if case == "few" else 9, 6 if case == "few" else 20, 0.0)
-        stations, pulses = truth.stations[0].copy(), truth.pulses[0].copy()
-        if case in ("stations flat", "one plane", "parallel planes"):
-            stations[:, 2] = 0.0
-        if case in ("pulses flat", "one plane", "parallel planes"):
-            pulses[:, 2] = 3.0 if case == "parallel planes" else 0.0
-        if case == "in line":
-            stations[:, 1:] = 0.0
-        rng = np.random.default_rng(seed + 50)
-        z = np.linalg.norm(pulses[:, None] - stations, axis=-1) + truth.emission[0][:, None]
-        found = calibrate(network_of(z + 0.03 * rng.standard_normal(z.shape), 0.03), starts=24)
+        found = calibrate(network_of(degenerate(case, seed), 0.03), starts=24)
         assert found.status is not Status.OK
         assert found.findings
 

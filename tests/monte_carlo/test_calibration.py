@@ -2,15 +2,17 @@
 
 import json
 import time
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import HALL, distances, hall
+from calibration_scenes import DEGENERATE, HALL, degenerate, distances, hall, reflected
 from monte_carlo.tables import FOLDER, code_digest, ledger
 from scipy.stats import chi2
 
 from optloc import Status, calibrate, network_of
+from optloc.calibration.calibrated import refuted_blocks
 from optloc.calibration.likelihood import likelihood
 from optloc.calibration.outliers import truncated
 from optloc.calibration.rounds import starts_of
@@ -184,3 +186,30 @@ def test_one_row_in_ten_is_gross():
             book.add(name, GROSS, *counts, " / ".join(map(str, labels)), seconds)
         assert counts[1] >= 0.9 * GROSS
         assert counts[2] == 0
+
+
+SETS, MIRRORED = 100, 200
+SETS_HEADER = ("hall, 3 cm", "counted", "ok", "with a finding", "statuses")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("case", DEGENERATE)
+def test_degenerate_networks_are_named_in_full(case):
+    some = [calibrate(network_of(degenerate(case, seed), 0.03), starts=24) for seed in range(SEED, SEED + SETS)]
+    ok = sum(found.status is Status.OK for found in some)
+    named = sum(bool(found.findings) for found in some)
+    labels = Counter(found.status.label for found in some)
+    facts = f"seeds {SEED} to {SEED + SETS - 1}"
+    with ledger("calibration_degenerate", SETS_HEADER, list(DEGENERATE), facts, kept=KEPT) as book:
+        words = ", ".join(f"{count} {label}" for label, count in labels.most_common())
+        book.add(case, SETS, ok, named, words)
+    assert ok == 0
+    assert named == SETS
+
+
+@pytest.mark.full
+def test_stations_on_the_wrong_side_are_refuted_in_full():
+    for seed in range(SEED, SEED + MIRRORED):
+        truth, z = hall(seed, 12, 20, 0.03)
+        wrong, i = reflected(truth)
+        assert f"station A{i + 1}" in [block.name for block in refuted_blocks(network_of(z, 0.03), wrong)], seed
