@@ -439,7 +439,8 @@ def _alternatives(
     out: list[Alternative] = []
     shapes = [_shape(at, soft)]
     scale = max(float(np.abs(shapes[0]).max()), 1e-300)
-    for i in np.argsort(costs, kind="stable"):
+    # of the same network, refined twice, the first name says more
+    for i in np.argsort(np.round(costs, 3), kind="stable"):
         one, gap = ends.take(np.array([i])), float(costs[i] - cost)
         shape = _shape(one, soft)
         # a thousandth of the size, or where costs agree to what is left of the digits, is the same network

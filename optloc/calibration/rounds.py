@@ -15,7 +15,10 @@ from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, toge
 from optloc.calibration.network import Network
 
 # Starts at a time: a batch of eight costs little more than one.
-_LOW_RANK, _RANDOM = 8, 4
+_LOW_RANK, _RANDOM = 8, 8
+# Stations from which random places alone are tried first: most of them lead to the optimum there, and take a tenth of
+# the time.
+_MANY = 10
 # Fits whose relaxed cost is within this factor of the best are refined: the relaxation weighs errors otherwise than the
 # likelihood does, so that its best need not lead to the best.
 _NEARLY = 2.0
@@ -211,9 +214,9 @@ def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
-    begun = 0
+    begun, patient = 0, net.stations >= _MANY
     while True:
-        if able:
+        if able and not patient:
             at, start, weight = starts.low_rank(_LOW_RANK)
             found = starts.ends(at, start + begun, weight) if at.count else None
             begun += _LOW_RANK
@@ -221,6 +224,7 @@ def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
                 yield begun, found
         found = starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun, np.ones(_RANDOM, dtype=int))
         begun += _RANDOM
+        patient = False
         yield begun, found
 
 
