@@ -10,7 +10,7 @@ import numpy as np
 from optloc.calibration.blocks import MOVED, Block, blocks, elsewhere, moved
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import CLOCKED, Network
-from optloc.calibration.rounds import Ends, rounds, starts_of
+from optloc.calibration.rounds import Ends, joined, rounds, starts_of
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import REFUTED, equal_cost
 
@@ -87,12 +87,7 @@ def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], Non
 
 def _joined(found: Found | None, ends: Ends, made: int) -> Found:
     if found is not None:
-        ends = Ends(
-            together(found.ends.at, ends.at),
-            np.concatenate([found.ends.cost, ends.cost]),
-            np.concatenate([found.ends.start, ends.start]),
-            np.concatenate([found.ends.weight, ends.weight]),
-        )
+        ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())
     if found is None:
         return Found(ends, ends.at.take(np.array([i])), float(ends.cost[i]), made)

@@ -60,6 +60,12 @@ class Ends:
         return int(self.weight[which][np.unique(self.start[which], return_index=True)[1]].sum())
 
 
+def joined(some: list[Ends]) -> Ends:
+    """Return all ends of several rounds."""
+    arrays = (np.concatenate([getattr(one, name) for one in some]) for name in ("cost", "start", "weight"))
+    return Ends(together(*(one.at for one in some)), *arrays)
+
+
 def arrivals(network: Network) -> tuple[Array, Array, Array]:
     """Return what each pulse measured as one number a station.
 
@@ -210,22 +216,24 @@ def starts_of(lik: Likelihood, seed: int) -> Starts:
 
 
 def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
-    """Yield how many starts were made, and the ends of each round: low rank where it applies, and random places."""
+    """Yield how many starts were made, and the ends of each round: low rank where it applies, and random places.
+
+    Both belong to a round: starts that find the same fit of low rank agree in where that leads, right or wrong.
+    """
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
     begun, patient = 0, net.stations >= _MANY
     while True:
+        made = list[Ends]()
         if able and not patient:
             at, start, weight = starts.low_rank(_LOW_RANK)
-            found = starts.ends(at, start + begun, weight) if at.count else None
+            made += [starts.ends(at, start + begun, weight)] if at.count else []
             begun += _LOW_RANK
-            if found is not None:
-                yield begun, found
-        found = starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun, np.ones(_RANDOM, dtype=int))
+        made.append(starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun, np.ones(_RANDOM, dtype=int)))
         begun += _RANDOM
         patient = False
-        yield begun, found
+        yield begun, joined(made)
 
 
 def laid(at: Estimate, net: Network, rng: np.random.Generator) -> Estimate:
