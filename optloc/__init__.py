@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from optloc.adequacy.advice import advise, explained
     from optloc.adequacy.evidence import Reliability, reliability
     from optloc.adequacy.geometry import Advice
-    from optloc.adequacy.level import CommonLevel, LateSignals
+    from optloc.adequacy.noise_level import CommonLevel, LateSignals
     from optloc.base import frames, units
     from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
     from optloc.base.frames import CARTESIAN, ECEF, Frame
@@ -197,7 +197,7 @@ _HOMES = {
     "adequacy.advice": "advise explained",
     "adequacy.evidence": "Reliability reliability",
     "adequacy.geometry": "Advice",
-    "adequacy.level": "CommonLevel LateSignals",
+    "adequacy.noise_level": "CommonLevel LateSignals",
     "base.errors": "InvalidProblem NoSolution OptlocError",
     "base.frames": "CARTESIAN ECEF Frame",
     "base.inputs": "Budget",

@@ -268,14 +268,14 @@ def test_nan_measurements_are_a_result_not_an_error():
 
 
 def test_every_case_passes_the_checks_again():
-    from optloc.problem.check import checked
+    from optloc.problem.validation import checked
 
     for case in CASES.values():
         assert checked(case.problem) is case.problem
 
 
 def test_a_problem_put_together_by_hand_can_be_checked():
-    from optloc.problem.check import checked
+    from optloc.problem.validation import checked
 
     good = posed()
     wrong = replace(good, stations=Stations(good.stations.position, ("a",)))

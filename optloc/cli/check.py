@@ -12,7 +12,7 @@ from rich.table import Table
 
 from optloc.adequacy.elements import By, batch_of
 from optloc.adequacy.geometry import Advice
-from optloc.adequacy.level import CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.adequacy.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import together
 from optloc.base.types import Array, Bias, Stations

@@ -15,7 +15,7 @@ from rich.text import Text
 from optloc.adequacy.advice import advise, advise_at, explained_at
 from optloc.adequacy.elements import GROUPINGS, By, batch_of
 from optloc.adequacy.geometry import Advice
-from optloc.adequacy.level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.adequacy.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import together
 from optloc.base.types import ANSWERED, Array, Status

@@ -41,10 +41,10 @@ from optloc.files.unknowns import (
 )
 from optloc.models import MODELS
 from optloc.models.medium import Medium
-from optloc.problem.check import checked
 from optloc.problem.noise import Block, Noise, arrivals, group, together
 from optloc.problem.problem import Problem
 from optloc.problem.signal import Signal
+from optloc.problem.validation import checked
 from optloc.quality.levels import NoiseLevels, with_estimated_noise
 
 LOG = logging.getLogger("optloc.read")

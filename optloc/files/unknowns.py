@@ -30,8 +30,8 @@ from optloc.files.stations import spread, survey
 from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, reported, speed, visible
 from optloc.problem.bias import changing, family, prior_shape
-from optloc.problem.check import check_polygon, like
 from optloc.problem.clocks import clock_densities
+from optloc.problem.validation import check_polygon, like
 
 # Derivatives of the position that a motion estimates.
 _ORDERS = {"static": 0, "free": 0, "free_velocity": 1, "constant_velocity": 1, "constant_acceleration": 2}

@@ -21,8 +21,8 @@ from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.starts.angles import courses
 from optloc.track import Dynamics, State, Track, current_statistical, followed, singer
-from optloc.track.batch import fitted, posterior_bound
 from optloc.track.dynamics import correlated
+from optloc.track.whole_run import fitted, posterior_bound
 
 # The three simulations of the paper, as printed where they can be and repaired where not.
 

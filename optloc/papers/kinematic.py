@@ -22,10 +22,10 @@ from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.track import Dynamics, State, Track, followed, polynomial
 from optloc.track.associate import Associate, Clutter, assigned, joint, nearest
-from optloc.track.batch import posterior_bound
 from optloc.track.several_models import imm, parallel, resized
 from optloc.track.several_targets import Candidates, Missing, associated
 from optloc.track.updates import Update, Updated, joseph, whitened
+from optloc.track.whole_run import posterior_bound
 
 # The scene of the paper: three targets, four stations, twenty updates behind one fix.
 

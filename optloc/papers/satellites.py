@@ -38,11 +38,11 @@ from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
-from optloc.track.batch import posterior_bound
 from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.dynamics import Dynamics, polynomial
 from optloc.track.start import two_point, with_height_rows
 from optloc.track.track import State, Track, followed
+from optloc.track.whole_run import posterior_bound
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,9 +13,9 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Bias, Rows
 from optloc.models import MODELS, Model
 from optloc.models.primitives import rotate
-from optloc.problem.check import check_unknowns
 from optloc.problem.clocks import coefficients, density_of, effects, knots_over
 from optloc.problem.problem import Problem
+from optloc.problem.validation import check_unknowns
 
 Form = Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"]
 Per = Literal["station", "pair", "kind", "target"]

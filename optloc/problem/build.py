@@ -15,9 +15,9 @@ from optloc.base.types import Array, Bias, Motion, Prior, Rows, Stations
 from optloc.models import BEARING, MODELS, kind_named
 from optloc.models.medium import Medium
 from optloc.problem import noise as noises
-from optloc.problem.check import checked
 from optloc.problem.problem import Problem
 from optloc.problem.signal import Signal
+from optloc.problem.validation import checked
 
 
 @dataclass(frozen=True, slots=True)

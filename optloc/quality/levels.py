@@ -16,7 +16,7 @@ from optloc.adequacy.elements import (
     ends_of,
     split,
 )
-from optloc.adequacy.level import CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.adequacy.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.adequacy.variance_components import Fitted, Tested, fit, tested, total, visible, without
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array

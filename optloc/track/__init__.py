@@ -1,6 +1,5 @@
 """Trackers: fixes in time, started by the fixes of `optloc.solve`."""
 
-from optloc.track.batch import fitted, posterior_bound, smoothed
 from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.dynamics import Dynamics, current_statistical, polynomial, singer
 from optloc.track.measurement_space import lines, simplified
@@ -8,6 +7,7 @@ from optloc.track.run import Entry, Rules, collected, tracked
 from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted
 from optloc.track.updates import UPDATES, Updated, ekf, reweighted, whitened
+from optloc.track.whole_run import fitted, posterior_bound, smoothed
 
 __all__ = [
     "UPDATES",

@@ -9,7 +9,7 @@ from quality.test_health import RUN, written
 
 from optloc import assemble, common_level, measured, solve
 from optloc.adequacy.elements import batch_of
-from optloc.adequacy.level import common_level_at
+from optloc.adequacy.noise_level import common_level_at
 from optloc.adequacy.score import descend
 from optloc.cli import app
 

@@ -28,7 +28,7 @@ from optloc.papers.angles import (
 )
 from optloc.problem.epochs import cut
 from optloc.track import State, begun, current_statistical, followed, polynomial, singer
-from optloc.track.batch import posterior_bound
+from optloc.track.whole_run import posterior_bound
 
 # --- a second implementation, in the order [x vx ax | y vy ay | z vz az] -------------------------------------------
 

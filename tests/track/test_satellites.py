@@ -11,10 +11,10 @@ from optloc.base.types import Status
 from optloc.linear.constraints import height as known_height
 from optloc.problem.epochs import cut
 from optloc.track import followed, polynomial
-from optloc.track.batch import posterior_bound
 from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.start import first_fix, state_of, two_point, with_height_rows
 from optloc.track.track import State
+from optloc.track.whole_run import posterior_bound
 
 SAT = geodetic_to_ecef(np.radians([24.44, 25.09, 24.44]), np.radians([125.21, 125.68, 125.99]), np.full(3, 800e3))
 P0 = geodetic_to_ecef(np.radians(25.80), np.radians(127.37), 0.0)

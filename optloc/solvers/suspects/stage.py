@@ -12,7 +12,7 @@ import numpy as np
 from optloc.adequacy.elements import batch_of
 from optloc.adequacy.evidence import Error, errors, influence
 from optloc.adequacy.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
-from optloc.adequacy.level import SEVERAL, CommonLevel, common_level_at
+from optloc.adequacy.noise_level import SEVERAL, CommonLevel, common_level_at
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
