@@ -250,3 +250,20 @@ def test_too_few_rows_are_a_status():
     assert found.status is Status.TOO_FEW_ROWS
     with pytest.raises(optloc.NoSolution):
         found.require()
+
+
+def test_flat_pulses_are_no_riddle_where_heights_tell_the_side():
+    """The mirror image of a station in the pulses' plane breaks its known height; three places known leave the others."""
+    truth, _ = hall(4, 9, 20, 0.0)
+    pulses = truth.pulses[0].copy()
+    pulses[:, 2] = 3.0
+    rng = np.random.default_rng(4)
+    z = np.linalg.norm(pulses[:, None] - truth.stations, axis=-1) + truth.emission[0][:, None]
+    z += 0.03 * rng.standard_normal(z.shape)
+    place = np.full((9, 3), np.nan)
+    place[:3] = truth.stations[0, :3]
+    assert calibrate(network_of(z, 0.03, place=place, place_sigma=0.01)).status is Status.AMBIGUOUS
+    place[:, 2] = truth.stations[0, :, 2]
+    found = calibrate(network_of(z, 0.03, place=place, place_sigma=0.01))
+    assert found.status is Status.OK
+    assert np.abs(errors(found, truth)[0]).max() < 0.2

@@ -73,7 +73,7 @@ def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], Non
     for made, one in rounds(starts_of(lik, seed)):
         good = np.isfinite(one.cost)
         if good.any():
-            found = _joined(found, one.take(good), made)
+            found = _added(found, one.take(good), made)
             _move_on(lik, found)
             if tell is not None:
                 tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
@@ -85,7 +85,7 @@ def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], Non
     return found
 
 
-def _joined(found: Found | None, ends: Ends, made: int) -> Found:
+def _added(found: Found | None, ends: Ends, made: int) -> Found:
     if found is not None:
         ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())

@@ -11,12 +11,12 @@ from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.types import PRECEDENCE, Array, Status
 from optloc.calibration.agreement import AGREEING, Found, frame_size, proven, search
 from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
+from optloc.calibration.flatness import flat
 from optloc.calibration.gauge import Determined, determined, excess, fixed_by, in_frame, over, with_mean_clock
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
 from optloc.calibration.outliers import PRICE, outliers
 from optloc.calibration.rounds import laid
-from optloc.problem.chart import quantile
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 
@@ -24,8 +24,6 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 _CORE = 60
 # Method that places the other pulses; their proof comes with that of all.
 _QUICK = "gtrs+lsr"
-# Level at which stations refute that they are in one plane: that of three sigma of a single number.
-_FLAT = 0.9973
 # Share of pulses with two places that the others outvote: of more, the cheapest combination of their sides is chosen
 # among so many that it feigns a shape of the stations (flat ones come out 0.1 to 0.3 m thick at 3 cm).
 _TWOFOLD = 0.5
@@ -298,7 +296,7 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
         covariance = np.full((lik.free.size, lik.free.size), np.nan)
     else:
         covariance = told.covariance(fixed_by(net, named) if named else told.free.T)
-        findings += _flat_findings(lik, at, covariance)
+        findings += [(Status.AMBIGUOUS, words) for words in flat(lik, at, covariance)]
         findings += _curved_findings(lik, at, told)
     if p < REFUTED:
         findings.append((Status.MISFIT, f"The residuals are larger than the stated noise allows: p = {p:.2g}."))
@@ -355,44 +353,6 @@ def _open_words(net: Network, told: Determined) -> str:
         f"{count} motion{'s' if count > 1 else ''} of the network beyond the frame change no measurement, mostly of "
         f"{', '.join(largest)}; add pulses off their plane, distances between stations, or known places."
     )
-
-
-def _flat_findings(lik: Likelihood, at: Estimate, covariance: Array) -> list[tuple[Status, str]]:
-    """Return what follows from stations, or pulses, in one plane: each of the others has a mirror image."""
-    out: list[tuple[Status, str]] = []
-    net = lik.network
-    if np.isfinite(net.place_sigma).all():
-        return out
-    m, d = net.stations, net.dimension
-    places = covariance[: m * d, : m * d].reshape(m, d, m, d)
-    if _in_one_plane(at.stations[0], lambda normal: np.einsum("c,icje,e->ij", normal, places, normal)):
-        words = "The stations are in one plane as far as the data tell: which side of it pulses are on is open."
-        out.append((Status.AMBIGUOUS, words))
-    placed = np.flatnonzero(net.given.sum(axis=1) > d)
-    if _in_one_plane(at.pulses[0, placed], lambda normal: _of_pulses(lik, at, covariance, placed, normal)):
-        words = "The pulses are in one plane as far as the data tell: which side of it stations are on is open."
-        out.append((Status.AMBIGUOUS, words))
-    return out
-
-
-def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
-    """Return whether points (m, d) are in one plane, by the covariance (m, m) of their heights along a normal."""
-    centred = points - points.mean(axis=0)
-    turn = np.linalg.svd(centred)[2]
-    # of heights above the best plane what no other plane explains: its covariance is the same in every frame
-    left = np.linalg.svd(np.column_stack([np.ones(len(points)), centred @ turn[:-1].T]).T)[2][points.shape[1] :]
-    height = left @ (centred @ turn[-1])
-    spread = left @ covariance(turn[-1]) @ left.T
-    return not len(left) or bool(height @ np.linalg.pinv(spread, hermitian=True) @ height < quantile(_FLAT, len(left)))
-
-
-def _of_pulses(lik: Likelihood, at: Estimate, covariance: Array, which: Array, normal: Array) -> Array:
-    """Return the covariance (n, n) of the heights of some pulses: from their own rows, and from the stations."""
-    by_station, by_pulse = (one[0, which] for one in lik.jacobian(at))
-    own = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])
-    along = np.einsum("jr,jrp->jp", own, by_station)
-    # a pulse's own errors and those of the stations have nothing in common: these come from what pulses leave over
-    return np.asarray(np.diag((own**2).sum(axis=1)) + along @ covariance @ along.T)
 
 
 def _curved_findings(lik: Likelihood, at: Estimate, told: Determined) -> list[tuple[Status, str]]:

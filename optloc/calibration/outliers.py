@@ -22,8 +22,8 @@ from optloc.calibration.rounds import Starts, starts_of
 PRICE = 16.0
 """Cost of a row that is left out: beyond four sigma it is cheaper than what it says, as with suspects of a fix."""
 
-# Starts, and how many of the cheapest are gone on with: with one row in ten wrong in 12 x 20 halls forty and three
-# missed the stations of 3 networks of 26, sixty and four of none of 15.
+# Starts, and how many of the cheapest are gone on with: of 15 halls of 12 x 20 with one row in ten wrong forty and
+# three missed the stations of three, sixty and four of none.
 _STARTS, _BEST = 60, 4
 # Rounds of weights, of a start and of one that goes on, and the steps of each.
 _ROUNDS, _MORE, _STEPS = 14, 5, 10
