@@ -253,7 +253,7 @@ def test_too_few_rows_are_a_status():
 
 
 def test_flat_pulses_are_no_riddle_where_heights_tell_the_side():
-    """The mirror image of a station in the pulses' plane breaks its known height; three places known leave the others."""
+    """Mirrored in the pulses' plane a station breaks its known height; three places known leave the others."""
     truth, _ = hall(4, 9, 20, 0.0)
     pulses = truth.pulses[0].copy()
     pulses[:, 2] = 3.0
