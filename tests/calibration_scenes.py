@@ -1,5 +1,7 @@
 """Halls and fields with stations and pulses at random places, for tests of networks."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from optloc.calibration.likelihood import Estimate
@@ -40,6 +42,16 @@ def degenerate(case, seed):
         stations[:, 1:] = 0.0
     z = np.linalg.norm(pulses[:, None] - stations, axis=-1) + truth.emission[0][:, None]
     return z + 0.03 * np.random.default_rng(seed + 50).standard_normal(z.shape)
+
+
+def thin(seed, which, thickness):
+    """Return a hall of 9 x 20 whose stations or pulses are near a plane, metres to either side, and arrivals to 3 cm."""
+    truth, _ = hall(seed, 9, 20, 0.0)
+    points = getattr(truth, which).copy()
+    points[..., 2] = 3.0 + thickness * (points[..., 2] - 3.0) / 3.0
+    truth = replace(truth, **{which: points})
+    z = np.linalg.norm(truth.pulses[0][:, None] - truth.stations[0], axis=-1) + truth.emission[0][:, None]
+    return truth, z + 0.03 * np.random.default_rng(seed + 7).standard_normal(z.shape)
 
 
 def reflected(truth):

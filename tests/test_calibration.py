@@ -3,7 +3,7 @@
 import casadi
 import numpy as np
 import pytest
-from calibration_scenes import HALL, degenerate, hall, reflected
+from calibration_scenes import HALL, degenerate, hall, reflected, thin
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
@@ -267,3 +267,10 @@ def test_flat_pulses_are_no_riddle_where_heights_tell_the_side():
     found = calibrate(network_of(z, 0.03, place=place, place_sigma=0.01))
     assert found.status is Status.OK
     assert np.abs(errors(found, truth)[0]).max() < 0.2
+
+
+def test_starts_that_share_a_fit_of_low_rank_do_not_agree():
+    """Pulses within 0.3 m of a plane: four starts found one fit, which led to a network 23 above the optimum."""
+    truth, z = thin(200002, "pulses", 0.3)
+    found = calibrate(network_of(z, 0.03))
+    assert found.status is not Status.OK or found.cost <= likelihood(network_of(z, 0.03)).refine(truth)[1][0] + 1.0

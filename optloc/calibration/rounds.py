@@ -41,28 +41,26 @@ class Ends:
     cost : array (S,)
         Their costs.
     start : int array (S,)
-        Number of the start that each comes from.
-    weight : int array (S,)
-        How many starts that one stands for: those that had found the same fit.
+        Number of the start that each comes from; starts that found the same fit of low rank are one, for they agree in
+        where that leads, right or wrong.
     """
 
     at: Estimate
     cost: Array
     start: Array
-    weight: Array
 
     def take(self, which: Array) -> Ends:
         """Return some of the ends."""
-        return Ends(self.at.take(which), self.cost[which], self.start[which], self.weight[which])
+        return Ends(self.at.take(which), self.cost[which], self.start[which])
 
     def counted(self, which: Array) -> int:
         """Return how many starts some of the ends (mask) come from."""
-        return int(self.weight[which][np.unique(self.start[which], return_index=True)[1]].sum())
+        return len(np.unique(self.start[which]))
 
 
 def joined(some: list[Ends]) -> Ends:
     """Return all ends of several rounds."""
-    arrays = (np.concatenate([getattr(one, name) for one in some]) for name in ("cost", "start", "weight"))
+    arrays = (np.concatenate([getattr(one, name) for one in some]) for name in ("cost", "start"))
     return Ends(together(*(one.at for one in some)), *arrays)
 
 
@@ -138,8 +136,8 @@ class Starts:
         """Return 2 or 3."""
         return self.lik.network.dimension
 
-    def low_rank(self, count: int) -> tuple[Estimate, Array, Array]:
-        """Return networks from fits of low rank, the number of each fit, and how many of `count` starts found it."""
+    def low_rank(self, count: int) -> tuple[Estimate, Array]:
+        """Return networks from the fits of low rank that `count` starts find, and the number of each fit."""
         net, d = self.lik.network, self.dimension
         full = (self.weight > 0.0).sum(axis=1) >= d + 3
         relative = self.weight / self.weight.max()
@@ -150,11 +148,9 @@ class Starts:
         # starts that found the same fit lead to the same network
         order = keep[np.argsort(fit.cost[keep], kind="stable")]
         new = np.diff(fit.cost[order], prepend=-1.0) > 1e-6 * fit.cost[order] + 1e-24
-        family = np.zeros(count, dtype=int) - 1
-        family[order] = np.cumsum(new) - 1
         stations, pulses, which = upgrade(fit.take(order[new]))
         if not len(which):
-            return _nothing(net), np.zeros(0, dtype=int), np.zeros(0, dtype=int)
+            return _nothing(net), np.zeros(0, dtype=int)
         b = fit.stations.b[order[new]][which] * self.spread
         places = np.zeros((len(which), net.pulses, d))
         places[:, full] = pulses * self.spread
@@ -164,8 +160,7 @@ class Starts:
         offsets = np.where(self.emission, offsets + self.shift, 0.0)
         made = Estimate(stations * self.spread, b, places, offsets * net.emission)
         self._settle(made, ~full)
-        # each start of a family arrives where the family does
-        return made, which, np.bincount(family[family >= 0])[which]
+        return made, which
 
     def _settle(self, made: Estimate, few: Array) -> None:
         """Give pulses that took no part in a fit the emission that their places at the centre call for."""
@@ -188,15 +183,15 @@ class Starts:
         offset = ((self.z - apart) * weight).sum(axis=-1)
         return Estimate(stations, np.zeros((count, net.stations)), pulses, offset * net.emission)
 
-    def ends(self, at: Estimate, start: Array, weight: Array) -> Ends:
+    def ends(self, at: Estimate, start: Array) -> Ends:
         """Refine networks, laid over what is known of the stations in both ways."""
         net = self.lik.network
         if np.isfinite(net.place_sigma).any():
             free = replace(net, place_sigma=np.full(net.place.shape, np.inf), place=np.zeros(net.place.shape))
             rough, _ = likelihood(free).refine(at, _ROUGH)
-            at, start, weight = laid(rough, net, self.rng), np.tile(start, 2), np.tile(weight, 2)
+            at, start = laid(rough, net, self.rng), np.tile(start, 2)
         found, cost = self.lik.refine(at)
-        return Ends(found, cost, start, weight)
+        return Ends(found, cost, start)
 
 
 def _nothing(net: Network) -> Estimate:
@@ -216,10 +211,7 @@ def starts_of(lik: Likelihood, seed: int) -> Starts:
 
 
 def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
-    """Yield how many starts were made, and the ends of each round: low rank where it applies, and random places.
-
-    Both belong to a round: starts that find the same fit of low rank agree in where that leads, right or wrong.
-    """
+    """Yield how many starts were made, and the ends of each round: low rank where it applies, and random places."""
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
@@ -227,10 +219,10 @@ def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
     while True:
         made = list[Ends]()
         if able and not patient:
-            at, start, weight = starts.low_rank(_LOW_RANK)
-            made += [starts.ends(at, start + begun, weight)] if at.count else []
+            at, start = starts.low_rank(_LOW_RANK)
+            made += [starts.ends(at, start + begun)] if at.count else []
             begun += _LOW_RANK
-        made.append(starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun, np.ones(_RANDOM, dtype=int)))
+        made.append(starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun))
         begun += _RANDOM
         patient = False
         yield begun, joined(made)
