@@ -45,7 +45,7 @@ def degenerate(case, seed):
 
 
 def thin(seed, which, thickness):
-    """Return a hall of 9 x 20 whose stations or pulses are near a plane, metres to either side, and arrivals to 3 cm."""
+    """Return a hall of 9 x 20 with stations or pulses near a plane, metres to either side, and arrivals to 3 cm."""
     truth, _ = hall(seed, 9, 20, 0.0)
     points = getattr(truth, which).copy()
     points[..., 2] = 3.0 + thickness * (points[..., 2] - 3.0) / 3.0
