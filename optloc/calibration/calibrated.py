@@ -11,8 +11,7 @@ from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.types import PRECEDENCE, Array, Status
 from optloc.calibration.agreement import AGREEING, Found, frame_size, proven, search
 from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
-from optloc.calibration.flatness import flat
-from optloc.calibration.gauge import Determined, determined, excess, fixed_by, in_frame, over, with_mean_clock
+from optloc.calibration.gauge import Determined, determined, excess, fixed_by, flat, in_frame, over, with_mean_clock
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
 from optloc.calibration.outliers import PRICE, outliers
