@@ -1,14 +1,17 @@
 """Networks from nothing: known answers, what no frame changes, named refusals, and single blocks refuted."""
 
+from dataclasses import replace
+
 import casadi
 import numpy as np
 import pytest
 from calibration_scenes import HALL, degenerate, hall, reflected, thin
+from scipy.stats import chi2
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
 from optloc.calibration.calibrated import refuted_blocks
-from optloc.calibration.gauge import determined, excess
+from optloc.calibration.gauge import determined, excess, rise
 from optloc.calibration.likelihood import likelihood
 from optloc.calibration.rounds import starts_of
 
@@ -99,9 +102,35 @@ def test_errors_exceed_a_covariance_where_noise_is_large():
         truth, z = hall(4, 7, 20, sigma)
         lik = likelihood(network_of(z, sigma))
         at = lik.refine(truth)[0]
-        shares.append(excess(lik, at, determined(lik, at)))
+        shares.append(excess(lik, at, determined(lik, at), 0.2))
     assert abs(shares[0]) < 0.02
     assert shares[1] > 0.2
+
+
+def test_a_covariance_that_only_the_cost_refutes_is_not_ok():
+    # the truth, its pulses wherever they fit best, costs no more than noise does, and is beyond the 99.99 % ellipsoid
+    truth, z = hall(500096, 6, 20, 0.03)
+    net = network_of(z, 0.03)
+    lik = likelihood(net)
+    found = calibrate(net)
+    error, covariance = errors(found, truth)
+    _, dearer = replace(lik, free=np.zeros_like(lik.free)).refine(truth)
+    width, axes = np.linalg.eigh(covariance)
+    told = width > 1e-9 * width[-1]
+    assert dearer[0] - found.cost < chi2.ppf(0.95, told.sum())
+    assert (((axes.T @ error)[told]) ** 2 / width[told]).sum() > chi2.ppf(0.9999, told.sum())
+    assert found.status is Status.CURVED
+
+
+def test_the_cost_rises_as_the_covariance_says_where_noise_is_small():
+    shares = []
+    for sigma in (1e-4, 0.03):
+        truth, z = hall(500096, 6, 20, sigma)
+        lik = likelihood(network_of(z, sigma))
+        at = lik.refine(truth)[0]
+        shares.append(rise(lik, at, determined(lik, at)))
+    assert abs(shares[0] - 1.0) < 0.02
+    assert shares[1] < 0.74
 
 
 def test_gross_rows_are_named_and_the_network_is_unproven_at_best():

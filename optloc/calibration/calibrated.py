@@ -11,11 +11,22 @@ from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.types import PRECEDENCE, Array, Status
 from optloc.calibration.agreement import AGREEING, Found, frame_size, proven, search
 from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
-from optloc.calibration.gauge import Determined, determined, excess, fixed_by, flat, in_frame, over, with_mean_clock
+from optloc.calibration.gauge import (
+    Determined,
+    determined,
+    excess,
+    fixed_by,
+    flat,
+    in_frame,
+    over,
+    rise,
+    with_mean_clock,
+)
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
 from optloc.calibration.outliers import PRICE, outliers
 from optloc.calibration.rounds import laid
+from optloc.compute.range_shape import STRAIGHT
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 
@@ -36,6 +47,8 @@ _ZERO = 1e-9
 _GIVES_WAY = 0.1
 # Share by which squared errors may exceed the covariance: 10 % of a deviation.
 _COVERS = 0.2
+# Share of what the covariance says that the cost must rise by: that of a fix that is `ok`.
+_RISES = np.exp(-STRAIGHT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,13 +368,13 @@ def _open_words(net: Network, told: Determined) -> str:
 
 
 def _curved_findings(lik: Likelihood, at: Estimate, told: Determined) -> list[tuple[Status, str]]:
-    share = excess(lik, at, told)
-    if share <= _COVERS:
-        return []
-    words = (
-        f"The covariance is too small: squared errors exceed it by up to {share:.0%} where the measurement is repeated."
-    )
-    return [(Status.CURVED, words)]
+    words = list[str]()
+    share, slow = excess(lik, at, told, _COVERS), rise(lik, at, told)
+    if share > _COVERS:
+        words.append(f"squared errors exceed it by up to {share:.0%} where the measurement is repeated")
+    if slow < _RISES:
+        words.append(f"three deviations away the cost rises by {slow:.0%} of what it says")
+    return [(Status.CURVED, f"The covariance is too small: {' and '.join(words)}.")] if words else []
 
 
 def _proof(found: tuple[Block, ...]) -> tuple[str, list[tuple[Status, str]]]:

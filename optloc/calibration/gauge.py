@@ -80,13 +80,15 @@ def without_pulses(lik: Likelihood, at: Estimate) -> Array:
     return np.asarray(np.linalg.qr(np.concatenate([reduced, lik.known(at)[1][0]]), mode="r"))
 
 
-# Repetitions of the measurement that a covariance is checked by: they tell an excess of 5 % to 3 %.
-_REPEATED = 10
-# After how many they end where no more than this excess is possible: most networks of many stations have none.
+# Repetitions of the measurement that a covariance is checked by: so few where there is hardly an excess, as of most
+# networks of many stations; else so many at least, and at most, until they tell on which side of what is allowed it is.
 _FEW, _NONE = 4, 0.05
+_REPEATED, _MOST = 10, 60
+# Deviations at which the cost is compared with that of a Gaussian, and steps in which pulses settle there.
+_FAR, _SETTLING = 3.0, 6
 
 
-def excess(lik: Likelihood, at: Estimate, told: Determined) -> float:
+def excess(lik: Likelihood, at: Estimate, told: Determined, allowed: float) -> float:
     """Return by what share squared errors, in the covariance that comes with them, exceed what it promises.
 
     The measurement is repeated, as if the network were the one found. Each repetition has an estimate and a covariance
@@ -102,6 +104,8 @@ def excess(lik: Likelihood, at: Estimate, told: Determined) -> float:
         The one found, S = 1.
     told : Determined
         What is determined there, nothing left open.
+    allowed : float
+        The share that matters: repetitions end where they tell on which side of it the excess is.
 
     Returns
     -------
@@ -117,7 +121,7 @@ def excess(lik: Likelihood, at: Estimate, told: Determined) -> float:
     place = np.where(soft > 0.0, at.stations[0], net.place)
     apart = net.distance - lik.spans(at)[0][0] * net.distance_sigma
     over_by: list[float] = []
-    for _ in range(_REPEATED):
+    while not _is_told(over_by, allowed):
         again = replace(
             net,
             z=exact + sigma * rng.standard_normal(sigma.shape),
@@ -133,14 +137,49 @@ def excess(lik: Likelihood, at: Estimate, told: Determined) -> float:
         held = replace(own, free=np.zeros_like(lik.free))
         squared = float(((without_pulses(own, found) @ off) ** 2).sum())
         over_by.append((squared - float((held.refine(at)[1] - cost)[0])) / max(size, 1))
-        if len(over_by) == _FEW and _above(over_by) <= _NONE:
-            break
-    return _above(over_by)
+    return sum(_mean(over_by))
 
 
-def _above(values: list[float]) -> float:
+def rise(lik: Likelihood, at: Estimate, told: Determined) -> float:
+    """Return the least share that the cost rises by of what the covariance says, in any of its principal directions.
+
+    Looked at three deviations to either side, as of a fix, the pulses wherever they then fit best. Where the network
+    found happens to have more information than its neighbours, repetitions of it show nothing, and the cost does.
+
+    Parameters
+    ----------
+    lik : Likelihood
+        The network.
+    at : Estimate
+        The one found, S = 1.
+    told : Determined
+        What is determined there, nothing left open.
+    """
+    m, d = lik.network.stations, lik.network.dimension
+    width, axes = np.linalg.eigh(told.covariance(told.free.T))
+    far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
+    moves = np.concatenate([far, -far])
+    s = len(moves)
+    clocks = at.clocks if lik.network.synchronised else at.clocks + moves[:, m * d :]
+    there = at.take(np.zeros(s, dtype=int))
+    stations = at.stations + moves[:, : m * d].reshape(s, m, d)
+    there = replace(there, stations=stations, clocks=np.broadcast_to(clocks, (s, m)))
+    held = replace(lik, free=np.zeros_like(lik.free))
+    return float((held.refine(there, _SETTLING)[1].min() - lik.cost(at)[0]) / _FAR**2)
+
+
+def _is_told(over_by: list[float], allowed: float) -> bool:
+    """Return whether repetitions tell on which side of a bound their mean is, or are many enough."""
+    if len(over_by) < _FEW:
+        return False
+    mean, error = _mean(over_by)
+    enough = len(over_by) >= _REPEATED and not mean - error <= allowed < mean + error
+    return len(over_by) >= _MOST or enough or mean + error <= min(_NONE, allowed)
+
+
+def _mean(values: list[float]) -> tuple[float, float]:
     """Return a mean and two of its deviations."""
-    return float(np.mean(values) + 2.0 * np.std(values, ddof=1) / np.sqrt(len(values)))
+    return float(np.mean(values)), float(2.0 * np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def over(one: Estimate, at: Estimate) -> Estimate:
