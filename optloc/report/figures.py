@@ -123,6 +123,7 @@ def with_legend(figure: Figure) -> Figure:
     figure.legend(shown.values(), shown, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + _LEGEND_LINE * -(-len(shown) // columns))
+    figure.set_layout_engine("constrained")
     return figure
 
 
@@ -409,6 +410,7 @@ def svg_text(figure: Figure) -> str:
     # Text stays text, to be found and read aloud; the salt makes identities depend on the figure alone.
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "optloc"}):
         figure.savefig(text, format="svg", metadata={"Date": None})
+    figure.set_layout_engine("none")  # what is drawn again stays where it is: to find the place takes as long
     return text.getvalue()
 
 

@@ -243,9 +243,9 @@ def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
         with_legend(figure)
     paths = [place / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
     make_folder(paths[0].parent)
+    write_text(paths[1], svg_text(figure))
     with written(paths[0]) as file:
         figure.savefig(file, dpi=_DPI)
-    write_text(paths[1], svg_text(figure))
     return paths
 
 

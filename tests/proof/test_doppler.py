@@ -56,12 +56,12 @@ def test_own_derivatives_are_those_of_own_values():
 @pytest.mark.skipif(not enabled(), reason="budgets of boxes are smaller in plain Python")
 def test_no_claim_of_a_doppler_fix_is_wrong(seed, record_property):
     # mixtures of few rows first: what is solved before machine code is loaded is slow
-    counts = {name: attack(name, 2, seed, 0) for name in reversed(FAMILIES)}
+    counts = {name: attack(name, 1, seed, 0) for name in reversed(FAMILIES)}
     record_property("claims", str(counts))
     total = sum(counts.values(), Counter())
     # Most is proven, and the rivals that the attack meets are other places than the answer.
-    assert total["global"] >= 16
-    assert total["rivals"] >= 3
+    assert total["global"] >= 8
+    assert total["rivals"] >= 1
 
 
 @pytest.mark.skipif(not enabled(), reason="budgets of boxes are smaller in plain Python")

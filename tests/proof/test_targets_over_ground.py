@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from often import few
 from scipy.optimize import least_squares
 
 from optloc import Frame, Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve
@@ -423,11 +424,11 @@ def test_what_is_not_covered_is_said(what, word):
     assert word in unsupported(simple(**what)[0].flat())
 
 
-def test_azimuths_alone_begin_in_the_plan(seed):
+@pytest.mark.parametrize("number", few((1, 0, 2), 1))  # the first is proven in a second, the next in half a minute
+def test_azimuths_alone_begin_in_the_plan(seed, number):
     """They say nothing of the height, which is known: no search is needed, and none finds a wrong minimum."""
-    for number in range(3):
-        rng = np.random.default_rng([8, seed, number])
-        made, truth = drawn(rng, ("azimuth",))
-        fix = solve(simulate(made, truth=truth, seed=number))
-        assert "search" not in [stage.name for stage in fix.stages]
-        assert np.sum((fix.x[[0, 1]] - truth[[0, 1]]) ** 2) < 50.0 * np.trace(fix.cov[:2, :2])
+    rng = np.random.default_rng([8, seed, number])
+    made, truth = drawn(rng, ("azimuth",))
+    fix = solve(simulate(made, truth=truth, seed=number))
+    assert "search" not in [stage.name for stage in fix.stages]
+    assert np.sum((fix.x[[0, 1]] - truth[[0, 1]]) ** 2) < 50.0 * np.trace(fix.cov[:2, :2])

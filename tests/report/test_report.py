@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from often import few
 from report.browser import Browser, executable
 from typer.testing import CliRunner
 
@@ -175,7 +176,7 @@ def browser():
 
 @browsed
 @pytest.mark.parametrize("size", WIDTHS)
-@pytest.mark.parametrize("study", ["made", "shipped"])
+@pytest.mark.parametrize("study", few(["made", "shipped"], 1))
 def test_a_browser_shows_every_figure(browser, request, study, size):
     page, *files = request.getfixturevalue(study)
     width, height, phone = size

@@ -151,7 +151,7 @@ def test_lists_show_what_studies_are_made_of():
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_shipped_studies_run(name):
-    made = plan_of(Path(name), trials=2)
+    made = plan_of(Path(name), trials=1)
     methods = {}
     for one in made.chunks:  # each method once, on the scenarios in turn
         if len(methods.setdefault(one.cell.method.name, [])) < 1:
