@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.threads import held_by_forks
-from optloc.compute.kept import begin_child, folder, is_kept, kept, locked
+from optloc.compute.kept import begin_child, callee_compiler, folder, is_kept, kept, locked
 from optloc.compute.progress import Reporter
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -73,11 +73,11 @@ def _marked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _Kernel:
-    """A function of scalars and arrays in two forms; numba takes it for the compiled one where kernels call it."""
+    """A function of scalars and arrays: as it is, compiled for Python, and compiled for kernels that call it."""
 
-    def __init__(self, function: Callable[..., Any], inline: str) -> None:
-        self.function, self.inline, self.ready = _marked(function), inline, False
-        self._machine: Any = None
+    def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
+        self.function, self.taken_in, self.ready = _marked(function), taken_in, False
+        self._forms: dict[bool, Any] = {}
         update_wrapper(self, function)
         _KERNELS.append(self)
 
@@ -88,29 +88,36 @@ class _Kernel:
 
     @property
     def machine(self) -> Any:
-        """The compiled form; without an entry for C, which nobody calls, it is made a fifth faster."""
-        made = self._machine  # by a name of its own: another thread may renew the kernel meanwhile
+        """The form that Python calls."""
+        return self._form(callee=False)
+
+    def _form(self, *, callee: bool) -> Any:
+        """Return a compiled form; without an entry for C, which nobody calls, it is made a fifth faster."""
+        made = self._forms.get(callee)  # by a name of its own: another thread may renew the kernel meanwhile
         if made is None:
             with _LOCK:  # one form for all threads: numba compiles, and looks up types, for each form anew
-                made = self._machine
+                made = self._forms.get(callee)
                 if made is None:
                     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-                    made = _numba().njit(**options, inline=self.inline)(self.function)
+                    options |= {"forceinline": self.taken_in}  # by LLVM: to join sources in Python takes longer
+                    if callee:
+                        options |= {"no_cpython_wrapper": True, "pipeline_class": callee_compiler()}
+                    made = _numba().njit(**options)(self.function)
                     # What numba's own option `cache` sets; where nothing can be written, machine code is not kept.
-                    made._cache = kept(self.function) or made._cache  # noqa: SLF001
-                    self._machine = made
+                    made._cache = kept(self.function, callee=callee) or made._cache  # noqa: SLF001
+                    self._forms[callee] = made
         return made
 
     def renew(self) -> None:
-        """Forget the compiled form."""
+        """Forget the compiled forms."""
         with _LOCK:
-            self.function, self.ready, self._machine = _marked(self.function), False, None
+            self.function, self.ready, self._forms = _marked(self.function), False, {}
 
     def __getattr__(self, name: str) -> Any:
         """Return what numba wants to know of a function that a kernel calls."""
         if name not in ("_numba_type_", "targetoptions", "py_func"):
             raise AttributeError(name)
-        return getattr(self.machine, name)
+        return getattr(self._form(callee=True), name)
 
     def __call__(self, *args: Any) -> Any:
         if not enabled():
@@ -163,7 +170,7 @@ _DONE: set[str] = set()
 
 
 def _text() -> str:
-    loaded = {kernel.name for kernel in _KERNELS if kernel.inline == "never"}
+    loaded = {kernel.name for kernel in _KERNELS}
     return f"making machine code: {len(_DONE)} of about {len(loaded | _DONE)} functions, once; kept in {folder()}"
 
 
@@ -184,9 +191,8 @@ def name_of(function: Callable[..., Any]) -> str:
 
 
 def names_in(package: str) -> list[str]:
-    """Return the whole names of all kernels of a package that are compiled by themselves, as far as it is loaded."""
-    names = [kernel.name for kernel in _KERNELS if kernel.inline == "never"]
-    return [name for name in names if name.startswith(f"{package}.")]
+    """Return the whole names of all kernels of a package, as far as it is loaded."""
+    return [kernel.name for kernel in _KERNELS if kernel.name.startswith(f"{package}.")]
 
 
 # So many problems are few: plain Python answers them before machine code could be made.
@@ -271,12 +277,12 @@ def compiled(function: _Function) -> _Function:
 
     Division by zero gives infinity or NaN, as in numpy; the order of operations is that of the source.
     """
-    return cast(_Function, _Kernel(function, "never"))
+    return cast(_Function, _Kernel(function, taken_in=False))
 
 
 def inlined(function: _Function) -> _Function:
-    """Return a function like `compiled`, of which compiled callers take in the source: every array handed on costs."""
-    return cast(_Function, _Kernel(function, "always"))
+    """Return a function like `compiled`, which compiled callers always take in: every array handed on costs."""
+    return cast(_Function, _Kernel(function, taken_in=True))
 
 
 @compiled
@@ -314,7 +320,7 @@ def with_constants(kernel: _Function, mark: str, **constants: Any) -> _Function:
         if changed:
             own = FunctionType(old.__code__, {**old.__globals__, **changed}, old.__name__, old.__defaults__)
             own.__qualname__, own.__doc__ = f"{old.__qualname__}_{mark}", old.__doc__
-            made[one] = _Kernel(own, one.inline)
+            made[one] = _Kernel(own, taken_in=one.taken_in)
         return made[one]
 
     assert isinstance(kernel, _Kernel)

@@ -5,6 +5,9 @@ functions it calls, wherever they stand: after an edit or an upgrade of one of t
 on answering. So the folder of machine code is named by a digest of all sources of kernels, of the versions of what
 compiles them, and of the processor that they are compiled for. What was installed for it (`optloc.compute.manifest`) is
 read first.
+
+What kernels call is only made ready to be taken in by them: to optimise and translate it by itself, and once more in
+each that takes it in, took half of the time of a compilation. It is kept as well, for kernels of other processes.
 """
 
 from __future__ import annotations
@@ -20,12 +23,13 @@ from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryFile
+from types import SimpleNamespace
 from typing import IO, Any
 
 from optloc.compute.manifest import PACKAGE, PREFIX, digest_of, installed, of_this_process
 
 # Folders of machine code of other sources that are left, the last used ones: branches of one checkout and versions that
-# share a folder by NUMBA_CACHE_DIR take turns. One is some 40 MB.
+# share a folder by NUMBA_CACHE_DIR take turns. One is some 90 MB.
 _LEFT = 4
 _LOG = logging.getLogger("optloc")
 
@@ -70,6 +74,59 @@ def _used(path: Path) -> float:
         return 0.0
 
 
+@cache
+def _taken_in() -> Any:
+    """Return numba's type of the code of a function, for what callers take in: neither optimised nor translated."""
+    from llvmlite import binding
+    from numba.core import codegen
+
+    llvm: Any = binding
+    numba: Any = codegen
+
+    class TakenIn(numba.JITCodeLibrary):  # type: ignore[misc]
+        # Nothing of it is in the engine, so there is no place for an environment.
+        codegen = SimpleNamespace(set_env=lambda name, environment: None)
+
+        def _optimize_final_module(self) -> None:
+            pass
+
+        def _finalize_final_module(self) -> None:
+            self._finalize_dynamic_globals()
+            self._finalized = True
+
+        def get_pointer_to_function(self, name: str) -> int:
+            return 0
+
+        def serialize_using_object_code(self) -> Any:
+            return self.serialize_using_bitcode()
+
+        @classmethod
+        def read(cls, engine: Any, stored: tuple[str, str, bytes]) -> Any:
+            """Return what was stored, in the engine of this process."""
+            made = cls(engine, stored[0])
+            made._final_module = llvm.parse_bitcode(stored[2])
+            made._finalize_final_module()
+            return made
+
+    return TakenIn
+
+
+@cache
+def callee_compiler() -> Any:
+    """Return numba's compiler of what only compiled functions call, as its option `pipeline_class` takes it."""
+    from numba.core import compiler
+
+    numba: Any = compiler
+
+    class Callees(numba.Compiler):  # type: ignore[misc]
+        def define_pipelines(self) -> Any:
+            state = self.state
+            state.library = _taken_in()(state.targetctx.codegen(), state.func_id.func_qualname)
+            return super().define_pipelines()
+
+    return Callees
+
+
 class _Place:
     """Where the machine code of a function is kept, as numba asks for it (a cache locator)."""
 
@@ -98,23 +155,49 @@ class _Place:
 
 
 @cache
+def _entries() -> tuple[Any, Any]:
+    """Return numba's types of what is kept of a function: that Python calls, and that only kernels call."""
+    from numba.core import caching
+
+    numba: Any = caching  # half typed
+
+    class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
+        suffix = ""
+
+        def __init__(self, place: _Place, function: Callable[..., Any]) -> None:
+            self._locator, self._lineno = place, function.__code__.co_firstlineno
+            # By the whole name of the module: all lie in one folder.
+            name = f"{function.__module__}.{function.__qualname__}{self.suffix}"
+            self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
+
+    class TakenIn(Impl):
+        suffix = ".callee"
+
+        def rebuild(self, target_context: Any, payload: Any) -> Any:
+            def read(stored: Any) -> Any:
+                return _taken_in().read(target_context.codegen(), stored)
+
+            context = SimpleNamespace(
+                codegen=lambda: SimpleNamespace(unserialize_library=read),
+                get_executable=target_context.get_executable,
+                typing_context=target_context.typing_context,
+            )
+            return super().rebuild(context, payload)._replace(target_context=target_context)
+
+    return Impl, TakenIn
+
+
+@cache
 def _cache_type() -> Any:
     """Return numba's cache of a function, told where it lies and by which name; damaged entries are as good as none."""
     from numba.core import caching
 
     numba: Any = caching  # half typed
 
-    class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
-        def __init__(self, place: _Place, function: Callable[..., Any]) -> None:
-            self._locator, self._lineno = place, function.__code__.co_firstlineno
-            # By the whole name of the module: all lie in one folder.
-            name = f"{function.__module__}.{function.__qualname__}"
-            self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
-
     class Kept(numba.FunctionCache):  # type: ignore[misc]
-        def __init__(self, function: Callable[..., Any], place: Path) -> None:
+        def __init__(self, function: Callable[..., Any], place: Path, *, callee: bool) -> None:
             locator = _Place(function, place)
-            self._impl_class = partial(Impl, locator)
+            self._impl_class = partial(_entries()[callee], locator)
             super().__init__(function)
             self._name = f"{function.__module__}.{function.__qualname__}"
             # what stands outside of optloc was not installed with it
@@ -147,10 +230,10 @@ def _cache_type() -> Any:
     return Kept
 
 
-def kept(function: Callable[..., Any]) -> Any:
+def kept(function: Callable[..., Any], *, callee: bool) -> Any:
     """Return a cache for the machine code of a function, as a dispatcher of numba holds one; None without a folder."""
     place = kept_in()
-    return None if place is None else _cache_type()(function, place)
+    return None if place is None else _cache_type()(function, place, callee=callee)
 
 
 def kept_in() -> Path | None:

@@ -37,7 +37,7 @@ class Sleeps:
 
 for seconds in (4.5, 1.5, 0.9):
     kernel = jit.compiled(lambda value: value)
-    kernel._machine = Sleeps(seconds)
+    kernel._forms[False] = Sleeps(seconds)
     assert kernel(7) == 7
 """
 
