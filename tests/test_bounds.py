@@ -206,8 +206,11 @@ def test_epochs_tied_by_noise_have_no_course():
         crlb_course(tied, np.array([1e3, 1e3]))
 
 
+@pytest.mark.filterwarnings("error")
 def test_information_beyond_all_numbers_is_as_good_as_none():
     information = np.array([np.full((2, 2), np.inf), [[4.0, 0.0], [0.0, 1.0]]])
     found = _inverse(information, np.array([[np.inf, np.inf], [4.0, 1.0]]), np.eye(2))
     assert np.isnan(found[0]).all()
     assert found[1] == pytest.approx(np.diag([0.25, 1.0]))
+    hardly = np.diag([1e-310, 1e-310])  # its inverse is beyond all numbers
+    assert not np.isfinite(_inverse(hardly[None], np.full((1, 2), 1e-310), np.eye(2))).any()

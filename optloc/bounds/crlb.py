@@ -196,6 +196,7 @@ def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]
         yield first, shared_information(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what leaves the numbers is answered by NaN
 def _inverse(information: Array, size: Array, basis: Array) -> Array:
     """Return inverses (q, n, n) on a basis (n, p), NaN where a combination is open.
 
