@@ -10,7 +10,10 @@ from verdicts import alone
 
 from optloc import Frame, InvalidProblem, Motion, Status, assemble, measured, simulate, solve
 from optloc.base.types import Band, Polygon
-from optloc.linear.constraints import box, height, polygon, speed, visible
+from optloc.linear.constraints import box, exact, faces, height, on_face, polygon, speed, visible
+from optloc.solvers.certify.admitted import _is_dear
+from optloc.solvers.certify.posed import pose
+from optloc.solvers.refine import refine
 
 ENU = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
 PLANE = np.array([[0.0, 0.0], [5e3, 400.0], [300.0, 5e3], [5e3, 5200.0], [2.5e3, -2e3]])
@@ -219,6 +222,28 @@ def test_where_nothing_binds_the_fix_is_the_unconstrained_one():
     np.testing.assert_allclose(fix.cov, free.cov, rtol=1e-6)
     assert (fix.active[()], int(fix.dof)) == ((), int(free.dof))
     assert float(fix.cost) == pytest.approx(float(free.cost), rel=1e-9)
+    # edges that are far away take nothing from what is proven of all positions
+    assert fix.certificate.unique
+    assert free.certificate.unique
+    assert fix.status == free.status
+
+
+@pytest.mark.parametrize("side", [box((-2e3, -1e9, -1e9), (1e9,) * 3), height(3e3, 1e9)], ids=["plane", "height"])
+def test_an_edge_is_too_dear_only_where_all_of_it_is(side):
+    rng, levels = np.random.default_rng(4), np.linspace(0.5, 1.5, 11)
+    for _ in range(3):
+        problem, _ = drawn(SPACE, rng.uniform([-4e3, -4e3, 0.0], 4e3), rng, *side, frame=ENU)
+        flat = problem.flat()
+        on = on_face(flat, faces(flat)[1])
+        least = refine(
+            on.take(np.zeros(40, int)), rng.uniform(-9e3, 9e3, (40, 3)), face=exact(on), limit=300
+        ).cost.min()
+        many = on.take(np.zeros(11, int))
+        anywhere = rng.uniform(-9e3, 9e3, (11, 3, 3))
+        dear, boxes = _is_dear(many, pose(flat.take(np.zeros(11, int))), anywhere, least * levels, 1)
+        assert not dear[levels > 1.0 + 1e-6].any()
+        assert dear[levels < 0.8].all()
+        assert (boxes > 0).any()
 
 
 def posed(*constraints, place=SPACE, frame=ENU, **more):

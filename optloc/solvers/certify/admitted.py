@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import Annotated
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.records import overwrite, take
+from optloc.base.records import Axes, overwrite, take
 from optloc.base.types import Array, Certificate, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import (
@@ -26,6 +27,7 @@ from optloc.linear.constraints import (
     is_exact,
     is_held,
     on_face,
+    restore,
     violation,
     violation_names,
 )
@@ -33,10 +35,13 @@ from optloc.linear.normal import marginal
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
+from optloc.proof.batch import Asked
+from optloc.proof.near import BETTER, STATIONARY, VALUE
 from optloc.proof.scope import unsupported
 from optloc.solvers.certify.branch_and_bound import (
     HELD,
     RESTLESS,
+    budgets,
     certified_freely,
     certify_stage,
     column,
@@ -45,15 +50,20 @@ from optloc.solvers.certify.branch_and_bound import (
     to_prove,
     unknown,
 )
-from optloc.solvers.certify.posed import admitted, is_free
+from optloc.solvers.certify.posed import Costs, admitted, costs_of, is_free, pose, prove, state_columns, surfaces_of
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, in_parts, offer, pack, where
+from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
+from optloc.solvers.starts.position import vectors
 from optloc.solvers.verdict.judge import failed, fill, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
+# Begins of a proof that a face costs too much: each where it met a place at less than halfway to the level, or so many
+# steps nearer to the minimum.
+_BEGINS, _STEPS = 12, 8
 # Rounds of minima that are found along faces and of proofs anew: one suffices but for batches of bad fixes.
 _ROUNDS = 4
 UNFOLLOWED = "the proof does not follow the edge {}: {}"
@@ -120,16 +130,16 @@ class Along:
         where that is not proven.
     boxes : int array (n,)
         Boxes looked at.
-    why : list of str
+    why : object array (n,)
         Why nothing is proven, or "".
     """
 
-    x: Array
-    cost: Array
-    least: Array
-    rest: Array
-    boxes: Array
-    why: list[str]
+    x: Annotated[Array, Axes(2, slots=True)]
+    cost: Annotated[Array, Axes(1, slots=True, empty=np.inf)]
+    least: Annotated[Array, Axes(0)]
+    rest: Annotated[Array, Axes(0)]
+    boxes: Annotated[Array, Axes(0)]
+    why: Annotated[Array, Axes(0)]
 
 
 Minima = tuple[Array, Array, Array]
@@ -160,7 +170,7 @@ def _prove_within(
     problem: Problem, pool: Pool, fix: Fix, margin: float, effort: int
 ) -> tuple[list[Certificate], Minima]:
     """Return certificates of n fixes, and all minima that are admitted."""
-    sides, known, found = faces(problem), dict[Face, Along](), list[Minima]()
+    sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), pose(problem)
     sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
     why, seeds, tight = fill(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
     for number, face in enumerate(sides):
@@ -168,7 +178,7 @@ def _prove_within(
         above = _least_around(known, face, len(pool))
         if not (above < margin).any():
             continue
-        along = known[face] = _prove_along(problem, fix, face, seeds, margin, effort)
+        along = known[face] = _know_along(problem, costs, fix, face, seeds, margin, effort)
         own, admitted = np.maximum(above, along.rest), _is_admitted(problem, face, along)
         if number:
             # of an edge that the proof does not follow nothing is known; where the free minima are all admitted, the
@@ -198,6 +208,93 @@ def _least_around(known: dict[Face, Along], face: Face, size: int) -> Array:
     return np.asarray(np.max([np.full(size, -np.inf), *around], axis=0))
 
 
+def _know_along(
+    problem: Problem, costs: Costs, fix: Fix, face: Face, seeds: Array, margin: float, effort: int
+) -> Along:
+    """Return what is known of n problems along a face: its minima, unless all of it costs too much for any.
+
+    Most faces lie far from what the data say: that needs few boxes, and their minima, which may be flat and hard to
+    find, are not asked for. `costs` are those of the problems, `seeds` (n, q, size) where minima are looked for.
+    """
+    n, size = len(seeds), seeds.shape[-1]
+    dear, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+    if len(face) > len(exact(problem)) and not unsupported(on_face(problem, face)):
+        dear, boxes = _is_dear(on_face(problem, face), costs, seeds, fix.cost + margin, effort)
+    least = np.full(n, margin)
+    out = Along(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, fill(n, ""))
+    rest = np.flatnonzero(~dear)
+    if not len(rest):
+        return out
+    some = _prove_along(problem.take(rest), fix[rest], face, seeds[rest], margin, effort)
+    return overwrite(out, rest, replace(some, boxes=some.boxes + boxes[rest]))
+
+
+def _is_dear(on: Problem, costs: Costs, seeds: Array, level: Array, effort: int) -> tuple[Array, Array]:
+    """Return whether all of a face, of equalities alone, costs at least a level (n,), and the boxes looked at (n,).
+
+    The proof begins at any place of which the cost is not steep: that is proven to cost little more than the least. It
+    begins anew nearer to the minimum where the cost is steep, and where it met what is less than halfway to the level.
+    """
+    dear, boxes = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
+    x, cost = _cheapest(on, costs, seeds)
+    # of angles that may be a turn off, costs above a level are not those of the rows
+    items = np.flatnonzero(np.isfinite(cost) & (costs.level > level))
+    for _ in range(_BEGINS):
+        items = items[cost[items] - level[items] > equal_cost(level[items])]
+        if not len(items):
+            break
+        part, own = on.take(items), costs.take(items)
+        answer = prove(own, _question(part, own, x[items], cost[items] - level[items], effort))
+        boxes[items] += answer.boxes
+        dear[items] = answer.verdict == VALUE
+        near, met, steep = x[items], *(np.flatnonzero(answer.verdict == code) for code in (BETTER, STATIONARY))
+        if len(met):
+            near[met] = vectors(part.take(met), answer.found[met][:, None])[:, 0]
+        if len(steep):
+            near[steep] = refine(part.take(steep), near[steep], face=exact(on), limit=_STEPS).x
+        x[items], before = near, cost[items]
+        cost[items] = _costs(part, own, near[:, None])[:, 0]
+        items = items[cost[items] < before]
+    return dear, boxes
+
+
+def _cheapest(on: Problem, costs: Costs, seeds: Array) -> tuple[Array, Array]:
+    """Return the cheapest of some vectors (n, q, size) when moved onto a face, (n, size), and what it costs (n,)."""
+    n, q, size = seeds.shape
+    with np.errstate(all="ignore"):
+        x = restore(on.take(np.repeat(np.arange(n), q)), exact(on), seeds.reshape(-1, size)).reshape(seeds.shape)
+    cost = _costs(on, costs, x)
+    best = np.arange(n), np.argmin(cost, axis=1)
+    return x[best], cost[best]
+
+
+def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
+    """Return posed costs (n, q) of vectors (n, q, size); infinite where there is none."""
+    with np.errstate(all="ignore"):
+        cost = costs_of(costs, x[..., state_columns(problem)])[0]
+    return np.where(np.isfinite(cost), cost, np.inf)
+
+
+def _question(on: Problem, costs: Costs, x: Array, less: Array, effort: int) -> Asked:
+    """Return the question whether nothing along a face costs less than vectors x (n, size) by more than `less` (n,)."""
+    place = x[:, state_columns(on)]
+    (n, d), value = place.shape, np.zeros(len(x))
+    planes, surface = surfaces_of(on, place)
+    return Asked(
+        x=place,
+        others=np.zeros((n, 0, d)),
+        known=np.zeros(n, dtype=np.int64),
+        hidden=np.zeros(n, dtype=np.int64),
+        kappa=value,
+        eps=less,
+        region=np.full((n, 2, d), np.nan),
+        fallback=np.full((n, 2, d), np.nan),
+        budget=budgets(value, costs.dense, effort),
+        planes=planes,
+        surface=surface,
+    )
+
+
 def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: int) -> Along:
     """Return what is known of n problems along a face, looked for from seeds (n, q, size)."""
     began, on, limits = perf_counter(), on_face(problem, face), admitted(problem, problem.dimension)
@@ -210,7 +307,7 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
         none, least = np.zeros(len(seeds), dtype=np.int64), _gain(alone.cost, fix.cost) if corner else lost
         # a corner is the only minimum of itself
         rest = np.where(np.isfinite(least), np.inf, -np.inf)
-        return Along(*_minima(alone), least, rest, none, [UNFOLLOWED.format(names, reason)] * len(seeds))
+        return Along(*_minima(alone), least, rest, none, fill(len(seeds), UNFOLLOWED.format(names, reason)))
     gain = _gain(alone.cost, fix.cost)
     # nothing on a face that costs so much more need be told apart; where a minimum that is not admitted costs less than
     # the fix, all up to the margin above the fix must be found: in whole numbers, so that fixes of a batch ask alike
@@ -231,7 +328,7 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
     gap = np.array([claim.margin if claim.unique else 0.0 for claim in certificate])
     boxes = np.array([claim.boxes for claim in certificate], dtype=np.int64)
     least, rest = np.where(sure, gain, -np.inf), np.where(sure, gain + gap, -np.inf)
-    return Along(*_minima(alone), least, rest, boxes, [claim.reason for claim in certificate])
+    return Along(*_minima(alone), least, rest, boxes, column([claim.reason for claim in certificate]))
 
 
 def _gain(cost: Array, best: Array) -> Array:
