@@ -1,10 +1,12 @@
 """What all tests share: where the real data is, reproducible property tests, and seeds that a run may choose."""
 
 import os
+from functools import cache
 from pathlib import Path
 
 import hypothesis
 import pytest
+import typer.testing
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA_DEFAULT = ROOT.parent / "shared" / "data"
@@ -17,6 +19,9 @@ hypothesis.settings.load_profile("optloc")
 os.environ.setdefault("OPTLOC_COMPILE", "wait")
 # What tests begin is the optloc that they test, not a checkout in the current folder, which has no machine code.
 os.environ["PYTHONSAFEPATH"] = "1"
+
+# The command line is put together once, not for each of a thousand commands.
+typer.testing._get_command = cache(typer.testing._get_command)
 
 # Seeds of a test in full: data that nobody had seen broke a proof once, where ten seeds had been one.
 FULL_SEEDS = 10

@@ -177,12 +177,14 @@ class Likelihood:
 
     def _descended(self, at: Estimate, steps: int) -> tuple[Estimate, Array]:
         net = self.network
-        root = np.ascontiguousarray(self.root.reshape(-1, *net.z.shape))
+        root = self.root.reshape(-1, *net.z.shape)
         known = (net.place, self.prior, self.free, net.between, net.distance, 1.0 / net.distance_sigma, self.hold)
         slots = (self.first, self.second, self.gains, self.ticks, self.emits, self.emission)
+        # Row after row: machine code is of one order of arrays, and would be made anew for each other.
+        rows = Rows(*(np.array(array, order="C") for array in (net.z, root, *slots, *known)))
         made = [np.array(getattr(at, name), order="C") for name in State._fields]
         cost = np.zeros(at.count)
-        descend(Rows(net.z, root, *slots, *known), State(*made), cost, steps)
+        descend(rows, State(*made), cost, steps)
         return Estimate(*made), cost
 
     def of(self, which: Array) -> Likelihood:
