@@ -8,7 +8,7 @@ from cases import RATE, STATIONS, TARGET, plain_h, turn_matrix, turned
 
 from optloc import ECEF, MODELS
 from optloc.models import Point, lifted_row
-from optloc.models.primitives import WGS84_A, WGS84_F, Jet, geodetic_height, rotate, wrap
+from optloc.models.primitives import WGS84_A, WGS84_F, Jet, geodetic_height, geodetic_normal, rotate, wrap
 
 KINDS = [(kind, d) for kind, model in MODELS.items() for d in model.dimensions]
 BATCH = 40
@@ -169,6 +169,17 @@ def test_gradient_of_height_is_the_normal_of_the_ellipsoid():
     jet = geodetic_height(tuple(Jet(ecef[:, i], {i: np.ones(1)}) for i in range(3)))
     normal = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     assert np.abs(np.stack([jet.partials[i] for i in range(3)]) - normal).max() < 1e-8
+
+
+def test_the_normal_turns_as_differences_of_it_say():
+    lat, lon, height = grid()
+    ecef = np.concatenate([ECEF.from_geodetic(lat, lon, height), [[0.0, 0.0, 6.4e6], [0.0, 0.0, -6.4e6]]])
+    seeds = tuple(Jet(ecef[:, i], {i: np.ones(1)}) for i in range(3))
+    for i, component in enumerate(geodetic_normal(seeds)):
+        for j, step in enumerate(50.0 * np.eye(3)):
+            ahead, back = (geodetic_normal(tuple((ecef + s * step).T))[i] for s in (1.0, -1.0))
+            # rounding of a difference over 100 m, and its third derivative, of turns of 1.6e-7 a metre
+            assert np.abs(component.partials[j] - (ahead - back) / 100.0).max() < 1e-15
 
 
 def test_height_and_its_derivative_are_finite_on_the_axis():

@@ -444,6 +444,7 @@ def refined(packed: Packed, item: Array, start: Array, rules: Rules) -> tuple[An
     """
     of_epochs = packed.tables.local > 0 and packed.tables.epochs > 1
     out, kernel = answers(start, 0 if of_epochs else None), refine_runs if of_epochs else refine_block
+    item = np.ascontiguousarray(item)  # machine code would be made anew for entries that lie apart
     mapped(lambda part: kernel(packed, item, part[0], part[1], rules, out), chunks(len(start)))
     return out, np.asarray(out.status == LEFT_OPEN)
 

@@ -39,6 +39,8 @@ Components = tuple[Any, ...]
 # Semi-major axis in metres and flattening: defining constants of WGS 84.
 WGS84_A = 6378137.0
 WGS84_F = 1.0 / 298.257223563
+# Its squared eccentricity.
+_E2 = WGS84_F * (2.0 - WGS84_F)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,35 +156,60 @@ def geodetic_height(ecef: Components) -> Any:
 
     Bowring's parametric latitude with two fixed steps: exact to 1e-11 m from -5 km to 1 000 km, to which doubles add
     4e-9 m; no test, so that it serves symbols as well as numbers. The height
-    ``h = p cos(phi) + z sin(phi) - a sqrt(1 - e2 sin(phi)^2)`` is stationary in phi.
+    ``h = p cos(phi) + z sin(phi) - a sqrt(1 - e2 sin(phi)^2)`` is stationary in phi: its gradient is the normal.
 
     References
     ----------
     B. R. Bowring, "Transformation from spatial to geographical coordinates", Survey Review 23 (1976).
     """
-    e2 = WGS84_F * (2.0 - WGS84_F)
+    if (place := _values(ecef)) is not None:
+        return differential(geodetic_height(place), list(zip(ecef, geodetic_normal(place), strict=True)))
     p, sin_phi, cos_phi = _latitude(ecef)
-    return p * cos_phi + ecef[2] * sin_phi - WGS84_A * namespace(p).sqrt(1.0 - e2 * sin_phi * sin_phi)
+    return p * cos_phi + ecef[2] * sin_phi - WGS84_A * namespace(p).sqrt(1.0 - _E2 * sin_phi * sin_phi)
 
 
 def geodetic_normal(ecef: Components) -> Components:
-    """Return the unit normal of the WGS 84 ellipsoid at a point, which is the gradient of its height."""
+    """Return the unit normal of the WGS 84 ellipsoid at a point, which is the gradient of its height.
+
+    It turns with the meridian's radius of curvature to north and south, and with the distance from the axis around it.
+    """
+    if (place := _values(ecef)) is not None:
+        normal = geodetic_normal(place)
+        slopes = _turning(place)
+        return tuple(differential(n, list(zip(ecef, row, strict=True))) for n, row in zip(normal, slopes, strict=True))
     p, sin_phi, cos_phi = _latitude(ecef)
     return ecef[0] / p * cos_phi, ecef[1] / p * cos_phi, sin_phi
+
+
+def _turning(ecef: Components) -> tuple[Components, ...]:
+    """Return the derivatives of the normal: a row for each of its components, also on the axis."""
+    x, y, _ = ecef
+    p, sin_phi, cos_phi = _latitude(ecef)
+    left = 1.0 - _E2 * sin_phi * sin_phi
+    # of the latitude along the meridian; the radius of curvature is that at the height
+    north = 1.0 / (WGS84_A * (1.0 - _E2) / (left * namespace(p).sqrt(left)) + geodetic_height(ecef))
+    around = cos_phi / p
+    # outwards the latitude falls, and so does `around` with the distance from the axis
+    bend = (sin_phi * sin_phi * north - around) / (p * p)
+    side = -sin_phi * cos_phi * north / p
+    return (
+        (around + x * x * bend, x * y * bend, x * side),
+        (x * y * bend, around + y * y * bend, y * side),
+        (x * side, y * side, cos_phi * cos_phi * north),
+    )
 
 
 def _latitude(ecef: Components) -> tuple[Any, Any, Any]:
     """Return distance from the axis, and sine and cosine of the geodetic latitude."""
     x, y, z = ecef
     xp = namespace(x)
-    e2 = WGS84_F * (2.0 - WGS84_F)
     b = WGS84_A * (1.0 - WGS84_F)
     p = xp.sqrt(x * x + y * y + 1e-12)  # a micrometre off the axis, so that the poles have a derivative
     sin_u, cos_u = _direction(z * WGS84_A, p * b)
     # Two steps of Bowring, from the parametric latitude on: see `geodetic_height` for what is left.
     for _ in range(2):
-        up = z + (e2 / (1.0 - e2)) * b * sin_u * sin_u * sin_u
-        out = p - e2 * WGS84_A * cos_u * cos_u * cos_u
+        up = z + (_E2 / (1.0 - _E2)) * b * sin_u * sin_u * sin_u
+        out = p - _E2 * WGS84_A * cos_u * cos_u * cos_u
         sin_phi, cos_phi = _direction(up, out)
         sin_u, cos_u = _direction((1.0 - WGS84_F) * sin_phi, cos_phi)
     return p, sin_phi, cos_phi
@@ -304,11 +331,16 @@ def differential(value: Any, parts: Sequence[tuple[Any, Any]]) -> Any:
     parts : sequence of (number or Jet, array)
         What it depends on, and its derivative to each.
     """
+    jets = [(part, slope) for part, slope in parts if isinstance(part, Jet)]
     total: dict[int, Any] = {}
-    for part, slope in parts:
-        if isinstance(part, Jet):
-            total = _sum(total, _scale(part.partials, slope))
-    return Jet(value, total) if total else value
+    for part, slope in jets:
+        total = _sum(total, _scale(part.partials, slope))
+    return Jet(value, total) if jets else value
+
+
+def _values(numbers: Components) -> Components | None:
+    """Return the values of numbers of which some are jets, or None where none is."""
+    return tuple(_parts(one)[0] for one in numbers) if any(isinstance(one, Jet) for one in numbers) else None
 
 
 def _parts(other: Any) -> tuple[Any, dict[int, Any]]:
