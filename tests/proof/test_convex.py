@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from proof.costs import random_case
+from proof.sampling import many
 from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
-from optloc.compute.jit import enabled
 from optloc.proof.box import is_empty, uncut
 from optloc.proof.chart import curve_box, is_convex
 from optloc.proof.curvature import C00, SUMS, clip_to_stationary, convex, spread_of
@@ -13,7 +13,8 @@ from optloc.proof.near import set_convex
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges
 
-BOXES, POINTS = (500, 200) if enabled() else (40, 200)
+BOXES, POINTS = (500, 40), 200
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def curved(line, sense, half):
@@ -30,7 +31,7 @@ def square(six):
 def test_gradient_and_hessian_of_a_range_change_less_than_bounded(d):
     rng = np.random.default_rng(d)
     limited, used = 0, []
-    for _ in range(BOXES):
+    for _ in range(many(*BOXES)):
         line, sense, half = drawn_box(rng, d)
         node, curve = curved(line, sense, half)
         v = line + ways(rng, half, POINTS) @ sense.T
@@ -44,14 +45,14 @@ def test_gradient_and_hessian_of_a_range_change_less_than_bounded(d):
             assert change <= curve[9] * (1.0 + 1e-9) + 1e-12
             limited += 1
             used.append(np.max(turn[:d] / curve[6 : 6 + d]))
-    assert limited > BOXES // 3
+    assert limited > many(*BOXES) // 3
     assert np.median(used) > 0.5
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_bounds_over_part_of_a_box_shrink_at_least_in_proportion(d):
     rng = np.random.default_rng(10 + d)
-    for _ in range(BOXES):
+    for _ in range(many(*BOXES)):
         line, sense, half = drawn_box(rng, d)
         node, curve = curved(line, sense, half)
         share = rng.uniform()
@@ -73,7 +74,7 @@ def at_box(case, origin, rng, d, wide):
 def test_the_hessian_exceeds_the_margin_all_over_a_convex_box(d, kind):
     rng = np.random.default_rng(20 + d)
     seen = 0
-    for i in range(BOXES):
+    for i in range(many(*BOXES)):
         case, truth = random_case(rng, d, kind=kind, outside=i % 2 == 0)
         cost, chart, box = at_box(case, truth, rng, d, 10.0 ** rng.uniform(0.0, 2.0))
         margin = rng.choice([0.0, 0.3])
@@ -84,14 +85,14 @@ def test_the_hessian_exceeds_the_margin_all_over_a_convex_box(d, kind):
         H = T.T @ case.derivatives(x[:, :d])[1] @ T
         assert np.linalg.eigvalsh(H)[:, 0].min() > margin - 1e-9
         seen += 1
-    assert seen > BOXES // 10
+    assert seen > many(*BOXES) // 10
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_entries_of_the_hessian_change_less_than_bounded(d):
     rng = np.random.default_rng(30 + d)
     seen = 0
-    for i in range(BOXES):
+    for i in range(many(*BOXES)):
         case, truth = random_case(rng, d, outside=i % 2 == 0)
         cost, chart, box = at_box(case, truth, rng, d, 10.0 ** rng.uniform(0.0, 2.0))
         is_convex(cost, chart, box, 0.0)
@@ -105,7 +106,7 @@ def test_entries_of_the_hessian_change_less_than_bounded(d):
         assert np.allclose(centre, T.T @ case.derivatives(box.centre[:d])[1] @ T, rtol=1e-6, atol=1e-9)
         assert (np.abs(H - centre) <= wide + ball + 1e-9).all()
         seen += 1
-    assert seen > BOXES // 3
+    assert seen > many(*BOXES) // 3
 
 
 def stationary_points(case, rng):
@@ -124,7 +125,7 @@ def stationary_points(case, rng):
 def test_no_box_around_a_stationary_point_is_excluded(d):
     rng = np.random.default_rng(40 + d)
     around = excluded = 0
-    for i in range(BOXES // 5):
+    for i in range(many(*BOXES) // 5):
         case, truth = random_case(rng, d, m=d + 2, outside=i % 2 == 0, sigma=30.0)
         cost, chart, box = charted(case, truth)
         for point in stationary_points(case, rng):
@@ -141,7 +142,7 @@ def test_no_box_around_a_stationary_point_is_excluded(d):
                 assert not (inside and none)
                 around += inside
                 excluded += none
-    assert around > (BOXES // 8 if enabled() else 0)
+    assert around > many(BOXES[0] // 8, 0)
     assert excluded > 0.05 * around
 
 

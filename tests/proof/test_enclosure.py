@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 from proof.costs import WIDTH, random_case
+from proof.sampling import many
 from proof.test_ranges import charted
 
-from optloc.compute.jit import enabled
 from optloc.proof.chart import value_at
 from optloc.proof.curvature import sum_up
 from optloc.proof.enclosure import around_node, around_rays, enclose
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
 
-CASES, RAYS = (18, 500) if enabled() else (6, 200)
+CASES, RAYS = (18, 6), (500, 200)
+pytestmark = pytest.mark.usefixtures("form")
 
 
 def enclosed(case, x, rho):
@@ -26,8 +27,9 @@ def enclosed(case, x, rho):
 
 def points_below(case, x, rho, rng, d, chart):
     """Return points with |residual| <= rho: as far as possible along rays from x, and anywhere."""
-    way = rng.standard_normal((RAYS, d)) @ chart.sense[:d, :d].T
-    reach = np.full(RAYS, 1e-3)
+    rays = many(*RAYS)
+    way = rng.standard_normal((rays, d)) @ chart.sense[:d, :d].T
+    reach = np.full(rays, 1e-3)
     for _ in range(36):  # double until outside, then keep the last point inside
         out = case.cost(x + reach[:, None] * way) > rho**2
         reach = np.where(out, reach, 2.0 * reach)
@@ -37,7 +39,7 @@ def points_below(case, x, rho, rng, d, chart):
         out = case.cost(x + middle[:, None] * way) > rho**2
         inside, outside = np.where(out, inside, middle), np.where(out, middle, outside)
     near = x + inside[:, None] * way
-    far = case.stations.mean(0) + rng.standard_normal((RAYS, d)) * 10.0 ** rng.uniform(3.0, 5.0, (RAYS, 1))
+    far = case.stations.mean(0) + rng.standard_normal((rays, d)) * 10.0 ** rng.uniform(3.0, 5.0, (rays, 1))
     both = np.concatenate([near[np.isfinite(near).all(1)], far, case.minima(rng, 6)])
     return both[case.cost(both) <= rho**2]
 
@@ -48,7 +50,7 @@ def points_below(case, x, rho, rng, d, chart):
 def test_all_points_below_the_level_are_enclosed(d, kind):
     rng = np.random.default_rng(1)
     made = checked = 0
-    for i in range(CASES):
+    for i in range(many(*CASES)):
         case, truth = random_case(rng, d, kind=kind, outside=i % 2 == 0, sigma=(1.0, 10.0, 30.0)[i % 3])
         x = case.minimum(truth)
         if np.linalg.norm(x - truth) > 1e5:
@@ -62,7 +64,7 @@ def test_all_points_below_the_level_are_enclosed(d, kind):
         assert (s >= corners[0][:d]).all()
         assert (s <= corners[1][:d]).all()
         made, checked = made + 1, checked + len(s)
-    assert made > 0.6 * CASES
+    assert made > 0.6 * many(*CASES)
     assert checked > made * 100
 
 
@@ -142,7 +144,7 @@ def test_too_few_differences_have_no_enclosure():
 def test_points_seen_in_nearly_the_same_directions_are_enclosed(d, swing):
     rng = np.random.default_rng(5)
     made = held = 0
-    for _ in range(CASES):
+    for _ in range(many(*CASES)):
         stations, x = rng.uniform(-5.0, 5.0, (4, d)), rng.uniform(-4.0, 4.0, d)
         axes = np.stack([np.linalg.qr(rng.standard_normal((d, d)))[0] for _ in range(4)])
         kinds = np.array([AZIMUTH] * 4 + [ELEVATION] * (4 if d == 3 else 0), dtype=np.int64)
@@ -176,5 +178,5 @@ def test_points_seen_in_nearly_the_same_directions_are_enclosed(d, swing):
         assert (s >= low[:d]).all()
         assert (s <= high[:d]).all()
         held += len(s)
-    assert made > CASES // 2
+    assert made > many(*CASES) // 2
     assert held > made * 20

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from proof.costs import WIDTH, beside
+from proof.sampling import many
 from scipy.optimize import least_squares
 
 from optloc.compute.jit import enabled
@@ -83,11 +84,12 @@ def by_enclosure(cost, box, x, others, kappa, eps, budget, found):
     return prove(cost, box, x, others, kappa, eps, budget, nowhere, nowhere, False, found)
 
 
+@pytest.mark.usefixtures("form")
 def test_in_the_plane_verdicts_are_those_of_brute_force():
     """Four stations nearly in line, so that a mirror image competes: the global minimum is proven, no other is."""
     rng = np.random.default_rng(5)
     wrong = right = 0
-    for _ in range(25 if enabled() else 4):
+    for _ in range(many(25, 4)):
         S = rng.uniform(-5e3, 5e3, (4, 2)) * [1.0, 0.1]
         x = outside(2, rng)
         kinds, data, K, w = differences(S, 30.0, x, rng)
@@ -139,9 +141,10 @@ def shares(cell, kappa):
     return counts / len(cell)
 
 
-@pytest.mark.parametrize(("kappa", "least"), [(0.0, 0.95), (9.0, 0.75)])
+@pytest.mark.usefixtures("form")
+@pytest.mark.parametrize(("kappa", "least"), [(0.0, 0.95), pytest.param(9.0, 0.75, marks=pytest.mark.full)])
 def test_flat_networks_are_proven_where_enclosures_fail(kappa, least):
-    enclosure, everywhere = shares(flat_cell(25 if enabled() else 3, 6), kappa)
+    enclosure, everywhere = shares(flat_cell(many(25, 3), 6), kappa)
     assert everywhere >= enclosure
     if enabled():
         assert everywhere >= least
@@ -177,10 +180,11 @@ def wrong_claims(count, seed):
     return claims, offers
 
 
+@pytest.mark.usefixtures("form")
 def test_no_mirror_of_a_flat_network_is_proven(seed):
-    claims, offers = wrong_claims(60 if enabled() else 2, 30 + seed)
+    claims, offers = wrong_claims(many(60, 2), 30 + seed)
     assert claims == 0
-    assert offers > (60 if enabled() else 0)
+    assert offers > many(60, 0)
 
 
 @pytest.mark.full
@@ -190,6 +194,7 @@ def test_no_mirror_of_a_flat_network_is_proven_in_full(seed):
     assert offers > 300
 
 
+@pytest.mark.usefixtures("form")
 def test_a_cost_that_falls_to_infinity_is_no_proof():
     """Wave fronts that bend away from their source: the cost falls towards infinity, whatever point is offered."""
     S = np.array([[-1e3, 0.0], [0.0, 200.0], [1e3, 0.0], [0.0, -200.0]])
@@ -202,6 +207,7 @@ def test_a_cost_that_falls_to_infinity_is_no_proof():
     assert verdict not in (UNIQUE, VALUE)
 
 
+@pytest.mark.usefixtures("form")
 def test_costs_that_grow_without_end_are_not_for_the_atlas():
     kinds, data, K, _ = differences(np.eye(3), 1.0, np.ones(3), np.random.default_rng(9))
     assert reaches_infinity(kinds, K)
@@ -216,10 +222,11 @@ def test_costs_that_grow_without_end_are_not_for_the_atlas():
     assert verdict not in (UNIQUE, VALUE)
 
 
+@pytest.mark.usefixtures("form")
 def test_the_box_around_a_minimum_is_convex_in_every_sample():
     """Hessians in the coordinates of the atlas, by central differences of the cost itself."""
     rng = np.random.default_rng(10)
-    for problem, minima in flat_cell(8 if enabled() else 2, 11):
+    for problem, minima in flat_cell(many(8, 2), 11):
         _, data, K, w = problem
         middle, radius = cube(*problem[:2], minima[0][1])
         atlas, cost, box = atlas_of(middle, radius, 3, 1), cost_of(*problem), empty_box(*K.shape)

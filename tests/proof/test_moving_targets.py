@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from proof.sampling import many
 from scipy.optimize import least_squares
 
 from optloc import Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
@@ -91,29 +92,31 @@ def inside(rng: np.random.Generator, axes: Axes, table, count: int) -> Array:
     return axes.origin + s @ axes.turn.T
 
 
+@pytest.mark.usefixtures("form")
 def test_no_point_costs_less_than_its_box(seed):
     rng, told = np.random.default_rng([1, seed]), 0
-    for course, axes, table in boxes(rng, 140):
+    for course, axes, table in boxes(rng, many(140, 28)):
         here = residual_at(course.rows, table.nodes, table.sheet)
         noise = blur_of(course.rows, 1.0, table.nodes)
         set_lines(course, table)
         low = least_length(course, table, here, False)
         set_bends(course, axes, table)
         low = max(low, least_length(course, table, here, True)) - noise
-        cost = min(cost_of_state(course, state)[0] for state in inside(rng, axes, table, 100))
+        cost = min(cost_of_state(course, state)[0] for state in inside(rng, axes, table, many(100, 20)))
         assert low <= np.sqrt(cost) * (1.0 + 1e-9) + 1e-9
         told += low > 0.0
-    assert told > 40
+    assert told > many(40, 8)
 
 
+@pytest.mark.usefixtures("form")
 def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
     rng, convex, empty = np.random.default_rng([2, seed]), 0, 0
-    for course, axes, table in boxes(rng, 140):
+    for course, axes, table in boxes(rng, many(140, 14)):
         residual_at(course.rows, table.nodes, table.sheet)
         set_lines(course, table)
         set_bends(course, axes, table)
         ball, noise = sum_up(course, table, blur_of(course.rows, 1.0, table.nodes))
-        states, good = inside(rng, axes, table, 20), is_convex(table, ball, 0.0)
+        states, good = inside(rng, axes, table, many(20, 8)), is_convex(table, ball, 0.0)
         convex += good
         for state in states if ball < np.inf else ():
             bent = axes.turn.T @ hessian_of_state(course, state) @ axes.turn * table.half * table.half[:, None]
@@ -124,8 +127,8 @@ def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
             empty += 1
             for state in states[:5]:
                 assert not descends_inside(course, axes, table.half, state)
-    assert convex > 20
-    assert empty > 20
+    assert convex > many(20, 1)
+    assert empty > many(20, 1)
 
 
 def descends_inside(course, axes: Axes, half: Array, state: Array) -> bool:
