@@ -59,12 +59,15 @@ FIGURES = {
 }
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.full) if n.endswith("of two") else n for n in FIGURES]
+)
 def test_a_picture_is_whole(name, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         figure = FIGURES[name]()
-        for ending in ("png", "svg", "pdf"):
+        # how a format is written does not depend on the picture
+        for ending in ("png", "svg", "pdf") if name == "fix" else ("png",):
             plot.save(figure, tmp_path / f"p.{ending}")
             assert (tmp_path / f"p.{ending}").stat().st_size > 4_000
     for axes in figure.axes:

@@ -147,6 +147,7 @@ def test_dollars_in_a_name_begin_no_formula():
     assert "gain $\\nosuch$" in svg_text(figure)
 
 
+@pytest.mark.full
 def test_the_same_study_gives_the_same_figures(site, made, tmp_path):
     again = write_report(site, tmp_path / "again")
     for one, two in zip(sorted(made), sorted(again), strict=True):
