@@ -4,9 +4,11 @@ import ast
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
+from sources import parsed
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -46,7 +48,7 @@ def modules(root: Path) -> dict[str, Path]:
 def imports(name: str, path: Path, known: Mapping[str, Path]) -> Iterator[tuple[int, str]]:
     """Yield line and module of everything imported anywhere in a file; a name of a module counts for the module."""
     package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -57,6 +59,7 @@ def imports(name: str, path: Path, known: Mapping[str, Path]) -> Iterator[tuple[
                 yield node.lineno, inner if inner in known else source
 
 
+@cache
 def arrows(root: Path) -> list[tuple[str, int, str]]:
     """Return importing module, line and imported module of all imports."""
     known = modules(root)
@@ -148,7 +151,7 @@ def test_files_and_functions_are_of_a_size_to_be_read():
     assert not [name for name, path in known.items() if path.read_text(encoding="utf-8").count("\n") > LINES]
     long = []
     for name, path in known.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 words = ast.get_docstring(node, clean=False)
                 body = node.end_lineno - node.lineno + 1 - (words.count("\n") + 1 if words else 0)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from cases import CASES, truth_of
 from joblib import Parallel, delayed
+from often import few
 
 import optloc
 from optloc import assemble, measured, solve
@@ -148,8 +149,8 @@ def test_threads_forks_and_workers_give_one_answer():
         assert process.exitcode == 0
 
 
-def test_a_stricter_python_gives_the_same_answer():
-    options = ["-OO", "-W", "error", "-X", "dev"]
+@pytest.mark.parametrize("options", few([["-W", "error", "-X", "dev"], ["-OO", "-W", "error", "-X", "dev"]], 1))
+def test_a_stricter_python_gives_the_same_answer(options):
     ask = ["-m", "optloc.cli", "fix", "demo", "--json", "--method", "proven"]
     plain, strict = (
         subprocess.run([sys.executable, *more, *ask], capture_output=True, text=True, check=False)

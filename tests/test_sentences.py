@@ -4,6 +4,8 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+from sources import parsed
+
 from optloc.base.types import Status
 
 ROOT = Path(__file__).resolve().parents[1] / "optloc"
@@ -32,7 +34,7 @@ def text(node: ast.AST | None, known: dict[str, list[ast.expr]], depth: int = 0)
 
 def sentences(path: Path) -> Iterator[tuple[int, str]]:
     """Yield line and text of all that a module says."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     for scope in ast.walk(tree):
         if not isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
@@ -76,7 +78,7 @@ def test_every_error_names_a_place_and_a_step():
     """Lines of a stream have no names: who reads them says which line it was, and the key that is wrong."""
     lacking, count = [], 0
     for path in sorted(ROOT.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if not isinstance(node, ast.Call) or getattr(node.func, "id", "") != "InvalidProblem":
                 continue
             count += 1

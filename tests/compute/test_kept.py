@@ -98,7 +98,9 @@ def test_what_kernels_name_stands_in_the_sources():
         if not module.startswith("optloc."):
             continue
         assert module.startswith(inside), module
-        origin = origins.setdefault(module, imported(module))
+        if module not in origins:
+            origins[module] = imported(module)
+        origin = origins[module]
         for name in names(kernel.function.__code__):
             assert origin.get(name, module).startswith((*inside, *libraries)), (module, name)
     assert len(origins) > 15

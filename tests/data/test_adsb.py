@@ -27,7 +27,11 @@ def folder(data_dir):
 # The height as a row, in vacuum, is in test_adsb_smoke.py.
 @pytest.mark.parametrize(
     ("given", "refraction"),
-    [("exactly", False), ("exactly", True), ("row", True)],
+    [
+        pytest.param("exactly", False, marks=pytest.mark.full),
+        pytest.param("exactly", True, marks=pytest.mark.full),
+        ("row", True),
+    ],
     ids=["exact", "exact-air", "row-air"],
 )
 def test_five_stations_and_the_height(folder, given, refraction):

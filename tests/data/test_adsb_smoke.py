@@ -13,7 +13,7 @@ pytestmark = pytest.mark.data
 README = (63.0, 314.0)
 
 
-@pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
+@pytest.mark.parametrize("method", ["auto", pytest.param("gtrs+lsr", marks=pytest.mark.full)])
 def test_messages_are_fixed_as_one_batch(data_dir, method):
     data = adsb.load(data_dir / "locards_adsb")
     assert data.problem.epochs == 763

@@ -77,6 +77,7 @@ def test_three_satellites_and_the_height(session, case, draws, method):
     assert near[fix.has(Status.AMBIGUOUS)].all(), name
 
 
+@pytest.mark.full
 def test_the_elevation_mask_leaves_fewer_answers(data_dir):
     data = gnss.load(data_dir / "gnss_static", "K078", "prc_l1_m").draws(40, seed=3)
     reference, free, masked = (

@@ -54,6 +54,7 @@ def test_the_mount_learnt_on_one_half_helps_the_other(data_dir, half):
     assert found["blind"][0] < 0.9 * found["before"][0]
 
 
+@pytest.mark.full
 def test_a_mount_that_is_far_off_is_learnt_without_a_guess(data_dir):
     run = starloc.read_run(data_dir / "starloc_aoa", "R2", "nom", without=WRONG["R2"])
     _, blind, known = learn(run.half(0))

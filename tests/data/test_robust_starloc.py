@@ -20,6 +20,7 @@ EXCHANGED, WRONGLY_SEEN = {35, 36}, {9, 20, 55}
 MAP, WRONG, RIGHT = 0.05, np.deg2rad(20.0), np.deg2rad(1.0)
 
 
+@pytest.mark.full
 def test_groups_of_six_bearings_bear_wrong_detections(data_dir):
     data = starloc.load(data_dir / "starloc_aoa", "R2", "cal", groups=800, seed=6)
     problem = data.problem()

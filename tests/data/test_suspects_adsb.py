@@ -11,6 +11,7 @@ pytestmark = pytest.mark.data
 HEARD = 5
 
 
+@pytest.mark.full
 def test_the_same_stations_are_accused_in_odd_and_even_messages(data_dir):
     messages = adsb.heard(data_dir / "locards_adsb", refraction=True)
     fix = solve(messages.problem("row"), "robust")

@@ -43,7 +43,7 @@ def flown(folder, flight):
     return Flown([entry.label for entry in entries], error[np.isfinite(error)], left_out)
 
 
-@pytest.mark.parametrize("flight", few(LIMIT, 3))
+@pytest.mark.parametrize("flight", few(LIMIT, 2))
 def test_flights_are_tracked_without_a_guess(data_dir, flight):
     found = flown(data_dir / "util_uwb_tdoa", flight)
     report(
@@ -75,7 +75,7 @@ def test_the_table_of_the_documentation(data_dir):
     )
 
 
-@pytest.mark.parametrize("flight", few(LIMIT, 2))
+@pytest.mark.parametrize("flight", few(LIMIT, 1))
 def test_flights_from_the_floor_find_themselves_in_the_air(data_dir, flight):
     """On the floor multipath puts most rows metres off: no state there is right, but one is soon there in the air."""
     problem, truth = uwb.course(data_dir / "util_uwb_tdoa", flight, WINDOW, airborne=False)

@@ -50,6 +50,7 @@ def test_simulation_2_is_a_start_transient():
     assert np.linalg.norm(WINDING.states[:, 2], axis=-1).max() == pytest.approx(0.0762, rel=2e-3)
 
 
+@pytest.mark.full
 def test_simulation_3():
     found = angles_tables.run_circles(draw(REPAIRED, 50, 1, 2), quiet)
     wanted = {100.0: ((426, 754, 768), (471, 583, 788)), 300.0: ((497, 624, 854), (538, 669, 919))}
@@ -158,6 +159,7 @@ def report():
     return made
 
 
+@pytest.mark.full
 def test_a_reproduction_has_every_table_and_figure(report):
     rows = {table.name: table.rows for table in report.tables}
     assert list(rows) == [
@@ -172,6 +174,7 @@ def test_a_reproduction_has_every_table_and_figure(report):
     assert all(len(row) == len(table.header) for table in report.tables for row in table.rows)
 
 
+@pytest.mark.full
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
     cheap = Study(angles_tables.STUDY.sizes, lambda _: 1, lambda *_: report)
     monkeypatch.setattr(angles_tables, "STUDY", cheap)

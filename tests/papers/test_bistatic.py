@@ -103,6 +103,7 @@ def report():
     return made
 
 
+@pytest.mark.full
 def test_a_reproduction_has_every_table_and_figure(report):
     names = [table.name for table in report.tables]
     assert names == ["still", "claims", "slow", "short", "directions", "ground", "printed"]
@@ -115,6 +116,7 @@ def test_a_reproduction_has_every_table_and_figure(report):
     assert "nan" not in report.markdown()
 
 
+@pytest.mark.full
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
     cheap = Study(bistatic.STUDY.sizes, lambda _: 1, lambda *_: report)
     monkeypatch.setattr(bistatic, "STUDY", cheap)

@@ -211,6 +211,7 @@ def divergence(count, seed):
     return plain, score(solve(drawn, "searched").x, truth(PRINTED, drawn), limit), limit
 
 
+@pytest.mark.full
 def test_from_wild_starts_the_recursion_diverges_and_the_fix_without_a_guess_does_not():
     plain, found, limit = divergence(100, 1)
     assert 1 <= plain.lost.sum() <= 9
@@ -260,6 +261,7 @@ def report():
     return made
 
 
+@pytest.mark.full
 def test_a_reproduction_has_every_table_and_figure(report):
     names = [table.name for table in report.tables]
     assert {f"table-{i}" for i in (2, 3, 4, 5, 6)} | {"scenes", "minima", "gains", "readings"} <= set(names)
@@ -274,6 +276,7 @@ def test_a_reproduction_has_every_table_and_figure(report):
     assert all(len(row) == len(table.header) for table in report.tables for row in table.rows)
 
 
+@pytest.mark.full
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     seeds = []
     cheap = Study(registration_tables.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)

@@ -52,7 +52,9 @@ def test_what_is_no_loss_is_refused(word):
         solve(problem, word)
 
 
-@pytest.mark.parametrize(("share", "delay", "kind"), [(0.2, 8.0, "range"), (0.2, 10.0, "toa")])
+@pytest.mark.parametrize(
+    ("share", "delay", "kind"), [(0.2, 8.0, "range"), pytest.param(0.2, 10.0, "toa", marks=pytest.mark.full)]
+)
 def test_share_and_delay_are_found(share, delay, kind):
     found = [late_signals(late(seed, share, delay, kind=kind)[0]) for seed in range(3)]
     # 400 rows each: 0.02 and 9 % of the delay are the standard errors of who knows which rows are late.

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.linalg import multi_dot
+from often import few
 from quality.rings import FREE, RING, SIGMA, ranged
 from scipy.optimize import minimize
 from scipy.stats import chi2
@@ -185,7 +186,7 @@ def office(seed, sigma, spots=27):
     return assemble(OFFICE, measured("range", z.ravel(), a=a, sigma=1.0, epoch=epoch), motions=FREE), target
 
 
-@pytest.mark.parametrize("sigma", [(1.0, 1.0, 1.0, 1.0, 1.0), (0.3, 1.0, 1.0, 2.0, 1.0)])
+@pytest.mark.parametrize("sigma", few([(0.3, 1.0, 1.0, 2.0, 1.0), (1.0, 1.0, 1.0, 1.0, 1.0)], 1))
 def test_few_fixes_neither_collapse_nor_mislead(sigma):
     sigma, inside, off, within = np.array(sigma), [], [], []
     for seed in range(60):

@@ -139,7 +139,8 @@ def test_fifty_kills_change_nothing(options, whole, tmp_path):
     print(f"{kills} kills, {late} after the first part, {rounds} tables identical, no orphan")  # noqa: T201  (a count)
 
 
-@pytest.mark.parametrize("options", [["-j", "2"], pytest.param(["-x", "dask", "-j", "2"], marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("options", [["-j", "2"], ["-x", "dask", "-j", "2"]])
 def test_killed_workers_change_nothing(options, whole, tmp_path):
     out, dice, kills = tmp_path / "out", random.Random(7), 0
     with running(out, *options) as run:

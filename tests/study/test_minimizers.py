@@ -263,6 +263,7 @@ def test_pairs_count_who_is_right_alone(folder):
     assert "did you mean" in RUN.invoke(app, ["study", "pairs", str(folder), "--against", "bfsg"]).output
 
 
+@pytest.mark.full
 def test_the_public_test_set_has_a_leaderboard(mine, tmp_path):
     page = tmp_path / "board.md"
     words = ["study", "bench", "--trials", "2", "-j", "1", "--quiet", "--page", str(page)]

@@ -162,7 +162,8 @@ def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_
     assert {method for method, _ in found.failures} == set(names)
 
 
-@pytest.mark.parametrize("jobs", [pytest.param(1, marks=FULL), 2])
+@FULL
+@pytest.mark.parametrize("jobs", [1, 2])
 def test_methods_that_end_or_hold_up_their_process_are_named(jobs, tmp_path):
     names = ["segfault", "sleep"] if jobs == 1 else ["exit", "deaf"]
     found = run_plan(plan(study(names, trials=1)), tmp_path / "out", executor("processes", jobs, limit=3.0))
