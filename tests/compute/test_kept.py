@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import types
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,7 @@ def test_every_source_counts(tmp_path, monkeypatch):
     assert len(seen) == 1 + len(list(tmp_path.rglob("*.py"))) > 30
 
 
+@cache
 def imported(module: str) -> dict[str, str]:
     """Return the module that each name of a module was imported from."""
     tree = ast.parse(Path(sys.modules[module].__file__).read_text(encoding="utf-8"))
@@ -98,9 +100,7 @@ def test_what_kernels_name_stands_in_the_sources():
         if not module.startswith("optloc."):
             continue
         assert module.startswith(inside), module
-        if module not in origins:
-            origins[module] = imported(module)
-        origin = origins[module]
+        origin = origins.setdefault(module, imported(module))
         for name in names(kernel.function.__code__):
             assert origin.get(name, module).startswith((*inside, *libraries)), (module, name)
     assert len(origins) > 15

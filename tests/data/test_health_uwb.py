@@ -13,9 +13,8 @@ pytestmark = pytest.mark.data
 RING = [f"S{(i + 1) % 8}-S{i}" for i in range(8)]
 
 
-@pytest.mark.parametrize(
-    "flight", [pytest.param("F01", marks=pytest.mark.full), pytest.param("F03", marks=pytest.mark.full)]
-)
+@pytest.mark.full
+@pytest.mark.parametrize("flight", ["F01", "F03"])
 def test_pairs_of_two_halves_of_a_flight(data_dir, flight):
     data = uwb.load(data_dir / "util_uwb_tdoa", flight, shared=False)
     every = np.arange(len(data.windows))

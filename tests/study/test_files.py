@@ -156,7 +156,7 @@ def test_shipped_studies_run(name):
     for one in made.chunks:
         methods.setdefault(one.cell.method.name, []).append(one)
     assert len(methods) == len({cell.method.name for cell in made.cells})
-    for i, chunks in enumerate(methods.values()):  # each method once, on the scenarios in turn
+    for i, chunks in enumerate(methods.values(), 1):  # each method once, on the scenarios in turn
         assert compute(chunks[i % len(chunks)]).counts.get("died", 0) == 0
 
 

@@ -232,8 +232,9 @@ def _know_along(
 def _is_dear(on: Problem, costs: Costs, seeds: Array, level: Array, effort: int) -> tuple[Array, Array]:
     """Return whether all of a face, of equalities alone, costs at least a level (n,), and the boxes looked at (n,).
 
-    The proof begins at any place of which the cost is not steep: that is proven to cost little more than the least. It
-    begins anew nearer to the minimum where the cost is steep, and where it met what is less than halfway to the level.
+    A proof says that nothing costs less than a place by more than so much: here by what the place costs above the
+    level. So any place will do that costs more; it need be no minimum. The proof begins anew nearer to the minimum
+    where the cost is steep at the place, and where it met one of less than half as much above the level.
     """
     dear, boxes = np.zeros(len(seeds), dtype=bool), np.zeros(len(seeds), dtype=np.int64)
     x, cost = _cheapest(on, costs, seeds)
