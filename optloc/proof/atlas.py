@@ -136,6 +136,19 @@ def first_minima(minima: Minima, count: int) -> Minima:
 
 
 @compiled
+def one_more(atlas: Atlas) -> Atlas:
+    """Return the same pieces with room for one more known minimum, the last."""
+    before, count = atlas.minima, atlas.minima.home.shape[0]
+    wider = atlas_of(atlas.middle, atlas.radius, atlas.dimension, count + 1)
+    minima = wider.minima
+    for i in range(count):
+        minima.home[i] = before.home[i]
+        minima.start[i], minima.axes[i], minima.back[i] = before.start[i], before.axes[i], before.back[i]
+        minima.sides[i], minima.core[i] = before.sides[i], before.core[i]
+    return wider
+
+
+@compiled
 def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
     """Write point and scale at the centre of a box, and their derivatives.
 

@@ -22,6 +22,8 @@ _STRETCH, _PARTS = (16, 512), 32
 # Few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second. Where there is
 # no machine code that could go on, they get so many more: about three seconds.
 SMALL, FIRST_BOXES, PLAIN_BOXES = 24, 400, 2000
+# Other minima that a proof goes on beside when it meets them; with more it begins anew.
+RIVALS = 4
 # Fewest boxes that each of them gets: most proofs inside a network end with the first.
 _AT_LEAST = 5
 
@@ -37,8 +39,10 @@ class Asked(NamedTuple):
         Other known minima, the finite ones first.
     known, hidden : int array (n,)
         How many of them are there, and how many of these, the last ones, do not count though they may cost less.
-    kappa, eps : array (n,)
-        Gap to prove, and how far below the cost of the fix still counts as equal.
+    gaps : array (n, G)
+        Gaps to other minima that will do, falling to 0 for the value alone, which may stand there more than once.
+    eps : array (n,)
+        How far below the cost of the fix still counts as equal.
     region : array (n, 2, d)
         Corners of the regions; NaN for all positions.
     fallback : array (n, 2, d)
@@ -53,7 +57,7 @@ class Asked(NamedTuple):
     others: Array
     known: Array
     hidden: Array
-    kappa: Array
+    gaps: Array
     eps: Array
     region: Array
     fallback: Array
@@ -79,6 +83,12 @@ class Answered(NamedTuple):
         Certified lower bounds of the posed cost.
     everywhere : bool array (n,)
         Whether the claim is for all positions, not for the region asked for or the fallback.
+    gap : array (n,)
+        The gap that is proven, or where none is the smallest that was tried.
+    met : int array (n,)
+        How many other minima were met on the way, beside which the claim holds.
+    rivals : array (n, RIVALS, d)
+        These, the first of them.
     found : array (n, d)
         Better or other points; NaN where there is none.
     """
@@ -87,6 +97,9 @@ class Answered(NamedTuple):
     boxes: Array
     bound: Array
     everywhere: Array
+    gap: Array
+    met: Array
+    rivals: Array
     found: Array
 
     def take(self, index: Array | slice) -> Answered:
@@ -143,8 +156,20 @@ def empty_answer(n: int, d: int) -> Answered:
         boxes=np.zeros(n, dtype=np.int64),
         bound=np.zeros(n),
         everywhere=np.zeros(n, dtype=np.bool_),
+        gap=np.zeros(n),
+        met=np.zeros(n, dtype=np.int64),
+        rivals=np.full((n, RIVALS, d), np.nan),
         found=np.full((n, d), np.nan),
     )
+
+
+def without_rivals(
+    verdict: Array, boxes: Array, bound: Array, everywhere: Array, asked: Asked, found: Array
+) -> Answered:
+    """Return the outcome of proofs that try the first gap alone, and begin anew beside every minimum that they meet."""
+    n, d = found.shape
+    none = np.zeros(n, dtype=np.int64)
+    return Answered(verdict, boxes, bound, everywhere, asked.gaps[:, 0], none, np.full((n, 0, d), np.nan), found)
 
 
 def _prove(pose: Posed, asked: Asked) -> Answered:
@@ -200,10 +225,11 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
     """Prove what is asked of each fix, and write what became of it."""
     # Taken out of the records once: every look into one counts the references of an array.
     kinds, data, K, w = pose.kinds, pose.data, pose.K, pose.w
-    fixes, others, known, kappas, tolerances = asked.x, asked.others, asked.known, asked.kappa, asked.eps
+    fixes, others, known, steps, tolerances = asked.x, asked.others, asked.known, asked.gaps, asked.eps
     regions, fallbacks, budgets = asked.region, asked.fallback, asked.budget
     hidden, planes, surfaces = asked.hidden, asked.planes, asked.surface
     verdicts, counts, bounds, wholes, points = out.verdict, out.boxes, out.bound, out.everywhere, out.found
+    shown, numbers, rivals = out.gap, out.met, out.rivals
     J = K.shape[2]
     A, weight, groups, box = np.empty((J, J)), np.empty(J), empty_groups(J), empty_box(K.shape[1], J)
     for i in range(len(fixes)):
@@ -215,7 +241,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
         if (weight == 0.0).any():
             cost = present_in(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
-        x, kappa, eps, found = fixes[i], kappas[i], tolerances[i], points[i]
+        x, gaps, eps, found = fixes[i], steps[i], tolerances[i], points[i]
         beside, low, high = (
             Known(others[i, : known[i]], hidden[i], planes[i], surfaces[i]),
             regions[i, 0],
@@ -224,14 +250,16 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
         boxes = 0
         wholes[i] = isnan(low[0])
         if wholes[i]:
-            verdict, boxes, bound = prove_everywhere(cost, own, x, beside, kappa, eps, budgets[i], found)
-            verdicts[i], counts[i], bounds[i] = verdict, boxes, bound
+            verdict, boxes, bound, gap, met = prove_everywhere(
+                cost, own, x, beside, gaps, eps, budgets[i], rivals[i], found
+            )
+            verdicts[i], counts[i], bounds[i], shown[i], numbers[i] = verdict, boxes, bound, gap, met
             if verdict != OPEN or isnan(fallbacks[i, 0, 0]):
                 continue
             wholes[i] = False
             low, high = fallbacks[i, 0], fallbacks[i, 1]
-        verdict, more, bound = prove(cost, own, x, beside, kappa, eps, budgets[i], low, high, False, found)
-        verdicts[i], counts[i], bounds[i] = verdict, boxes + more, bound
+        verdict, more, bound = prove(cost, own, x, beside, gaps[0], eps, budgets[i], low, high, False, found)
+        verdicts[i], counts[i], bounds[i], shown[i], numbers[i] = verdict, boxes + more, bound, gaps[0], 0
 
 
 @compiled

@@ -16,6 +16,7 @@ from optloc.proof.atlas import (
     coordinates_on,
     first_minima,
     home_of,
+    one_more,
     position,
     set_centre,
     widen_around,
@@ -27,6 +28,7 @@ from optloc.proof.box import (
     DEPTH,
     HALF,
     J0,
+    LEAST,
     PIECE,
     cost_at,
     cube,
@@ -241,8 +243,9 @@ def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float
 # What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
 # infinity below the level.
 CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
-# Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest.
-_CAPACITY = 2048
+# Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest;
+# and as many that wait. A box leaves two, and six slabs around a minimum that is met in it.
+_CAPACITY, _SPARE = 2048, 8
 # A box at infinity of this size whose cost is below the level is not split further: across it the cost is the same to
 # many digits, so no smaller one would be dropped either.
 _TINY = 1e-5
@@ -262,17 +265,20 @@ def search_everywhere(
     atlas: Atlas,
     chart: Chart,
     corners: Array,
-    level: float,
-    value: float,
+    levels: Array,
+    eps: float,
     whole: bool,
     budget: int,
+    rivals: Array,
     found: Array,
-) -> tuple[int, int, float]:
-    """Search all positions but some boxes for minima that cost less than a level.
+) -> tuple[int, int, float, int, int]:
+    """Search all positions but some boxes for minima that cost less than a level, the lowest level first.
 
-    A box is done where the cost is at least `level`, or where it has no minimum, its gradient or its curvature being of
-    one sign: the least cost over all positions, if it is attained, is attained elsewhere. What of a box can be neither
-    is all that is looked at again. Around known minima boxes lie along their principal axes.
+    A box is done where the cost is at least the first level, or where it has no minimum, its gradient or its curvature
+    being of one sign: the least cost over all positions, if it is attained, is attained elsewhere. What of a box can be
+    neither is all that is looked at again. Around known minima boxes lie along their principal axes, and around those
+    that are met as well. Boxes that cost more than a lower level wait until that is shown: so one tree tells how far
+    the budget goes.
 
     Parameters
     ----------
@@ -283,34 +289,51 @@ def search_everywhere(
     chart : Chart
         Search coordinates around the fix, in which low points descend.
     corners : array (2, 3)
-        Corners in these coordinates beyond which the cost is at least `level`; NaN where none are known.
-    level : float
-        Cost to exceed.
-    value : float
-        Cost below which a point refutes the fix.
+        Corners in these coordinates beyond which the cost is at least the first level; NaN where none are known.
+    levels : array (G,)
+        Costs to exceed, falling; a point that costs less than the last refutes the fix.
+    eps : float
+        How far the last is below the cost of the fix.
     whole : bool
-        Whether a box is done as well where it has no minimum; otherwise only if it costs at least `value`.
+        Whether a box is done as well where it has no minimum; otherwise only if it costs at least the last level.
     budget : int
         How many boxes may be looked at.
+    rivals : array (F, D)
+        Written: minima that cost less than the first level and were met.
     found : array (D,)
         Written: the point of the outcomes CHEAPER and ANOTHER.
 
     Returns
     -------
     outcome : int
-        CLEAR: no minimum costs less than `level`. CHEAPER: `found` costs less than `value`. ANOTHER: `found` is a
-        minimum that costs less than `level`. SPENT: boxes are left. INFINITE: the cost at infinity is below `level`.
+        CLEAR: no minimum beside those known and met costs less than a level. CHEAPER: `found` costs less than the
+        last. ANOTHER: `found` is a minimum that costs less than the first, and was not searched around. SPENT: boxes
+        are left. INFINITE: the cost at infinity is below the level.
     boxes : int
         How many boxes were looked at.
     bound : float
-        A lower bound of f: `value`, unless boxes are left.
+        A lower bound of f: the last level, unless boxes are left.
+    shown : int
+        Which of the levels is exceeded.
+    met : int
+        How many rivals there are.
     """
     box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
-    stack, last, rho = np.empty((_CAPACITY, DEPTH)), atlas.dimension - 1, sqrt(max(level, 0.0))
-    size, boxes, lows, floor = push_pieces(stack, atlas), 0, 0, accuracy_floor_far(cost, atlas)
-    while size > 0:
-        if boxes >= budget or size + 2 > _CAPACITY:
-            return SPENT, boxes, least_left(stack, size)
+    stack, aside, d = np.empty((_CAPACITY, DEPTH)), np.empty((_CAPACITY, DEPTH)), atlas.dimension
+    size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
+    floor, first, now, value = accuracy_floor_far(cost, atlas), zero(), levels.shape[0] - 1, levels[-1]
+    while True:
+        if size == 0:  # nothing below this level is left
+            if now <= first:
+                return CLEAR, boxes, value, now, met
+            now -= 1
+            size, waiting = _take_back(stack, aside, waiting, levels[now])
+            continue
+        shown, level = now + 1, levels[first]
+        if boxes >= budget or max(size, waiting) + _SPARE > _CAPACITY:
+            if shown < levels.shape[0]:
+                return CLEAR, boxes, value, shown, met
+            return SPENT, boxes, least_left(stack, size), shown, met
         size -= 1
         boxes += 1
         piece = int(stack[size, PIECE])
@@ -324,27 +347,74 @@ def search_everywhere(
         here, noise = cost_at(cost.K, cost.w, box.nodes), rounding(cost.K, cost.weight, floor, box.nodes)
         if here < value:
             position(atlas, found)
-            return CHEAPER, boxes, 0.0
-        touching = piece < 2 * atlas.dimension and box.at[last] <= box.half[last]
-        # What cannot hold a residual shorter than rho is cut off from all sides.
+            return CHEAPER, boxes, 0.0, shown, met
+        touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
+        # What cannot hold a residual shorter than that of the first level is cut off from all sides.
         uncut(box.half, box.cut)
-        flat = box.half[2] == 0.0
-        shrink(cost.K, cost.weight, rho + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
+        rho, flat = sqrt(max(level, 0.0)) + noise, box.half[2] == 0.0
+        shrink(cost.K, cost.weight, rho, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
         # The test is dear, and fails in large boxes: only where the cost is low it can spare splits.
         sound = whole or (low > 0.0 and low * low >= value)
         if is_empty(box.cut) or (
             sound and here < _NEAR * (level + 1.0) and _clips_away(cost, atlas, box, touching, noise)
         ):
             continue
-        if here < level:
-            lows += 1
-            # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
-            if lows & (lows - 1) == 0 and _another(cost, atlas, chart, near, level, found):
-                return ANOTHER, boxes, 0.0
-        if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, atlas, box) < level:
-            return INFINITE, boxes, 0.0
-        size = _push_rest(stack, size, box, steepest_side(box.half, box.rows, atlas.dimension), low, piece)
-    return CLEAR, boxes, value
+        side = steepest_side(box.half, box.rows, d)
+        lows += int(here < level)
+        # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
+        if here < level and lows & (lows - 1) == 0 and _another(cost, atlas, chart, near, level, found):
+            known, trial = atlas.minima.home.shape[0], one_more(atlas)
+            if met == rivals.shape[0] or not _set_rival(cost, near, trial, known, found, value, eps):
+                return ANOTHER, boxes, 0.0, shown, met
+            for k in range(d):
+                rivals[met, k] = found[k]
+            met, atlas = met + 1, trial
+            core = atlas.minima.core[known]
+            size = push_around(stack, size, -core, core, atlas.minima.sides[known], 2 * d + 1 + known)
+            set_centre(atlas, piece, box.at)
+        if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
+            first = _first_below(levels, first, _at_infinity(cost, atlas, box))
+            if first > now:
+                return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
+        if low > 0.0 and low * low >= levels[now]:
+            waiting = _push_rest(aside, waiting, box, side, low, piece)
+        else:
+            size = _push_rest(stack, size, box, side, low, piece)
+
+
+@compiled
+def _first_below(levels: Array, first: int, ends: float) -> int:
+    """Return the first level from one on that a cost does not fall short of; one beyond the last where there is none."""
+    while first < levels.shape[0] and ends < levels[first]:
+        first += 1
+    return first
+
+
+@compiled
+def _take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[int, int]:
+    """Move the boxes whose bound is below a level from aside to the stack; return how many there are on each."""
+    size, left = zero(), zero()
+    for i in range(waiting):
+        if aside[i, LEAST] * aside[i, LEAST] < level:
+            stack[size] = aside[i]
+            size += 1
+        else:
+            aside[left] = aside[i]
+            left += 1
+    return size, left
+
+
+@compiled
+def _set_rival(cost: Cost, near: Box, atlas: Atlas, i: int, x: Array, value: float, eps: float) -> bool:
+    """Write a minimum that was met, and whose tables `near` holds, into an atlas; return False where it costs less.
+
+    As of those that are known, all its convex box must cost at least `value`.
+    """
+    slack = max(0.5 * (cost_at(cost.K, cost.w, near.nodes) - value), 0.5 * eps)
+    if not set_minimum(cost, near, atlas, i, x, value + 0.5 * slack, 0.5 * slack, inf):
+        return False
+    _widen_core(atlas, i, inf)
+    return True
 
 
 @compiled
@@ -493,9 +563,9 @@ _CLOSE = 1e-3
 
 @inlined
 def prove_everywhere(
-    cost: Cost, box: Box, x: Array, beside: Known, kappa: float, eps: float, budget: int, found: Array
-) -> tuple[int, int, float]:
-    """Prove that no position costs less than a fix, and that no other minimum has a gap below kappa.
+    cost: Cost, box: Box, x: Array, beside: Known, gaps: Array, eps: float, budget: int, rivals: Array, found: Array
+) -> tuple[int, int, float, float, int]:
+    """Prove that no position costs less than a fix, and that no other minimum has a gap below as much as can be shown.
 
     The claim is for all positions, to infinity. Where something encloses the cheap ones, that is searched first; where
     nothing does, or the search does not end soon, and the cost stays finite at infinity, the atlas of all space: along
@@ -503,27 +573,35 @@ def prove_everywhere(
 
     Parameters
     ----------
-    cost, box, x, beside, kappa, eps, budget, found
+    cost, box, x, beside, eps, budget, found
         As of `optloc.proof.near.prove`.
+    gaps : array (G,)
+        Gaps that will do, falling, the last 0 for the value alone. Only the atlas tries more than the first.
+    rivals : array (F, D)
+        Written: minima within the first gap that were met, and beside which the claim holds.
 
     Returns
     -------
     verdict : int
-        As of `optloc.proof.near.prove`. UNBOUNDED: the cost at infinity is below that of the fix plus kappa.
+        As of `optloc.proof.near.prove`. UNBOUNDED: the cost at infinity is below that of the fix plus every gap.
     boxes : int
         How many boxes were looked at.
     bound : float
         A certified lower bound of f over all positions; -inf where there is none.
+    gap : float
+        The gap that is proven, or where none is the smallest that was tried.
+    met : int
+        How many rivals there are.
     """
     nowhere, bound_to = np.full(x.shape[0], np.nan), beside.planes.shape[0] + beside.surface.shape[0] > 0
     open_end = not bound_to and reaches_infinity(cost.kinds, cost.K)  # the atlas is of all space
     first = min(budget, _soon(cost, x, beside)) if open_end else budget
-    verdict, boxes, bound = prove(cost, box, x, beside, kappa, eps, first, nowhere, nowhere, False, found)
+    verdict, boxes, bound = prove(cost, box, x, beside, gaps[0], eps, first, nowhere, nowhere, False, found)
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))
     if not open_end or not again or boxes >= budget:
-        return verdict, boxes, bound
-    verdict, more, bound = prove_atlas(cost, box, x, beside, kappa, eps, budget - boxes, found)
-    return verdict, boxes + more, bound
+        return verdict, boxes, bound, gaps[0], 0
+    verdict, more, bound, gap, met = prove_atlas(cost, box, x, beside, gaps, eps, budget - boxes, rivals, found)
+    return verdict, boxes + more, bound, gap, met
 
 
 @compiled
@@ -538,16 +616,16 @@ def _soon(cost: Cost, x: Array, beside: Known) -> int:
 
 @compiled
 def prove_atlas(
-    cost: Cost, box: Box, x: Array, beside: Known, kappa: float, eps: float, budget: int, found: Array
-) -> tuple[int, int, float]:
+    cost: Cost, box: Box, x: Array, beside: Known, gaps: Array, eps: float, budget: int, rivals: Array, found: Array
+) -> tuple[int, int, float, float, int]:
     """Prove the same as `prove_everywhere` with the atlas alone, where `optloc.proof.box.reaches_infinity` holds."""
     chart, _ = chart_at(cost, x, box)
     least, corners, nowhere = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), np.full(x.shape[0], nan)
-    if not region_of(cost, chart, box, sqrt(least + kappa), nowhere, nowhere, corners[0], corners[1]):
+    if not region_of(cost, chart, box, sqrt(least + gaps[0]), nowhere, nowhere, corners[0], corners[1]):
         corners[:] = nan
     others = beside.points
     middle, radius = cube(cost.kinds, cost.data, x)
-    atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if kappa > 0.0 else 0))
+    atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if gaps[0] > 0.0 else 0))
     known, place = zero(), np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):
         place[:] = x if p == 0 else others[p - 1]
@@ -557,18 +635,22 @@ def prove_atlas(
             _widen_core(atlas, known, limit)
             known += 1
         elif p == 0:
-            return STATIONARY, 0, -inf
+            return STATIONARY, 0, -inf, gaps[0], 0
     atlas = with_minima(middle, radius, x.shape[0], first_minima(atlas.minima, known))
-    level = least + kappa if kappa > 0.0 else least - eps
+    levels = np.empty(gaps.shape[0])
+    for k in range(gaps.shape[0]):
+        levels[k] = least + gaps[k] if gaps[k] > 0.0 else least - eps
     whole = beside.hidden == 0
-    outcome, boxes, bound = search_everywhere(cost, atlas, chart, corners, level, least - eps, whole, budget, found)
+    outcome, boxes, bound, shown, met = search_everywhere(
+        cost, atlas, chart, corners, levels, eps, whole, budget, rivals, found
+    )
     if outcome == CLEAR:
-        return UNIQUE if kappa > 0.0 else VALUE, boxes, bound
+        return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
     if outcome == CHEAPER:
-        return BETTER, boxes, bound
+        return BETTER, boxes, bound, gaps[0], 0
     if outcome == ANOTHER:
-        return OTHER, boxes, bound
-    return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps)
+        return OTHER, boxes, bound, gaps[0], 0
+    return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps), gaps[-1], 0
 
 
 @compiled

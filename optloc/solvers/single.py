@@ -27,7 +27,7 @@ from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_
 from optloc.proof.near import UNIQUE
 from optloc.proof.pose import Affine, Posed, pose_affinely
 from optloc.proof.scope import is_run, unsupported
-from optloc.solvers.certify.branch_and_bound import budgets, certify_stage, state_claim
+from optloc.solvers.certify.branch_and_bound import budgets, certify_stage, gaps_below, state_claim
 from optloc.solvers.certify.posed import agrees
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.methods import Method
@@ -198,10 +198,12 @@ class Single:
         asked.x[:] = position
         prove_here(room.pose, asked, answered)
         out = []
-        told = zip(costs, *(array.tolist() for array in answered[:4]), strict=True)
-        for cost, verdict, boxes, bound, everywhere in told:
+        told = zip(costs, *(array.tolist() for array in answered[:6]), strict=True)
+        for cost, verdict, boxes, bound, everywhere, shown, met in told:
+            if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
+                return None
             # a bound that is not that of this cost is one of another: the long way finds out which is wrong
-            if verdict != UNIQUE or not everywhere or not abs(cost - bound) <= _APART * equal_cost(cost):
+            if not abs(cost - bound) <= _APART * equal_cost(cost):
                 return None
             out.append(state_claim(cost, bound, LISTED_GAP, boxes, 0, None))
         return out
@@ -280,7 +282,7 @@ class Single:
             others=np.empty((n, 0, d)),
             known=np.zeros(n, dtype=np.int64),
             hidden=np.zeros(n, dtype=np.int64),
-            kappa=gap,
+            gaps=np.tile(gaps_below(LISTED_GAP, d), (n, 1)),
             eps=np.empty(n),
             region=nowhere,
             # where all positions cannot be bounded the long way says what can

@@ -16,6 +16,16 @@ def beside(points, d=3, hidden=0):
     return Known(np.array(points, dtype=float).reshape(-1, d), hidden, np.zeros((0, 3)), np.zeros(0))
 
 
+def down_from(kappa):
+    """Return the gaps to prove from one asked for down to the value alone."""
+    return np.array([kappa, 0.0] if kappa > 0.0 else [0.0])
+
+
+def no_rivals(d=3):
+    """Return no room for minima that a proof meets: it ends at the first."""
+    return np.zeros((0, d))
+
+
 NO_REGION = np.full(3, np.nan)
 # How many numbers any shipped node has at most.
 WIDTH = max(node.width for node in NODES)

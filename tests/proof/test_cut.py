@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from proof.costs import WIDTH, beside
+from proof.costs import WIDTH, beside, down_from, no_rivals
 from proof.sampling import bounded, many, numbers, rotation, value
 from proof.test_soundness import verdicts
 
@@ -347,7 +347,8 @@ def test_no_bound_is_above_what_another_place_costs(budget):
     K, x, found = 500.0 * np.eye(5), numbers_of(WRONG), np.zeros(3)
     cost, box = cost_of(np.full(5, RATIO), data, K, 500.0 * z), empty_box(5, 5)
     eps = 1e-6 * (1.0 + 1553.19)
-    verdict, _, bound = prove_everywhere(cost, box, x, beside([]), 0.0, eps, budget, found)
+    args = beside([]), down_from(0.0), eps, budget, no_rivals(), found
+    verdict, _, bound, *_ = prove_everywhere(cost, box, x, *args)
     assert verdict not in (UNIQUE, VALUE)
     r = np.linalg.norm(np.array(BETTER_PLACE) - S, axis=1)
     assert bound <= (((r[1:] / r[0] - z) * 500.0) ** 2).sum() + 1e-6

@@ -2,17 +2,20 @@
 
 import numpy as np
 import pytest
-from proof.costs import WIDTH, beside
+from proof.costs import WIDTH, beside, down_from, no_rivals
 from proof.sampling import many
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.chart import cost_of, empty_box
 from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere, set_minimum
-from optloc.proof.near import BETTER, OTHER, UNIQUE, VALUE, prove
+from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE, prove
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+
+# Of directions, radians.
+FINE = {"xatol": 1e-12}
 
 
 def differences(S, sigma, x, rng):
@@ -71,12 +74,23 @@ def proven(prover, kinds, data, K, w, x, others, kappa, budget=4000):
         rest = beside(others, len(x))
         f = K @ np.linalg.norm(x - data[:, : len(x)], axis=1) - w if (kinds == RANGE).all() else np.zeros(1)
         cost, box = cost_of(kinds, data, K, w), empty_box(*K.shape)
-        verdict, more, _ = prover(cost, box, x, rest, kappa, 1e-6 * (1.0 + f @ f), budget, found)
+        verdict, more, *_ = prover(cost, box, x, rest, kappa, 1e-6 * (1.0 + f @ f), budget, found)
         boxes += more
         if verdict != OTHER:
             break
         others.append(minima_of(data[:, : len(x)], K, w, [found])[0][1])
     return verdict, boxes
+
+
+def by_atlas(cost, box, x, others, kappa, eps, budget, found):
+    return prove_atlas(cost, box, x, others, down_from(kappa), eps, budget, no_rivals(len(x)), found)
+
+
+def by_both(cost, box, x, others, kappa, eps, budget, found):
+    verdict, boxes, bound, gap, _ = prove_everywhere(
+        cost, box, x, others, down_from(kappa), eps, budget, no_rivals(len(x)), found
+    )
+    return verdict if gap == kappa else BUDGET, boxes, bound
 
 
 def by_enclosure(cost, box, x, others, kappa, eps, budget, found):
@@ -102,7 +116,7 @@ def test_in_the_plane_verdicts_are_those_of_brute_force():
         for cost, x in minima:
             found = np.full(2, np.nan)
             args = (x, beside([], 2), 0.0, 1e-6 * (1.0 + cost), 4000)
-            verdict = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args, found)[0]
+            verdict = by_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args, found)[0]
             if verdict == BETTER:
                 assert ((K @ np.linalg.norm(found - S, axis=1) - w) ** 2).sum() < cost
                 wrong += 1
@@ -134,7 +148,7 @@ def shares(cell, kappa):
     for problem, minima in cell:
         best, x = minima[0]
         others = [p for cost, p in minima[1:] if cost < best + kappa] if kappa else []
-        for k, prover in enumerate((by_enclosure, prove_everywhere)):
+        for k, prover in enumerate((by_enclosure, by_both)):
             verdict, _ = proven(prover, *problem, x, others, kappa)
             # A better point is the failure of the solver here, not of the proof.
             counts[k] += verdict in (UNIQUE, VALUE, BETTER)
@@ -175,7 +189,8 @@ def wrong_claims(count, seed):
         asked += [(best, 25.0)] if more < least + 24.0 else []
         for place, kappa in asked:
             args = (place, beside([], 3), kappa, 1e-6 * (1.0 + more), 3000, np.zeros(3))
-            claims += prove_atlas(cost, box, *args)[0] in (UNIQUE, VALUE)
+            verdict, _, _, gap, _ = by_atlas(cost, box, *args)
+            claims += verdict in (UNIQUE, VALUE) and (place is mirror or gap == kappa)
             offers += 1
     return claims, offers
 
@@ -194,6 +209,87 @@ def test_no_mirror_of_a_flat_network_is_proven_in_full(seed):
     assert offers > 300
 
 
+def check_what_is_shown(problem, minima, budget):
+    """Check a claim of as much as a budget shows against the minima known; return the gap, -1 for none, and rivals."""
+    kinds, data, K, w = problem
+    (least, best), rivals = minima[0], np.full((4, 3), np.nan)
+    args = (beside([]), np.array([25.0, 9.0, 0.0]), 1e-6 * (1.0 + least), budget, rivals, np.zeros(3))
+    verdict, boxes, bound, gap, met = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), best, *args)
+    if verdict not in (UNIQUE, VALUE):
+        return -1.0, 0
+    assert boxes <= budget
+    assert (verdict == UNIQUE) == (gap > 0.0)
+    assert least - 2e-6 * (1.0 + least) <= bound <= least
+    for cost, x in minima[1:]:
+        near = np.linalg.norm(rivals[:met] - x, axis=1) < 1e-3 * np.linalg.norm(x - best)
+        assert cost > least + gap or near.any()
+    for x in rivals[:met]:  # each is a minimum, and there is none twice
+        cost, again = minima_of(data[:, :3], K, w, [x])[0]
+        assert np.linalg.norm(again - x) < 1e-3 * np.linalg.norm(x - best)
+        assert least <= cost < least + 25.0
+    assert all(np.linalg.norm(a - b) > 1.0 for i, a in enumerate(rivals[:met]) for b in rivals[:i])
+    return gap, met
+
+
+@pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
+def test_a_budget_shows_as_much_as_it_can_and_goes_on_beside_rivals(seed):
+    """Of every minimum that SciPy knows within the gap that is claimed the proof has told."""
+    budgets, shown, met = (40, 150, 600, 3000), [], 0
+    for problem, minima in flat_cell(30, 90 + seed):
+        gaps = []
+        for budget in budgets:
+            gap, rivals = check_what_is_shown(problem, minima, budget)
+            gaps.append(gap)
+            met += rivals
+        assert gaps == sorted(gaps)  # more boxes never show less
+        shown += gaps
+    assert {-1.0, 0.0, 25.0} <= {*shown}
+    assert met > 10
+
+
+def cost_along(S, K, w, turn, v):
+    """Return the costs at an inverse range of directions in the plane, also at infinity; nothing cancels."""
+    way = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    beyond = v * (S**2).sum(1) - 2.0 * way @ S.T  # r - 1/v, times r v + 1
+    phi = beyond / (1.0 + np.linalg.norm(way[..., None, :] - v * S, axis=-1))
+    return ((phi @ K.T - w) ** 2).sum(-1)
+
+
+def ends_of(S, K, w):
+    """Return the costs at infinity of all directions in the plane from which the cost rises on all sides."""
+    turn = np.linspace(-np.pi, np.pi, 721)
+    cost, ends = cost_along(S, K, w, turn, 0.0), []
+    for k in np.flatnonzero((cost[1:-1] <= cost[:-2]) & (cost[1:-1] <= cost[2:])) + 1:
+        least = [
+            minimize_scalar(
+                lambda t, v=v: cost_along(S, K, w, t, v), bounds=turn[[k - 1, k + 1]], method="bounded", options=FINE
+            ).fun
+            for v in (0.0, 1e-7)
+        ]
+        ends += [least[0]] if least[1] > least[0] else []
+    return np.array(ends)
+
+
+@pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
+def test_no_way_to_infinity_ends_within_the_gap_that_is_proven(seed):
+    rng, fallen, tried = np.random.default_rng([seed, 3]), 0, 0
+    while tried < 100 or fallen < 2:
+        tried += 1
+        S, x, sigma = rng.uniform(-5e3, 5e3, (4, 2)), outside(2, rng), 10.0 ** rng.uniform(1.8, 2.8)
+        kinds, data, K, w = differences(S, sigma, x, rng)
+        minima = minima_of(S, K, w, [x, *(2.0 * x * rng.standard_normal((4, 2)))])
+        if not minima:
+            continue
+        least, best = minima[0]
+        args = (beside([], 2), np.array([25.0, 9.0, 6.0, 0.0]), 1e-6 * (1.0 + least), 1000, np.zeros((4, 2)), x)
+        verdict, boxes, _, gap, _ = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), best, *args)
+        if verdict == UNIQUE:
+            ends = ends_of(S, K, w) - least
+            assert not (ends < gap - 1e-3).any()
+            fallen += gap < 25.0 and boxes < 1000 and ends.min(initial=25.0) < 25.0
+        assert tried < 5000
+
+
 @pytest.mark.usefixtures("form")
 def test_a_cost_that_falls_to_infinity_is_no_proof():
     """Wave fronts that bend away from their source: the cost falls towards infinity, whatever point is offered."""
@@ -203,7 +299,7 @@ def test_a_cost_that_falls_to_infinity_is_no_proof():
     w = w + 0.5 * K @ np.array([-200.0, 0.0, -200.0, 0.0]) / 100.0
     x = least_squares(lambda p: K @ np.linalg.norm(p - S, axis=1) - w, [0.0, 1e5]).x
     args = (x, beside([], 2), 9.0, 1e-6, 4000, np.zeros(2))
-    verdict = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args)[0]
+    verdict = by_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args)[0]
     assert verdict not in (UNIQUE, VALUE)
 
 
@@ -218,7 +314,7 @@ def test_costs_that_grow_without_end_are_not_for_the_atlas():
     data, K = np.concatenate([data, np.zeros((1, WIDTH))]), np.pad(K, ((0, 0), (0, 1)))
     cost, box = cost_of(np.append(kinds, LINEAR), data, K, np.zeros(2)), empty_box(*K.shape)
     x = np.array([3.0, 4.0, 5.0])
-    verdict = prove_everywhere(cost, box, x, beside([]), 0.0, 1e-6, 10, np.zeros(3))[0]
+    verdict = by_both(cost, box, x, beside([]), 0.0, 1e-6, 10, np.zeros(3))[0]
     assert verdict not in (UNIQUE, VALUE)
 
 

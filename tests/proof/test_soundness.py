@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from often import few
+from proof.costs import down_from
 from proof.independent import Trial
 from proof.layouts import BY_NAME, CELLS, rows
 
@@ -55,7 +56,7 @@ def verdicts(problem, item, x, kappa: float, budget: int = 300):
         np.zeros((n, 0, d)),
         np.zeros(n, dtype=np.int64),
         np.zeros(n, dtype=np.int64),
-        np.full(n, kappa),
+        np.tile(down_from(kappa), (n, 1)),
         EQUAL * (1.0 + cost),
         nowhere,
         reach,

@@ -11,7 +11,7 @@ from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, enabled, usable, zero
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, home_of, set_centre, with_minima
-from optloc.proof.batch import Answered, Asked, plainly
+from optloc.proof.batch import Answered, Asked, plainly, without_rivals
 from optloc.proof.box import (
     DEPTH,
     bound_nodes,
@@ -339,7 +339,7 @@ def prove_runs(posed: Runs, asked: Asked) -> Answered:
                 posed.runs[i],
                 asked.x[i],
                 beside,
-                asked.kappa[i],
+                asked.gaps[i, 0],
                 asked.eps[i],
                 int(asked.budget[i]),
                 corners[0],
@@ -354,7 +354,7 @@ def prove_runs(posed: Runs, asked: Asked) -> Answered:
         mapped(prove, range(n))
     else:
         verdict[:], bound[:] = BUDGET, -inf
-    return Answered(verdict, boxes, bound, whole, found)
+    return without_rivals(verdict, boxes, bound, whole, asked, found)
 
 
 def runs_lack_code(posed: Runs | Courses, count: int) -> bool:
@@ -397,13 +397,13 @@ def prove_courses(posed: Courses, asked: Asked) -> Answered:
             verdict[i] = STATIONARY
             return
         verdict[i], boxes[i], bound[i] = prove_course(
-            whole, few, axes, plainly(others), asked.kappa[i], asked.eps[i], int(asked.budget[i]), another
+            whole, few, axes, plainly(others), asked.gaps[i, 0], asked.eps[i], int(asked.budget[i]), another
         )
         found[i] = state_off(ground, another) if over_ground(ground) else another
 
     if usable(prove_course, n):
         mapped(prove, range(n))
-    return Answered(verdict, boxes, bound, np.zeros(n, np.bool_), found)
+    return without_rivals(verdict, boxes, bound, np.zeros(n, np.bool_), asked, found)
 
 
 def _on_surface(courses: tuple[Course, Course], state: Array) -> tuple[tuple[Course, Course], Ground]:

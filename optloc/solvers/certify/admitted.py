@@ -286,7 +286,7 @@ def _question(on: Problem, costs: Costs, x: Array, less: Array, effort: int) -> 
         others=np.zeros((n, 0, d)),
         known=np.zeros(n, dtype=np.int64),
         hidden=np.zeros(n, dtype=np.int64),
-        kappa=value,
+        gaps=value[:, None],
         eps=less,
         region=np.full((n, 2, d), np.nan),
         fallback=np.full((n, 2, d), np.nan),

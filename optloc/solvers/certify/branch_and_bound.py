@@ -141,6 +141,8 @@ _BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
 # Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth, of
 # two coordinates and 2 us each.
 _AROUND = 15
+# Within what share of its distance from the fix a minimum that was met is one that is listed: a descent's accuracy.
+_SAME = 1e-3
 # Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
 _HIDDEN = 4
 
@@ -219,7 +221,7 @@ class Work:
             np.full((size, 0, d), np.nan),
             corners,
             around(problem, state),
-            np.array(_gaps(margin, d)),
+            np.array(gaps_below(margin, d)),
             np.zeros(size, dtype=np.int64),
             np.array(answered),
             effort,
@@ -239,7 +241,7 @@ class Work:
         return ", ".join(counts + more)
 
 
-def _gaps(margin: float, dimension: int) -> list[float]:
+def gaps_below(margin: float, dimension: int) -> list[float]:
     """Return the gaps to prove, from the one asked for down to the value alone."""
     below = [m for m in _MARGINS if m < margin]
     near = min(quantile(_LEVEL, dimension), margin)
@@ -277,7 +279,7 @@ def _round(work: Work, items: Array) -> None:
     _give_up(work, items[~free], HELD)
     asked, costs = _asked(work, items), work.pose.take(items)
     # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
-    turning = free & (costs.level < work.fix.cost[items] + asked.kappa)
+    turning = free & (costs.level < work.fix.cost[items] + asked.gaps[:, 0])
     _lower(work, items[turning], TURNS)
     good = np.flatnonzero(free & ~turning)
     if not len(good):
@@ -286,11 +288,18 @@ def _round(work: Work, items: Array) -> None:
         items, asked, costs = items[good], asked.take(good), costs.take(good)
     answer = prove(costs, asked)
     work.spent[items] += answer.boxes
-    done = np.isin(answer.verdict, (UNIQUE, VALUE))
-    _claim(work, items, asked, answer, np.flatnonzero(done))
-    short = answer.verdict == BUDGET
+    done, beside = np.isin(answer.verdict, (UNIQUE, VALUE)), answer.met > 0
+    holds = done & ~beside
+    if (done & beside).any():
+        holds[done & beside] = _list(work, items[done & beside], answer.take(done & beside))
+    _claim(work, items, asked, answer, np.flatnonzero(holds))
+    short, last = answer.verdict == BUDGET, len(work.margins) - 1
+    # What the budget of a gap did not show, that of the value may.
+    below = short & (answer.gap < asked.gaps[:, 0])
+    work.level[items[below]] = last - 1
     _lower(work, items[short], _unfinished(work.pose, len(items)))
     remote = answer.verdict == UNBOUNDED
+    work.level[items[remote & (answer.gap == 0.0)]] = last
     _lower(work, items[remote], REMOTE, remote=True)
     found = np.isin(answer.verdict, (BETTER, OTHER))
     if found.any():
@@ -299,7 +308,9 @@ def _round(work: Work, items: Array) -> None:
 
 
 def _asked(work: Work, items: Array) -> Asked:
-    kappa, fix, ignored = work.margins[work.level[items]], work.fix, work.ignored[items]
+    fix, ignored, last = work.fix, work.ignored[items], len(work.margins) - 1
+    gaps = work.margins[np.minimum(work.level[items, None] + np.arange(last + 1), last)]
+    kappa = gaps[:, 0]
     own = state_columns(work.problem)
     planes, surface = surfaces_of(work.problem.take(items), fix.position[items])
     gap = fix.alternatives.gap[items]
@@ -313,7 +324,7 @@ def _asked(work: Work, items: Array) -> Asked:
         others=np.where(np.isfinite(others), others, 0.0),
         known=np.isfinite(others).all(-1).sum(1),
         hidden=seen,
-        kappa=kappa,
+        gaps=gaps,
         eps=equal_cost(fix.cost[items]),
         region=work.region[items],
         fallback=work.fallback[items],
@@ -357,7 +368,7 @@ def _give_up(work: Work, items: Array, why: str) -> None:
 
 def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array) -> None:
     """Write the certificates of those of some fixes that are proven."""
-    proven, kappa = items[done], asked.kappa[done]
+    proven, kappa = items[done], answer.gap[done]
     bound, listed = answer.bound[done], work.fix.alternatives.gap[proven] < kappa[:, None]
     region: list[tuple[Corner, Corner] | None] = [None] * len(done)
     for k in np.flatnonzero(~answer.everywhere[done]).tolist():
@@ -372,10 +383,32 @@ def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array
 
 
 def _add(work: Work, items: Array, points: Array, better: Array) -> None:
-    """Refine points that were found beside some fixes, and let them compete."""
+    """Refine points (n, d) that were found beside some fixes, and let them compete."""
+    _, changed = _compete(work, items, points[:, None])
+    _stick(work, items[~changed], points[~changed], better[~changed])
+
+
+def _list(work: Work, items: Array, answer: Answered) -> Array:
+    """Refine minima that proofs of some fixes went on beside, let them compete; return which claims hold (n,)."""
+    rivals = answer.rivals[:, : answer.met.max()]
+    rivals = np.where((np.arange(rivals.shape[1]) < answer.met[:, None])[..., None], rivals, np.nan)
+    lower, changed = _compete(work, items, rivals)
+    fix, own = work.fix[items], state_columns(work.problem)
+    known, place = fix.alternatives.x[..., own], fix.x[:, None, own]
+    with np.errstate(invalid="ignore"):
+        apart = np.linalg.norm(known[:, None] - rivals[:, :, None], axis=-1)
+        near = (apart <= _SAME * np.linalg.norm(rivals - place, axis=-1, keepdims=True)).any(-1)
+    holds = ~lower & fix.answered & (near | np.isnan(rivals[..., 0])).all(1)
+    stuck = ~changed & ~holds
+    _stick(work, items[stuck], rivals[stuck, 0], np.zeros(stuck.sum(), dtype=bool))
+    return np.asarray(holds)
+
+
+def _compete(work: Work, items: Array, points: Array) -> tuple[Array, Array]:
+    """Refine points (n, P, d) beside some fixes; return which fixes they replaced, and of which they say more, (n,)."""
     began = perf_counter()
     part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
-    x = pack(np.concatenate([standing(before, own), vectors(part, points[:, None])], axis=1))
+    x = pack(np.concatenate([standing(before, own), vectors(part, points)], axis=1))
     pool = keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
     new = judge(part, pool)
     with np.errstate(invalid="ignore"):
@@ -389,8 +422,12 @@ def _add(work: Work, items: Array, points: Array, better: Array) -> None:
         work.pool = work.pool.merge(items[keep], take(pool, keep))
         work.fix = overwrite(work.fix, items[keep], new[keep])
         work.pending[items[keep]] = new.answered[keep]
-    stuck = np.flatnonzero(~changed)
-    stuck = stuck[~_ignore(work, items[stuck], points[stuck])]
+    return lower, changed
+
+
+def _stick(work: Work, items: Array, points: Array, better: Array) -> None:
+    """Say what becomes of fixes beside which points (n, d) were found that are no candidates."""
+    stuck = np.flatnonzero(~_ignore(work, items, points))
     _bar(work, items, points, stuck[better[stuck]])
     _lower(work, items[stuck[~better[stuck]]], _unfinished(work.pose, len(items)))
 
