@@ -384,7 +384,7 @@ def search_everywhere(
 
 @compiled
 def _first_below(levels: Array, first: int, ends: float) -> int:
-    """Return the first level from one on that a cost does not fall short of; one beyond the last where there is none."""
+    """Return the first level from one on that a cost reaches, or how many there are where it reaches none."""
     while first < levels.shape[0] and ends < levels[first]:
         first += 1
     return first
