@@ -359,9 +359,9 @@ def clip_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, ha
 def _station(frame: Frame, data: Array, first: int) -> Triple:
     """Return the station a at data[first:first + 3] in the units of the cube."""
     m0, m1, m2 = frame.middle
-    radius = frame.radius
-    third = (data[first + 2] - m2) / radius if frame.space else 0.0
-    return (data[first] - m0) / radius, (data[first + 1] - m1) / radius, third
+    per = 1.0 / frame.radius
+    third = (data[first + 2] - m2) * per if frame.space else 0.0
+    return (data[first] - m0) * per, (data[first + 1] - m1) * per, third
 
 
 @inlined

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isnan, sqrt
+from math import inf, isnan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -258,7 +258,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
                 continue
             wholes[i] = False
             low, high = fallbacks[i, 0], fallbacks[i, 1]
-        verdict, more, bound = prove(cost, own, x, beside, gaps[0], eps, budgets[i], low, high, False, found)
+        verdict, more, bound = prove(cost, own, x, beside, gaps[0], eps, budgets[i], inf, low, high, False, found)
         verdicts[i], counts[i], bounds[i], shown[i], numbers[i] = verdict, boxes + more, bound, gaps[0], 0
 
 

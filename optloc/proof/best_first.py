@@ -38,15 +38,10 @@ from optloc.proof.box import (
 )
 from optloc.proof.chart import Box, Chart, Cost, Known, chart_on, cost_of, curve_box, descend, empty_box, turned, widen
 from optloc.proof.chart import place as set_place
+from optloc.proof.convex_boxes import accuracy_floor_far, is_known, known_minima, set_minimum
 from optloc.proof.curvature import clip_to_stationary
-from optloc.proof.everywhere import (
-    accuracy_floor_far,
-    is_left,
-    leaves,
-    push_pieces,
-    set_minimum,
-)
-from optloc.proof.near import cut_side, is_known, known_minima, lay_or_halve, region_of
+from optloc.proof.everywhere import is_left, leaves, push_pieces
+from optloc.proof.near import cut_side, lay_or_halve, region_of
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.pose import Posed
 from optloc.proof.surface import SIDES, reach_of_piece

@@ -37,8 +37,8 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.chart import Box, Chart, Cost, chart_at, place, widen
+from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum
 from optloc.proof.enclosure import enclose
-from optloc.proof.everywhere import accuracy_floor_far, set_minimum
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW
 

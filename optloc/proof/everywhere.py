@@ -8,14 +8,12 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
-from optloc.compute.systems import principal
 from optloc.proof.atlas import (
     Atlas,
     atlas_of,
     clip_to_corners,
     coordinates_on,
     first_minima,
-    home_of,
     one_more,
     position,
     set_centre,
@@ -27,7 +25,6 @@ from optloc.proof.box import (
     CENTRE,
     DEPTH,
     HALF,
-    J0,
     LEAST,
     PIECE,
     cost_at,
@@ -48,195 +45,10 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
-from optloc.proof.curvature import G0, G1, G2, convex, has_no_infimum, spread_of, sum_up
+from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
+from optloc.proof.curvature import has_no_infimum, spread_of, sum_up
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
-from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, size_of
-from optloc.proof.nodes.node import ANY, DIFFERENCE
-
-# The cost over the pieces of an atlas: all nodes over a box, out to infinity, and the surroundings of known minima.
-#
-# Angles and ratios are functions of the scaled line ``p - v a`` alone; ranges count less the distance to the centre of
-# the cube, which rows whose coefficients of ranges sum to zero do not feel.
-
-
-@compiled
-def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes: measurements and the cube."""
-    total = 0.0
-    for i in range(cost.w.shape[0]):
-        total += cost.w[i] * cost.w[i]
-    total = sqrt(total)
-    # Lines are p - v a with |p| at most sqrt(3) and |a| below 1: their lengths, and sums of two, are below 4 reaches.
-    size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
-    for j in range(cost.kinds.shape[0]):
-        own = size if infinity_of(cost.kinds[j]) == DIFFERENCE else 4.0 * size_of(cost.kinds[j], cost.data[j], 1.0)
-        total += cost.weight[j] * own
-    return total
-
-
-# The surroundings of a known minimum in an atlas: its principal axes, and a box in which it is the only minimum.
-
-# No convex box is looked for beyond this many standard deviations: a fix so well determined needs none wider. Nor
-# nearer to infinity than a tenth of the way, where its coordinates end.
-_WIDEST, _SHARE = 1e4, 0.9
-# The box searched along the axes of a minimum: convex boxes, and standard deviations at least. Beyond it the cost is
-# high enough for boxes along the axes of space.
-_WIDER, _WIDE = 3.0, 3.0
-# The same for a proof: a valley of a flat network is narrow, oblique to the faces, and longer than its curvature at the
-# minimum says. Over 300 fixes of five stations on flat ground 12 took a sixth fewer boxes than 3, and 8 half of that.
-_VALLEY = 12.0
-# Half-widths of the first convex box that is tried, standard deviations, and by what cubes and sides are tried larger:
-# most cubes end at four. A side is at least two thirds of the largest.
-_FIRST, _DOUBLED, _GROWTH = 2.0, 2.0, 1.5
-
-
-@compiled
-def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: float, eps: float, limit: float) -> bool:
-    """Write a minimum and its surroundings into an atlas; return False where it is none, or costs too little.
-
-    Parameters
-    ----------
-    cost : Cost
-        The cost.
-    box : Box
-        Tables to work with.
-    atlas : Atlas
-        Minimum i is written.
-    i : int
-        Which.
-    x : array (D,)
-        Its position, polished.
-    value : float
-        What it must cost at least: its surroundings are not searched.
-    eps : float
-        How far the cost may fall below that of x in its convex box.
-    limit : float
-        How far, in metres, these may reach along any coordinate.
-    """
-    minima, d = atlas.minima, atlas.dimension
-    minima.home[i] = home_of(atlas, x, minima.start[i])
-    if not set_axes(cost, box, atlas, i):
-        return False
-    _tables(cost, box, atlas, i, np.zeros(3))
-    if not cost_at(cost.K, cost.w, box.nodes) >= value:
-        return False
-    sums = box.sums
-    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
-    margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
-    hull = np.zeros(3)
-    set_hull(atlas, i, hull, limit)
-    if not _grow(cost, box, atlas, i, hull, margin):
-        return False
-    for k in range(d):
-        minima.core[i, k] = min(max(_WIDER * minima.sides[i, k], _WIDE), hull[k])
-    return True
-
-
-@compiled
-def _widen_core(atlas: Atlas, i: int, limit: float) -> None:
-    """Let the box searched along the axes of minimum i hold the valley in which it lies, within a limit in metres."""
-    hull = np.zeros(3)
-    set_hull(atlas, i, hull, limit)
-    for k in range(atlas.dimension):
-        atlas.minima.core[i, k] = max(atlas.minima.core[i, k], min(_VALLEY, hull[k]))
-
-
-@compiled
-def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Write half-widths (3,) around minimum i beyond which no convex box is looked for, within a limit in metres."""
-    minima, d = atlas.minima, atlas.dimension
-    for k in range(d):
-        steep = abs(minima.axes[i, d - 1, k]) * d if minima.home[i] < 2 * d else 0.0
-        hull[k] = min(_WIDEST, _SHARE * minima.start[i, d - 1] / steep if steep > 0.0 else _WIDEST)
-    if limit < inf:
-        _draw_in(atlas, i, hull, limit)
-
-
-@compiled
-def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Make half-widths (3,) around minimum i so small that no coordinate is farther than so many metres."""
-    minima, d = atlas.minima, atlas.dimension
-    beside, out, scale = 0.0, 0.0, 1.0  # how far p and v change, and v
-    for k in range(d):
-        reach = 0.0
-        for m in range(d):
-            reach += abs(minima.axes[i, k, m]) * hull[m]
-        if k == d - 1 and minima.home[i] < 2 * d:
-            out, scale = reach, minima.start[i, k]
-        else:
-            beside = max(beside, reach)
-    # |p/v - p'/v'| <= (|p - p'| + |v - v'|/v') / v, because |p'| <= 1.
-    share = limit * scale / (atlas.radius * (beside + out / scale) + limit * out)
-    for k in range(d):
-        hull[k] *= min(share, 1.0)
-
-
-@compiled
-def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
-    """Write the principal axes of minimum i in the coordinates of its home; return False where there are none."""
-    minima, d = atlas.minima, atlas.dimension
-    minima.axes[i], minima.back[i] = np.eye(3), np.eye(3)
-    _tables(cost, box, atlas, i, np.zeros(3))
-    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
-    information, vectors = np.zeros((3, 3)), np.zeros((3, 3))
-    for k in range(d):
-        for m in range(d):
-            for row in range(box.rows.shape[0]):
-                information[k, m] += box.rows[row, J0 + k] * box.rows[row, J0 + m]
-    principal(information, vectors)
-    minima.axes[i], minima.back[i] = 0.0, 0.0
-    for k in range(d):
-        if not information[k, k] > 0.0:
-            return False
-        root = sqrt(information[k, k])
-        for m in range(d):
-            minima.axes[i, m, k], minima.back[i, k, m] = vectors[m, k] / root, vectors[m, k] * root
-    return True
-
-
-@inlined
-def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
-    """Fill the tables of a box with half-widths (3,) around minimum i."""
-    box.at[:], box.half[:] = 0.0, half
-    set_centre(atlas, 2 * atlas.dimension + 1 + i, box.at)
-    bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
-    curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
-    noise = rounding(cost.K, cost.weight, accuracy_floor_far(cost, atlas), box.nodes)
-    sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
-
-
-@compiled
-def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
-    _tables(cost, box, atlas, i, half)
-    # Ranges are differences here, whose Hessians have no sign: the test must take them for any node.
-    return convex(np.full_like(cost.kinds, ANY), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
-
-
-@compiled
-def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float) -> bool:
-    """Write half-widths of a box around minimum i on which the cost is convex; return False where there is none.
-
-    A cube that shrinks or doubles, then its sides one by one, none beyond the hull (3,).
-    """
-    sides, size = atlas.minima.sides[i], _FIRST
-    trial = np.minimum(hull, size)
-    while not _convex(cost, box, atlas, i, trial, margin):
-        # Where it is not even at the centre, or on a millionth of a standard deviation, no box holds the minimum.
-        if (size == _FIRST and not _convex(cost, box, atlas, i, np.zeros(3), margin)) or size < 1e-6:
-            return False
-        size *= 0.5
-        trial = np.minimum(hull, size)
-    while size < _WIDEST and _convex(cost, box, atlas, i, np.minimum(hull, _DOUBLED * size), margin):
-        size *= _DOUBLED
-    sides[:] = np.minimum(hull, size)
-    for k in range(atlas.dimension):
-        trial = sides.copy()
-        trial[k] = min(_GROWTH * sides[k], hull[k])
-        while trial[k] > sides[k] and _convex(cost, box, atlas, i, trial, margin):
-            sides[k] = trial[k]
-            trial[k] = min(_GROWTH * sides[k], hull[k])
-    return True
-
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 
 # Branch and bound over all positions, for costs that nothing encloses.
 
@@ -331,17 +143,14 @@ def search_everywhere(
             continue
         shown, level = now + 1, levels[first]
         if boxes >= budget or max(size, waiting) + _SPARE > _CAPACITY:
-            if shown < levels.shape[0]:
-                return CLEAR, boxes, value, shown, met
-            return SPENT, boxes, least_left(stack, size), shown, met
+            spent = shown == levels.shape[0]
+            return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
         size -= 1
         boxes += 1
         piece = int(stack[size, PIECE])
         if not _take(stack, size, atlas, chart, corners, box, piece):
             continue
-        bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
-        linearise_rows(cost.K, cost.w, box.nodes, box.rows)
-        low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
+        low = _bound(cost, atlas, box, floor)
         if low > 0.0 and low * low >= level:
             continue
         here, noise = cost_at(cost.K, cost.w, box.nodes), rounding(cost.K, cost.weight, floor, box.nodes)
@@ -349,28 +158,17 @@ def search_everywhere(
             position(atlas, found)
             return CHEAPER, boxes, 0.0, shown, met
         touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
-        # What cannot hold a residual shorter than that of the first level is cut off from all sides.
-        uncut(box.half, box.cut)
-        rho, flat = sqrt(max(level, 0.0)) + noise, box.half[2] == 0.0
-        shrink(cost.K, cost.weight, rho, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
-        # The test is dear, and fails in large boxes: only where the cost is low it can spare splits.
-        sound = whole or (low > 0.0 and low * low >= value)
-        if is_empty(box.cut) or (
-            sound and here < _NEAR * (level + 1.0) and _clips_away(cost, atlas, box, touching, noise)
-        ):
+        # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
+        sound = (whole or (low > 0.0 and low * low >= value)) and here < _NEAR * (level + 1.0)
+        if _is_cleared(cost, atlas, box, touching, sqrt(max(level, 0.0)), noise, sound):
             continue
         side = steepest_side(box.half, box.rows, d)
         lows += int(here < level)
         # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
-        if here < level and lows & (lows - 1) == 0 and _another(cost, atlas, chart, near, level, found):
-            known, trial = atlas.minima.home.shape[0], one_more(atlas)
-            if met == rivals.shape[0] or not _set_rival(cost, near, trial, known, found, value, eps):
-                return ANOTHER, boxes, 0.0, shown, met
-            for k in range(d):
-                rivals[met, k] = found[k]
-            met, atlas = met + 1, trial
-            core = atlas.minima.core[known]
-            size = push_around(stack, size, -core, core, atlas.minima.sides[known], 2 * d + 1 + known)
+        if here < level and lows & (lows - 1) == 0:
+            met, size, atlas = _meet(cost, atlas, chart, near, levels, first, eps, stack, size, rivals, met, found)
+            if met < 0:
+                return ANOTHER, boxes, 0.0, shown, 0
             set_centre(atlas, piece, box.at)
         if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
             first = _first_below(levels, first, _at_infinity(cost, atlas, box))
@@ -404,20 +202,62 @@ def _take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[
     return size, left
 
 
-@compiled
-def _set_rival(cost: Cost, near: Box, atlas: Atlas, i: int, x: Array, value: float, eps: float) -> bool:
-    """Write a minimum that was met, and whose tables `near` holds, into an atlas; return False where it costs less.
+@inlined
+def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
+    """Return a lower bound of the residual's length over a box whose centre is set; its tables are filled."""
+    bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
+    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
+    return least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
 
-    As of those that are known, all its convex box must cost at least `value`.
+
+@inlined
+def _is_cleared(cost: Cost, atlas: Atlas, box: Box, touching: bool, rho: float, noise: float, sound: bool) -> bool:
+    """Return whether nothing of a box can hold a residual shorter than rho, or a minimum where that is `sound`.
+
+    Else the ends of what can are those of ``box.cut``.
     """
-    slack = max(0.5 * (cost_at(cost.K, cost.w, near.nodes) - value), 0.5 * eps)
-    if not set_minimum(cost, near, atlas, i, x, value + 0.5 * slack, 0.5 * slack, inf):
-        return False
-    _widen_core(atlas, i, inf)
-    return True
+    uncut(box.half, box.cut)
+    flat = box.half[2] == 0.0
+    shrink(cost.K, cost.weight, rho + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
+    return is_empty(box.cut) or (sound and _clips_away(cost, atlas, box, touching, noise))
 
 
 @compiled
+def _meet(
+    cost: Cost,
+    atlas: Atlas,
+    chart: Chart,
+    near: Box,
+    levels: Array,
+    first: int,
+    eps: float,
+    stack: Array,
+    size: int,
+    rivals: Array,
+    met: int,
+    found: Array,
+) -> tuple[int, int, Atlas]:
+    """Descend from the centre set; where that ends in another minimum, write it and push boxes around it.
+
+    Returns how many rivals there are, -1 where that one cannot be searched around; the size of the stack; the atlas.
+    """
+    if not _another(cost, atlas, chart, near, levels[first], found):
+        return met, size, atlas
+    known, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
+    # As of those that are known all its convex box must cost at least what nothing may fall short of.
+    slack = max(0.5 * (cost_at(cost.K, cost.w, near.nodes) - value), 0.5 * eps)
+    if met == rivals.shape[0] or not set_minimum(
+        cost, near, wider, known, found, value + 0.5 * slack, 0.5 * slack, inf
+    ):
+        return -1, size, atlas
+    widen_core(wider, known, inf)
+    for k in range(atlas.dimension):
+        rivals[met, k] = found[k]
+    core, piece = wider.minima.core[known], 2 * wider.dimension + 1 + known
+    return met + 1, push_around(stack, size, -core, core, wider.minima.sides[known], piece), wider
+
+
+@inlined
 def _take(stack: Array, row: int, atlas: Atlas, chart: Chart, corners: Array, box: Box, piece: int) -> bool:
     """Take a box off the stack and set its centre; return False where nothing of it is to be looked at.
 
@@ -533,7 +373,7 @@ def leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> 
     return _clips_away(cost, atlas, box, touching, rounding(cost.K, cost.weight, floor, box.nodes))
 
 
-@compiled
+@inlined
 def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float) -> bool:
     """Return the same as `leaves` of the part between the ends of ``box.cut``, clipped to where an infimum may lie."""
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
@@ -552,11 +392,10 @@ def _at_infinity(cost: Cost, atlas: Atlas, box: Box) -> float:
 
 # A verdict beside those of `optloc.proof.near`: the cost at infinity is within the gap.
 UNBOUNDED = 8
-# Boxes after which the search of an enclosure is given up for the atlas: of a fix between the stations, and of others.
-# Far out, and where a mirror image is known, around which no box along the axes of the fix is convex, the atlas takes
-# fewer boxes in most cases; it begins with some fifteen, and what an enclosure shows at all, it shows with less. Over
-# 2000 fixes of five and six stations of all shapes twice or half as many are a few hundredths of the time.
-_SOON, _SOON_OUTSIDE = 100, 8
+# How many times as large as the convex box around the fix an enclosure may be for its search to be tried, of a fix
+# between the stations and of others, and boxes after which that is given up for the atlas. What is six times as large
+# takes some sixteen boxes, as an atlas of a fix outside does; of what is fifty times as large few end with a hundred.
+_REACH, _REACH_OUTSIDE, _SOON = 50.0, 6.0, 100
 # Distance, relative to that of the fix, within which two minima are the same: a descent's own accuracy.
 _CLOSE = 1e-3
 
@@ -595,8 +434,8 @@ def prove_everywhere(
     """
     nowhere, bound_to = np.full(x.shape[0], np.nan), beside.planes.shape[0] + beside.surface.shape[0] > 0
     open_end = not bound_to and reaches_infinity(cost.kinds, cost.K)  # the atlas is of all space
-    first = min(budget, _soon(cost, x, beside)) if open_end else budget
-    verdict, boxes, bound = prove(cost, box, x, beside, gaps[0], eps, first, nowhere, nowhere, False, found)
+    first, reach = (min(budget, _SOON), _reach_of(cost, x)) if open_end else (budget, inf)
+    verdict, boxes, bound = prove(cost, box, x, beside, gaps[0], eps, first, reach, nowhere, nowhere, False, found)
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))
     if not open_end or not again or boxes >= budget:
         return verdict, boxes, bound, gaps[0], 0
@@ -605,13 +444,13 @@ def prove_everywhere(
 
 
 @compiled
-def _soon(cost: Cost, x: Array, beside: Known) -> int:
-    """Return after how many boxes the search of an enclosure is given up."""
+def _reach_of(cost: Cost, x: Array) -> float:
+    """Return how many times as large as a convex box an enclosure may be for its search to be tried."""
     middle, radius = cube(cost.kinds, cost.data, x)
-    between = beside.points.shape[0] == 0
+    between = True
     for k in range(x.shape[0]):
         between = between and abs(x[k] - middle[k]) < radius
-    return _SOON if between else _SOON_OUTSIDE
+    return _REACH if between else _REACH_OUTSIDE
 
 
 @compiled
@@ -632,7 +471,7 @@ def prove_atlas(
         hidden = p > others.shape[0] - beside.hidden
         least_here, limit = (-inf, HIDDEN_REACH) if hidden else (least - 0.5 * eps, inf)
         if set_minimum(cost, box, atlas, known, place, least_here, 0.5 * eps, limit):
-            _widen_core(atlas, known, limit)
+            widen_core(atlas, known, limit)
             known += 1
         elif p == 0:
             return STATIONARY, 0, -inf, gaps[0], 0

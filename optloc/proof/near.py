@@ -28,7 +28,6 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.chart import (
-    HIDDEN_REACH,
     Box,
     Chart,
     Cost,
@@ -37,7 +36,6 @@ from optloc.proof.chart import (
     curve_along,
     curve_box,
     descend,
-    is_convex,
     lay_down,
     place,
     shapes_of,
@@ -45,6 +43,7 @@ from optloc.proof.chart import (
     value_at,
     widen,
 )
+from optloc.proof.convex_boxes import is_known, known_minima
 from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
 from optloc.proof.enclosure import around_node, enclose
 from optloc.proof.nodes.node import (
@@ -276,141 +275,6 @@ def _widest(half: Array) -> int:
     return 1 if half[1] >= half[2] else 2
 
 
-# Boxes around minima on which the cost is convex: no second minimum fits in.
-
-# What is left of a box that is not convex: a third of its volume. And how often it is made smaller: a hull of a billion
-# standard deviations comes down to half of one.
-_SHARE, _SHRINKS = 0.7, 60
-# Other minima must be known to a hundredth of a standard deviation: margin of convexity over slope.
-_POLISHED = 100.0
-
-
-@inlined
-def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float) -> bool:
-    """Make a box around its centre as large as the cost is found convex on it; return False where it is on none.
-
-    Convex over the whole hull in most cases; else the hull is shrunk as a whole.
-
-    Parameters
-    ----------
-    cost, chart : Cost, Chart
-        The cost and its search coordinates.
-    box : Box
-        Its centre `at` is a minimum; its half-widths are written.
-    hull : array (3,)
-        Half-widths beyond which there is nothing to gain.
-    margin : float
-        By how much the Hessian of f/2 must exceed zero.
-    """
-    size = 1.0
-    for _ in range(_SHRINKS):
-        for k in range(3):
-            box.half[k] = size * hull[k]
-        if is_convex(cost, chart, box, margin):
-            return True
-        size *= _SHARE
-    return False
-
-
-@compiled
-def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
-    """Return whether a box lies inside the convex box (half-widths `sides`) of a known minimum."""
-    for p in range(minima.shape[0]):
-        inside = True
-        for k in range(3):
-            inside = inside and abs(at[k] - minima[p, k]) + half[k] <= sides[p, k]
-        if inside:
-            return True
-    return False
-
-
-@inlined
-def known_minima(
-    cost: Cost,
-    chart: Chart,
-    box: Box,
-    known: Known,
-    low: Array,
-    high: Array,
-    margin: float,
-    value: float,
-    own: bool,
-) -> tuple[Array, Array, int, int]:
-    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, two numbers.
-
-    These are how many there are, 0 where the cost is not convex around the fix; and how many of them are the fix, which
-    comes first, or hidden. Points that are no minima are left out, and those whose box holds a point below `value`,
-    unless they are hidden; without the fix (`own`), those of another piece of a surface.
-    """
-    others = known.points
-    count, free, size = 0, 0, 1 + others.shape[0]
-    minima, sides, hull, shift = np.zeros((size, 3)), np.zeros((size, 3)), np.empty(3), np.zeros(3)
-    for i in range(0 if own else 1, size):
-        hidden = 0 < i <= known.hidden
-        p = size - i if hidden else (i - known.hidden if i > 0 else 0)
-        box.at[:] = 0.0
-        if p > 0:
-            for k in range(3):
-                for m in range(others.shape[1]):
-                    box.at[k] += chart.back[k, m] * (others[p - 1, m] - chart.origin[m])
-            box.half[:] = 0.0
-            if chart.surface.shape[0] > 0:
-                box.at[2] = 0.0
-            if not is_convex(cost, chart, box, 0.0) or is_elsewhere(chart, box, others[p - 1]):
-                continue
-            sums = box.sums
-            # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point, and the cost there
-            # is less by slope^2 / margin at most.
-            margin = _POLISHED * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
-            least = cost_at(cost.K, cost.w, box.nodes) - margin / (_POLISHED * _POLISHED)
-            if not hidden and not least >= value:
-                continue
-        for k in range(3):
-            hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
-        if hidden:
-            draw_in(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
-        if set_convex(cost, chart, box, hull, margin):
-            # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
-            shift[:] = 0.0
-            if p > 0:
-                widen(chart, box.centre, shift)
-            for k in range(3):
-                minima[count, k], sides[count, k] = box.at[k], max(box.half[k] - shift[k], 0.0)
-            count += 1
-            free += int(p == 0 or hidden)
-        elif p == 0:
-            return minima, sides, 0, 0
-    return minima, sides, count, free
-
-
-# How far, metres, the point of a surface at the search coordinates of another may be from it: below an Earth's radius,
-# where its other side is, and above all rounding.
-_ASIDE = 1e5
-
-
-@inlined
-def is_elsewhere(chart: Chart, box: Box, place_of: Array) -> bool:
-    """Return whether a point (D,) of a surface is not that at its own search coordinates, but behind it."""
-    apart = 0.0
-    for m in range(place_of.shape[0]):
-        apart = max(apart, abs(place_of[m] - box.centre[m]))
-    return bool(chart.surface.shape[0] > 0 and apart > _ASIDE)
-
-
-@compiled
-def draw_in(sense: Array, hull: Array) -> None:
-    """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
-    share = 1.0
-    for k in range(3):
-        reach = 0.0
-        for m in range(3):
-            reach += abs(sense[k, m]) * hull[m]
-        if reach * share > HIDDEN_REACH:
-            share = HIDDEN_REACH / reach
-    for k in range(3):
-        hull[k] *= share
-
-
 # The proof.
 
 # Half-width from which on an enclosure is none: its products would overflow.
@@ -431,6 +295,7 @@ def prove(
     kappa: float,
     eps: float,
     budget: int,
+    reach: float,
     lower: Array,
     upper: Array,
     closed: bool,
@@ -454,6 +319,8 @@ def prove(
         How far below the cost of the fix still counts as equal, 1e-6 (1 + f) or so: covers rounding.
     budget : int
         How many boxes may be looked at.
+    reach : float
+        How many times as large as the convex box around the fix what is searched may be; beyond, no box is looked at.
     lower, upper : array (D,)
         Corners of the region to search, in the frame of x; NaN in lower[0] asks for an enclosure of all points that
         cost less than f(x) + kappa, which makes the claim a global one.
@@ -495,6 +362,8 @@ def prove(
     minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
     if count == 0:
         return STATIONARY, 0, -inf
+    if not _extent(low, high, sides[0]) <= reach:
+        return BUDGET, 0, -inf
     if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
         count = free
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
@@ -514,6 +383,16 @@ def prove(
     for k in range(x.shape[0]):
         found[k] = box.centre[k]
     return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
+
+
+@inlined
+def _extent(low: Array, high: Array, sides: Array) -> float:
+    """Return how many times as large as a box around a fix what is searched is along one axis."""
+    most = 0.0
+    for k in range(3):
+        if sides[k] > 0.0:
+            most = max(most, max(high[k], -low[k]) / sides[k])
+    return most
 
 
 @compiled

@@ -8,8 +8,8 @@ from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.proof.box import is_empty, uncut
 from optloc.proof.chart import curve_box, is_convex
+from optloc.proof.convex_boxes import set_convex
 from optloc.proof.curvature import C00, SUMS, clip_to_stationary, convex, spread_of
-from optloc.proof.near import set_convex
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges
 

@@ -14,9 +14,10 @@ from optloc.compute.systems import inverse
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.box import cube, is_empty, least_residual, linearise_rows, rounding, shrink, uncut
 from optloc.proof.chart import Chart, chart_at, cost_of, curve_box, empty_box, value_at
+from optloc.proof.convex_boxes import accuracy_floor_far
 from optloc.proof.curvature import clip_to_stationary, sum_up
 from optloc.proof.enclosure import enclose
-from optloc.proof.everywhere import accuracy_floor_far, leaves, prove_everywhere
+from optloc.proof.everywhere import leaves, prove_everywhere
 from optloc.proof.near import UNIQUE, VALUE
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, SLOPE0

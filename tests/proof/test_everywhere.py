@@ -10,7 +10,8 @@ from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.chart import cost_of, empty_box
-from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere, set_minimum
+from optloc.proof.convex_boxes import set_minimum
+from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE, prove
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 
@@ -95,7 +96,7 @@ def by_both(cost, box, x, others, kappa, eps, budget, found):
 
 def by_enclosure(cost, box, x, others, kappa, eps, budget, found):
     nowhere = np.full(len(x), np.nan)
-    return prove(cost, box, x, others, kappa, eps, budget, nowhere, nowhere, False, found)
+    return prove(cost, box, x, others, kappa, eps, budget, np.inf, nowhere, nowhere, False, found)
 
 
 @pytest.mark.usefixtures("form")

@@ -7,7 +7,7 @@ from proof.sampling import numbers, value
 from optloc.proof.atlas import atlas_of, clip_to_corners, home_of, position, set_centre, within
 from optloc.proof.box import cube
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
-from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
+from optloc.proof.nodes.node import AZIMUTH, CURVE_WIDTH, ELEVATION, NODE_WIDTH, RANGE, RATIO
 
 NAMES = {2: ("range", "azimuth", "groa"), 3: ("range", "azimuth", "groa", "elevation")}
 CODES = {"range": RANGE, "azimuth": AZIMUTH, "groa": RATIO, "elevation": ELEVATION}
@@ -70,7 +70,7 @@ def test_no_sample_leaves_its_enclosure_in_any_piece(d):
         kinds, data, atlas = scene(d, rng)
         piece = n % (2 * d + 2)
         at, half = some_box(d, piece, rng)
-        nodes = np.zeros((len(kinds), 6))
+        nodes = np.zeros((len(kinds), NODE_WIDTH))
         set_centre(atlas, piece, at)
         bound_pieces(atlas, kinds, data, half, nodes)
         s = rng.uniform(-1.0, 1.0, (800, 3))
@@ -97,7 +97,7 @@ def test_gradients_and_hessians_change_no_more_than_bounded(d):
         kinds, data, atlas = scene(d, rng)
         piece = n % (2 * d + 2)
         at, half = some_box(d, piece, rng)
-        nodes, curves, there, bent = (np.zeros((len(kinds), size)) for size in (6, 14, 6, 14))
+        nodes, curves, there, bent = (np.zeros((len(kinds), size)) for size in (NODE_WIDTH, CURVE_WIDTH) * 2)
         set_centre(atlas, piece, at)
         bound_pieces(atlas, kinds, data, half, nodes)
         curve_pieces(atlas, kinds, data, half, nodes, curves)

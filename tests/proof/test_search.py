@@ -21,7 +21,7 @@ def proof(case, x, kappa=0.0, others=(), region=None, budget=BUDGET_HERE, closed
     eps = 1e-6 * (1.0 + case.cost(x))
     K = np.ascontiguousarray(case.K)
     cost, box = cost_of(case.kinds, case.data, K, case.w), empty_box(*K.shape)
-    answer = prove(cost, box, x, known, kappa, eps, budget, low, high, closed, found)
+    answer = prove(cost, box, x, known, kappa, eps, budget, np.inf, low, high, closed, found)
     return *answer, found
 
 

@@ -122,9 +122,11 @@ def bound_pieces(atlas, kinds, data, half, nodes):
     for j in range(kinds.shape[0]):
         kind, own = kinds[j], data[j]
         if kind == RANGE:
-            value, low, high, g = bound_difference(frame, own, centre, h, away, sense)
+            value, low, high, g, form = bound_difference(frame, own, centre, h, away, sense)
             nodes[j, SLOPE0], nodes[j, SLOPE1], nodes[j, SLOPE2] = g
             nodes[j, PHI], nodes[j, LOW], nodes[j, HIGH] = value, low, high
+            nodes[j, FORM], nodes[j, FORM + 4], nodes[j, FORM + 5] = form[0], form[2], form[3]
+            nodes[j, FORM + 1], nodes[j, FORM + 2], nodes[j, FORM + 3] = form[1]
             continue
         slope = nodes[j, SLOPE0 : SLOPE2 + 1]
         set_line(frame, own, 0, away, sense)
@@ -140,8 +142,7 @@ def curve_pieces(atlas, kinds, data, half, nodes, curves):
     for j in range(kinds.shape[0]):
         kind, own = kinds[j], data[j]
         if kind == RANGE:
-            flat = nodes[j, SLOPE0] == 0.0 and nodes[j, SLOPE1] == 0.0 and nodes[j, SLOPE2] == 0.0
-            second, turns, chi = curve_difference(frame, own, centre, bent, h, flat, away, sense)
+            second, turns, chi = curve_difference(frame, own, nodes[j], centre, bent, h, away, sense)
             curves[j, H00], curves[j, H01], curves[j, H02] = second[0], second[1], second[2]
             curves[j, H11], curves[j, H12], curves[j, H22] = second[3], second[4], second[5]
             curves[j, TURN0], curves[j, TURN1], curves[j, TURN2] = turns
@@ -209,7 +210,7 @@ _KERNELS = ("bound", "curve", "size", "ball", "ray")
 # What the loops name beside the functions of the nodes.
 _NAMED = (range_form, triple, frame_of, set_line, bound_difference, curve_centre, curve_difference)
 _COLUMNS = (
-    *("RANGE", "PHI", "SLOPE0", "SLOPE1", "SLOPE2", "LOW", "HIGH"),
+    *("RANGE", "PHI", "SLOPE0", "SLOPE1", "SLOPE2", "LOW", "HIGH", "FORM"),
     *("H00", "H01", "H02", "H11", "H12", "H22", "TURN0", "TURN1", "TURN2", "CHI", "FORCE"),
 )
 

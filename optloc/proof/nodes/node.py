@@ -51,8 +51,9 @@ FLAT, CONVEX, MIXED = range(3)
 # lines alone, so that scaled lines serve as well. Or only differences of such nodes are finite: ranges.
 GROWS, SCALED, DIFFERENCE = range(3)
 
-# Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, enclosure of the remainder.
-PHI, SLOPE0, SLOPE1, SLOPE2, LOW, HIGH, NODE_WIDTH = range(7)
+# Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, enclosure of the remainder. And
+# of a range over a piece of an atlas what its curvature asks for: all that `range_form` says, but for the last number.
+PHI, SLOPE0, SLOPE1, SLOPE2, LOW, HIGH, FORM, NODE_WIDTH = 0, 1, 2, 3, 4, 5, 6, 12
 # Columns of a table of second derivatives (J, CURVE_WIDTH): the Hessian's entries, bounds of the change of the gradient
 # and of the Hessian, and what the rows add to them: the force K'(K phi - w) on the node, its pull K'J, and how far the
 # force may be from what it is computed to be.
@@ -329,14 +330,15 @@ def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
     """
     n = triple(line, 0)
     r = length(n)
-    u = pull((n[0] / r, n[1] / r, n[2] / r) if r > 0.0 else (1.0, 0.0, 0.0), sense)
+    per = 1.0 / r if r > 0.0 else 0.0
+    u = pull((n[0] * per, n[1] * per, n[2] * per) if r > 0.0 else (1.0, 0.0, 0.0), sense)
     swing, aside = reach(u, h), across(sense, u, h)
     # The farthest corner, up to the rounding of its root.
     far = sqrt((r + swing) * (r + swing) + aside * aside) * (1.0 + 1e-15)
     return r, u, r - swing, excess(r - swing, aside), far
 
 
-@compiled
+@inlined
 def range_bend(
     sense: Array, h: Triple, r: float, u: Triple, least: float, remainder: float
 ) -> tuple[Symmetric, Triple, float, float]:
@@ -358,23 +360,23 @@ def range_bend(
     turn, change, norm
         As above.
     """
-    g = _gram(sense, u)
-    hessian = (g[0] / r, g[1] / r, g[2] / r, g[3] / r, g[4] / r, g[5] / r)
+    g, per = _gram(sense, u), 1.0 / r
+    hessian = (g[0] * per, g[1] * per, g[2] * per, g[3] * per, g[4] * per, g[5] * per)
     trace = hessian[0] + hessian[3] + hessian[5]
     if not least > 0.0:
         return hessian, (inf, inf, inf), inf, trace
-    back, (w0, w1, w2) = r / least, reaches(hessian, h)
+    most, (w0, w1, w2) = 1.0 / least, reaches(hessian, h)
     turn = (
-        w0 * back + remainder * abs(u[0]) / least,
-        w1 * back + remainder * abs(u[1]) / least,
-        w2 * back + remainder * abs(u[2]) / least,
+        (w0 * r + remainder * abs(u[0])) * most,
+        (w1 * r + remainder * abs(u[1])) * most,
+        (w2 * r + remainder * abs(u[2])) * most,
     )
     eta = length(turn)
-    change = eta * (2.0 * length(u) + eta) / least + trace * (reach(u, h) + remainder) / least
+    change = (eta * (2.0 * length(u) + eta) + trace * (reach(u, h) + remainder)) * most
     return hessian, turn, change, trace
 
 
-@compiled
+@inlined
 def reaches(matrix: Symmetric, h: Triple) -> Triple:
     """Return the greatest values over a box of the entries of ``matrix s``, see `row_reach`."""
     m00, m01, m02, m11, m12, m22 = matrix

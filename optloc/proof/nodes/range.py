@@ -14,6 +14,7 @@ from optloc.proof.nodes.node import (
     CHI,
     CONVEX,
     DIFFERENCE,
+    FORM,
     H00,
     H01,
     H02,
@@ -41,6 +42,7 @@ from optloc.proof.nodes.node import (
     range_bend,
     range_form,
     reach,
+    triple,
 )
 from optloc.proof.nodes.ratio import quotient, quotient_bend
 
@@ -151,8 +153,8 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
 @inlined
 def bound_difference(
     frame: Frame, data: Array, centre: RangeForm, h: Triple, away: Array, sense: Array
-) -> tuple[float, float, float, Triple]:
-    """Return a range less the distance to the centre over a box, metres: value, ends of the remainder, and slope.
+) -> tuple[float, float, float, Triple, RangeForm]:
+    """Return a range less the distance to the centre over a box, metres: value, ends of the remainder, slope, its form.
 
     A quotient N/S with N linear, as ratios are (`optloc.proof.nodes.ratio.bound_ratio`), and at most ``R |a|`` in size.
 
@@ -172,7 +174,7 @@ def bound_difference(
     radius = frame.radius
     set_line(frame, data, 0, away, sense)
     a, rise, n = scaled_station(frame, data)
-    r, u, least, q, far = range_form(away, sense, h)
+    r, u, least, q, far = form = range_form(away, sense, h)
     r0, u0, least0, q0, far0 = centre
     size, u, most = r + r0, blend(1.0, u, 1.0, u0), q + q0
     phi, least = rise / size if size > 0.0 else 0.0, max(least, 0.0) + max(least0, 0.0)
@@ -181,8 +183,8 @@ def bound_difference(
         low, high = quotient(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
         # By the triangle inequality the difference of the two distances is within |a| of zero.
         if high - low <= 2.0 * a:
-            return radius * phi, radius * low, radius * high, blend(radius, g, 0.0, g)
-    return radius * phi, radius * (-a - phi), radius * (a - phi), (0.0, 0.0, 0.0)
+            return radius * phi, radius * low, radius * high, blend(radius, g, 0.0, g), form
+    return radius * phi, radius * (-a - phi), radius * (a - phi), (0.0, 0.0, 0.0), form
 
 
 @inlined
@@ -196,7 +198,7 @@ def curve_centre(slant: Array, centre: RangeForm, h: Triple) -> RangeBend:
 
 @inlined
 def curve_difference(
-    frame: Frame, data: Array, centre: RangeForm, bent: RangeBend, h: Triple, flat: bool, away: Array, sense: Array
+    frame: Frame, data: Array, node: Array, centre: RangeForm, bent: RangeBend, h: Triple, away: Array, sense: Array
 ) -> tuple[Symmetric, Triple, float]:
     """Return how a range less the distance to the centre curves over a box: Hessian, and bounds of what changes.
 
@@ -204,32 +206,28 @@ def curve_difference(
     ----------
     frame, data, centre, h, away, sense
         As of `bound_difference`.
+    node : array (NODE_WIDTH,)
+        What that found.
     bent : tuple
         What `curve_centre` says of p.
-    flat : bool
-        Whether that found no slope.
     """
-    radius = frame.radius
-    set_line(frame, data, 0, away, sense)
-    a, rise, n = scaled_station(frame, data)
+    m0, m1, m2 = frame.middle
     still, own = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if a == 0.0:  # the node is zero
+    if data[0] == m0 and data[1] == m1 and (data[2] == m2 or not frame.space):  # the node is zero
         return own, still, 0.0
-    r, u, least, q, _ = range_form(away, sense, h)
+    r, u, least, q = node[FORM], triple(node, FORM + 1), node[FORM + 4], node[FORM + 5]
     r0, u0, least0, q0, _ = centre
-    if flat or not (least > 0.0 and least0 > 0.0):
+    slope = triple(node, SLOPE0)
+    if slope == still or not (least > 0.0 and least0 > 0.0):
         return own, (inf, inf, inf), inf
+    set_line(frame, data, 0, away, sense)
     second, ds, change, norm = range_bend(sense, h, r, u, least, q)
     second0, ds0, change0, norm0 = bent
     size, u = r + r0, blend(1.0, u, 1.0, u0)
-    phi = rise / size
-    g = blend(1.0 / size, n, -phi / size, u)
-    # N is linear.
+    # The numerator of the quotient is linear.
     changes = (still, blend(1.0, ds, 1.0, ds0), 0.0, change + change0, norm + norm0, reach(u, h) + q + q0)
-    own, turn, chi = quotient_bend(g, u, (phi, size, least + least0), changes, h, own, add(second, second0))
-    h00, h01, h02, h11, h12, h22 = own
-    own = (radius * h00, radius * h01, radius * h02, radius * h11, radius * h12, radius * h22)
-    return own, blend(radius, turn, 0.0, turn), radius * chi
+    # In metres: the value, its slope, and so all that becomes of them.
+    return quotient_bend(slope, u, (node[PHI], size, least + least0), changes, h, own, add(second, second0))
 
 
 @compiled

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, sqrt
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, inlined
 from optloc.proof.nodes.node import (
     SCALED,
     Node,
@@ -177,7 +177,7 @@ def _square_entry(sense: Array, sense_b: Array, k: int, m: int) -> float:
     return 2.0 * entry
 
 
-@compiled
+@inlined
 def quotient_bend(
     g: Triple,
     u: Triple,
@@ -209,24 +209,25 @@ def quotient_bend(
     b00, b01, b02, b11, b12, b22 = bend
     g0, g1, g2 = g
     u0, u1, u2 = u
+    per, most = 1.0 / size, 1.0 / least  # a quotient takes as long as five products
     own = (
-        (c00 - 2.0 * g0 * u0 - phi * b00) / size,
-        (c01 - g0 * u1 - u0 * g1 - phi * b01) / size,
-        (c02 - g0 * u2 - u0 * g2 - phi * b02) / size,
-        (c11 - 2.0 * g1 * u1 - phi * b11) / size,
-        (c12 - g1 * u2 - u1 * g2 - phi * b12) / size,
-        (c22 - 2.0 * g2 * u2 - phi * b22) / size,
+        (c00 - 2.0 * g0 * u0 - phi * b00) * per,
+        (c01 - g0 * u1 - u0 * g1 - phi * b01) * per,
+        (c02 - g0 * u2 - u0 * g2 - phi * b02) * per,
+        (c11 - 2.0 * g1 * u1 - phi * b11) * per,
+        (c12 - g1 * u2 - u1 * g2 - phi * b12) * per,
+        (c22 - 2.0 * g2 * u2 - phi * b22) * per,
     )
     # phi' r' = N', so the change of phi is (N' - N - phi (S' - S)) / S': its own slope, and what that changes by.
-    rise = reach(g, h) * size / least + (reach(dn, h) + abs(phi) * reach(ds, h)) / least
+    rise = (reach(g, h) * size + reach(dn, h) + abs(phi) * reach(ds, h)) * most
     norm = own[0] * own[0] + own[3] * own[3] + own[5] * own[5]
     norm += 2.0 * (own[1] * own[1] + own[2] * own[2] + own[4] * own[4])
-    t0 = (dn[0] + abs(phi) * ds[0] + rise * (abs(u0) + ds[0]) + widen * abs(g0)) / least
-    t1 = (dn[1] + abs(phi) * ds[1] + rise * (abs(u1) + ds[1]) + widen * abs(g1)) / least
-    t2 = (dn[2] + abs(phi) * ds[2] + rise * (abs(u2) + ds[2]) + widen * abs(g2)) / least
+    t0 = (dn[0] + abs(phi) * ds[0] + rise * (abs(u0) + ds[0]) + widen * abs(g0)) * most
+    t1 = (dn[1] + abs(phi) * ds[1] + rise * (abs(u1) + ds[1]) + widen * abs(g1)) * most
+    t2 = (dn[2] + abs(phi) * ds[2] + rise * (abs(u2) + ds[2]) + widen * abs(g2)) * most
     dg, du = length((t0, t1, t2)), length(ds)
     mixed = 2.0 * (dg * length(u) + length(g) * du + dg * du)
-    chi = (chi_n + mixed + abs(phi) * chi_s + rise * (norm_s + chi_s) + widen * sqrt(norm)) / least
+    chi = (chi_n + mixed + abs(phi) * chi_s + rise * (norm_s + chi_s) + widen * sqrt(norm)) * most
     (w0, w1, w2), far = reaches(own, h), chi * length(h)
     return own, (min(t0, w0 + far), min(t1, w1 + far), min(t2, w2 + far)), chi
 

@@ -27,31 +27,10 @@ from optloc.proof.chart import (
     turned,
     widen,
 )
+from optloc.proof.convex_boxes import draw_in, is_elsewhere, set_axes, set_hull
 from optloc.proof.curvature import G0, G1, G2, entry
-from optloc.proof.everywhere import (
-    CHEAPER,
-    CLEAR,
-    INFINITE,
-    SPENT,
-    UNBOUNDED,
-    push_pieces,
-    set_axes,
-    set_hull,
-)
-from optloc.proof.near import (
-    BETTER,
-    BUDGET,
-    OPEN,
-    OTHER,
-    SINGULAR,
-    STATIONARY,
-    UNIQUE,
-    VALUE,
-    Aim,
-    draw_in,
-    is_elsewhere,
-    region_of,
-)
+from optloc.proof.everywhere import CHEAPER, CLEAR, INFINITE, SPENT, UNBOUNDED, push_pieces
+from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, Aim, region_of
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
 from optloc.proof.runs.ground import Ground, axes_at, corners_on, over_ground, state_off, state_on

@@ -37,22 +37,10 @@ from optloc.proof.chart import (
     place,
     widen,
 )
+from optloc.proof.convex_boxes import accuracy_floor_far, is_known
 from optloc.proof.curvature import G0, G1, G2, curve_nodes, has_no_infimum
-from optloc.proof.everywhere import (
-    ANOTHER,
-    CHEAPER,
-    CLEAR,
-    INFINITE,
-    SPENT,
-    accuracy_floor_far,
-    is_left,
-    is_listed,
-)
-from optloc.proof.near import (
-    Aim,
-    is_known,
-    lay_or_halve,
-)
+from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, is_left, is_listed
+from optloc.proof.near import Aim, lay_or_halve
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
 from optloc.proof.runs.posed import Run
