@@ -8,12 +8,14 @@ from scipy.optimize import least_squares, minimize_scalar
 
 from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of
+from optloc.proof.batch import Asked, prove_all
 from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.chart import cost_of, empty_box
 from optloc.proof.convex_boxes import set_minimum
 from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE, prove
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+from optloc.proof.pose import Posed
 
 # Of directions, radians.
 FINE = {"xatol": 1e-12}
@@ -210,41 +212,60 @@ def test_no_mirror_of_a_flat_network_is_proven_in_full(seed):
     assert offers > 300
 
 
-def check_what_is_shown(problem, minima, budget):
-    """Check a claim of as much as a budget shows against the minima known; return the gap, -1 for none, and rivals."""
-    kinds, data, K, w = problem
-    (least, best), rivals = minima[0], np.full((4, 3), np.nan)
-    args = (beside([]), np.array([25.0, 9.0, 0.0]), 1e-6 * (1.0 + least), budget, rivals, np.zeros(3))
-    verdict, boxes, bound, gap, met = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), best, *args)
-    if verdict not in (UNIQUE, VALUE):
-        return -1.0, 0
-    assert boxes <= budget
-    assert (verdict == UNIQUE) == (gap > 0.0)
-    assert least - 2e-6 * (1.0 + least) <= bound <= least
+def shown(problems, minima, gaps, budget):
+    """Return what a budget shows of the least minimum of each problem, by the machine code of batches."""
+    kinds, x, least = problems[0][0], np.array([m[0][1] for m in minima]), np.array([m[0][0] for m in minima])
+    data, K, w = (np.stack(arrays) for arrays in list(zip(*problems, strict=True))[1:])
+    (n, d), none = x.shape, np.zeros(len(x), dtype=np.int64)
+    nowhere = np.full((n, 2, d), np.nan)
+    asked = Asked(
+        x,
+        np.zeros((n, 0, d)),
+        none,
+        none,
+        np.tile(gaps, (n, 1)),
+        1e-6 * (1.0 + least),
+        nowhere,
+        nowhere,
+        np.full(n, budget),
+        np.zeros((n, 0, 3)),
+        np.zeros((n, 0)),
+    )
+    return prove_all(Posed(kinds, data, K, w, np.full(n, np.inf)), asked)
+
+
+def check_what_is_shown(problem, minima, answer, budget):
+    """Check a claim against the minima known; return the gap, -1 for none."""
+    (_, data, K, w), (least, best) = problem, minima[0]
+    if answer.verdict not in (UNIQUE, VALUE):
+        return -1.0
+    rivals = answer.rivals[: answer.met]
+    assert answer.boxes <= budget
+    assert (answer.verdict == UNIQUE) == (answer.gap > 0.0)
+    assert least - 2e-6 * (1.0 + least) <= answer.bound <= least
     for cost, x in minima[1:]:
-        near = np.linalg.norm(rivals[:met] - x, axis=1) < 1e-3 * np.linalg.norm(x - best)
-        assert cost > least + gap or near.any()
-    for x in rivals[:met]:  # each is a minimum, and there is none twice
+        near = np.linalg.norm(rivals - x, axis=1) < 1e-3 * np.linalg.norm(x - best)
+        assert cost > least + answer.gap or near.any()
+    for x in rivals:  # each is a minimum, and there is none twice
         cost, again = minima_of(data[:, :3], K, w, [x])[0]
         assert np.linalg.norm(again - x) < 1e-3 * np.linalg.norm(x - best)
         assert least <= cost < least + 25.0
-    assert all(np.linalg.norm(a - b) > 1.0 for i, a in enumerate(rivals[:met]) for b in rivals[:i])
-    return gap, met
+    assert all(np.linalg.norm(a - b) > 1.0 for i, a in enumerate(rivals) for b in rivals[:i])
+    return float(answer.gap)
 
 
 @pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 def test_a_budget_shows_as_much_as_it_can_and_goes_on_beside_rivals(seed):
     """Of every minimum that SciPy knows within the gap that is claimed the proof has told."""
-    budgets, shown, met = (40, 150, 600, 3000), [], 0
-    for problem, minima in flat_cell(30, 90 + seed):
-        gaps = []
-        for budget in budgets:
-            gap, rivals = check_what_is_shown(problem, minima, budget)
-            gaps.append(gap)
-            met += rivals
-        assert gaps == sorted(gaps)  # more boxes never show less
-        shown += gaps
-    assert {-1.0, 0.0, 25.0} <= {*shown}
+    cell, budgets, met = flat_cell(40, 90 + seed), (120, 250, 600, 3000), 0
+    gaps = np.empty((len(cell), len(budgets)))
+    for k, budget in enumerate(budgets):
+        answer = shown(*zip(*cell, strict=True), [25.0, 9.0, 0.0], budget)
+        met += int(answer.met.sum())
+        for i, (problem, minima) in enumerate(cell):
+            gaps[i, k] = check_what_is_shown(problem, minima, answer.take(i), budget)
+    assert (np.diff(gaps, axis=1) >= 0.0).all()  # more boxes never show less
+    assert {-1.0, 0.0, 25.0} <= {*gaps.ravel()}
     assert met > 10
 
 
@@ -273,22 +294,22 @@ def ends_of(S, K, w):
 
 @pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 def test_no_way_to_infinity_ends_within_the_gap_that_is_proven(seed):
-    rng, fallen, tried = np.random.default_rng([seed, 3]), 0, 0
-    while tried < 100 or fallen < 2:
-        tried += 1
-        S, x, sigma = rng.uniform(-5e3, 5e3, (4, 2)), outside(2, rng), 10.0 ** rng.uniform(1.8, 2.8)
-        kinds, data, K, w = differences(S, sigma, x, rng)
-        minima = minima_of(S, K, w, [x, *(2.0 * x * rng.standard_normal((4, 2)))])
-        if not minima:
-            continue
-        least, best = minima[0]
-        args = (beside([], 2), np.array([25.0, 9.0, 6.0, 0.0]), 1e-6 * (1.0 + least), 1000, np.zeros((4, 2)), x)
-        verdict, boxes, _, gap, _ = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), best, *args)
-        if verdict == UNIQUE:
-            ends = ends_of(S, K, w) - least
-            assert not (ends < gap - 1e-3).any()
-            fallen += gap < 25.0 and boxes < 1000 and ends.min(initial=25.0) < 25.0
-        assert tried < 5000
+    rng, fallen = np.random.default_rng([seed, 3]), 0
+    for _ in range(20):
+        problems, minima, S = [], [], rng.uniform(-5e3, 5e3, (100, 4, 2))
+        for place in S:
+            x = outside(2, rng)
+            problems.append(differences(place, 10.0 ** rng.uniform(1.8, 2.8), x, rng))
+            starts = [x, *(2.0 * x * rng.standard_normal((4, 2)))]
+            minima.append(minima_of(place, *problems[-1][2:], starts) or [(np.inf, x)])
+        answer = shown(problems, minima, [25.0, 9.0, 6.0, 0.0], 1000)
+        for i in np.flatnonzero(answer.verdict == UNIQUE):
+            ends = ends_of(S[i], *problems[i][2:]) - minima[i][0][0]
+            assert not (ends < answer.gap[i] - 1e-3).any()
+            fallen += answer.gap[i] < 25.0 and answer.boxes[i] < 1000 and ends.min(initial=25.0) < 25.0
+        if fallen > 1:
+            break
+    assert fallen > 1
 
 
 @pytest.mark.usefixtures("form")
