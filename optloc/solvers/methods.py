@@ -24,7 +24,7 @@ from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP
 from optloc.solvers.pool import Pool, offer, pack, where
-from optloc.solvers.range_fixes import Quick, worth
+from optloc.solvers.range_fixes import Quick, at_hand
 from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
@@ -239,7 +239,7 @@ class Method:
             name = "+".join(words)
             if shortcut(self):
                 return [_named(name, replace(short, alone=True))]
-            if count >= worth(count) and self.words[: len(words)] == words:
+            if at_hand(count) and self.words[: len(words)] == words:
                 return [_named(name, short), *map(_stage, self.words[len(words) :])]
         return [_stage(word) for word in self.words]
 

@@ -77,7 +77,7 @@ class Prepared:
         values = np.asarray(z, dtype=float)
         shape = self._batch(values)
         if self.short is not None and is_few(shape):
-            fix = self.short(values)
+            fix = self.short(np.broadcast_to(values, (*shape, values.shape[-1])) if self.shape else values)
             if fix is not None:
                 return fix
         # nothing is ready: the stages of the method do it as ever

@@ -213,18 +213,8 @@ _CHUNK = 4096
 TOLERANCE, LIMIT = 1e-7, 100
 
 
-# Problems from which on a batch takes machine code: fewer take the stages, whose answers do not depend on what else is
-# in the batch, to the last bit. A single problem has a way of its own (`optloc.solvers.single`).
-_WORTH = 16
 # Problems up to which narrow blocks are quicker: one of four lanes takes 25 us, two 45, four as long as one of 64.
 _FEW = 8
-
-
-def worth(count: int) -> int:
-    """Return from how many problems on the direct way is taken: whatever was loaded before, for equal answers."""
-    from optloc.compute.range_fixes import fixes
-
-    return _WORTH if usable(fixes, count) else count + 1
 
 
 def kernel_for(count: int, *, often: bool = False) -> Callable[..., int]:
@@ -263,10 +253,11 @@ class Quick:
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled pools of a flat batch of problems."""
-        count, least = problem.batch_shape[0], worth(problem.batch_shape[0])
-        plan = direct(problem) if pool is None and (self.alone or count >= least) else None
+        count = problem.batch_shape[0]
+        quick = at_hand(count)
+        plan = direct(problem) if pool is None and (self.alone or quick) else None
         refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
-        if plan is None or count < least:
+        if plan is None or not quick:
             start = pool
             if plan is not None:
                 refinement = partial(lsr_with_mirror, descend=partial(_descend, plan))

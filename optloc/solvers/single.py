@@ -8,7 +8,7 @@ takes the long way, which knows what to say of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import prod
 from threading import local
@@ -333,7 +333,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     Parameters
     ----------
     problem : Problem
-        Its own measurements do not matter.
+        Its own measurements do not matter, nor do batch axes that they alone have, or that are of length one.
     method : Method
         What its fixes are to be the same as.
     often : bool
@@ -344,7 +344,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     proves = _WORDS.get(method.words)
     if proves is None or (method.then is not None and not proves) or separable(problem):
         return None
-    bare = problem.with_rows(z=np.zeros(problem.count))
+    bare = _alone(problem)
     plan = None if bare.batch_shape else direct(bare)
     if plan is None or (proves and (unsupported(bare) or is_run(bare))):
         return None
@@ -367,20 +367,35 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     )
 
 
+def _alone(problem: Problem) -> Problem:
+    """Return a problem without measurements, and without batch axes of length one of its stations."""
+    bare = problem.with_rows(z=np.zeros(problem.count))
+    if not bare.batch_shape or prod(bare.batch_shape) > 1:
+        return bare
+    # what has a direct way has batch axes of its stations alone, of which only the places matter
+    place = bare.stations.position
+    return replace(
+        bare, stations=replace(bare.stations, position=place.reshape(place.shape[-3:]), velocity=None, axes=None)
+    )
+
+
 # What fixes one problem is made in two milliseconds and takes some 50 kB.
 _KEPT = Cache["Single | None"](64)
 
 
 def at_once(problem: Problem, method: Method) -> Fix | None:
-    """Return the fix of a problem without batch axes, past all batches; None where only the stages know what to say.
+    """Return the fixes of one problem, or of few that differ in measurements alone; None where the stages have to.
 
     What does not depend on the measurements is kept for the next problem of the same structure.
     """
-    if problem.batch_shape or not is_direct(problem):
+    shape, place = problem.batch_shape, problem.stations.position
+    if not is_few(shape) or place.size != prod(place.shape[-3:]) or not is_direct(problem):
         return None
-    place = problem.stations.position.tobytes()
-    ready = _KEPT.find((method, place, *key_of(problem)), lambda: single(problem, method))
-    return None if ready is None else ready(problem.z)
+    ready = _KEPT.find((method, place.tobytes(), *key_of(problem)), lambda: single(problem, method))
+    if ready is None:
+        return None
+    z = problem.z
+    return ready(z if z.shape[:-1] == shape else np.broadcast_to(z, (*shape, z.shape[-1])))
 
 
 def is_few(shape: tuple[int, ...]) -> bool:
