@@ -14,7 +14,7 @@ import scipy.linalg
 
 from optloc import Status, assemble, certify, measured, prepare, simulate, solve
 from optloc.base import linalg
-from optloc.solvers import METHODS, SOLVERS
+from optloc.solvers import METHODS, SOLVERS, range_fixes, single
 from optloc.solvers.certify import admitted
 
 STATIONS = np.array([[0.0, 0.0], [1000.0, 0.0], [0.0, 1000.0], [1000.0, 1100.0], [500.0, -300.0]])
@@ -85,6 +85,8 @@ def watched(monkeypatch, decide):
 
         return guarded
 
+    for kept in (range_fixes._KEPT, single._KEPT):  # what was made before would not fail again
+        kept.clear()
     with monkeypatch.context() as patch:
         for module, name, value in list(functions()):
             patch.setattr(module, name, guard(name, value))
@@ -129,7 +131,7 @@ def check(monkeypatch, method, place):
 
 
 @pytest.mark.parametrize(
-    ("methods", "least"), [(SHORT, 40), pytest.param(EVERY, 50, marks=pytest.mark.full)], ids=["short", "every"]
+    ("methods", "least"), [(SHORT, 30), pytest.param(EVERY, 50, marks=pytest.mark.full)], ids=["short", "every"]
 )
 def test_each_call_of_linear_algebra_may_fail_once(monkeypatch, methods, least):
     """Each place in the code once, in the first method that comes there, and of each method the last place."""
@@ -146,7 +148,9 @@ def test_each_call_of_linear_algebra_may_fail_once(monkeypatch, methods, least):
 @pytest.mark.full
 @METHOD
 def test_each_call_of_each_method_may_fail_once(monkeypatch, method):
-    assert sum(check(monkeypatch, method, place) for place in places(monkeypatch, method))
+    told = sum(check(monkeypatch, method, place) for place in places(monkeypatch, method))
+    # machine code calls nothing that fails, and where its maps cannot be made the stages go on
+    assert told or method in ("auto", "gtrs+lsr")
 
 
 @pytest.mark.parametrize("method", [each for each in EVERY if each != "gtrs+lsr"])  # it has no stages of these names
@@ -162,6 +166,7 @@ def test_what_fails_for_good_takes_nobody_with_it(monkeypatch, method):
         return entry.run(some, pool)
 
     monkeypatch.setitem(SOLVERS, word, replace(entry, stage=stage))
+    monkeypatch.setattr("optloc.solvers.at_once", lambda *_: None)  # which goes past the stages
     fix = solve(many, method)
     assert fix[2].status == Status.NUMERICAL
     assert fix[2].reason == f"{word}: divided by zero"

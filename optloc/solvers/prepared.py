@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -77,9 +78,10 @@ class Prepared:
         values = np.asarray(z, dtype=float)
         shape = self._batch(values)
         if self.short is not None and is_few(shape):
-            fix = self.short(np.broadcast_to(values, (*shape, values.shape[-1])) if self.shape else values)
-            if fix is not None:
-                return fix
+            with suppress(NUMERICAL):  # the stages tell which of them fails
+                fix = self.short(np.broadcast_to(values, (*shape, values.shape[-1])) if self.shape else values)
+                if fix is not None:
+                    return fix
         # nothing is ready: the stages of the method do it as ever
         if self.plan is None or not at_hand(prod(shape)):
             wide = np.broadcast_to(values, (*shape, values.shape[-1]))
@@ -149,7 +151,10 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     # without measurements, so that nothing prepared can depend on them
     bare = problem.with_rows(z=np.zeros(problem.count))
-    plan = direct(bare) if shortcut(parsed) and not separable(bare) else None
+    plan = short = None
+    with suppress(NUMERICAL):  # the stages tell which of its fixes fails
+        plan = direct(bare) if shortcut(parsed) and not separable(bare) else None
+        short = single(bare, parsed)
     position = problem.stations.position
     place = position.reshape(-1, *position.shape[-2:])
-    return Prepared(bare, method, plan, place, bare.batch_shape, single(bare, parsed))
+    return Prepared(bare, method, plan, place, bare.batch_shape, short)

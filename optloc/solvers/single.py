@@ -8,6 +8,7 @@ takes the long way, which knows what to say of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import prod
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.cache import Cache
+from optloc.base.errors import NUMERICAL
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.problem.chart import Chart, quantile
 from optloc.problem.epochs import separable
@@ -391,11 +393,12 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
     shape, place = problem.batch_shape, problem.stations.position
     if not is_few(shape) or place.size != prod(place.shape[-3:]) or not is_direct(problem):
         return None
-    ready = _KEPT.find((method, place.tobytes(), *key_of(problem)), lambda: single(problem, method))
-    if ready is None:
-        return None
-    z = problem.z
-    return ready(z if z.shape[:-1] == shape else np.broadcast_to(z, (*shape, z.shape[-1])))
+    with suppress(NUMERICAL):  # the stages tell which of them fails
+        ready = _KEPT.find((method, place.tobytes(), *key_of(problem)), lambda: single(problem, method))
+        if ready is not None:
+            z = problem.z
+            return ready(z if z.shape[:-1] == shape else np.broadcast_to(z, (*shape, z.shape[-1])))
+    return None
 
 
 def is_few(shape: tuple[int, ...]) -> bool:
