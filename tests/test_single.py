@@ -253,3 +253,28 @@ def test_solve_takes_the_short_way(method, monkeypatch):
     for one in (z[0], z[1], z[0]):
         fix, same = solve(problem.with_rows(z=one), method), ready.short(one)
         assert (fix.shape, fix.x.tobytes(), fix.cov.tobytes()) == (same.shape, same.x.tobytes(), same.cov.tobytes())
+
+
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
+@pytest.mark.parametrize("axis", [(), (1,)], ids=["shared", "of length one"])
+def test_few_that_differ_in_measurements_alone_take_the_short_way(method, axis, monkeypatch):
+    """In `solve` and prepared, whether the stations have no batch axis or one of length one."""
+    bare, z = network(6), drawn(6, "inside", 7)
+    place = bare.stations.position.reshape(*axis, *bare.stations.position.shape[-3:])
+    problem, ready = replace(bare, stations=replace(bare.stations, position=place)), prepare(bare, method)
+    many = prepare(problem, method)
+    monkeypatch.setattr("optloc.solvers.solve_in_stages", None)
+    monkeypatch.setattr("optloc.solvers.prepared.settle_directly", None)
+    for fix in (solve(problem.with_rows(z=z), method), many(z)):
+        assert fix.shape == (7,)
+        for one, own in zip(fix, z, strict=True):
+            check_same(one, ready.short(own))
+    assert (solve(problem.with_rows(z=z[0]), method).shape, many(z[0]).shape) == (axis, axis)
+
+
+def test_few_with_stations_of_their_own_take_the_stages():
+    bare, z = network(6), drawn(6, "inside", 3)
+    place = bare.stations.position + np.array([0.0, 10.0, -20.0])[:, None, None, None]
+    fix = solve(replace(bare, stations=replace(bare.stations, position=place)).with_rows(z=z))
+    alone = solve(bare.with_rows(z=z))
+    assert np.allclose(fix.x - [[0.0], [10.0], [-20.0]], alone.x, atol=1e-4)

@@ -104,6 +104,13 @@ def fresh(place):
     return timed(lambda i: solve(made[i]))
 
 
+def few(count):
+    """Sets of measurements of one scene, so many in one call."""
+    z = scene(PLACES[0]).z
+    made = [posed(z[i : i + count]) for i in range(COUNT - count)]
+    return timed(lambda i: solve(made[i]), len(made))
+
+
 def new():
     """Structures that nobody has seen: the stations in another order each time."""
     orders = list(permutations(range(1, 6)))[1:101]
@@ -144,6 +151,8 @@ def figures():
         for method in ("auto", "gtrs+lsr"):
             yield f"{place}: prepared, {method}", *prepared(method, place), place
         yield f"{place}: `solve`, auto, of a known structure", *fresh(place), place
+    for count in (4, 16):
+        yield f"inside: `solve`, auto, of {count} sets of measurements at once", *few(count), PLACES[0]
     yield "`solve`, auto, of a new structure", *new(), PLACES[0]
     yield "`assemble`", *assembled(), PLACES[0]
     for name in ("ekf", "iekf"):

@@ -69,7 +69,7 @@ def megabytes(problem, method):
 def test_million_fixes(scene):
     problem = million(scene)
     assert seconds(problem, "gtrs+lsr") < 3.0
-    assert megabytes(problem, "gtrs+lsr") < 500.0
+    assert megabytes(problem, "gtrs+lsr") < 700.0  # a second place for all where some have a rival
 
 
 def test_one_fix():
