@@ -154,14 +154,14 @@ def _axes(section: StationsTable, table: Table, frame: Frame, position: Array) -
 
 def _turn(table: Table, d: int) -> Array | None:
     """Return the rotations (n, d, d) that columns of the table give, from the station's axes to the base axes."""
-    from scipy.spatial.transform import Rotation
+    if not any(table.has(key) for key in ("yaw_deg", "heading_deg", *_QUATERNION)):
+        return None
+    from scipy.spatial.transform import Rotation  # a fifth of a second, which most fixes can do without
 
     # Yaw counts from x towards y, a heading from north towards east: the other way round.
     if table.has("yaw_deg") or table.has("heading_deg"):
         yaw = table.numbers("yaw_deg") if table.has("yaw_deg") else -table.numbers("heading_deg")
         return np.asarray(Rotation.from_euler("z", yaw[:, None], degrees=True).as_matrix()[:, :d, :d])
-    if not any(table.has(key) for key in _QUATERNION):
-        return None
     if d == 2:
         raise InvalidProblem(
             "a quaternion turns axes in space, but the stations have x and y only", table.source, "use yaw_deg"
