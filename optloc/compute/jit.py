@@ -77,6 +77,7 @@ class _Kernel:
 
     def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
         self.function, self.taken_in, self.ready = _marked(function), taken_in, False
+        self.seen, self.asked = False, 0  # machine code on disk; problems that it was asked for
         self._forms: dict[bool, Any] = {}
         update_wrapper(self, function)
         _KERNELS.append(self)
@@ -111,7 +112,7 @@ class _Kernel:
     def renew(self) -> None:
         """Forget the compiled forms."""
         with _LOCK:
-            self.function, self.ready, self._forms = _marked(self.function), False, {}
+            self.function, self.ready, self.seen, self._forms = _marked(self.function), False, False, {}
 
     def __getattr__(self, name: str) -> Any:
         """Return what numba wants to know of a function that a kernel calls."""
@@ -220,12 +221,23 @@ def usable(kernel: Callable[..., Any], count: int) -> bool:
     assert isinstance(kernel, _Kernel)
     if not enabled():
         return False
-    if ready(kernel) or is_kept(kernel.name):
+    kernel.seen = kernel.seen or ready(kernel) or is_kept(kernel.name)  # to look into the folder takes a millisecond
+    if kernel.seen:
         return True
     chosen = way()
     if chosen == "child" and count > FEW:
         begin_child()
     return chosen == "wait" or (not chosen and count > FEW)
+
+
+def worth_loading(kernel: Callable[..., Any], count: int) -> bool:
+    """Return whether machine code is the way for so many problems more: plain Python is sooner done with the first few.
+
+    Counts the problems of a process, so that one which solves few again and again goes on with machine code.
+    """
+    assert isinstance(kernel, _Kernel)
+    kernel.asked += count
+    return ready(kernel) or (kernel.asked > FEW and usable(kernel, count))
 
 
 def ready(kernel: Callable[..., Any]) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable
+from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, worth_loading
 from optloc.proof.box import bound_nodes, cost_at, rounding
 from optloc.proof.chart import Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 from optloc.proof.everywhere import prove_everywhere
@@ -110,10 +110,10 @@ class Answered(NamedTuple):
 def prove_all(pose: Posed, asked: Asked) -> Answered:
     """Return the outcome of the proofs of n fixes of n posed problems.
 
-    A few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
+    The first few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
     """
     n = len(asked.x)
-    if ready(_loop) or ((n > FEW or len(pose.kinds) > SMALL) and usable(_loop, n)):
+    if worth_loading(_loop, n) or (len(pose.kinds) > SMALL and usable(_loop, n)):
         return _prove(pose, asked)
     parts = []
     for first in range(0, n, FEW):
@@ -207,7 +207,7 @@ def loaded() -> bool:
 def costs_at(pose: Posed, x: Array) -> tuple[Array, Array]:
     """Return posed costs (n, P) at positions x (n, P, d), and what rounding may have made of their residuals (n, P)."""
     out = np.zeros((2, *x.shape[:2]))
-    if ready(_evaluate) or (len(x) > FEW and usable(_evaluate, len(x))):
+    if worth_loading(_evaluate, len(x)):
         _evaluate(Posed(*(plainly(array) for array in pose)), plainly(x), out)
         return out[0], out[1]
     with plain(), np.errstate(all="ignore"):  # as few proofs are: machine code takes longer to load
