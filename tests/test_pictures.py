@@ -57,10 +57,12 @@ FIGURES = {
     "bound": lambda: plot.plot_bound_map(bounded(), "title"),
     "accuracy": lambda: plot.plot_accuracy(NOISE, {"one": 2.0 * NOISE, "two": 3.0 * NOISE}, 1.9 * NOISE, "title"),
 }
+# Pictures of the same kind as those before them.
+ALIKE = {*(name for name in FIGURES if name.endswith("of two")), "landscape of a run"}
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.full) if n.endswith("of two") else n for n in FIGURES]
+    "name", [pytest.param(n, marks=pytest.mark.full) if n in ALIKE else n for n in FIGURES]
 )
 def test_a_picture_is_whole(name, tmp_path):
     with warnings.catch_warnings():
