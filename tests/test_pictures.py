@@ -61,9 +61,7 @@ FIGURES = {
 ALIKE = {*(name for name in FIGURES if name.endswith("of two")), "landscape of a run"}
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.full) if n in ALIKE else n for n in FIGURES]
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full) if n in ALIKE else n for n in FIGURES])
 def test_a_picture_is_whole(name, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

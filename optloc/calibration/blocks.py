@@ -295,11 +295,16 @@ def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto")
                 np.where(given, net.z[np.ix_(which, slots)] - tick, 0.0),
                 a=a,
                 b=b if kind == "tdoa" else None,
-                sigma=np.where(given, net.sigma[np.ix_(which, slots)], 1.0),
-                weight=given.astype(float),
+                sigma=_shared(np.where(given, net.sigma[np.ix_(which, slots)], 1.0)),
+                weight=_shared(given.astype(float)),
             )
         )
     return solve(assemble(stations, *kinds), method)
+
+
+def _shared(values: Array) -> Array:
+    """Return values (n, q) as one row (q,) where all rows are equal: problems that share them are solved at once."""
+    return np.asarray(values[0]) if (values == values[0]).all() else values
 
 
 def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
@@ -330,8 +335,8 @@ def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, F
                     kind,
                     np.where(given, z[which], 0.0),
                     a=ends,
-                    sigma=np.where(given, sigma[which], 1.0),
-                    weight=given.astype(float),
+                    sigma=_shared(np.where(given, sigma[which], 1.0)),
+                    weight=_shared(given.astype(float)),
                 )
             )
     spread = float(np.ptp(places, axis=0).max()) or 1.0

@@ -78,7 +78,7 @@ class Prepared:
         values = np.asarray(z, dtype=float)
         shape = self._batch(values)
         if self.short is not None and is_few(shape):
-            with suppress(NUMERICAL):  # the stages tell which of them fails
+            with suppress(*NUMERICAL):  # the stages tell which of them fails
                 fix = self.short(np.broadcast_to(values, (*shape, values.shape[-1])) if self.shape else values)
                 if fix is not None:
                     return fix
@@ -152,7 +152,7 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
     # without measurements, so that nothing prepared can depend on them
     bare = problem.with_rows(z=np.zeros(problem.count))
     plan = short = None
-    with suppress(NUMERICAL):  # the stages tell which of its fixes fails
+    with suppress(*NUMERICAL):  # the stages tell which of its fixes fails
         plan = direct(bare) if shortcut(parsed) and not separable(bare) else None
         short = single(bare, parsed)
     position = problem.stations.position

@@ -393,7 +393,7 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
     shape, place = problem.batch_shape, problem.stations.position
     if not is_few(shape) or place.size != prod(place.shape[-3:]) or not is_direct(problem):
         return None
-    with suppress(NUMERICAL):  # the stages tell which of them fails
+    with suppress(*NUMERICAL):  # the stages tell which of them fails
         ready = _KEPT.find((method, place.tobytes(), *key_of(problem)), lambda: single(problem, method))
         if ready is not None:
             z = problem.z

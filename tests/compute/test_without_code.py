@@ -72,6 +72,7 @@ def test_who_waits(monkeypatch, way, few, many):
     monkeypatch.setattr("optloc.compute.jit.is_kept", lambda name: False)
     monkeypatch.setattr("optloc.compute.jit.begin_child", lambda: begun.append(1))
     monkeypatch.setattr(_loop, "ready", False)
+    monkeypatch.setattr(_loop, "seen", False)
     monkeypatch.setenv("OPTLOC_COMPILE", way)
     assert (usable(_loop, 16), usable(_loop, 17)) == (few, many)
     assert len(begun) == (way == "child")
@@ -80,6 +81,7 @@ def test_who_waits(monkeypatch, way, few, many):
 def test_another_way_is_named(monkeypatch):
     monkeypatch.setattr("optloc.compute.jit.is_kept", lambda name: False)
     monkeypatch.setattr(_loop, "ready", False)
+    monkeypatch.setattr(_loop, "seen", False)
     monkeypatch.setenv("OPTLOC_COMPILE", "later")
     with pytest.raises(InvalidProblem, match=r"'later'.*wait, child, never"):
         usable(_loop, 1)
