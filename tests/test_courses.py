@@ -13,6 +13,7 @@ from optloc import Frame, InvalidProblem, Motion, Status, assemble, constraints,
 from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef
 from optloc.base.types import Stations
 from optloc.bounds.crlb import crlb
+from optloc.compute.sums import equations_at
 from optloc.files import read
 from optloc.linear.constraints import exact, restore, violation
 from optloc.linear.courses import course_at, elapsed
@@ -124,6 +125,18 @@ def test_heights_hold_at_every_epoch(case, frame):
         assert np.abs(heights(problem, fix.x) - level).max() < 1e-6
         assert np.linalg.norm(fix.x[:3] - truth[:3]) < 4.0 * np.sqrt(np.trace(fix.cov[:3, :3]))
         assert {name.name.partition(" at ")[0] for name in fix.active[()]} == {"height equal"}
+
+
+def test_frames_of_one_process_do_not_share_what_is_traced():
+    """A batch in one local frame after one in another, and in that of the Earth: each as if it were the first."""
+    times = 50.0 * np.arange(8)
+    motion, held = CASES["level"](times)
+    for frame in (ECEF, Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0), Frame.enu(lat_deg=-20.0, lon_deg=100.0)):
+        problem = posed(motion, held, epochs=8, step=50.0, frame=frame)
+        x = state(1e4, motion.order, frame)
+        equations, linear = equations_at(problem.flat(), x[None]), differentiate(problem, x)[1]
+        white = linear / 10.0  # the rows are independent, of one sigma
+        np.testing.assert_allclose(equations.shared[0], white.T @ white, rtol=1e-6, atol=1e-9 * (white**2).sum())
 
 
 def test_a_straight_course_leaves_the_height_that_it_has_at_the_reference_time():

@@ -20,6 +20,7 @@ from optloc.calibration.gauge import (
     in_frame,
     over,
     rise,
+    thinness,
     with_mean_clock,
 )
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
@@ -47,6 +48,9 @@ _ZERO = 1e-9
 _GIVES_WAY = 0.1
 # Share by which squared errors may exceed the covariance: 10 % of a deviation.
 _COVERS = 0.2
+# Share of its thickness that the shape of a network may be unsure by: lines turned by so many radians are 8 % shorter
+# in projection. Of 27 halls of 0.3 m that all else let pass, 5 were wrong, at half the thickness and above.
+_FIRM = 0.4
 # Share of what the covariance says that the cost must rise by: that of a fix that is `ok`.
 _RISES = np.exp(-STRAIGHT)
 
@@ -374,7 +378,12 @@ def _curved_findings(lik: Likelihood, at: Estimate, told: Determined) -> list[tu
         words.append(f"squared errors exceed it by up to {share:.0%} where the measurement is repeated")
     if slow < _RISES:
         words.append(f"three deviations away the cost rises by {slow:.0%} of what it says")
-    return [(Status.CURVED, f"The covariance is too small: {' and '.join(words)}.")] if words else []
+    found = [(Status.CURVED, f"The covariance is too small: {' and '.join(words)}.")] if words else []
+    deviation, thickness = thinness(lik, at, told)
+    if deviation > _FIRM * thickness:
+        unsure = f"The shape is unsure by {deviation:.2g} m, and the stations are {thickness:.2g} m thick"
+        found.append((Status.CURVED, f"{unsure}: its errors are not linear."))
+    return found
 
 
 def _proof(found: tuple[Block, ...]) -> tuple[str, list[tuple[Status, str]]]:

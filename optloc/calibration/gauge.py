@@ -168,6 +168,36 @@ def rise(lik: Likelihood, at: Estimate, told: Determined) -> float:
     return float((held.refine(there, _SETTLING)[1].min() - lik.cost(at)[0]) / _FAR**2)
 
 
+def thinness(lik: Likelihood, at: Estimate, told: Determined) -> tuple[float, float]:
+    """Return how unsure the shape of a free network is, and how thick the network is.
+
+    Errors of a share of the thickness turn lines between stations by as many radians, and what is turned is not linear.
+    Neither the cost at the network found nor repetitions of it show that where the thickness itself is an error.
+
+    Parameters
+    ----------
+    lik : Likelihood
+        The network.
+    at : Estimate
+        The one found, S = 1.
+    told : Determined
+        What is determined there, nothing left open.
+
+    Returns
+    -------
+    deviation : float
+        Standard deviation of all stations together along the weakest direction, metres; zero where places are known.
+    thickness : float
+        Root mean square of the stations' distances from their best plane (line in two dimensions), metres.
+    """
+    m, d = lik.network.stations, lik.network.dimension
+    if m <= d or np.isfinite(lik.network.place_sigma).any():
+        return 0.0, 0.0
+    width = np.linalg.eigvalsh(told.covariance(told.free.T)[: m * d, : m * d])
+    centred = at.stations[0] - at.stations[0].mean(axis=0)
+    return float(np.sqrt(width[-1])), float(np.linalg.svd(centred, compute_uv=False)[-1] / np.sqrt(m))
+
+
 def _is_told(over_by: list[float], allowed: float) -> bool:
     """Return whether repetitions tell on which side of a bound their mean is, or are many enough."""
     if len(over_by) < _FEW:

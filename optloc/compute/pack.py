@@ -9,6 +9,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.tables import Sources, Tables, tables
+from optloc.linear.courses import over_ground
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A
@@ -94,7 +95,9 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
 
 def coarseness(problem: Problem) -> Array:
     """Return the size (m,) of the numbers beside the measurement that are rounded to get to a row's value."""
-    return np.concatenate([np.full(rows.count, WGS84_A if MODELS[rows.kind].ecef else 0.0) for rows in problem.rows])
+    # courses over ground are worked out from the centre of the Earth
+    far = [MODELS[rows.kind].ecef or over_ground(problem) for rows in problem.rows]
+    return np.repeat(np.where(far, WGS84_A, 0.0), [rows.count for rows in problem.rows])
 
 
 def observed(problem: Problem) -> Array:

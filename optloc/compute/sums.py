@@ -11,15 +11,15 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.compute.jit import enabled, usable
 from optloc.compute.pack import pack
+from optloc.linear.evaluate import fitting
 from optloc.linear.normal import Normal, depends_on_place, linearise, normal, total, whitener_at, with_priors
 from optloc.linear.walks import walks
 from optloc.problem.epochs import windows
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
 
-# Numbers of rows, over all problems, from which machine code saves more than it takes to get it going; tables of longer
-# runs would not be constant in memory.
-_WORTH, _LONGEST = 2000, 2**13
+# Rows of a problem up to which there is machine code: tables of longer runs would not be constant in memory.
+_LONGEST = 2**13
 
 
 def equations_at(
@@ -48,7 +48,7 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
     """Return the normal equations of the measurements alone; arguments as of `equations_at`."""
     if x.shape[-1] == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
-    quick = _by_machine_code(problem, x, noise) if at is None else None
+    quick = _by_machine_code(problem, fitting(problem, x), noise) if at is None else None
     if quick is not None:
         return quick
     parts = []
@@ -62,7 +62,7 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
 
 
 def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
-    """Return the sums by machine code, or None where it does not serve the problem or does not pay."""
+    """Return the sums by machine code, or None where it does not serve the problem."""
     count, shape = x.size // x.shape[-1], x.shape[:-1]
     # one vector for each problem, or several side by side
     alike = problem.batch_shape in {(), (1,), (count,)} if x.ndim == 2 else problem.batch_shape == shape[-1:]
@@ -80,8 +80,8 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
 
 
 def serves(problem: Problem, starts: int) -> bool:
-    """Return whether machine code is at hand, or may be waited for, and pays for a number of vectors of a problem."""
-    if problem.count > _LONGEST or starts * problem.count < _WORTH or not enabled() or walks(problem):
+    """Return whether machine code is at hand, or may be waited for, for a number of vectors of a problem."""
+    if not starts or problem.count > _LONGEST or not enabled() or walks(problem):
         return False
     from optloc.compute.equations import normal_block
     from optloc.compute.refine import refine_block, refine_runs

@@ -13,6 +13,7 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.types import Array
+from optloc.linear.courses import over_ground
 from optloc.linear.evaluate import Plan, join
 from optloc.models import Model
 from optloc.models.primitives import Jet
@@ -372,7 +373,7 @@ def trace(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset[
     """
     model = plan.model
     medium = problem.medium if model.straight else None
-    frame = problem.frame if model.ecef or medium is not None else None
+    frame = problem.frame if model.ecef or medium is not None or over_ground(problem) else None
     key = (model, given, moved, problem.dimension, frame, medium)
     return _TRACED.find(key, lambda: _trace(problem, model, given, moved))
 

@@ -295,7 +295,7 @@ Refinement = Callable[[Problem, Array, Rules], Refined]
 def by_machine_code(
     problem: Problem, start: Array, item: Array | None, rules: Rules, otherwise: Refinement
 ) -> Refined | None:
-    """Return where a refinement by machine code ends, or None where it does not serve the problem or does not pay.
+    """Return where a refinement by machine code ends, or None where it does not serve the problem.
 
     Parameters
     ----------
