@@ -58,6 +58,9 @@ CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 # Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest;
 # and as many that wait. A box leaves two, and six slabs around a minimum that is met in it.
 _CAPACITY, _SPARE = 2048, 8
+# Boxes that may wait: where there are as many, those that follow are looked at in their turn, as if no lower level were
+# to be shown first. What is taken back leaves room for going into the depth.
+_WAITING = 3 * _CAPACITY // 4
 # A box at infinity of this size whose cost is below the level is not split further: across it the cost is the same to
 # many digits, so no smaller one would be dropped either.
 _TINY = 1e-5
@@ -142,7 +145,7 @@ def search_everywhere(
             size, waiting = _take_back(stack, aside, waiting, levels[now])
             continue
         shown, level = now + 1, levels[first]
-        if boxes >= budget or max(size, waiting) + _SPARE > _CAPACITY:
+        if boxes >= budget or size + _SPARE > _CAPACITY:
             spent = shown == levels.shape[0]
             return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
         size -= 1
@@ -174,7 +177,7 @@ def search_everywhere(
             first = _first_below(levels, first, _at_infinity(cost, atlas, box))
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
-        if low > 0.0 and low * low >= levels[now]:
+        if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
             waiting = _push_rest(aside, waiting, box, side, low, piece)
         else:
             size = _push_rest(stack, size, box, side, low, piece)

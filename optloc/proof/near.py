@@ -84,6 +84,8 @@ class Aim(NamedTuple):
         otherwise only if its cost is at least `value`.
     free : int
         How many of the known minima, the fix first, are hidden or the fix: what their boxes hold does not count.
+    own : int
+        How many of these are the fix: one, and none on another piece of a surface.
     """
 
     level: float
@@ -91,6 +93,7 @@ class Aim(NamedTuple):
     better: float
     whole: bool
     free: int
+    own: int
 
 
 @compiled
@@ -198,7 +201,7 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Aim, enou
     In the convex box of a known minimum there is no second, but a lower point there may be: `enough` says where any of
     them will do. The box of the fix holds nothing cheaper where no way leads out of the search.
     """
-    first = 0 if aim.whole else 1
+    first = 0 if aim.whole else aim.own
     if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
         return True
     return enough and is_known(at, half, minima, sides)
@@ -371,7 +374,7 @@ def prove(
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     whole = whole and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
-    aim, stack = Aim(level, value=least - eps, better=better, whole=whole, free=free), np.empty((_CAPACITY, DEPTH))
+    aim, stack = Aim(level, least - eps, better, whole, free, own=1), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, sides[0], 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
     if outcome == CLEAR and not alone:
@@ -424,7 +427,7 @@ def _search_sides(
         minima, sides, count, free = known_minima(cost, chart, box, known, low, high, 0.0, aim.value, False)
         if not aim.level > aim.value:
             count = free
-        own = Aim(aim.level, aim.value, aim.better, aim.whole, free)
+        own = Aim(aim.level, aim.value, aim.better, aim.whole, free, own=0)
         # No hole: the origin of a piece is no minimum.
         size = push_around(stack, 0, low, high, np.zeros(3), 0)
         outcome, more, _ = branch(cost, chart, box, minima[:count], sides[:count], own, budget - boxes, stack, size)

@@ -36,7 +36,12 @@ EITHER = {
     "GROA + TDOA": 0.7,
     "AOA + TDOA": 0.7,
 }
-DAILY = ["TDOA, 6 stations, inside, 10 m", "TDOA, 5 stations, outside, 30 m", "range, 5 stations, inside, 10 m"]
+DAILY = [
+    "TDOA, 6 stations, inside, 10 m",
+    "TDOA, 5 stations, outside, 30 m",
+    "range, 5 stations, inside, 10 m",
+    "three satellites and a height, 15 m",
+]
 
 
 @pytest.fixture(scope="module")

@@ -206,7 +206,7 @@ def prove_run(
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
     least = cost_of_place(run, x, tables)
     level = least + kappa if kappa > 0.0 else least - eps
-    aim = Aim(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0)
+    aim = Aim(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
     task = Task(x, beside, aim, eps, budget, found)
     bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
     middle, radius = cube(run.cost.kinds, run.cost.data, x)

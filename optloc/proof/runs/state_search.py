@@ -366,7 +366,7 @@ def prove_course(
     search = Search(whole, few, axes, table, small, floors, room[0], room[1])
     least = _linearise(search, table)
     level = least + kappa if kappa > 0.0 else least - eps
-    aim = Aim(level, least - eps, least - 0.5 * eps, False, 0)
+    aim = Aim(level, least - eps, least - 0.5 * eps, False, 0, 0)
     known, place = zero(), x.copy()
     for p in range(1 + (others.shape[0] if kappa > 0.0 else 0)):
         for m in range(n if p > 0 else 0):
