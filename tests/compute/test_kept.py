@@ -46,7 +46,9 @@ print(said, len(made.buffer) // 2, caller.answer.machine._cache.cache_path)
 
 def asked(folder: Path, **environment: str) -> tuple[int, int, Path]:
     """Return the answer of a small package, how many functions were compiled for it, and where they are kept."""
-    everything = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{Path(kept.__file__).parents[2]}", **environment}
+    # Without bytecode: a file that is written twice in a second would be taken for what was read before.
+    path = {"PYTHONPATH": f"{folder}{os.pathsep}{Path(kept.__file__).parents[2]}", "PYTHONDONTWRITEBYTECODE": "1"}
+    everything = {**os.environ, **path, **environment}
     done = subprocess.run([sys.executable, "-c", ASK], env=everything, capture_output=True, text=True, check=True)
     said, count, place = done.stdout.split()
     return int(said), int(count), Path(place)
