@@ -165,7 +165,7 @@ def test_ctrl_c_is_one_sentence_and_ends_everybody(options, group, tmp_path):
     dice, out = random.Random(len(options) + group), tmp_path / "out"
     with running(out, *options) as run:
         wait(run, lambda: parts(out) > 0)
-        time.sleep(dice.uniform(0.0, 0.5))
+        time.sleep(dice.uniform(0.0, 0.2))
         (os.killpg if group else os.kill)(run.pid, signal.SIGINT)
         _, said = run.communicate(timeout=60)
         assert run.returncode == 130, said
