@@ -303,3 +303,11 @@ def test_starts_that_share_a_fit_of_low_rank_do_not_agree():
     truth, z = thin(200002, "pulses", 0.3)
     found = calibrate(network_of(z, 0.03))
     assert found.status is not Status.OK or found.cost <= likelihood(network_of(z, 0.03)).refine(truth)[1][0] + 1.0
+
+
+def test_a_network_that_is_thin_beside_its_errors_is_curved():
+    """Its truth is far beyond the 99.99 % ellipsoid, and neither repetitions nor the cost along axes tell."""
+    _, z = hall(900014, 10, 12, 0.3)
+    found = calibrate(network_of(z, 0.3))
+    assert found.status is Status.CURVED
+    assert [words for words in found.findings if "m thick" in words] == list(found.findings)
