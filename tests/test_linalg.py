@@ -83,6 +83,18 @@ def test_whitening_makes_unit_covariance():
         assert np.allclose(W, np.tril(W))
 
 
+def test_whitening_of_many_rows_takes_those_that_are_present():
+    rng = np.random.default_rng(5)
+    covariance, present = positive(rng, 7, 40), rng.random((7, 40)) < 0.4
+    present[0] = False
+    both = present[:, :, None] & present[:, None, :]
+    W = linalg.whitening(np.where(both, covariance, 0.0))
+    assert np.allclose(W, np.tril(W))
+    assert not W[~both].any()
+    for whole, found, own in zip(covariance, W, present, strict=True):
+        np.testing.assert_allclose(found[np.ix_(own, own)], linalg.whitening(whole[np.ix_(own, own)]), rtol=1e-9)
+
+
 def all_pairs(count):
     a, b = np.triu_indices(count, 1)
     design = np.zeros((len(a), count))

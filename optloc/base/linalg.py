@@ -14,6 +14,11 @@ PIVOT = 1e-15
 """Share of its diagonal that a pivot must exceed: five units in the last place, below which no digit of it is known."""
 
 
+# Rows from which those that are absent are taken out before a covariance is factored: time goes with the third power of
+# their number, and epochs of a file have as many as all of them together have.
+_MANY = 16
+
+
 def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     """Return Cholesky factors of a batch of symmetric matrices.
 
@@ -216,6 +221,10 @@ def whitening(covariance: Array) -> Array:
     if covariance.shape[-1] == 1:
         single: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
         return single
+    if covariance.shape[-1] > _MANY and not arrays.foreign(covariance):
+        most = max(int((~absent).sum(-1).max(initial=0)), 1)
+        if most < covariance.shape[-1]:
+            return _whitening_of_present(covariance, absent, most)
     scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
     unit = covariance * scale[..., :, None] * scale[..., None, :]
     eye = xp.broadcast_to(arrays.eye(covariance.shape[-1], covariance), covariance.shape)
@@ -233,6 +242,19 @@ def whitening(covariance: Array) -> Array:
         matrix = xp.where(ok[..., None, None], matrix, roots[..., :, None] * vectors.mT)
     whitened: Array = matrix * xp.where(absent, 0.0, scale)[..., None, :]
     return whitened
+
+
+def _whitening_of_present(covariance: Array, absent: Array, most: int) -> Array:
+    """Return the same as `whitening` from the rows that are present, at most so many of each item."""
+    # stable: they stay in their order, so that the matrix stays triangular
+    kept = np.argsort(absent, axis=-1, kind="stable")[..., :most]
+    rows, columns = kept[..., :, None], kept[..., None, :]
+    own = np.take_along_axis(np.take_along_axis(covariance, rows, -2), columns, -1)
+    across = np.zeros((*own.shape[:-1], covariance.shape[-1]))
+    np.put_along_axis(across, np.broadcast_to(columns, own.shape), whitening(own), -1)
+    out = np.zeros(covariance.shape)
+    np.put_along_axis(out, np.broadcast_to(rows, across.shape), across, -2)
+    return out
 
 
 # Least squares on the tangent space of equality constraints.

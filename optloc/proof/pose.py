@@ -22,6 +22,9 @@ from optloc.proof.nodes.node import LINEAR, Node, Row
 
 # Cosine below which two columns of whitened rows count as orthogonal: whitening costs some digits of a double.
 _ORTHOGONAL = 1e-9
+# Share of the length of a column up to which a number of its triangle is rounding: some tens of units in the last place,
+# for the backward error of reflections goes by columns (Higham 2002, theorem 19.4).
+_DEPENDENT = 1e-14
 
 
 @dataclass(slots=True)
@@ -195,6 +198,10 @@ def compress(K: Array, w: Array) -> tuple[Array, Array]:
     if q <= nodes + 1:
         return K, w
     basis, upper = np.linalg.qr(K)
+    # Differences of J ranges have rank J - 1. What rounding leaves of a row that depends on others is no range that no
+    # other balances, for which the cost would grow towards infinity.
+    length = np.sqrt((K**2).sum(-2, keepdims=True))
+    upper = np.where(np.abs(upper) > _DEPENDENT * length, upper, 0.0)
     # What no position can fit stands in a row of its own, so that the cost keeps its value.
     upper = np.concatenate([upper, np.zeros((*upper.shape[:-2], 1, nodes))], axis=-2)
     return upper, _fold(basis, w)

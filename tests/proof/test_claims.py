@@ -8,7 +8,7 @@ from cases import CASES, ENU, STATIONS, TARGET
 from proof.plain import node_values
 from scipy.optimize import least_squares
 
-from optloc import Motion, Stations, assemble, certify, measured, solve
+from optloc import Motion, Stations, assemble, certify, measured, simulate, solve
 from optloc.base.types import Band
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import height
@@ -243,3 +243,13 @@ def test_places_that_only_look_different_are_not_moving():
     problem = moving("run", 0.0)
     still = replace(problem.stations, position=problem.stations.position.copy())
     assert unsupported(replace(problem, stations=still).flat()) == ""
+
+
+def test_differences_that_repeat_are_proven_to_infinity():
+    """Of eight anchors in a ring seven differences are independent: an eighth row is rounding, and grows nowhere."""
+    hall = np.array([[x, y, z] for z in (0.2, 3.0) for x, y in ((-4, -4), (4, -4), (4, 4), (-4, 4))])
+    a = np.tile(np.arange(8), 3)
+    problem = assemble(hall, measured("tdoa", a=a, b=(a + 1) % 8, sigma=0.2))
+    truth = np.random.default_rng(1).uniform([-3.0, -3.0, 0.5], [3.0, 3.0, 2.5], (12, 3))
+    fix = solve(simulate(problem, truth=truth, seed=2))
+    assert {certificate.proof for certificate in fix.certificate} == {"global"}
