@@ -69,6 +69,12 @@ class Elements:
     of_offset: Array
     path: Array
 
+    @property
+    def common(self) -> Array:
+        """Return which groups (G + 1,) are what rows have in common; the last stands for none."""
+        shared = [common_name(name) for name in self.names]
+        return np.append(np.isin(np.array(self.names, dtype=object), shared), False)
+
     def take(self, index: Any) -> Elements:
         """Return some of the problems."""
         arrays = ("residual", "jacobian", "effect", "offset", "fixed", "sigma", "of_effect", "of_offset", "path")

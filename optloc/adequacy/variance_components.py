@@ -26,6 +26,10 @@ CUT = 3.5
 One normal error in 2000 is beyond, so that the variance of the rest is 0.5 % too small and needs no correction; at 4
 the tails of airliners' messages (7.7 % beyond 3 sigma) count as noise of single receivers."""
 
+_WIDE = 10.0
+"""The same of an error that rows have in common: a fix follows it as it follows another place, so that no test tells it
+there, and what is left out of the level is in no covariance. One in fifteen headings of robots is beyond 3.5."""
+
 LOOSE = 0.5
 """Relative standard error of a standard deviation from which the data are said not to tell it."""
 
@@ -429,7 +433,7 @@ def without(tests: Tested, gross: Array) -> Tested:
 def cleaned(made: Elements, variance: Array) -> tuple[Array, Tested]:
     """Return which errors are gross (N, q), and the tests without them."""
     tests = tested(made, variance)
-    found = snooped(tests, slice(0, tests.errors), CUT)
+    found = snooped(tests, slice(0, tests.errors), np.where(made.common[made.of_effect], _WIDE, CUT))
     return found.gross, found.tests
 
 
@@ -453,8 +457,8 @@ class Snooped:
     tests: Tested
 
 
-def snooped(tests: Tested, columns: slice, cut: float) -> Snooped:
-    """Return the gross errors along some columns of tests.
+def snooped(tests: Tested, columns: slice, cut: float | Array) -> Snooped:
+    """Return the gross errors along some columns of tests, each with its cut or all with one.
 
     Of each problem the column with the largest test beyond the cut is left out, and the rest are tested anew, until
     none is beyond it: data snooping (Baarda 1968, section 4).
@@ -463,9 +467,9 @@ def snooped(tests: Tested, columns: slice, cut: float) -> Snooped:
     shift, sigma = shown(tests, columns)
     gross = np.zeros(shift.shape, dtype=bool)
     while True:
-        sigmas = np.abs(tests.sigmas[:, columns])
-        worst = sigmas.argmax(1)
-        hit = np.flatnonzero(sigmas[np.arange(n), worst] > cut)
+        beyond = np.abs(tests.sigmas[:, columns]) / cut
+        worst = beyond.argmax(1)
+        hit = np.flatnonzero(beyond[np.arange(n), worst] > 1.0)
         now = shown(tests, columns)
         shift, sigma = (np.where(gross, old, new) for old, new in zip((shift, sigma), now, strict=True))
         if not len(hit):

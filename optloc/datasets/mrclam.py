@@ -33,17 +33,18 @@ class Sightings:
     epoch: Array
     z: dict[str, Array]
 
-    def every(self, n: int) -> Sightings:
-        """Return every n-th epoch."""
-        inside = self.epoch % n == 0
+    def every(self, n: int, first: int = 0) -> Sightings:
+        """Return every n-th epoch, from a first one on."""
+        inside = self.epoch % n == first
         z = {kind: values[inside] for kind, values in self.z.items()}
-        return Sightings(self.landmarks, self.truth[::n], self.a[inside], self.epoch[inside] // n, z)
+        return Sightings(self.landmarks, self.truth[first::n], self.a[inside], self.epoch[inside] // n, z)
 
-    def problem(self, kinds: tuple[str, ...]) -> Problem:
-        """Return the epochs by some kinds of rows as one problem."""
+    def problem(self, kinds: tuple[str, ...], *, known: bool = False) -> Problem:
+        """Return the epochs by some kinds of rows as one problem; `known`: at places that are not asked for."""
         sigma = sigmas(kinds)
         rows = [measured(kind, self.z[kind], a=self.a, sigma=sigma[kind], epoch=self.epoch) for kind in kinds]
-        return assemble(self.landmarks, *rows, motions=(Motion(span="epoch"),))
+        motion = Motion(span="epoch", known=self.truth[:, None] if known else None)
+        return assemble(self.landmarks, *rows, motions=(motion,))
 
 
 def sigmas(kinds: tuple[str, ...]) -> dict[str, float]:

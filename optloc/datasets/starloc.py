@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SIGMA = np.deg2rad(0.3)  # of an angle in a group: half as much again as its robust spread
-# Where a whole run is one problem the noise grows as the camera turns: bearings and poses are 0.09 s apart, by a fit of
-# the residuals at the true places to the rate.
+# As the camera turns the noise grows: bearings and poses are 0.09 s apart, by a fit of the residuals at the true places
+# to the rate.
 STILL, LAG = np.deg2rad(0.2), 0.09
 SIZE = 6  # bearings in a group; markers that were seen less often are left out
 _QUATERNION = ["qx", "qy", "qz", "qw"]
@@ -32,21 +32,28 @@ _QUATERNION = ["qx", "qy", "qz", "qw"]
 
 @dataclass(frozen=True, slots=True)
 class Groups:
-    """Camera places (n, 6, 3) and axes (n, 6, 3, 3; rows are its axes in the room), angles (n, 6, 2), truth (n, 3)."""
+    """Camera places (n, 6, 3) and axes (n, 6, 3, 3; rows are its axes in the room), angles (n, 6, 2), truth (n, 3).
+
+    `rate` (n, 6) is how fast the camera turns, radians a second.
+    """
 
     place: Array
     axes: Array
     angles: Array
     truth: Array
+    rate: Array
 
-    def problem(self) -> Problem:
-        """Return the groups as a batch of problems."""
+    def problem(self, *, turning: bool = False, known: bool = False) -> Problem:
+        """Return the groups as a batch of problems.
+
+        `turning`: with noise that grows as the camera turns; `known`: of markers whose places are not asked for.
+        """
         stations = replace(station_array(self.place[:, None]), axes=self.axes[:, None])
-        each = np.arange(SIZE)
+        sigma, each = _sigma(self.rate) if turning else SIGMA, np.arange(SIZE)
         rows = [
-            measured(kind, self.angles[..., i], a=each, sigma=SIGMA) for i, kind in enumerate(("azimuth", "elevation"))
+            measured(kind, self.angles[..., i], a=each, sigma=sigma) for i, kind in enumerate(("azimuth", "elevation"))
         ]
-        return assemble(stations, *rows)
+        return assemble(stations, *rows, motions=(Motion(known=self.truth[:, None, None]) if known else Motion(),))
 
     def turned(self, turn: Array) -> Groups:
         """Return the groups with the camera's axes turned by a rotation vector (3,) of its mount, radians.
@@ -88,7 +95,7 @@ class Bearings:
         tags, target = np.unique(self.rows["tag"].to_numpy(), return_inverse=True)
         poses = self.poses.loc[frames]
         camera = station_array(places(poses)[:, None], ("camera",))
-        sigma = np.hypot(STILL, LAG * poses["rate"].to_numpy()[epoch])
+        sigma = _sigma(poses["rate"].to_numpy()[epoch])
         return assemble(
             replace(camera, axes=_axes(poses)[:, None]),
             *(
@@ -108,11 +115,13 @@ class Bearings:
         tags = rng.choice(counts.index.to_numpy(), count, p=counts.to_numpy() / counts.sum())
         members = np.stack([rng.choice(np.flatnonzero(self.rows["tag"] == tag), SIZE, replace=False) for tag in tags])
         pose = self.poses.loc[self.rows["frame"].to_numpy()[members].ravel()]
+        rate = pose["rate"].to_numpy().reshape(count, SIZE)
         return Groups(
             places(pose).reshape(count, SIZE, 3),
             _axes(pose).reshape(count, SIZE, 3, 3),
             self.rows[["az_rad", "el_rad"]].to_numpy()[members],
             places(self.markers.loc[tags]),
+            rate,
         )
 
 
@@ -153,6 +162,11 @@ def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...]
 def load(folder: Path, name: str, attitude: str, groups: int, seed: int) -> Groups:
     """Return groups of one run, with the attitude of the mount by design ("nom") or calibrated ("cal")."""
     return read_run(folder, name, attitude).groups(groups, seed)
+
+
+def _sigma(rate: Array) -> Array:
+    """Return the standard deviation of angles while the camera turns, radians."""
+    return np.hypot(STILL, LAG * rate)
 
 
 def _axes(poses: pd.DataFrame) -> Array:

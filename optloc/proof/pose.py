@@ -22,7 +22,7 @@ from optloc.proof.nodes.node import LINEAR, Node, Row
 
 # Cosine below which two columns of whitened rows count as orthogonal: whitening costs some digits of a double.
 _ORTHOGONAL = 1e-9
-# Share of the length of a column up to which a number of its triangle is rounding: some tens of units in the last place,
+# Share of the length of a column up to which a number of its triangle is rounding: tens of units in the last place,
 # for the backward error of reflections goes by columns (Higham 2002, theorem 19.4).
 _DEPENDENT = 1e-14
 

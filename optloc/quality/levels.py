@@ -283,7 +283,7 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
 
 def levels_of(made: Elements, by: By) -> NoiseLevels:
     """Return the noise levels of linearised fixes; see `noise_levels`."""
-    common = np.isin(np.array(made.names, dtype=object), [common_name(name) for name in made.names])
+    common = made.common[:-1]
     plain = fit(made, common, common)
     # What rows have in common is stated nowhere: where the data do not show it, it is none.
     seen = visible(made, plain, common)
