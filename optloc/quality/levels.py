@@ -283,6 +283,14 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
 
 def levels_of(made: Elements, by: By) -> NoiseLevels:
     """Return the noise levels of linearised fixes; see `noise_levels`."""
+    from threadpoolctl import threadpool_limits
+
+    # Products of small matrices gain nothing from threads, and wait for them on a busy machine: ten times as long.
+    with threadpool_limits(1):
+        return _levels(made, by)
+
+
+def _levels(made: Elements, by: By) -> NoiseLevels:
     common = made.common[:-1]
     plain = fit(made, common, common)
     # What rows have in common is stated nowhere: where the data do not show it, it is none.
