@@ -88,11 +88,9 @@ def test_flights_by_what_each_anchor_is_off_in_a_window(data_dir, name):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", FLIGHTS)
-def test_flights_without_what_is_left_out(data_dir, name):
-    good, far = counted(name, flight(data_dir / "util_uwb_tdoa", name), "station", "robust")
-    assert good > 0
-    assert not far
+def test_flights_without_what_is_left_out(data_dir):
+    folder = data_dir / "util_uwb_tdoa"
+    within_one_in_a_hundred([counted(name, flight(folder, name), "station", "robust") for name in FLIGHTS])
 
 
 @pytest.mark.parametrize("method", ["auto", pytest.param("robust", marks=pytest.mark.full)])
