@@ -294,12 +294,21 @@ def _levels(made: Elements, by: By) -> NoiseLevels:
     common = made.common[:-1]
     plain = fit(made, common, common)
     # What rows have in common is stated nowhere: where the data do not show it, it is none.
-    seen = visible(made, plain, common)
+    seen = _with_their_like(visible(made, plain, common), common, by)
     found = fit(made, common & ~seen, common) if seen.any() else plain
-    while (seen & ~(found.low > 0.0)).any():
-        seen = seen & (found.low > 0.0)
+    while (fewer := _with_their_like(seen & (found.low > 0.0), common, by)).sum() < seen.sum():
+        seen = fewer
         found = fit(made, common & ~seen, common) if seen.any() else plain
     return _report(made, by, found, common & ~seen)
+
+
+def _with_their_like(shown: Array, common: Array, by: By) -> Array:
+    """Return which errors in common (G,) are kept: those of one station or pair show that the others have them too.
+
+    A fix follows as many of these as it has unknowns. Levels of a few that explain the rest say that the others are
+    exact, and so is the fix.
+    """
+    return shown if by == "kind" else common & shown.any()
 
 
 def _report(made: Elements, by: By, found: Fitted, none: Array) -> NoiseLevels:

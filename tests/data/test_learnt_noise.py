@@ -1,4 +1,4 @@
-"""Noise that is learnt where places are known, of one half of real data, says of the other half how right fixes are."""
+"""Noise that is learnt from one half of real data says of the other half how right fixes are."""
 
 from dataclasses import dataclass
 
@@ -24,16 +24,16 @@ FAR, LIKELY = 5.0, 0.01
 
 @dataclass(frozen=True)
 class Halves:
-    """Epochs with known places to learn from, others to fix, and their truth (n, d)."""
+    """Epochs to learn from, most with known places, others to fix, and their truth (n, d)."""
 
-    known: Problem
+    learn: Problem
     other: Problem
     truth: np.ndarray
 
 
 def counted(name: str, halves: Halves, by: str, method: str) -> tuple[int, int]:
     """Return how many fixes that are ok and likely there are, and how many of these are far off by their own sigma."""
-    levels = noise_levels(halves.known, by, common=True)
+    levels = noise_levels(halves.learn, by, common=True)
     fix = solve(by_epoch(with_noise_levels(halves.other, levels)).flat(), method)
     good = (fix.code == Status.OK) & (fix.p_value > LIKELY)
     error, cov = (fix.position - halves.truth)[good], fix.covariance("position")[good]
@@ -43,8 +43,8 @@ def counted(name: str, halves: Halves, by: str, method: str) -> tuple[int, int]:
     return int(good.sum()), far
 
 
-def flight(folder, name: str) -> Halves:
-    """Return every other window of a flight."""
+def flight(folder, name: str, *, known: bool = True) -> Halves:
+    """Return every other window of a flight, to learn from at known places or by fixes."""
     data = uwb.load(folder, name, shared=False)
 
     def problem(windows: tuple[Window, ...], motion: Motion) -> Problem:
@@ -55,8 +55,8 @@ def flight(folder, name: str) -> Halves:
         )
 
     learn, other = (np.array([w.truth for w in data.windows[k::2]]) for k in (0, 1))
-    known = problem(data.windows[0::2], Motion(span="epoch", known=learn[:, None]))
-    return Halves(known, problem(data.windows[1::2], Motion(span="epoch")), other)
+    motion = Motion(span="epoch", known=learn[:, None] if known else None)
+    return Halves(problem(data.windows[0::2], motion), problem(data.windows[1::2], Motion(span="epoch")), other)
 
 
 def robots(folder, number: int) -> Halves:
@@ -79,10 +79,11 @@ def within_one_in_a_hundred(counts: list[tuple[int, int]]) -> None:
     assert far <= 0.01 * good
 
 
+@pytest.mark.parametrize("known", [True, False], ids=["at known places", "from fixes"])
 @pytest.mark.parametrize("name", EACH)
-def test_flights_by_what_each_anchor_is_off_in_a_window(data_dir, name):
+def test_flights_by_what_each_anchor_is_off_in_a_window(data_dir, name, known):
     # What lasts for a window is the error of an anchor's arrival, not of a pair: its two pairs have it with two signs.
-    good, far = counted(name, flight(data_dir / "util_uwb_tdoa", name), "station", "auto")
+    good, far = counted(name, flight(data_dir / "util_uwb_tdoa", name, known=known), "station", "auto")
     assert good > 0
     assert not far
 
