@@ -51,7 +51,7 @@ _SHARE = 0.5
 # Steps of the medians, which only bring the factors near; turns of gross errors and steps; scoring steps of a turn.
 _COARSE, _ROUNDS, _STEPS = 8, 5, 40
 # Moves that end them: of a coarse step in log-factors; of a scoring step and of a turn in standard errors.
-_NEAR, _CLOSE, _SETTLED = 0.05, 1e-3, 0.05
+_NEAR, _CLOSE, _SETTLED = 0.05, 1e-2, 0.05
 # Redundancy of an error from which its test counts for a median, and what stands for a median of zero.
 _SHOWN, _SMALL = 1e-3, 1e-2
 # Bounds of a coarse step of a log-factor: medians of few errors are rough.
