@@ -13,9 +13,8 @@ from optloc.base.types import Array
 PIVOT = 1e-15
 """Share of its diagonal that a pivot must exceed: five units in the last place, below which no digit of it is known."""
 
-
-# Rows from which those that are absent are taken out before a covariance is factored: time goes with the third power of
-# their number, and epochs of a file have as many as all of them together have.
+# Rows from which on those that are absent are taken out before a covariance is factored: time goes with the third power
+# of their number, and each epoch of a file has the rows of all epochs, most of them absent.
 _MANY = 16
 
 

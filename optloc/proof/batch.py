@@ -11,10 +11,10 @@ from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, worth_loading
 from optloc.proof.box import bound_nodes, cost_at, rounding
-from optloc.proof.chart import Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.near import BUDGET, OPEN, prove
 from optloc.proof.pose import Posed
+from optloc.proof.search_space import Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 
 # Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
 # what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
@@ -50,7 +50,7 @@ class Asked(NamedTuple):
     budget : int array (n,)
         How many boxes each may take.
     planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
-        Planes or a surface to which the claims are limited, see `optloc.proof.chart.Known`.
+        Planes or a surface to which the claims are limited, see `optloc.proof.search_space.Known`.
     """
 
     x: Array

@@ -36,14 +36,26 @@ from optloc.proof.box import (
     steepest_side,
     uncut,
 )
-from optloc.proof.chart import Box, Chart, Cost, Known, chart_on, cost_of, curve_box, descend, empty_box, turned, widen
-from optloc.proof.chart import place as set_place
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known, known_minima, set_minimum
 from optloc.proof.curvature import clip_to_stationary
 from optloc.proof.everywhere import is_left, leaves, push_pieces
 from optloc.proof.near import cut_side, lay_or_halve, region_of
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.pose import Posed
+from optloc.proof.search_space import (
+    Box,
+    Chart,
+    Cost,
+    Known,
+    chart_on,
+    cost_of,
+    curve_box,
+    descend,
+    empty_box,
+    turned,
+    widen,
+)
+from optloc.proof.search_space import place as set_place
 from optloc.proof.surface import SIDES, reach_of_piece
 
 # Standard deviations within which two minima are one: descents end a thousandth of one from their minimum.
@@ -72,7 +84,7 @@ class Aim(NamedTuple):
     Parameters
     ----------
     planes, surface : array (e, 3), (0,) or (SURFACE_WIDTH,)
-        To which the minima are limited, see `optloc.proof.chart.Known`.
+        To which the minima are limited, see `optloc.proof.search_space.Known`.
     gap : float
         By how much a minimum may cost more than the best.
     reach : float
@@ -327,7 +339,7 @@ class Places(NamedTuple):
     region : array (n, 2, d)
         Corners of what is searched where nothing encloses them.
     planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
-        To which the minima are limited, see `optloc.proof.chart.Known`.
+        To which the minima are limited, see `optloc.proof.search_space.Known`.
     """
 
     x: Array

@@ -11,10 +11,10 @@ from optloc.compute.jit import compiled, inlined
 from optloc.compute.systems import principal
 from optloc.proof.atlas import Atlas, home_of, set_centre
 from optloc.proof.box import J0, cost_at, linearise_rows, rounding
-from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, is_convex, widen
 from optloc.proof.curvature import G0, G1, G2, convex, sum_up
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, size_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE
+from optloc.proof.search_space import HIDDEN_REACH, Box, Chart, Cost, Known, is_convex, widen
 
 # Around a fix, in its search coordinates.
 

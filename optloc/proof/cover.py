@@ -36,11 +36,11 @@ from optloc.proof.box import (
     steepest_side,
     uncut,
 )
-from optloc.proof.chart import Box, Chart, Cost, chart_at, place, widen
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum
 from optloc.proof.enclosure import enclose
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW
+from optloc.proof.search_space import Box, Chart, Cost, chart_at, place, widen
 
 # Share of a box below which what is left of it is looked at again before it is cut, as in `optloc.proof.near`.
 _SHRUNK = 0.5

@@ -10,9 +10,9 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
 from optloc.compute.systems import inverse, invert
 from optloc.proof.box import rounding
-from optloc.proof.chart import LOOSE, Box, Chart, Cost
 from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
 from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
+from optloc.proof.search_space import LOOSE, Box, Chart, Cost
 
 # Balls that hold all points at which one node lies in an interval.
 
@@ -396,7 +396,7 @@ def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bo
 def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array) -> bool:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
-    Within a group of nodes (`optloc.proof.chart.Groups`) the errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
+    Within a group of nodes (`optloc.proof.search_space.Groups`) errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
     Ranges and linear forms are squared to equations linear in position and one more unknown; other nodes give balls of
     their own.
 

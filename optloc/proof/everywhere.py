@@ -44,11 +44,11 @@ from optloc.proof.box import (
     steepest_side,
     uncut,
 )
-from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
 from optloc.proof.curvature import has_no_infimum, spread_of, sum_up
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.search_space import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
 
 # Branch and bound over all positions, for costs that nothing encloses.
 

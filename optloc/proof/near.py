@@ -27,7 +27,19 @@ from optloc.proof.box import (
     shrink,
     uncut,
 )
-from optloc.proof.chart import (
+from optloc.proof.convex_boxes import is_known, known_minima
+from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
+from optloc.proof.enclosure import around_node, enclose
+from optloc.proof.nodes.node import (
+    HEIGHT,
+    HIGH,
+    LOW,
+    RANGE,
+    SLOPE0,
+    SLOPE1,
+    SLOPE2,
+)
+from optloc.proof.search_space import (
     Box,
     Chart,
     Cost,
@@ -42,18 +54,6 @@ from optloc.proof.chart import (
     turned,
     value_at,
     widen,
-)
-from optloc.proof.convex_boxes import is_known, known_minima
-from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
-from optloc.proof.enclosure import around_node, enclose
-from optloc.proof.nodes.node import (
-    HEIGHT,
-    HIGH,
-    LOW,
-    RANGE,
-    SLOPE0,
-    SLOPE1,
-    SLOPE2,
 )
 from optloc.proof.surface import DATA, LEVEL, MIDDLE, SIDES, is_beyond, is_one_side, reach_of_piece
 
@@ -311,7 +311,7 @@ def prove(
     cost : Cost
         The cost; unknowns other than the position have been projected out.
     box : Box
-        Tables to work with, see `optloc.proof.chart.empty_box`.
+        Tables to work with, see `optloc.proof.search_space.empty_box`.
     x : array (D,)
         The fix, polished.
     known : Known

@@ -198,8 +198,8 @@ def compress(K: Array, w: Array) -> tuple[Array, Array]:
     if q <= nodes + 1:
         return K, w
     basis, upper = np.linalg.qr(K)
-    # Differences of J ranges have rank J - 1. What rounding leaves of a row that depends on others is no range that no
-    # other balances, for which the cost would grow towards infinity.
+    # Differences of J ranges have rank J - 1. The last row is rounding then: left in, it would be a range that no other
+    # balances, and the cost would seem to grow towards infinity.
     length = np.sqrt((K**2).sum(-2, keepdims=True))
     upper = np.where(np.abs(upper) > _DEPENDENT * length, upper, 0.0)
     # What no position can fit stands in a row of its own, so that the cost keeps its value.

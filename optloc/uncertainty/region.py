@@ -20,11 +20,11 @@ from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quanti
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.box import reaches_infinity
-from optloc.proof.chart import Chart as Axes
-from optloc.proof.chart import Cost, cost_of, empty_box
 from optloc.proof.cover import cost_of_point, cover_everywhere, cover_near, room
 from optloc.proof.pose import pose_costs
 from optloc.proof.scope import crowded, unsupported
+from optloc.proof.search_space import Chart as Axes
+from optloc.proof.search_space import Cost, cost_of, empty_box
 
 # Boxes of a cover at most, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, that of an
 # ellipsoid 10 %, after some 20 and 100 ms. Plain Python takes a thousand times longer for each.

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.proof.chart import Known
 from optloc.proof.nodes.dispatch import NODES
 from optloc.proof.nodes.node import LINEAR, RANGE
+from optloc.proof.search_space import Known
 
 Array = np.ndarray
 

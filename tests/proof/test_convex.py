@@ -7,11 +7,11 @@ from proof.sampling import many
 from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.proof.box import is_empty, uncut
-from optloc.proof.chart import curve_box, is_convex
 from optloc.proof.convex_boxes import set_convex
 from optloc.proof.curvature import C00, SUMS, clip_to_stationary, convex, spread_of
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges
+from optloc.proof.search_space import curve_box, is_convex
 
 BOXES, POINTS = (500, 40), 200
 pytestmark = pytest.mark.usefixtures("form")

@@ -13,7 +13,6 @@ from optloc.compute.jit import enabled
 from optloc.compute.systems import inverse
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.box import cube, is_empty, least_residual, linearise_rows, rounding, shrink, uncut
-from optloc.proof.chart import Chart, chart_at, cost_of, curve_box, empty_box, value_at
 from optloc.proof.convex_boxes import accuracy_floor_far
 from optloc.proof.curvature import clip_to_stationary, sum_up
 from optloc.proof.enclosure import enclose
@@ -21,6 +20,7 @@ from optloc.proof.everywhere import leaves, prove_everywhere
 from optloc.proof.near import UNIQUE, VALUE
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, SLOPE0
+from optloc.proof.search_space import Chart, chart_at, cost_of, curve_box, empty_box, value_at
 
 CODES = {"range": RANGE, "linear": LINEAR, "azimuth": AZIMUTH, "elevation": ELEVATION, "groa": RATIO, "height": HEIGHT}
 NEAR = {2: ("range", "linear", "azimuth", "groa"), 3: tuple(CODES)}

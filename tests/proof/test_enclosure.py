@@ -6,10 +6,10 @@ from proof.costs import WIDTH, random_case
 from proof.sampling import many
 from proof.test_ranges import charted
 
-from optloc.proof.chart import value_at
 from optloc.proof.curvature import sum_up
 from optloc.proof.enclosure import around_node, around_rays, enclose
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
+from optloc.proof.search_space import value_at
 
 CASES, RAYS = (18, 6), (500, 200)
 pytestmark = pytest.mark.usefixtures("form")

@@ -10,12 +10,12 @@ from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.batch import Asked, prove_all
 from optloc.proof.box import cube, reaches_infinity
-from optloc.proof.chart import cost_of, empty_box
 from optloc.proof.convex_boxes import set_minimum
 from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE, prove
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 from optloc.proof.pose import Posed
+from optloc.proof.search_space import cost_of, empty_box
 
 # Of directions, radians.
 FINE = {"xatol": 1e-12}

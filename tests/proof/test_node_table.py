@@ -145,7 +145,7 @@ CHOICES = """
 import numpy as np
 import squared_range
 from optloc.compute.jit import plain
-from optloc.proof.chart import empty_box
+from optloc.proof.search_space import empty_box
 from optloc.proof.curvature import curve_nodes
 from optloc.proof.box import bound_nodes
 from optloc.proof.nodes.dispatch import code_of, width

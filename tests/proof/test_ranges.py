@@ -6,9 +6,9 @@ from proof.costs import WIDTH, random_case
 
 from optloc.compute.jit import enabled
 from optloc.proof.box import bound_nodes, cut_out, least_residual, linearise_rows, shrink
-from optloc.proof.chart import chart_at, cost_of, empty_box, place
 from optloc.proof.nodes.node import NODE_WIDTH, RANGE, greatest
 from optloc.proof.nodes.range import bound_ranges
+from optloc.proof.search_space import chart_at, cost_of, empty_box, place
 
 BOXES, POINTS = (600, 250) if enabled() else (60, 250)
 

@@ -13,13 +13,13 @@ from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.batch import costs_at
 from optloc.proof.box import cube
-from optloc.proof.chart import chart_on
 from optloc.proof.curvature import C00, entry
 from optloc.proof.pose import pose_costs
 from optloc.proof.runs.posed import pose_runs
 from optloc.proof.runs.prove import costs_of_runs
 from optloc.proof.runs.rows import blur_of, least_length, residual_at
 from optloc.proof.runs.search import Space, floor_of, set_curves, set_nodes, sum_at, tables_of
+from optloc.proof.search_space import chart_on
 from optloc.proof.surface import SLIP
 from optloc.solvers.certify.posed import surfaces_of
 

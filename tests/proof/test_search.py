@@ -5,8 +5,8 @@ import pytest
 from proof.costs import NO_REGION, beside, combined, differences, random_case
 
 from optloc.compute.jit import enabled
-from optloc.proof.chart import cost_of, empty_box
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
+from optloc.proof.search_space import cost_of, empty_box
 
 CASES, BUDGET_HERE = (24, 20_000) if enabled() else (3, 300)
 KAPPAS = (0.0, 9.0, 25.0)

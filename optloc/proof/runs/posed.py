@@ -12,11 +12,6 @@ from optloc.linear.normal import prior_parts, weighed
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.proof.batch import plainly
-from optloc.proof.chart import (
-    Cost,
-    cost_of,
-    empty_groups,
-)
 from optloc.proof.nodes.level import height_numbers
 from optloc.proof.pose import (
     Columns,
@@ -36,6 +31,11 @@ from optloc.proof.runs.ground import STRAIGHT, Ground
 from optloc.proof.runs.rows import Rows
 from optloc.proof.runs.states import Course
 from optloc.proof.scope import held_height
+from optloc.proof.search_space import (
+    Cost,
+    cost_of,
+    empty_groups,
+)
 
 # From a problem to its rows, and to those of few epochs.
 

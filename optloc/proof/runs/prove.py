@@ -18,15 +18,6 @@ from optloc.proof.box import (
     cube,
     push_around,
 )
-from optloc.proof.chart import (
-    HIDDEN_REACH,
-    Chart,
-    Known,
-    accuracy_floor,
-    chart_on,
-    turned,
-    widen,
-)
 from optloc.proof.convex_boxes import draw_in, is_elsewhere, set_axes, set_hull
 from optloc.proof.curvature import G0, G1, G2, entry
 from optloc.proof.everywhere import CHEAPER, CLEAR, INFINITE, SPENT, UNBOUNDED, push_pieces
@@ -54,6 +45,15 @@ from optloc.proof.runs.search import (
 from optloc.proof.runs.state_bounds import axes_of, hessian_of_state
 from optloc.proof.runs.state_search import prove_course
 from optloc.proof.runs.states import STATE, Course, cost_of_state
+from optloc.proof.search_space import (
+    HIDDEN_REACH,
+    Chart,
+    Known,
+    accuracy_floor,
+    chart_on,
+    turned,
+    widen,
+)
 from optloc.proof.surface import SIDES, is_one_side, reach_of_piece
 
 # Boxes around known minima on which the cost is convex.

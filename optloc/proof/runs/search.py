@@ -26,17 +26,6 @@ from optloc.proof.box import (
     steepest_side,
     uncut,
 )
-from optloc.proof.chart import (
-    Box,
-    Chart,
-    Cost,
-    accuracy_floor,
-    curve_along,
-    empty_box,
-    is_bounded,
-    place,
-    widen,
-)
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known
 from optloc.proof.curvature import G0, G1, G2, curve_nodes, has_no_infimum
 from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, is_left, is_listed
@@ -51,6 +40,17 @@ from optloc.proof.runs.rows import (
     residual_at,
     sheet_of,
     sum_up_rows,
+)
+from optloc.proof.search_space import (
+    Box,
+    Chart,
+    Cost,
+    accuracy_floor,
+    curve_along,
+    empty_box,
+    is_bounded,
+    place,
+    widen,
 )
 from optloc.proof.surface import SLIP
 

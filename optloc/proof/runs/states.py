@@ -17,7 +17,6 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.models.primitives import WGS84_A
 from optloc.proof.box import bound_nodes
-from optloc.proof.chart import accuracy_floor
 from optloc.proof.curvature import curve_nodes, entry
 from optloc.proof.nodes.node import CHI, CURVE_WIDTH, H00, HIGH, LOW, NODE_WIDTH, SLOPE0, TURN0, triple, write
 from optloc.proof.runs.ground import (
@@ -41,6 +40,7 @@ from optloc.proof.runs.rows import (
     residual_at,
     sheet_of,
 )
+from optloc.proof.search_space import accuracy_floor
 
 # What is searched.
 

@@ -17,10 +17,10 @@ from optloc.problem.chart import quantile
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked
-from optloc.proof.chart import HIDDEN_REACH
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.scope import unsupported
+from optloc.proof.search_space import HIDDEN_REACH
 from optloc.solvers.certify.posed import (
     Costs,
     agrees,
