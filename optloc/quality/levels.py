@@ -175,7 +175,7 @@ def with_estimated_noise(
         kept, x = usable(batch, solve(batch_of(now), method) if batch.layout.size else None)
         # Fixes with the noise as found, factors of the noise as stated: what is not told stays as stated, in any turn.
         levels = levels_of(elements(batch.take(kept), x, by, common), by)
-        if np.isnan(levels.error).all():  # more turns would be this one again
+        if np.isnan(levels.low).all():  # not even one factor for all; more turns would be this one again
             advice = "state a sigma, or add rows, stations or epochs"
             raise InvalidProblem("the data do not tell the noise", "noise", advice)
         now = with_noise_levels(problem, levels)

@@ -252,21 +252,25 @@ def test_what_rows_of_an_epoch_share_is_told():
     assert (errors[0] ** 2).mean() < 0.7 * (errors[1] ** 2).mean()
 
 
-def test_what_arrivals_of_a_window_share_is_told_of_all_anchors():
-    # Of eight errors a fix follows four: four that explain the rest would say that the other anchors are exact.
-    rng, windows, repeats = np.random.default_rng(5), 40, 4
-    hall = np.array([[x, y, z] for z in (0.2, 3.0) for x, y in ((-4, -4), (4, -4), (4, 4), (-4, 4))])
+HALL = np.array([[x, y, z] for z in (0.2, 3.0) for x, y in ((-4, -4), (4, -4), (4, 4), (-4, 4))])
+
+
+def windows_of(rng, common, *, windows=40, repeats=4):
+    """Return windows of differences of neighbours, 0.1 m a row, whose arrivals have an error in common, and the truth."""
     target = rng.uniform([-3.0, -3.0, 0.5], [3.0, 3.0, 2.5], (windows, 3))
-    heard = np.linalg.norm(target[:, None] - hall, axis=-1) + 0.14 * rng.standard_normal((windows, 8))
+    heard = np.linalg.norm(target[:, None] - HALL, axis=-1) + common * rng.standard_normal((windows, 8))
     a = np.tile(np.arange(8), repeats)
     z = heard[:, a] - heard[:, (a + 1) % 8] + 0.1 * rng.standard_normal((windows, len(a)))
-    epoch = np.repeat(np.arange(windows), len(a))
-    rows = measured("tdoa", z.ravel(), a=np.tile(a, windows), b=(np.tile(a, windows) + 1) % 8, sigma=0.2, epoch=epoch)
-    fixed, levels = with_estimated_noise(assemble(hall, rows, motions=FREE), "station", common=True)
-    shared = np.array([name.endswith("common") for name in levels.names])
-    assert shared.sum() == 8
-    # an arrival's level is that of a row over the root of two
-    found = levels.factor[shared] * levels.stated[shared]
+    a, epoch = np.tile(a, windows), np.repeat(np.arange(windows), len(a))
+    return assemble(HALL, measured("tdoa", z.ravel(), a=a, b=(a + 1) % 8, sigma=0.2, epoch=epoch), motions=FREE), target
+
+
+def test_what_arrivals_of_a_window_share_is_told_of_all_anchors():
+    # Of eight errors a fix follows four: four that explain the rest would say that the other anchors are exact.
+    problem, target = windows_of(np.random.default_rng(5), 0.14)
+    fixed, levels = with_estimated_noise(problem, "station", common=True)
+    found = levels.sigma[[name.endswith("common") for name in levels.names]]
+    assert len(found) == 8
     assert (found > 0.02).all()
     assert np.sqrt((found**2).mean()) == pytest.approx(0.14, rel=0.25)
     fix = solve(by_epoch(fixed))
@@ -274,6 +278,15 @@ def test_what_arrivals_of_a_window_share_is_told_of_all_anchors():
     off = np.einsum("na,nab,nb->n", error, np.linalg.inv(fix.covariance("position")), error)
     assert (off > chi2.isf(1e-4, 3)).sum() == 0
     assert off.mean() / 3.0 == pytest.approx(1.0, abs=0.35)
+
+
+def test_one_factor_for_all_is_enough_to_be_told():
+    """A row in a ring has noise of either end: no station is told alone, and all together are."""
+    problem, _ = windows_of(np.random.default_rng(6), 0.0)
+    fixed, levels = with_estimated_noise(problem, "station", common=True)
+    assert np.isnan(levels.error).all()
+    now = variances(fixed.noise, fixed.count)
+    np.testing.assert_allclose(np.sqrt(now), 0.1, rtol=0.05)
 
 
 def test_no_common_error_is_said_and_left_out():
