@@ -256,7 +256,7 @@ HALL = np.array([[x, y, z] for z in (0.2, 3.0) for x, y in ((-4, -4), (4, -4), (
 
 
 def windows_of(rng, common, *, windows=40, repeats=4):
-    """Return windows of differences of neighbours, 0.1 m a row, whose arrivals have an error in common, and the truth."""
+    """Return windows of differences of neighbours, 0.1 m a row, whose arrivals share an error, and the truth."""
     target = rng.uniform([-3.0, -3.0, 0.5], [3.0, 3.0, 2.5], (windows, 3))
     heard = np.linalg.norm(target[:, None] - HALL, axis=-1) + common * rng.standard_normal((windows, 8))
     a = np.tile(np.arange(8), repeats)
