@@ -26,6 +26,7 @@ from tempfile import TemporaryFile
 from types import SimpleNamespace
 from typing import IO, Any
 
+from optloc.compute.borrowing import borrowing
 from optloc.compute.manifest import PACKAGE, PREFIX, digest_of, installed, of_this_process
 
 # Folders of machine code of other sources that are left, the last used ones: branches of one checkout and versions that
@@ -115,6 +116,7 @@ def _taken_in() -> Any:
 def callee_compiler() -> Any:
     """Return numba's compiler of what only compiled functions call, as its option `pipeline_class` takes it."""
     from numba.core import compiler
+    from numba.core.typed_passes import AnnotateTypes
 
     numba: Any = compiler
 
@@ -122,7 +124,11 @@ def callee_compiler() -> Any:
         def define_pipelines(self) -> Any:
             state = self.state
             state.library = _taken_in()(state.targetctx.codegen(), state.func_id.func_qualname)
-            return super().define_pipelines()
+            pipelines = super().define_pipelines()
+            for pipeline in pipelines:
+                pipeline.add_pass_after(borrowing(), AnnotateTypes)
+                pipeline.finalize()
+            return pipelines
 
     return Callees
 

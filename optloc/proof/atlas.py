@@ -5,15 +5,15 @@ A position is ``x = m + R p / v``, with m the centre and R half the side of a cu
 - piece k < 2 D, a face of the cube: p on the surface of the unit cube, v in (0, 1]; v = 0 is infinity. The coordinates
   are those of p on the face, then v: the inverse-range chart;
 - piece 2 D, inside the cube: v = 1, the coordinates are those of p;
-- piece 2 D + 1 + i, around the known minimum i, the fix first: the coordinates are the principal axes s of the minimum
-  in those u of the piece above where it lies, its home: ``u = start + axes s``.
+- piece 2 D + 1 + i, around the known minimum i, the fix first: the coordinates are axes s of the minimum in those u of
+  the piece above where it lies, its home: ``u = start + axes s``. On a face v changes along the last one alone.
 
 The line to a station at ``m + R a`` is, but for the factor R/v, ``p - v a``.
 """
 
 from __future__ import annotations
 
-from math import sqrt
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +32,10 @@ class Minima(NamedTuple):
         The face or inside on which each lies.
     start, axes, back : array (P, 3), (P, 3, 3), (P, 3, 3)
         Coordinates ``u = start + axes s`` there, and the inverse of the axes.
-    sides, core : array (P, 3)
-        Half-widths of boxes in s: where the cost is convex, and, wider, what is searched along the axes.
+    sides : array (P, 3)
+        Half-widths of boxes in s where the cost is convex.
+    core : array (P, 2, 3)
+        Corners of wider boxes in s, searched along the axes; to infinity where the last number of the first is -inf.
     """
 
     home: Array
@@ -94,7 +96,7 @@ def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
         np.zeros((count, 3, 3)),
         np.zeros((count, 3, 3)),
         np.zeros((count, 3)),
-        np.zeros((count, 3)),
+        np.zeros((count, 2, 3)),
     )
     return with_minima(middle, radius, dimension, minima)
 
@@ -232,6 +234,8 @@ def position(atlas: Atlas, x: Array) -> None:
         x[k] = atlas.middle[k] + atlas.radius * atlas.point[k] / atlas.scale[0]
 
 
+# What a few sums and products round, relative to their sizes, and a thousand times that; and a thousand times more.
+_BEYOND, _OUTWARDS = 1e-12, 1.0 + 1e-9
 # Roundings of a coordinate of a piece around a minimum, three products and sums: of what is about 1 in size.
 _PLACED = 8.0 * 2.0**-52
 
@@ -245,25 +249,42 @@ def widen_around(atlas: Atlas, i: int, half: Array) -> None:
 
 
 @compiled
-def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
-    """Return whether a box around the centre set lies inside the box ``|s_k| <= sides_k`` (3,) around minimum i."""
+def infinity(atlas: Atlas, piece: int) -> float:
+    """Return the last coordinate of infinity in a piece, -inf where it is not reached along that alone.
+
+    Around a minimum a little beyond, where v rounds to zero.
+    """
+    d, around = atlas.dimension, piece - 2 * atlas.dimension - 1
+    if around < 0 or atlas.minima.home[around] == 2 * d:
+        return 0.0 if piece < 2 * d else -inf
+    for k in range(d - 1):
+        if atlas.minima.axes[around, d - 1, k] != 0.0:
+            return -inf
+    return float(-atlas.minima.start[around, d - 1] / atlas.minima.axes[around, d - 1, d - 1] * (1.0 + _BEYOND))
+
+
+@compiled
+def within(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
+    """Return whether a box around the centre set lies inside the convex box of minimum i, and whether in its core."""
     minima, d = atlas.minima, atlas.dimension
     # Boxes of another face never lie inside: their coordinates are not those of the minimum.
-    if minima.home[i] != atlas.place[0]:
-        return False
+    convex = core = bool(minima.home[i] == atlas.place[0])
     for k in range(d):
-        away = reach = blur = 0.0
+        if not (convex or core):
+            break
+        away = reach = 0.0
         for m in range(d):
-            blur += _PLACED * abs(minima.back[i, k, m])
             away += minima.back[i, k, m] * (atlas.place[1 + m] - minima.start[i, m])
+            reach += _PLACED * abs(minima.back[i, k, m])
             slope = 0.0
             for c in range(d):
                 slope += minima.back[i, k, c] * atlas.linear[c, m]
             reach += abs(slope) * half[m]
         # Inwards by more than the rounding of the inverse axes: a box left out must be one that was looked at.
-        if abs(away) + reach + blur > sides[k] * (1.0 - 1e-9):
-            return False
-    return True
+        low, high = (away - reach) * _OUTWARDS, (away + reach) * _OUTWARDS
+        convex = convex and max(high, -low) <= minima.sides[i, k]
+        core = core and high <= minima.core[i, 1, k] and low >= minima.core[i, 0, k]
+    return convex, core
 
 
 class Frame(NamedTuple):
@@ -298,10 +319,6 @@ def frame_of(atlas: Atlas) -> Frame:
     slant = (triple(atlas.slant[0], 0), triple(atlas.slant[1], 0), triple(atlas.slant[2], 0))
     point, rise = triple(atlas.point, 0), triple(atlas.scale, 1)
     return Frame(triple(atlas.middle, 0), atlas.radius, atlas.dimension == 3, point, slant, atlas.scale[0], rise)
-
-
-# What a few sums and products round, relative to their sizes, and a thousand times that.
-_BEYOND = 1e-12
 
 
 @compiled

@@ -214,7 +214,7 @@ def _search_everywhere(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, budg
             if more > count and known < most and set_minimum(cost, near, trial, known, at, -inf, _POLISHED, inf):
                 known, atlas, first = known + 1, trial, size
                 core, sides = minima.core[known - 1], minima.sides[known - 1]
-                size = push_around(stack, size, -core, core, sides, 2 * d + known)
+                size = push_around(stack, size, core[0], core[1], sides, 2 * d + known)
                 _queue_up(queue, 0.0, first, size)
             count = more
         size = push_halves(stack, size, side, box.at, box.half, low, piece, exact)

@@ -290,6 +290,18 @@ def clip(cut: Array, k: int, centre: float, reach: float) -> None:
 
 
 @inlined
+def share_left(cut: Array, half: Array) -> float:
+    """Return the share of the volume of a box that a cut leaves."""
+    share = 1.0
+    for k in range(3):
+        if cut[k] > cut[3 + k]:
+            return 0.0
+        if half[k] > 0.0:
+            share *= 0.5 * (cut[3 + k] - cut[k]) / half[k]
+    return share
+
+
+@inlined
 def cut_out(cut: Array, at: Array, half: Array) -> float:
     """Replace a box by its part between the ends of a cut; return the share of its volume that this is."""
     share = 1.0

@@ -381,7 +381,7 @@ def _pieces(boxes: Array, atlas: Atlas) -> int:
     if atlas.minima.home.shape[0]:
         boxes[count] = 0.0
         for k in range(d):
-            boxes[count, HALF + k] = atlas.minima.core[0, k]
+            boxes[count, HALF + k] = atlas.minima.core[0, 1, k]
         boxes[count, PIECE] = count
         count += 1
     return count
@@ -395,7 +395,7 @@ def _look_far(cost: Cost, atlas: Atlas, box: Box, front: Array, i: int, level: f
     set_centre(atlas, piece, box.at)
     # What lies in the surroundings of the fix is covered there.
     around = piece <= 2 * atlas.dimension and atlas.minima.home.shape[0] > 0
-    if around and within(atlas, box.half, 0, atlas.minima.core[0]):
+    if around and within(atlas, box.half, 0)[1]:
         return _OUT
     bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     return _decide(cost, box, level, floor)

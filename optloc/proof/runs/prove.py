@@ -107,7 +107,8 @@ def _set_far(run: Run, space: Space, tables: Tables, i: int, x: Array, value: fl
     if not _convex_sides(run, space, tables, np.zeros(3), piece, hull, margin, minima.sides[i]):
         return False
     for k in range(d):
-        minima.core[i, k] = min(max(_WIDER * minima.sides[i, k], _WIDE), hull[k])
+        minima.core[i, 1, k] = min(max(_WIDER * minima.sides[i, k], _WIDE), hull[k])
+        minima.core[i, 0, k] = -minima.core[i, 1, k]
     return True
 
 

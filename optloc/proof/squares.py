@@ -1,0 +1,253 @@
+"""Squared rows of ranges over a box of an atlas: linear in the position but for one range, they clip boxes of any size.
+
+With ``e_j = phi_j - phi_p - z_j`` the error of a range beside that of a reference station p, lines of an atlas (scaled
+by v, in half sides of the cube) obey
+
+    (q_j - q_p - v z_j) (q_j + q_p + v z_j) / v = N_j - N_p - 2 z_j q_p - v z_j^2,
+
+``q_j = |p - v a_j|`` and ``N_j = -2 a_j.p + v |a_j|^2`` linear. So an error is the right side over the sum of two
+ranges; and over a box only q_p bends, where each of the ranges does in the rows themselves. Any station of a group can
+be the reference: the one that bends least is.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, zero
+from optloc.proof.atlas import Atlas, frame_of, scaled_station, set_line
+from optloc.proof.box import (
+    DIRECTION,
+    J0,
+    MIDDLE,
+    ROW_WIDTH,
+    digits,
+    is_empty,
+    least_residual,
+    shrink,
+    uncut,
+)
+from optloc.proof.enclosure import SLACK
+from optloc.proof.nodes.node import FORCE, HIGH, LOW, NODE_WIDTH, PHI, RANGE, range_form, triple
+from optloc.proof.search_space import Box, Cost
+
+# Columns of a table of lines over a box (J, LINE_WIDTH): value, slope, least, greatest and remainder of the scaled
+# range; N and its gradient.
+VALUE, SLOPE, LEAST, MOST, BEND, LINEAR, GRADIENT, LINE_WIDTH = 0, 1, 4, 5, 6, 7, 8, 11
+
+
+class Squares(NamedTuple):
+    """Squared rows of groups of ranges, and tables for one box.
+
+    Parameters
+    ----------
+    group : int array (J,)
+        Of each node the number of its group, -1 where it has no squared row.
+    groups : int
+        How many groups there are.
+    late : array (J,)
+        What is measured of each range, less what is of the reference of its group, metres.
+    spread : array (J, J)
+        How far, at a residual of length one, the difference of two ranges of a group may be from what is measured.
+    sizes : array (J,)
+        Sizes of the coordinates that lines are differences of, half sides of the cube.
+    floor : float
+        Lengths of what residuals are differences of.
+    steep : float
+        How much longer residuals are for a change of one of the references' scaled ranges, at most.
+    lines : array (J, LINE_WIDTH)
+        Table of lines over a box.
+    K, weight, nodes, rows : arrays (q, G), (G,), (G, NODE_WIDTH), (q, ROW_WIDTH)
+        Tables of the rows, whose nodes are the ranges of references: see `optloc.proof.box`.
+    """
+
+    group: Array
+    groups: int
+    late: Array
+    spread: Array
+    sizes: Array
+    floor: float
+    steep: float
+    lines: Array
+    K: Array
+    weight: Array
+    nodes: Array
+    rows: Array
+
+
+@compiled
+def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
+    """Return the squared rows of a cost, where the tables of the box are those of a fix (`chart_at`)."""
+    kinds, groups, nodes, curves = cost.kinds, cost.groups, box.nodes, box.curves
+    J, order, R, tie = kinds.shape[0], groups.order, groups.R, groups.tie
+    group, late, spread, sizes = np.full(J, -1), np.zeros(J), np.zeros((J, J)), np.zeros(J)
+    first, count, floor, steep = zero(), zero(), 0.0, 0.0
+    for number in range(J):
+        members, reference = order[1, number], order[2, number]
+        if members == 0:
+            break
+        # Differences of ranges only: all of them follow the reference.
+        usable = members > 1 and reference >= 0
+        for i in range(first, first + members - 1):
+            usable = usable and kinds[order[0, i]] == RANGE and tie[order[0, i]] == 1.0
+        if usable:
+            last = first + members - 1
+            for i in range(first, last + 1):
+                j = order[0, i]
+                group[j] = count
+                if i < last:
+                    error = 0.0
+                    for m in range(first, last):
+                        error += R[i, m] * curves[order[0, m], FORCE]
+                    late[j] = nodes[j, PHI] - nodes[reference, PHI] - error
+                    steep += cost.weight[j] * abs(late[j])
+                for k in range(3):
+                    sizes[j] += (abs(cost.data[j, k]) + abs(middle[k])) / radius
+                floor += cost.weight[j] * (nodes[j, PHI] + nodes[reference, PHI] + abs(late[j]))
+                for m in range(first, last + 1):
+                    square = (R[i, i] if i < last else 0.0) + (R[m, m] if m < last else 0.0)
+                    square -= 2.0 * R[i, m] if i < last and m < last else 0.0
+                    spread[j, order[0, m]] = sqrt(max(square, 0.0))
+            count += 1
+        first += members
+    q, G = cost.K.shape[0], count
+    return Squares(
+        group,
+        count,
+        late,
+        spread,
+        sizes,
+        floor,
+        steep,
+        np.zeros((J, LINE_WIDTH)),
+        np.zeros((q, G)),
+        np.zeros(G),
+        np.zeros((G, NODE_WIDTH)),
+        np.zeros((q, ROW_WIDTH)),
+    )
+
+
+@compiled
+def bend_of(atlas: Atlas, squares: Squares, half: Array) -> float:
+    """Return how much a residual may change by what the distance to the centre of the cube bends over a box."""
+    return float(range_form(atlas.point, atlas.slant, triple(half, 0))[3] * squares.steep)
+
+
+@compiled
+def clip_to_squares(cost: Cost, atlas: Atlas, squares: Squares, rho: float, box: Box) -> bool:
+    """Clip a box around the centre set to where the residual may be shorter than rho; return whether anything is left.
+
+    What is left are the ends ``box.cut``.
+    """
+    _fill_lines(cost, atlas, squares, box.half)
+    longest = rho * (1.0 + SLACK) + SLACK
+    wider, size = _fill_rows(cost, atlas, squares, box.half)
+    longest *= 1.0 + wider
+    _deflate(squares, longest)
+    low = least_residual(squares.K, squares.weight, size, box.half, squares.nodes, squares.rows)
+    uncut(box.half, box.cut)
+    if low > longest:
+        return False
+    noise, flat = digits(squares.K) * size, box.half[2] == 0.0
+    shrink(squares.K, squares.weight, longest + noise, box.half, flat, squares.nodes, squares.rows, box.cut, box.solve)
+    return not is_empty(box.cut)
+
+
+@compiled
+def _fill_lines(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> None:
+    """Fill the table of lines over a box."""
+    frame, h, lines = frame_of(atlas), triple(half, 0), squares.lines
+    for j in range(lines.shape[0]):
+        if squares.group[j] < 0:
+            continue
+        set_line(frame, cost.data[j], 0, atlas.away, atlas.sense)
+        value, slope, least, bend, most = range_form(atlas.away, atlas.sense, h)
+        _, linear, gradient = scaled_station(frame, cost.data[j])
+        lines[j, VALUE], lines[j, LEAST], lines[j, MOST] = value, max(least, 0.0), most
+        lines[j, BEND], lines[j, LINEAR] = bend, linear
+        lines[j, SLOPE], lines[j, SLOPE + 1], lines[j, SLOPE + 2] = slope
+        lines[j, GRADIENT], lines[j, GRADIENT + 1], lines[j, GRADIENT + 2] = gradient
+
+
+@compiled
+def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple[float, float]:
+    """Fill the table of rows; return by what share they may be longer than a residual, and the sizes of their terms."""
+    lines, rows, K, radius, scale = squares.lines, squares.rows, cost.K, atlas.radius, atlas.scale
+    swing = abs(scale[1]) * half[0] + abs(scale[2]) * half[1] + abs(scale[3]) * half[2]
+    far, most = abs(scale[0]) + swing, 0.0
+    for k in range(3):
+        most += abs(atlas.point[k])
+        for m in range(3):
+            most += abs(atlas.slant[k, m]) * half[m]
+    rows[:], squares.K[:] = 0.0, 0.0
+    wider, size = 0.0, squares.floor
+    for g in range(squares.groups):
+        reference = -1
+        for j in range(lines.shape[0]):
+            if squares.group[j] == g and (reference < 0 or lines[j, BEND] < lines[reference, BEND]):
+                reference = j
+        bend = 0.5 * lines[reference, BEND]
+        for j in range(lines.shape[0]):
+            if squares.group[j] != g or j == reference:
+                continue
+            late = (squares.late[j] - squares.late[reference]) / radius
+            low = lines[j, LEAST] + lines[reference, LEAST] + scale[0] * late - swing * abs(late)
+            high = lines[j, MOST] + lines[reference, MOST] + scale[0] * late + swing * abs(late)
+            # Any positive number will do; the middle, unless that is not positive.
+            middle = max(0.5 * (low + high), 0.25 * (lines[j, MOST] + lines[reference, MOST]))
+            share = max(high / middle - 1.0, 1.0 - low / middle)
+            wider += cost.weight[j] * squares.spread[j, reference] * share
+            factor = radius / middle
+            constant = lines[j, LINEAR] - lines[reference, LINEAR] - 2.0 * late * (lines[reference, VALUE] + bend)
+            constant -= scale[0] * late * late
+            g0 = lines[j, GRADIENT] - lines[reference, GRADIENT]
+            g1 = lines[j, GRADIENT + 1] - lines[reference, GRADIENT + 1]
+            g2 = lines[j, GRADIENT + 2] - lines[reference, GRADIENT + 2]
+            g0 -= 2.0 * late * lines[reference, SLOPE] + late * late * scale[1]
+            g1 -= 2.0 * late * lines[reference, SLOPE + 1] + late * late * scale[2]
+            g2 -= 2.0 * late * lines[reference, SLOPE + 2] + late * late * scale[3]
+            both = squares.sizes[j] + squares.sizes[reference]
+            terms = both * (2.0 * most + far * both) + 2.0 * abs(late) * lines[reference, MOST] + late * late * far
+            size += cost.weight[j] * factor * terms
+            for i in range(K.shape[0]):
+                weight = K[i, j] * factor
+                rows[i, MIDDLE] += weight * constant
+                rows[i, J0] += weight * g0
+                rows[i, J0 + 1] += weight * g1
+                rows[i, J0 + 2] += weight * g2
+                squares.K[i, g] += weight * 2.0 * late
+        squares.nodes[g, LOW], squares.nodes[g, HIGH] = -bend, bend
+    # Sums over all nodes of a group are rounded as often as there are of them.
+    return wider, size * digits(cost.K) / digits(squares.K)
+
+
+@compiled
+def _deflate(squares: Squares, longest: float) -> None:
+    """Make rows shorter along what references may add to them, as much as is best: no residual is longer for it.
+
+    The nearer to least squares with the errors of the rows and of the references as noise, the more is clipped.
+    """
+    rows, K = squares.rows, squares.K
+    for g in range(squares.groups):
+        square = 0.0
+        for i in range(K.shape[0]):
+            square += K[i, g] * K[i, g]
+        squares.weight[g] = sqrt(square)
+        bend = squares.nodes[g, HIGH]
+        if not square > 0.0:
+            continue
+        left = 1.0 / sqrt(1.0 + square * bend * bend / (longest * longest))
+        for column in range(MIDDLE, DIRECTION):
+            along = 0.0
+            for i in range(K.shape[0]):
+                along += K[i, g] * rows[i, column]
+            along *= (1.0 - left) / square
+            for i in range(K.shape[0]):
+                rows[i, column] -= along * K[i, g]
+        for i in range(K.shape[0]):
+            K[i, g] *= left
+        squares.weight[g] *= left
