@@ -106,9 +106,12 @@ def mapped(
             if errors:
                 return
 
-    with ThreadPoolExecutor(count, thread_name_prefix="optloc") as pool:
+    # The calling thread is one of them: no processor has two to serve, and one less is begun.
+    with ThreadPoolExecutor(count - 1, thread_name_prefix="optloc") as pool:
         # What holds for the caller, such as a chosen back end, holds for its threads.
-        wait([pool.submit(copy_context().run, run) for _ in range(count)])
+        others = [pool.submit(copy_context().run, run) for _ in range(count - 1)]
+        run()
+        wait(others)
     if errors:
         raise errors[min(errors)]
     return [results[i] for i in range(len(work))]

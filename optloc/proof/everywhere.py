@@ -47,7 +47,7 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
-from optloc.proof.curvature import has_no_infimum, spread_of, sum_up
+from optloc.proof.curvature import has_no_infimum, most_curved_side, spread_of, sum_up
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.search_space import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
@@ -178,9 +178,9 @@ def search_everywhere(
         touching = _touches(box, d - 1, infinity(atlas, piece))
         # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
         sound = (whole or (low > 0.0 and low * low >= value)) and here < _NEAR * (level + 1.0)
-        if _is_cleared(cost, atlas, box, touching, sqrt(max(level, 0.0)), noise, sound):
+        side = _side_of_rest(cost, atlas, box, touching, sqrt(max(level, 0.0)), noise, sound)
+        if side < 0:
             continue
-        side = steepest_side(box.half, box.rows, d)
         lows += int(here < level)
         # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
         if here < level and lows & (lows - 1) == 0:
@@ -229,18 +229,23 @@ def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
 
 
 @inlined
-def _is_cleared(cost: Cost, atlas: Atlas, box: Box, touching: bool, rho: float, noise: float, sound: bool) -> bool:
-    """Return whether nothing of a box can hold a residual shorter than rho, or a minimum where that is `sound`.
+def _side_of_rest(cost: Cost, atlas: Atlas, box: Box, touching: bool, rho: float, noise: float, sound: bool) -> int:
+    """Return the side across which to halve what of a box may hold a residual shorter than rho; -1 for nothing of it.
 
-    Else the ends of what can are those of ``box.cut``.
+    Nor may it be without a minimum, where that is `sound`. What is left are the ends of ``box.cut``.
     """
     uncut(box.half, box.cut)
     flat = box.half[2] == 0.0
     shrink(cost.K, cost.weight, rho + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
     if is_empty(box.cut):
-        return True
+        return -1
     # What that leaves little of is looked at anew, which is cheaper.
-    return sound and share_left(box.cut, box.half) > _SHRUNK and _clips_away(cost, atlas, box, touching, noise)
+    if not sound or share_left(box.cut, box.half) <= _SHRUNK:
+        return int(steepest_side(box.half, box.rows, atlas.dimension))
+    if _clips_away(cost, atlas, box, touching, noise):
+        return -1
+    curved = most_curved_side(box.half, box.sums, atlas.dimension)
+    return int(curved if curved >= 0 else steepest_side(box.half, box.rows, atlas.dimension))
 
 
 @compiled

@@ -207,7 +207,7 @@ class Single:
             # a bound that is not that of this cost is one of another: the long way finds out which is wrong
             if not abs(cost - bound) <= _APART * equal_cost(cost):
                 return None
-            out.append(state_claim(cost, bound, LISTED_GAP, boxes, 0, None))
+            out.append(state_claim(cost, bound, LISTED_GAP, boxes, 0))
         return out
 
     def _agrees(self, fix: Fix, room: _Room) -> bool:

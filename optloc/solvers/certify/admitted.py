@@ -194,7 +194,7 @@ def _prove_within(
     bound = fix.cost - equal_cost(fix.cost)
     numbers = (values.tolist() for values in (why, boxes, sure, fix.cost, bound, listed))
     claims = [
-        state_claim(cost, low, gap, spent, count, None) if gap >= 0.0 else unknown(reason, spent)
+        state_claim(cost, low, gap, spent, count) if gap >= 0.0 else unknown(reason, spent)
         for reason, spent, gap, cost, low, count in zip(*numbers, strict=True)
     ]
     x, cost, face_of = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))

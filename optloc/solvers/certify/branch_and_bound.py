@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import repeat
+from operator import sub
 from time import perf_counter
 
 import numpy as np
@@ -65,17 +68,8 @@ def unknown(reason: str, boxes: int = 0) -> Certificate:
     return Certificate("unknown", reason, METHOD, boxes=boxes)
 
 
-def state_claim(
-    cost: float,
-    bound: float,
-    margin: float,
-    boxes: int,
-    listed: int,
-    region: tuple[Corner, Corner] | None,
-    *,
-    asked: bool = False,
-) -> Certificate:
-    """Return the certificate of a proven fix.
+def state_claim(cost: float, bound: float, margin: float, boxes: int, listed: int) -> Certificate:
+    """Return the certificate of a fix that is proven for all positions.
 
     Parameters
     ----------
@@ -87,13 +81,37 @@ def state_claim(
         Boxes looked at.
     listed : int
         How many alternatives the claim leaves out, because they are listed.
-    region : (lower, upper), optional
-        Corners of the region of the claim; None: all positions.
-    asked : bool
-        Whether somebody asked for that region.
     """
-    proof, sentence = "global" if region is None else "region", _sentence(margin, listed, region)
-    return Certificate(proof, sentence, METHOD, bound, cost - bound, margin > 0.0, margin, boxes, region, asked)
+    return next(state_claims([cost], [bound], [margin], [boxes], [listed], [None]))
+
+
+def state_claims(
+    cost: list[float],
+    bound: list[float],
+    margin: list[float],
+    boxes: list[int],
+    listed: list[int],
+    region: list[tuple[Corner, Corner] | None],
+    *,
+    asked: bool = False,
+) -> Iterator[Certificate]:
+    """Return the certificates of proven fixes, see `state_claim`.
+
+    Column by column: a batch has a claim for every fix, and a call of Python for each takes as long as a proof.
+
+    Parameters
+    ----------
+    cost, bound, margin, boxes, listed : list
+        As of `state_claim`, of each fix.
+    region : list of (lower, upper) or None
+        Corners of the region of each claim; None: all positions.
+    asked : bool
+        Whether somebody asked for these regions.
+    """
+    proof = ["global" if corners is None else "region" for corners in region]
+    sentence, unique = map(_sentence, margin, listed, region), [gap > 0.0 for gap in margin]
+    above = map(sub, cost, bound)
+    return map(Certificate, proof, sentence, repeat(METHOD), bound, above, unique, margin, boxes, region, repeat(asked))
 
 
 # Coordinates of space.
@@ -377,8 +395,8 @@ def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array
         low, high = corners[:, np.isfinite(corners).all(0)].tolist()  # what a known height says is not limited
         region[k] = tuple(low), tuple(high)
     numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
-    given = zip(*(values.tolist() for values in numbers), region, strict=True)
-    work.certificate[proven] = column([state_claim(*each, asked=work.limited) for each in given])
+    cost, low, gap, boxes, count = (values.tolist() for values in numbers)
+    work.certificate[proven] = column(list(state_claims(cost, low, gap, boxes, count, region, asked=work.limited)))
     work.pending[proven] = False
 
 
