@@ -57,6 +57,8 @@ class Squares(NamedTuple):
         Sizes of the coordinates that lines are differences of, half sides of the cube.
     floor : float
         Lengths of what residuals are differences of.
+    lack : float
+        How far a residual may be from what the squared rows say of it, for the rounding of what is measured.
     steep : float
         How much longer residuals are for a change of one of the references' scaled ranges, at most.
     lines : array (J, LINE_WIDTH)
@@ -71,6 +73,7 @@ class Squares(NamedTuple):
     spread: Array
     sizes: Array
     floor: float
+    lack: float
     steep: float
     lines: Array
     K: Array
@@ -82,36 +85,29 @@ class Squares(NamedTuple):
 @compiled
 def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
     """Return the squared rows of a cost, where the tables of the box are those of a fix (`chart_at`)."""
-    kinds, groups, nodes, curves = cost.kinds, cost.groups, box.nodes, box.curves
+    kinds, groups, nodes = cost.kinds, cost.groups, box.nodes
     J, order, R, tie = kinds.shape[0], groups.order, groups.R, groups.tie
     group, late, spread, sizes = np.full(J, -1), np.zeros(J), np.zeros((J, J)), np.zeros(J)
-    first, count, floor, steep = zero(), zero(), 0.0, 0.0
+    first, count, floor, lack, steep = zero(), zero(), 0.0, 0.0, 0.0
     for number in range(J):
         members, reference = order[1, number], order[2, number]
         if members == 0:
             break
+        own, last = order[0, first : first + members], members - 1
         # Differences of ranges only: all of them follow the reference.
         usable = members > 1 and reference >= 0
-        for i in range(first, first + members - 1):
-            usable = usable and kinds[order[0, i]] == RANGE and tie[order[0, i]] == 1.0
+        for i in range(last):
+            usable = usable and kinds[own[i]] == RANGE and tie[own[i]] == 1.0
         if usable:
-            last = first + members - 1
-            for i in range(first, last + 1):
-                j = order[0, i]
+            among = R[first : first + last, first : first + last]
+            lack += _set_late(cost, box, own, among, late)
+            _set_spread(own, among, spread)
+            for j in own:
                 group[j] = count
-                if i < last:
-                    error = 0.0
-                    for m in range(first, last):
-                        error += R[i, m] * curves[order[0, m], FORCE]
-                    late[j] = nodes[j, PHI] - nodes[reference, PHI] - error
-                    steep += cost.weight[j] * abs(late[j])
+                steep += cost.weight[j] * abs(late[j])
                 for k in range(3):
                     sizes[j] += (abs(cost.data[j, k]) + abs(middle[k])) / radius
                 floor += cost.weight[j] * (nodes[j, PHI] + nodes[reference, PHI] + abs(late[j]))
-                for m in range(first, last + 1):
-                    square = (R[i, i] if i < last else 0.0) + (R[m, m] if m < last else 0.0)
-                    square -= 2.0 * R[i, m] if i < last and m < last else 0.0
-                    spread[j, order[0, m]] = sqrt(max(square, 0.0))
             count += 1
         first += members
     q, G = cost.K.shape[0], count
@@ -122,6 +118,7 @@ def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
         spread,
         sizes,
         floor,
+        lack,
         steep,
         np.zeros((J, LINE_WIDTH)),
         np.zeros((q, G)),
@@ -129,6 +126,47 @@ def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
         np.zeros((G, NODE_WIDTH)),
         np.zeros((q, ROW_WIDTH)),
     )
+
+
+@compiled
+def _set_late(cost: Cost, box: Box, own: Array, R: Array, late: Array) -> float:
+    """Write what is measured of a group (the reference last); return how far that is from what the rows say.
+
+    Errors at the fix are e = R f, f the forces K'(K phi - w); A e = f, and what that is off is as long as its residual.
+    """
+    last, nodes, curves = own.shape[0] - 1, box.nodes, box.curves
+    reference = own[last]
+    for i in range(last):
+        error = 0.0
+        for m in range(last):
+            error += R[i, m] * curves[own[m], FORCE]
+        late[own[i]] = nodes[own[i], PHI] - nodes[reference, PHI] - error
+    square = 0.0
+    for i in range(last):
+        for m in range(last):
+            square += R[i, m] * _off(cost, box, own, late, i) * _off(cost, box, own, late, m)
+    return sqrt(max(square, 0.0))
+
+
+@compiled
+def _off(cost: Cost, box: Box, own: Array, late: Array, i: int) -> float:
+    """Return by how much the errors at the fix miss the force on a node."""
+    off, reference = box.curves[own[i], FORCE], own[own.shape[0] - 1]
+    for m in range(own.shape[0] - 1):
+        j = own[m]
+        off -= cost.A[own[i], j] * (box.nodes[j, PHI] - box.nodes[reference, PHI] - late[j])
+    return float(off)
+
+
+@compiled
+def _set_spread(own: Array, R: Array, spread: Array) -> None:
+    """Write standard deviations of the differences of a group, and a share of their terms for what rounding cancels."""
+    last = own.shape[0] - 1
+    for i in range(last + 1):
+        for m in range(last + 1):
+            first, second = R[i, i] if i < last else 0.0, R[m, m] if m < last else 0.0
+            tied = R[i, m] if i < last and m < last else 0.0
+            spread[own[i], own[m]] = sqrt(max(first + second - 2.0 * tied, 0.0) + SLACK * (first + second))
 
 
 @compiled
@@ -144,7 +182,7 @@ def clip_to_squares(cost: Cost, atlas: Atlas, squares: Squares, rho: float, box:
     What is left are the ends ``box.cut``.
     """
     _fill_lines(cost, atlas, squares, box.half)
-    longest = rho * (1.0 + SLACK) + SLACK
+    longest = rho * (1.0 + SLACK) + SLACK + squares.lack
     wider, size = _fill_rows(cost, atlas, squares, box.half)
     longest *= 1.0 + wider
     _deflate(squares, longest)

@@ -50,6 +50,7 @@ def test_no_position_with_a_short_residual_is_clipped(name):
     rng, lost, clipped = np.random.default_rng(1), 0, 0
     for cost, box, squares, atlas, x in scenes(name, many(60, 3), 1):
         assert squares.groups == 1
+        assert squares.lack < 1e-9
         at = np.zeros(3)
         piece = home_of(atlas, x, at)
         for _ in range(20):
