@@ -164,9 +164,8 @@ def search_everywhere(
         size -= 1
         boxes += 1
         piece = int(stack[size, PIECE])
-        if not _take(stack, size, atlas, chart, corners, box, piece):
-            continue
-        if not _squeeze(cost, atlas, squares, level, box, piece):
+        taken = _take(stack, size, atlas, chart, corners, box, piece)
+        if not (taken and _squeeze(cost, atlas, squares, level, box, piece)):
             continue
         low = _bound(cost, atlas, box, floor)
         if low > 0.0 and low * low >= level:
