@@ -161,9 +161,7 @@ def search_everywhere(
         if boxes >= budget or size + _SPARE > _CAPACITY:
             spent = shown == levels.shape[0]
             return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
-        size -= 1
-        boxes += 1
-        piece = int(stack[size, PIECE])
+        size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
         taken = _take(stack, size, atlas, chart, corners, box, piece)
         if not (taken and _squeeze(cost, atlas, squares, level, box, piece)):
             continue
