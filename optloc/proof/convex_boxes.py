@@ -180,9 +180,9 @@ _WIDEST, _SHARE = 1e4, 0.9
 # The box searched along the axes of a minimum: convex boxes, and standard deviations at least. Beyond it the cost is
 # high enough for boxes along the axes of space.
 _WIDER, _WIDE = 3.0, 3.0
-# The same for a proof: a valley is narrow, oblique to the faces, and longer than its curvature at the minimum says. What
-# is too wide is clipped by squared rows at once. Over 2 000 fixes of each of ten layouts 30 took as many boxes as 100,
-# and proved up to 5 % more of the fixes on flat ground unique; over 100 outside 12 took a sixth more boxes.
+# The same for a proof: a valley is narrow, oblique to the faces, and longer than its curvature at the minimum says.
+# What is too wide is clipped by squared rows at once. Over 2 000 fixes of each of ten layouts 30 took as many boxes as
+# 100, and proved up to 5 % more of the fixes on flat ground unique; over 100 outside 12 took a sixth more boxes.
 _VALLEY = 30.0
 # Half-widths of the first convex box that is tried, standard deviations, and by what it and its sides are tried larger:
 # a finer search takes as long as the boxes that it spares, or longer.
