@@ -141,21 +141,15 @@ def _set_late(cost: Cost, box: Box, own: Array, R: Array, late: Array) -> float:
         for m in range(last):
             error += R[i, m] * curves[own[m], FORCE]
         late[own[i]] = nodes[own[i], PHI] - nodes[reference, PHI] - error
-    square = 0.0
+    off, square = np.empty(last), 0.0
     for i in range(last):
+        off[i] = curves[own[i], FORCE]
         for m in range(last):
-            square += R[i, m] * _off(cost, box, own, late, i) * _off(cost, box, own, late, m)
+            j = own[m]
+            off[i] -= cost.A[own[i], j] * (nodes[j, PHI] - nodes[reference, PHI] - late[j])
+        for m in range(i + 1):
+            square += R[i, m] * off[i] * off[m] * (1.0 if m == i else 2.0)
     return sqrt(max(square, 0.0))
-
-
-@compiled
-def _off(cost: Cost, box: Box, own: Array, late: Array, i: int) -> float:
-    """Return by how much the errors at the fix miss the force on a node."""
-    off, reference = box.curves[own[i], FORCE], own[own.shape[0] - 1]
-    for m in range(own.shape[0] - 1):
-        j = own[m]
-        off -= cost.A[own[i], j] * (box.nodes[j, PHI] - box.nodes[reference, PHI] - late[j])
-    return float(off)
 
 
 @compiled
