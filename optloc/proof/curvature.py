@@ -298,10 +298,11 @@ def _clip_along(a: float, d: float, f: float, plane: bool, sums: Array, ball: fl
             own = a if k == 0 else (d if k == 1 else f)
             if not own > 0.0:
                 continue
-            middle, wide = sums[G0 + k], ball + sums[NOISE0 + k]
+            # The rounding of the sum counts, whatever is left of it: its own slope may be little.
+            middle, wide = sums[G0 + k], ball + sums[NOISE0 + k] + _ROUNDING * abs(sums[G0 + k])
             for m in range(3):
-                at = entry(k, m)
-                wide += 0.5 * sums[C00 + at] * max(abs(cut[m]), abs(cut[3 + m]))
+                at, far = entry(k, m), max(abs(cut[m]), abs(cut[3 + m]))
+                wide += (0.5 * sums[C00 + at] + _ROUNDING * abs(sums[at])) * far
                 if m != k:
                     middle += sums[at] * 0.5 * (cut[m] + cut[3 + m])
                     wide += abs(sums[at]) * 0.5 * (cut[3 + m] - cut[m])
