@@ -143,7 +143,7 @@ def test_no_loose_module():
 # its command and its map; chains of Stone Soup's detections; what methods of a study solve within how much work, and
 # their way down; the nuclear norm of a network, and studies of networks; their random places as machine code; convex
 # boxes around known minima (parts of two searches before); squared rows over a box, kernels that only borrow arrays.
-MODULES, LINES, BODY, RECURRING = 350, 600, 60, 20
+MODULES, LINES, BODY, RECURRING = 351, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

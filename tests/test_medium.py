@@ -326,7 +326,7 @@ def test_fixes_are_as_good_as_the_bound_and_say_so(name, medium, stations, truth
     # Nothing proves that rays which bend have no other place: never ok, and never a false one.
     assert not fix.has(optloc.Status.OK).any()
     assert all(fix.answered)
-    assert {c.proof for c in fix.claims} <= {"unknown", "local"}
+    assert {c.proof for c in fix.certificate} <= {"unknown", "local"}
     error = fix.position - x[:3]
     bound = crlb(problem.take(np.array([0])), x)[..., :3, :3].reshape(3, 3)
     share = (error**2).sum(1).mean() / np.trace(bound)

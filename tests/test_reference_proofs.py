@@ -9,6 +9,8 @@ from cases import STATIONS, TARGET, stations
 
 import optloc
 from optloc import Bias, Motion, Prior, assemble, measured, simulate
+from optloc.base.records import join
+from optloc.problem.claims import claim
 from optloc.solvers.certify.relaxations import METHODS, reference_bound
 from optloc.solvers.methods import compare_bounds
 from optloc.solvers.outside import accept
@@ -196,10 +198,10 @@ def test_kinds_without_ranges_and_unknown_methods():
 def test_the_stage_keeps_what_is_proven_and_proves_the_rest():
     problem = drawn("tdoa", 3)
     fix = optloc.solve(problem)
-    certificate = np.array(fix.certificate)
-    certificate[0] = replace(certificate[0], proof="global", method="another proof")
-    certificate[1] = replace(certificate[1], proof="unknown", method="none")
-    found = bounded(problem, replace(fix, claims=certificate))
+    claims = join([fix.claims], len(fix))
+    claims.write(0, claim(replace(fix.certificate[0], proof="global", method="another proof")))
+    claims.write(1, claim(replace(fix.certificate[1], proof="unknown", method="none")))
+    found = bounded(problem, replace(fix, claims=claims))
     assert found.certificate[0].method == "another proof"
     assert (found.certificate[1].proof, found.certificate[1].method) == ("global", "moment relaxation")
     assert found.certificate[1].gap < 1e-3

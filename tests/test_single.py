@@ -2,7 +2,7 @@
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -79,9 +79,11 @@ def check_same(one, other):
     assert (one.chart.kind, one.active[()]) == (other.chart.kind, other.active[()])
     assert np.allclose(one.chart.centre, other.chart.centre, rtol=1e-12)
     assert [stage.name for stage in one.stages] == [stage.name for stage in other.stages]
-    for name in ("x", "cov", "code", "reason", "claims", "cost", "dof", "weights", "marks", "infinity"):
-        assert getattr(one, name).dtype == getattr(other, name).dtype
-        assert getattr(one, name).shape == getattr(other, name).shape
+    names = ("x", "cov", "code", "reason", "cost", "dof", "weights", "marks", "infinity")
+    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
+    pairs += [(getattr(one.claims, own.name), getattr(other.claims, own.name)) for own in fields(one.claims)]
+    for mine, theirs in pairs:
+        assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape)
 
 
 @pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])

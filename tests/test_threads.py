@@ -16,7 +16,7 @@ from formulations.moment_sdp import moment_problem
 from formulations.nls import Program
 from optloc import Fix, InvalidProblem, Problem, assemble, measured, simulate, solve
 from optloc.base.cache import Cache
-from optloc.base.threads import mapped, thread_count
+from optloc.base.threads import flow, mapped, thread_count
 from optloc.compute import tables, trace
 from optloc.linear import evaluate
 from optloc.solvers import ipopt, range_fixes
@@ -56,6 +56,46 @@ def test_what_holds_for_the_caller_holds_for_its_threads():
         assert mapped(lambda _: choice.get(), range(4), 2) == ["mine"] * 4
     finally:
         choice.reset(token)
+
+
+@pytest.mark.parametrize("threads", ["1", "2", "7"])
+def test_parts_flow_in_their_order_and_share_the_threads(threads, monkeypatch):
+    monkeypatch.setenv("OPTLOC_THREADS", threads)
+
+    def slow(i: int) -> tuple[int, int]:
+        time.sleep(0.002 * (i % 3))
+        return i, thread_count()
+
+    share = max(1, int(threads) // min(int(threads), 5))
+    assert list(flow(slow, range(5))) == [(i, share) for i in range(5)]
+    assert list(flow(slow, [])) == []
+    assert thread_count() == int(threads)
+
+
+def test_no_more_parts_are_held_than_there_are_threads(monkeypatch):
+    monkeypatch.setenv("OPTLOC_THREADS", "2")
+    begun: list[int] = []
+    parts = flow(begun.append, range(20))
+    next(parts)
+    time.sleep(0.05)
+    assert len(begun) <= 4
+    parts.close()
+    assert len(begun) <= 5
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_the_error_of_a_part_comes_where_the_part_would(threads, monkeypatch):
+    monkeypatch.setenv("OPTLOC_THREADS", threads)
+
+    def bad(i: int) -> int:
+        if i == 3:
+            raise ValueError(str(i))
+        return i
+
+    parts, found = flow(bad, range(8)), []
+    with pytest.raises(ValueError, match=r"^3$"):
+        found.extend(parts)
+    assert found == [0, 1, 2]
 
 
 def test_the_number_of_threads_is_read_from_one_place(monkeypatch):

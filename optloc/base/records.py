@@ -70,8 +70,10 @@ def overwrite(record: Record, items: Array, other: Record) -> Record:
         width = max(old.shape[1], new.shape[1]) if layout.slots else 0
         changed[name] = np.array(_widen(old, layout, width))
         changed[name][items] = _widen(new, layout, width)
-    for (name, part), (_, others) in zip(_parts(record), _parts(other), strict=True):
-        changed[name] = overwrite(part, items, others)
+    parts, others = dict(_parts(record)), dict(_parts(other))
+    for name in parts | others:
+        part = parts[name] if name in parts else _blank(others[name], _count(record))
+        changed[name] = overwrite(part, items, others[name] if name in others else _blank(part, _count(other)))
     return replace(record, **changed)  # type: ignore[type-var]
 
 
@@ -161,7 +163,7 @@ class _Column:
 
     def _shares(self, value: Array) -> bool:
         """Return whether a part is one row for all, the same as of the parts before."""
-        return value.strides[0] == 0 and all(np.array_equal(own[:1], value[:1]) for _, own in self.parts[:1])
+        return value.strides[0] == 0 and all(_is_equal(own[:1], value[:1]) for _, own in self.parts[:1])
 
     def _allocate(self, like: Array, shape: tuple[int, ...]) -> None:
         if self.whole is None:
@@ -170,6 +172,11 @@ class _Column:
             for place, value in self.parts:
                 self.whole[place] = _widen(value, self.layout, shape[0] if self.layout.slots else 0)
             self.parts = []
+
+
+def _is_equal(a: Array, b: Array) -> bool:
+    # NaN is not equal to itself, but what lies at the same place is
+    return np.may_share_memory(a, b) or np.array_equal(a, b)
 
 
 @cache

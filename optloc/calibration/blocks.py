@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from optloc.calibration.descent import EASE, FIRST, FLOOR, LEAST, MOST, NOTHING,
 from optloc.calibration.likelihood import Estimate, Likelihood
 from optloc.calibration.network import Network
 from optloc.problem.build import assemble, measured
+from optloc.problem.claims import GLOBAL
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
@@ -246,8 +246,7 @@ def stations_alone(lik: Likelihood, at: Estimate, which: Array) -> Points:
 
 def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> Block:
     """Return a block from the fix that has its place: `above` is what the present place costs beyond the best."""
-    certificate, d = fix.certificate, len(here)
-    claim: Any = certificate.item() if isinstance(certificate, np.ndarray) else certificate
+    claims, d = fix.claims, len(here)
     x = np.concatenate([fix.position[None, :d], fix.alternatives.x.reshape(-1, fix.x.shape[-1])[:, :d]])
     gaps = np.concatenate([[0.0], fix.alternatives.gap.ravel()])
     kept = np.isfinite(gaps) & np.isfinite(x).all(axis=1)
@@ -257,8 +256,8 @@ def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: f
     apart = np.where(alike, np.linalg.norm(x - here, axis=1), np.inf)
     others = np.arange(len(x)) != (apart.argmin() if alike.any() else -1)
     refuted = above > _ALIKE + equal_cost(float(fix.cost))
-    cheapest = claim.proof == "global" and not refuted
-    proven = cheapest and claim.unique and claim.margin >= AMBIGUOUS_GAP
+    cheapest = claims.proof.item() == GLOBAL and not refuted
+    proven = cheapest and claims.margin.item() >= AMBIGUOUS_GAP
     return Block(name, station, index, proven, cheapest, refuted, tuple(gaps[others] - above), x[others])
 
 

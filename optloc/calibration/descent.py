@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put, put_rows
 
 FIRST, EASE, STIFFEN = 1e-3, 0.2, 6.0
 """Marquardt's damping: at first, and its factors after a good and a bad step."""
@@ -256,8 +256,8 @@ def _step(rows: Rows, root: Array, s: int, at: State, damping: float, room: Room
         _forward(room.block[j], room.coupling[j], room.local[j])
     coupling = room.coupling.reshape(n * (d + 1), p)
     if rows.free.any():
-        room.normal[:] -= coupling.T @ coupling
-        room.gradient[:] -= coupling.T @ room.local.reshape(n * (d + 1))
+        put_rows(room.normal - coupling.T @ coupling, room.normal)
+        put(room.gradient - coupling.T @ room.local.reshape(n * (d + 1)), room.gradient)
     if rows.hold.shape[0]:
         for i in range(p):
             for k in range(i + 1):
@@ -311,8 +311,10 @@ def _solve(lower: Array, right: Array) -> None:
 
 @compiled
 def _copy(source: State, target: State) -> None:
-    target.stations[:], target.clocks[:] = source.stations, source.clocks
-    target.pulses[:], target.emission[:] = source.pulses, source.emission
+    put_rows(source.stations, target.stations)
+    put(source.clocks, target.clocks)
+    put_rows(source.pulses, target.pulses)
+    put(source.emission, target.emission)
 
 
 @compiled

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put
 from optloc.compute.lanes import Room, arrange, gather, load, memory
 from optloc.compute.pack import Packed
 
@@ -66,7 +66,7 @@ def absorb(packed: Packed, mean: Array, cov: Array, limit: int, tolerance: float
     y, move, slope = np.zeros(n), np.zeros(n), np.zeros(n)
     if not _root(cov, root):
         return -1
-    out.mean[:] = mean
+    put(mean, out.mean)
     cost = _equations(packed, m, r, room, root, y, out.mean, half, factor, slope)
     _solve(factor, slope, move)
     # The innovations' own square is the least of the cost along straight rows: written so that an error of the step
@@ -96,7 +96,7 @@ def absorb(packed: Packed, mean: Array, cov: Array, limit: int, tolerance: float
             share = 0.5 * share if turn < _HALVINGS - 1 else share
         for i in range(n):
             length += (share * move[i]) ** 2
-        y[:] = place
+        put(place, y)
         cost = now
         if not sqrt(length) > tolerance:
             break

@@ -13,6 +13,7 @@ from optloc.base.frames import Frame
 from optloc.base.types import Array, Status
 from optloc.live.events import Event
 from optloc.plot.outlines import earth_points
+from optloc.problem.claims import PROOFS, UNKNOWN
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.report import formats
@@ -131,11 +132,11 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
     """
     records = fix_records(fix, events, None)
     out = []
-    for new, old, certificate in zip(records, before, fix.certificate.tolist(), strict=True):
-        proof: Record = {"proof": getattr(certificate, "proof", "unknown")}
-        proof |= {"margin": getattr(certificate, "margin", 0.0), "boxes": getattr(certificate, "boxes", 0)}
-        if proof["proof"] == "unknown" and getattr(certificate, "reason", ""):
-            proof["why"] = certificate.reason
+    told = (column.tolist() for column in (fix.claims.proof, fix.claims.margin, fix.claims.boxes, fix.claims.reason))
+    for new, old, number, margin, boxes, reason in zip(records, before, *told, strict=True):
+        proof: Record = {"proof": PROOFS[number], "margin": margin, "boxes": boxes}
+        if number == UNKNOWN:
+            proof["why"] = reason
         if old is None:
             out.append(new | proof)
         elif _same(new, old):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put_rows
 from optloc.placement.criteria import gather, invert, measure
 from optloc.placement.relaxation import relax
 
@@ -178,7 +178,7 @@ def expand(
         total = prior[p].copy()
         for own in taken:
             gather(rows[p, :, :, own : own + 1].copy(), total, ones, -1, 1.0, scaled, bases[0, p])
-            total[:, :] = bases[0, p]
+            put_rows(bases[0, p], total)
         bases[0, p] = total
         for s in range(1, scenarios):
             gather(rows[p, :, :, taken[s - 1] : taken[s - 1] + 1].copy(), total, -ones, -1, 1.0, scaled, bases[s, p])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put_rows
 from optloc.placement.branching import IN, OUT, number_left
 from optloc.placement.criteria import TRACE, VOLUME, invert, measure
 
@@ -167,7 +167,7 @@ def worth(asked: Asked, members: Array, size: int, lost: int, enough: float, wor
         if asked.kind == TRACE:
             top = trace_of(work.inverse, d)
         else:
-            work.cov[:, :] = work.inverse[:d, :d]
+            put_rows(work.inverse[:d, :d], work.cov)
             top, _, _ = measure(asked.kind, work.cov, work.turn, work.basis, work.shares)
         total = max(total, top) if worst else total + asked.weight[p] * top
         if total >= enough and (worst or asked.kind != VOLUME):  # a logarithm may be negative
@@ -230,10 +230,10 @@ def one_more(asked: Asked, others: Others, inverses: Array, begin: int, values: 
             trace_with(others.products[p], inverses[p], d, begin, single, brought)
         else:
             for j in range(begin, n):
-                work.inverse[:, :] = inverses[p]
+                put_rows(inverses[p], work.inverse)
                 for q in range(others.rows.shape[1]):
                     update(work.inverse, others.rows[p, q, :, j], work.matrix[0])
-                work.cov[:, :] = work.inverse[:d, :d]
+                put_rows(work.inverse[:d, :d], work.cov)
                 brought[j], _, _ = measure(asked.kind, work.cov, work.turn, work.basis, work.shares)
         for j in range(begin, n):
             values[j] = max(values[j], brought[j]) if asked.worst else values[j] + asked.weight[p] * brought[j]

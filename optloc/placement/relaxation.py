@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put
 from optloc.placement.criteria import VOLUME, add_square, derive, evaluate
 
 # Multipliers below this share of the largest are left out: they cost as much as the others, and move the bound by less.
@@ -305,8 +305,8 @@ def relax(
         found = bound_at(x, low, gradient, duals, rules, limits, reduced, at)
         if found > bound:
             bound = found
-            w[:] = x
-            cost[:] = reduced
+            put(x, w)
+            put(reduced, cost)
         best = min(best, value) if meets(x, rules, limits) else best
         late += 1 if best < enough else 0
         if bound >= enough or best - bound <= _CLOSE * size or late > _LATE:

@@ -11,8 +11,9 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.types import ANSWERED, PRECEDENCE, Array, Certificate, Status
+from optloc.base.types import ANSWERED, PRECEDENCE, Array, Status
 from optloc.problem.chart import Chart, Extent
+from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
 
 _STATES = ("position", "velocity", "acceleration")
@@ -168,8 +169,8 @@ class Fix:
         `Status` numbers.
     reason : object array (...)
         Sentence that belongs to the status: the direction, the groups, the count.
-    claims : object array (...)
-        `Certificate` of each fix; see `certificate`.
+    claims : Claims
+        What is proven of each, in columns; see `certificate`.
     alternatives : Alternatives
         Other minima.
     cost : array (...)
@@ -202,7 +203,7 @@ class Fix:
     frame: Frame
     code: Annotated[Array, Axes(0)]
     reason: Annotated[Array, Axes(0, empty="")]
-    claims: Annotated[Array, Axes(0)]
+    claims: Claims
     alternatives: Alternatives
     cost: Annotated[Array, Axes(0)]
     dof: Annotated[Array, Axes(0)]
@@ -228,7 +229,7 @@ class Fix:
     @property
     def certificate(self) -> Any:
         """Return the `Certificate` of a single fix, or the object array (...) of them of a batch."""
-        return self.claims[()]
+        return self.claims.tell()[()]
 
     @property
     def position(self) -> Array:
@@ -502,6 +503,6 @@ def tail_probability(cost: Array, dof: Array) -> Array:
 def _as_array(value: Any) -> Array:
     if isinstance(value, np.ndarray | np.generic):
         return np.asarray(value)
-    out = np.empty(1, dtype=object if isinstance(value, str | tuple | Certificate) else None)
+    out = np.empty(1, dtype=object if value is None or isinstance(value, str | tuple) else None)
     out[0] = value
     return out.reshape(())

@@ -7,7 +7,7 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.compute.jit import compiled, inlined, put
 from optloc.compute.systems import principal
 from optloc.proof.atlas import Atlas, home_of, infinity, set_centre
 from optloc.proof.box import J0, cost_at, linearise_rows, rounding
@@ -296,7 +296,9 @@ def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
     """Write axes of minimum i in the coordinates of its home, a standard deviation each; False where there are none."""
     minima, d = atlas.minima, atlas.dimension
     axes, back = minima.axes[i], minima.back[i]
-    axes[:], back[:] = np.eye(3), np.eye(3)
+    axes[:], back[:] = 0.0, 0.0
+    for k in range(3):
+        axes[k, k] = back[k, k] = 1.0
     _tables(cost, box, atlas, i, np.zeros(3))
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     information, vectors = np.zeros((3, 3)), np.zeros((3, 3))
@@ -349,7 +351,8 @@ def _set_triangular(information: Array, d: int, axes: Array, back: Array) -> boo
 @inlined
 def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
     """Fill the tables of a box with half-widths (3,) around minimum i."""
-    box.at[:], box.half[:] = 0.0, half
+    box.at[:] = 0.0
+    put(half, box.half)
     set_centre(atlas, 2 * atlas.dimension + 1 + i, box.at)
     bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
@@ -380,7 +383,7 @@ def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float
         trial = np.minimum(hull, size)
     while size < _WIDEST and _convex(cost, box, atlas, i, np.minimum(hull, _GROWTH * size), margin):
         size *= _GROWTH
-    sides[:] = np.minimum(hull, size)
+    put(np.minimum(hull, size), sides)
     for k in range(atlas.dimension):
         trial = sides.copy()
         trial[k] = min(_GROWTH * sides[k], hull[k])

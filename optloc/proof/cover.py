@@ -11,7 +11,7 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, zero
+from optloc.compute.jit import compiled, put, put_rows, zero
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, set_centre, with_minima, within
 from optloc.proof.box import (
     CENTRE,
@@ -127,8 +127,11 @@ def cover_near(
         How many boxes were looked at.
     """
     own, good = chart_at(cost, x, box)
-    chart.origin[:], chart.sense[:], chart.back[:], chart.gram[:] = own.origin, own.sense, own.back, own.gram
-    chart.slip[:] = own.slip
+    put(own.origin, chart.origin)
+    put_rows(own.sense, chart.sense)
+    put_rows(own.back, chart.back)
+    put_rows(own.gram, chart.gram)
+    put(own.slip, chart.slip)
     corners = np.empty((2, 3))
     low, high = corners[0], corners[1]
     if not good or not enclose(cost, own, box, sqrt(level), low, high):
@@ -157,7 +160,7 @@ def cover_near(
                 side = _side_near(cost, chart, box, x.shape[0])
                 following = push_halves(lists[1], following, side, box.at, box.half, 0.0, 0, False)
         size = following
-        lists[0, :size] = lists[1, :size]
+        put_rows(lists[1, :size], lists[0, :size])
         # The next generation may be twice as large, and must find room: a box leaves one inside or two to look at.
         if size == 0 or size + done > most:
             break
@@ -331,7 +334,7 @@ def cover_everywhere(
         As of `cover_near`.
     """
     middle, radius = cube(cost.kinds, cost.data, x)
-    base[:] = middle
+    put(middle, base)
     d = x.shape[0]
     atlas = atlas_of(middle, radius, d, 1)
     # The surroundings of the fix along its own axes, where they can be found: a long thin region is cut along them.
@@ -353,7 +356,7 @@ def cover_everywhere(
                 side = _side_far(cost, atlas, box, piece)
                 following = push_halves(lists[1], following, side, box.at, box.half, 0.0, piece, False)
         size = following
-        lists[0, :size] = lists[1, :size]
+        put_rows(lists[1, :size], lists[0, :size])
         if size == 0 or size + done > most:
             break
     count = done

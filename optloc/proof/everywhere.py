@@ -7,7 +7,7 @@ from math import inf, isnan, nan, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, zero
+from optloc.compute.jit import compiled, inlined, put, zero
 from optloc.proof.atlas import (
     Atlas,
     atlas_of,
@@ -531,7 +531,7 @@ def prove_atlas(
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if gaps[0] > 0.0 else 0))
     known, place = zero(), np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):
-        place[:] = x if p == 0 else others[p - 1]
+        put(x if p == 0 else others[p - 1], place)
         hidden = p > others.shape[0] - beside.hidden
         least_here, limit = (-inf, HIDDEN_REACH) if hidden else (least - 0.5 * eps, inf)
         if set_minimum(cost, box, atlas, known, place, least_here, 0.5 * eps, limit):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.compute.jit import compiled, inlined, put
 from optloc.proof.box import (
     DEPTH,
     DIRECTION,
@@ -219,7 +219,8 @@ def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim
         return CHEAPER
     if least < aim.level and not is_known(box.at, box.half, minima, sides):
         return ANOTHER
-    box.at[:], box.half[:] = at, half
+    put(at, box.at)
+    put(half, box.half)
     return CLEAR
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, zero
+from optloc.compute.jit import compiled, inlined, put, put_rows, zero
 from optloc.compute.systems import inverse, invert, positive, roughly_principal
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, rounding
 from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
@@ -429,7 +429,7 @@ def is_bounded(cost: Cost, chart: Chart, box: Box) -> bool:
 @compiled
 def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
     """Bound the nodes over a box whose centre is in the plane of its chart along a surface, onto which it is moved."""
-    box.sense[:] = chart.sense
+    put_rows(chart.sense, box.sense)
     if not lay(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
         box.half[2] = 0.0
         return False
@@ -539,7 +539,7 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
         length = _step(cost, box, damping)
         if not length >= 0.0:
             return float("inf")
-        start[:] = box.at
+        put(box.at, start)
         for k in range(3):
             box.at[k] -= box.solve[0, k]
         after = value_at(cost, chart, box)
@@ -559,7 +559,7 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
                 return cost_now if good else float("inf")
             damping *= _LESS
         else:
-            box.at[:] = start
+            put(start, box.at)
             damping = max(_MORE * damping, _LEAST)
     return float("inf")
 

@@ -15,7 +15,7 @@ from math import sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put_rows
 from optloc.compute.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
 from optloc.proof.nodes.level import EXACT, HEIGHT_WIDTH, LEAST_RADIUS, curve_height, normal_at
@@ -305,7 +305,7 @@ def principal_along(information: Array, axes: Array, count: int) -> None:
                 for j in range(3):
                     own[k, m] += axes[i, k] * information[i, j] * axes[j, m]
     roughly_principal(own, vectors)
-    information[:] = own
+    put_rows(own, information)
     for k in range(count):
         for m in range(3):
             axes[m, k] = 0.0

@@ -13,6 +13,7 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status
 from optloc.bounds.observability import Observability
 from optloc.problem.chart import CURVED, INVERSE_RANGE
+from optloc.problem.claims import PROOFS
 from optloc.problem.fix import Active, Explanation, Fix
 
 Columns = dict[str, Array]
@@ -184,7 +185,7 @@ def _repeat(count: int, **texts: Sequence[str]) -> Columns:
 
 def _told_in_words(fix: Fix, constrained: bool) -> dict[str, list[str]]:
     """Return the proof of each fix, the constraints that hold it, and its suspects: "A; B" together, "A | B" either."""
-    texts = {"proof": [getattr(c, "proof", "unknown") for c in fix.claims]}
+    texts = {"proof": [PROOFS[number] for number in fix.claims.proof.tolist()]}
     texts["findings"] = ["; ".join(one.label for one in each) for each in fix.findings]
     texts["chart"] = [""] * len(fix) if fix.chart is None else list(fix.chart.name)
     if constrained:

@@ -13,13 +13,14 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.records import take
 from optloc.base.registry import Table
 from optloc.base.types import Array, Certificate, Status
+from optloc.problem.claims import GLOBAL, REGION, Claims, claim
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, unsupported
 from optloc.solvers import stages
 from optloc.solvers.certify.admitted import certified, value_certified
-from optloc.solvers.certify.branch_and_bound import claimed
+from optloc.solvers.certify.branch_and_bound import claimed, claims_before
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP
@@ -29,7 +30,7 @@ from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
 from optloc.solvers.suspects.stage import suspect
-from optloc.solvers.verdict.judge import fill, judge, standing
+from optloc.solvers.verdict.judge import judge, standing
 
 # The back end that holds for a stretch of code (`formulations.backend`), for layers that know formulations from here.
 __all__ = [
@@ -98,24 +99,23 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
         found = None if formulation.bound is None else formulation.bound(problem, fix)
         if found is None or not np.isfinite(found.bound).any():
             continue
-        tight, known = found.tight(fix.cost), np.flatnonzero(np.isfinite(found.bound))
-        certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
+        tight, known = found.tight(fix.cost), np.flatnonzero(np.isfinite(found.bound)).tolist()
+        proven = claims_before(pool)
         for i in known:
-            proven = fix.certificate[i].proof
+            before = fix.claims.proof[i]
             # a proof of the whole space stays, one of a region gives way only to a tight bound
-            if proven != "global" and (tight[i] or proven != "region"):
-                certificate[i] = _certificate(float(fix.cost[i]), float(found.bound[i]), bool(tight[i]), found.method)
+            if before != GLOBAL and (tight[i] or before != REGION):
+                proven.write(i, _claim(float(fix.cost[i]), float(found.bound[i]), bool(tight[i]), found.method))
         stage = Stage("bound", f"{int(tight[known].sum())} of {len(tight)} proven", perf_counter() - began)
-        return replace(pool, certificate=certificate, stages=(*pool.stages, stage))
+        return replace(pool, proven=proven, stages=(*pool.stages, stage))
     return pool
 
 
-def _certificate(cost: float, bound: float, tight: bool, name: str) -> Certificate:
+def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
     reason = "no position costs less" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"
-    return Certificate(
-        "global" if tight else "local", text, f"{name.removesuffix('s')} relaxation", bound, cost - bound
-    )
+    proof = "global" if tight else "local"
+    return claim(Certificate(proof, text, f"{name.removesuffix('s')} relaxation", bound, cost - bound))
 
 
 def _start(stage: Solver, summary: str, *, batched: bool = False) -> Entry:
@@ -309,8 +309,8 @@ def _beside(problem: Problem, start: Pool, x: Array) -> Pool:
 
 def is_unproven(fix: Fix) -> Array:
     """Return which fixes (N,) could still change: no proof that all minima within the listed gap are known."""
-    sure = [c.proof == "global" and c.margin >= LISTED_GAP for c in fix.certificate]
-    return np.asarray(~np.array(sure, dtype=bool) & ~np.isin(fix.code, _SETTLED))
+    sure = (fix.claims.proof == GLOBAL) & (fix.claims.margin >= LISTED_GAP)
+    return np.asarray(~sure & ~np.isin(fix.code, _SETTLED))
 
 
 def shortcut(method: Method) -> bool:

@@ -10,11 +10,13 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Status
+from optloc.problem.claims import Claims, untried, where
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Curvature, Pool, begin
 from optloc.solvers.stages import Solver
-from optloc.solvers.verdict.judge import LOCAL, UNKNOWN, fill, judge, verdict
+from optloc.solvers.verdict.findings import NO_ANSWER, NO_PROOF
+from optloc.solvers.verdict.judge import fill, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
 FixSolver = Callable[[Problem, Fix | None], Fix]
@@ -98,7 +100,7 @@ def accept(problem: Problem, fix: Fix) -> Pool:
         loss="" if np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) else "given",
         searched=searched,
         remark=np.where(fix.code == Status.SEARCHED, fix.reason, ""),
-        certificate=_claims(fix.certificate),
+        proven=_claims(fix.claims),
         asked=fix.explanations is not None,
         conclusion=_verbatim(fix, verbatim),
     )
@@ -112,11 +114,10 @@ def _lengths(explanations: Array) -> Array:
     return np.array([len(found) for found in explanations], dtype=int)
 
 
-def _claims(certificate: Array) -> Array:
-    """Return certificates that claim something; None in the place of the others."""
-    out = np.array(certificate)
-    out[[each in (LOCAL, UNKNOWN) for each in certificate]] = None
-    return out
+def _claims(claims: Claims) -> Claims:
+    """Return claims of which those that say nothing are as if nobody had tried."""
+    nothing = (claims.reason == NO_PROOF.reason) | (claims.reason == NO_ANSWER.reason)
+    return where(nothing, untried(len(nothing)), claims)
 
 
 def _verbatim(fix: Fix, items: Array) -> Array:

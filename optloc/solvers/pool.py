@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from time import perf_counter
 from typing import Annotated, NamedTuple, TypeVar
 
@@ -12,9 +13,11 @@ import numpy as np
 
 from optloc.base.errors import NUMERICAL
 from optloc.base.records import Axes, join, overwrite
-from optloc.base.types import Array, Certificate, Status
+from optloc.base.threads import flow
+from optloc.base.types import Array, Status
 from optloc.linear.normal import degrees_of_freedom
 from optloc.models.layers import Layers
+from optloc.problem.claims import Claims
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 
@@ -65,13 +68,13 @@ class Claim(NamedTuple):
         Of the fix.
     listed : int
         How many other minima were known.
-    certificate : Certificate
-        What came of it.
+    proven : Claims
+        What came of it, without batch axes.
     """
 
     cost: float
     listed: int
-    certificate: Certificate
+    proven: Claims
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +117,8 @@ class Pool:
         Where the candidates are the best of a search, not of starts that are known to be safe.
     remark : object array (N,), optional
         What a stage has to say beside the status.
-    certificate : object array (N,), optional
-        `Certificate` of what is proven of the best candidates, None where nobody has tried.
+    proven : Claims, optional
+        What is proven of the best candidates; None where nobody has tried for any.
     claims : object array (N,), optional
         What a branch before has tried to prove, a `Claim`: it stands where nothing new was found. None elsewhere.
     hidden : object array (N,), optional
@@ -144,7 +147,7 @@ class Pool:
     loss: str = ""
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None
-    certificate: Annotated[Array, Axes(0, empty=None)] | None = None
+    proven: Claims | None = None
     claims: Annotated[Array, Axes(0, empty=None)] | None = None
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
     asked: bool = False
@@ -263,12 +266,13 @@ def in_parts(
         found = list(_contained(problem, slice(0, count), work, failed))
         return found[0] if len(found) == 1 else _joined(found, count)
 
-    def answers() -> Iterator[Answer]:
-        for first in range(0, count, most):
-            part = slice(first, min(first + most, count))
-            yield from _contained(problem.take(np.arange(part.start, part.stop)), part, work, failed)
+    def answer(part: slice) -> list[Answer]:
+        return list(_contained(problem.take(np.arange(part.start, part.stop)), part, work, failed))
 
-    return _joined(answers(), count)
+    # An even number of parts of one size: as many threads are done at a time.
+    size = -(-count // (2 * -(-count // (2 * most))))
+    parts = [slice(first, min(first + size, count)) for first in range(0, count, size)]
+    return _joined(chain.from_iterable(flow(answer, parts)), count)
 
 
 def _contained(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from math import prod
 from threading import local
@@ -20,8 +20,9 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
-from optloc.base.types import Array, Certificate, Status, first_status
+from optloc.base.types import Array, Status, first_status
 from optloc.problem.chart import Chart, quantile
+from optloc.problem.claims import GLOBAL, claims_of
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.problem import Problem
@@ -29,7 +30,7 @@ from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_
 from optloc.proof.near import UNIQUE
 from optloc.proof.pose import Affine, Posed, pose_affinely
 from optloc.proof.scope import is_run, unsupported
-from optloc.solvers.certify.branch_and_bound import budgets, certify_stage, gaps_below, state_claim
+from optloc.solvers.certify.branch_and_bound import METHOD, budgets, certify_stage, gaps_below, sentence
 from optloc.solvers.certify.posed import agrees
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.methods import Method
@@ -47,14 +48,13 @@ from optloc.solvers.range_fixes import (
 )
 from optloc.solvers.verdict.findings import (
     BENT_SENTENCE,
+    NO_PROOF,
     NOT_TRIED,
     centre_of,
     chart_kind,
-    is_proof_of_one,
     largest,
     marks_of,
 )
-from optloc.solvers.verdict.judge import LOCAL
 
 # Beginnings of methods that go the short way, and whether they prove.
 _WORDS = {("gtrs", "lsr"): False, ("gtrs", "lsr", "certify"): True}
@@ -67,6 +67,9 @@ _SENTENCES: dict[tuple[Status, int | None], str] = {
     (Status.UNPROVEN, None): NOT_TRIED,
     **{(Status.CURVED, kind): sentence for kind, sentence in BENT_SENTENCE.items()},
 }
+# What a proof of all that an `ok` asks for claims, and the claim of an answer without one.
+_UNIQUE = sentence(LISTED_GAP, 0, None)
+_NO_PROOF = tuple(getattr(NO_PROOF, each.name).item() for each in fields(NO_PROOF))
 # By how much of what counts as equal (`equal_cost`) the bound of a proof may be off the cost: it is one below.
 _APART = 3.0
 
@@ -181,7 +184,7 @@ class Single:
             return None
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
-        claims: list[Certificate] | None = [LOCAL] * n
+        claims: list[tuple[Any, ...]] | None = [_NO_PROOF] * n
         if self.map is not None:
             claims = self._prove(self.map, x[:, :d], costs, room)
             stages = (*stages, certify_stage(f"{n} global", fixed))
@@ -191,7 +194,7 @@ class Single:
             return fix if room.checked else None
         return fix
 
-    def _prove(self, posed: Affine, position: Array, costs: list[float], room: _Room) -> list[Certificate] | None:
+    def _prove(self, posed: Affine, position: Array, costs: list[float], room: _Room) -> list[tuple[Any, ...]] | None:
         """Return what is proven of all positions, or None where that is not all there is to prove."""
         asked, answered = room.asked, room.answered
         for i, cost in enumerate(costs):
@@ -207,7 +210,7 @@ class Single:
             # a bound that is not that of this cost is one of another: the long way finds out which is wrong
             if not abs(cost - bound) <= _APART * equal_cost(cost):
                 return None
-            out.append(state_claim(cost, bound, LISTED_GAP, boxes, 0))
+            out.append((GLOBAL, _UNIQUE, METHOD, bound, cost - bound, True, LISTED_GAP, boxes, None, False))
         return out
 
     def _agrees(self, fix: Fix, room: _Room) -> bool:
@@ -220,7 +223,7 @@ class Single:
         shape: tuple[int, ...],
         answer: Any,
         costs: list[float],
-        claims: list[Certificate],
+        claims: list[tuple[Any, ...]],
         stages: tuple[Stage, ...],
         room: _Room,
     ) -> Fix | None:
@@ -229,8 +232,9 @@ class Single:
         for i, (cost, bent, least) in enumerate(
             zip(costs, answer.kappa.tolist(), answer.infinity.tolist(), strict=True)
         ):
-            unique = is_proof_of_one(claims[i], least - cost)
-            marks.append(marks_of(cost > self.refuted, least - cost, self.region, np.inf, bent[0], unique))
+            marks.append(
+                marks_of(cost > self.refuted, least - cost, self.region, np.inf, bent[0], self.map is not None)
+            )
             code.append(_status(marks[i]))
             kinds.append(chart_kind(*bent))
             infinity.append(least - cost)
@@ -244,7 +248,7 @@ class Single:
             covariance,
             code=_numbers(code, shape, np.int8),
             reason=_objects(reason, shape),
-            claims=_objects(claims, shape),
+            claims=claims_of(claims, shape),
             cost=_numbers(costs, shape),
             stages=stages,
             active=_objects(_NOTHING[: len(costs)], shape),
@@ -322,7 +326,7 @@ def _objects(values: Sequence[object], shape: tuple[int, ...]) -> Array:
     return out.reshape(shape)
 
 
-def _numbers(values: Sequence[float], shape: tuple[int, ...], kind: Any = float) -> Array:
+def _numbers(values: Sequence[Any], shape: tuple[int, ...], kind: Any = float) -> Array:
     return np.array(values if shape else values[0], dtype=kind)
 
 

@@ -298,7 +298,7 @@ def _check(fix: Any, drawn: Drawn) -> None:
         "dof": (fix.dof, (n,), "iu"),
         "weights": (fix.weights, (n, drawn.problem.count), "f"),
         "reason": (fix.reason, (n,), "OU"),
-        "certificate": (fix.certificate, (n,), "O"),
+        "proof": (getattr(fix.claims, "proof", None), (n,), "iu"),
         "alternatives.x": (fix.alternatives.x, (n, *others, size), "f"),
         "alternatives.gap": (fix.alternatives.gap, (n, *others), "f"),
     }

@@ -21,6 +21,7 @@ from optloc.bounds.crlb import crlb
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import TOLERANCE, exact, violation
 from optloc.linear.normal import covariance, eliminated
+from optloc.problem.claims import PROOFS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.study.draws import Case, Drawn
@@ -505,8 +506,9 @@ def fix_values(case: Case | NetworkCase, known: Known | KnownNetworks, fix: Fix 
     # Codes index the labels: members of Status are numbered from zero.
     labels = np.array([status.label for status in Status], dtype=object)
     values |= {"status": labels[fix.code], "reason": fix.reason}
-    values |= {"proof": [c.proof for c in fix.certificate], "certificate": [c.method for c in fix.certificate]}
-    values["bound"] = np.array([c.bound for c in fix.certificate], dtype=float)
+    claims = fix.claims
+    values |= {"proof": np.array(PROOFS, dtype=object)[claims.proof], "certificate": claims.method}
+    values["bound"] = claims.bound
     return values
 
 

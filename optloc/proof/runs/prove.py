@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, usable, zero
+from optloc.compute.jit import compiled, enabled, put, usable, zero
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, home_of, set_centre, with_minima
 from optloc.proof.batch import Answered, Asked, plainly, without_rivals
 from optloc.proof.box import (
@@ -72,7 +72,7 @@ def _convex_sides(
     """Write half-widths (3,), none beyond the hull, of a box around a place on which the cost is convex."""
     box, share, floor = tables.box, _WIDEST, floor_of(space, run.cost)
     for _ in range(_TRIALS):
-        box.at[:] = at
+        put(at, box.at)
         for k in range(3):
             box.half[k] = sides[k] = min(share, hull[k])
         if space.far:
@@ -224,7 +224,7 @@ def _prove_far(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables)
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
     space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
     for p in range(1 + others.shape[0]):
-        place[:] = task.x if p == 0 else others[p - 1]
+        put(task.x if p == 0 else others[p - 1], place)
         hidden = p > others.shape[0] - task.beside.hidden
         if p > 0 and not (hidden or aim.level > aim.value):
             continue
@@ -290,7 +290,7 @@ def _beside(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables, co
     room = np.zeros((2, 1 + others.shape[0], 3))
     space = Space(False, atlas, chart, room[0], room[1])
     for p in range(0 if own else 1, 1 + others.shape[0]):
-        place[:] = task.x if p == 0 else others[p - 1]
+        put(task.x if p == 0 else others[p - 1], place)
         hidden = p > others.shape[0] - task.beside.hidden
         if p > 0 and not (hidden or task.aim.level > task.aim.value):
             continue

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put
 from optloc.compute.systems import inverse, positive
 from optloc.proof.atlas import Atlas, position, set_centre, widen_around
 from optloc.proof.box import (
@@ -212,7 +212,8 @@ def search_run(
         side = steepest_side(small.half, small.rows, d)
         if cost_at(look.K, look.w, small.nodes) < _WORTH * (aim.level + 1.0):
             boxes += 1
-            tables.box.at[:], tables.box.half[:] = small.at, small.half
+            put(small.at, tables.box.at)
+            put(small.half, tables.box.half)
             touching = space.far and piece < 2 * d and small.at[d - 1] <= small.half[d - 1]
             here, more = _bound(run, space, tables, floors[1], aim.level)
             low = max(low, more)
@@ -328,7 +329,7 @@ def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array
         length = _step(box, damping)
         if not length >= 0.0:
             return False
-        before[:] = u
+        put(u, before)
         inside = True
         for k in range(3):
             u[k] -= box.solve[0, k]
@@ -342,7 +343,8 @@ def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array
                 known = is_listed(space.atlas, found) if space.far else is_known(u, box.half, space.minima, space.sides)
                 return now < level and not known
         else:
-            u[:], damping = before, max(10.0 * damping, 1e-4)
+            put(before, u)
+            damping = max(10.0 * damping, 1e-4)
             cost_at_coordinates(run, space, tables, home, u)
     return False
 
@@ -350,7 +352,8 @@ def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array
 @compiled
 def cost_at_coordinates(run: Run, space: Space, tables: Tables, home: int, u: Array) -> float:
     """Return the cost at coordinates of a piece, with its derivatives in the sums of the box."""
-    tables.box.at[:], tables.box.half[:] = u, 0.0
+    tables.box.half[:] = 0.0
+    put(u, tables.box.at)
     if space.far:
         set_centre(space.atlas, home, u)
     return sum_at(run, space, tables, 0.0)[0]

@@ -7,7 +7,7 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, put
 from optloc.compute.systems import invert
 from optloc.proof.batch import plainly
 from optloc.proof.nodes.node import HIGH, LOW, SLOPE0
@@ -220,9 +220,9 @@ def _rest(course: Course, table: Table, blur: float) -> float:
     if not ball < inf:
         return inf
     remainder = greatest_length(rows, reach, sheet.length)
-    reach[:] = table.rests[:, 2]
+    put(table.rests[:, 2], reach)
     bent = greatest_length(rows, reach, sheet.length)
-    reach[:] = table.rests[:, 1]
+    put(table.rests[:, 1], reach)
     wide = greatest_length(rows, reach, sheet.length)
     jump = bent * size + 0.5 * wide * size
     return float(ball + cross + 2.0 * own + remainder * (bent + wide) + jump * jump)

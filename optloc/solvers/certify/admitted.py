@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import Axes, overwrite, take
-from optloc.base.types import Array, Certificate, Status
+from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import (
     TOLERANCE,
@@ -32,6 +32,7 @@ from optloc.linear.constraints import (
     violation_names,
 )
 from optloc.linear.normal import marginal
+from optloc.problem.claims import GLOBAL, REGION, Claims, untried
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
@@ -44,9 +45,9 @@ from optloc.solvers.certify.branch_and_bound import (
     budgets,
     certified_freely,
     certify_stage,
-    column,
+    claims_before,
     keep_evidence,
-    state_claim,
+    state_claims,
     to_prove,
     unknown,
 )
@@ -81,11 +82,11 @@ def certified(
     if pool is None or region is not None or not limited or unsupported(problem) or problem.motions[0].order:
         return certified_freely(problem, pool, region, margin, effort)
     began, stages, fix = perf_counter(), pool.stages, judge(problem, pool)
-    certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
+    proven = claims_before(pool)
     asked, same = to_prove(pool, fix)
     for i in np.flatnonzero(same).tolist():
         assert pool.claims is not None
-        certificate[i] = pool.claims[i].certificate
+        proven.write(i, pool.claims[i].proven)
     items, more = np.flatnonzero(asked & ~same), 0
     for _ in range(_ROUNDS):
         if not len(items):
@@ -96,15 +97,15 @@ def certified(
         better = judge(part, new)
         changed = np.flatnonzero(_is_new(fix[items], better))
         # of a fix that an inequality holds nothing is claimed: its covariance is that along the edge alone
-        certificate[items] = column(told)
-        certificate[items[~is_free(problem, fix, items)]] = unknown(HELD)
+        proven.write(items, told)
+        proven.write(items[~is_free(problem, fix, items)], unknown(HELD))
         more += len(changed)
         pool = pool.merge(items[changed], take(new, changed))
         fix = overwrite(fix, items[changed], better[changed])
         items = items[changed[better.answered[changed]]]
-    certificate[items] = unknown(RESTLESS)
+    proven.write(items, unknown(RESTLESS))
     detail = f"{int(asked.sum())} within {violation_names(problem)}" + (f", {more} other minima found" if more else "")
-    return replace(pool, certificate=certificate, stages=(*stages, certify_stage(detail, began)))
+    return replace(pool, proven=proven, stages=(*stages, certify_stage(detail, began)))
 
 
 def _is_new(fix: Fix, other: Fix) -> Array:
@@ -166,10 +167,8 @@ def _beside(problem: Problem, pool: Pool, minima: Minima) -> Pool:
     return keep_evidence(settle(problem, both, stage), pool)
 
 
-def _prove_within(
-    problem: Problem, pool: Pool, fix: Fix, margin: float, effort: int
-) -> tuple[list[Certificate], Minima]:
-    """Return certificates of n fixes, and all minima that are admitted."""
+def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: int) -> tuple[Claims, Minima]:
+    """Return claims (n,) about fixes, and all minima that are admitted."""
     sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), pose(problem)
     sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
     why, seeds, tight = fill(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
@@ -192,11 +191,9 @@ def _prove_within(
         why = np.where((own < 0.0) & (why == ""), along.why, why)
     listed = (fix.alternatives.gap < sure[:, None]).sum(1)
     bound = fix.cost - equal_cost(fix.cost)
-    numbers = (values.tolist() for values in (why, boxes, sure, fix.cost, bound, listed))
-    claims = [
-        state_claim(cost, low, gap, spent, count) if gap >= 0.0 else unknown(reason, spent)
-        for reason, spent, gap, cost, low, count in zip(*numbers, strict=True)
-    ]
+    claims, lost = state_claims(fix.cost, bound, sure, boxes, listed), sure < 0.0
+    claims.write(lost, unknown(""))
+    claims.reason[lost], claims.boxes[lost] = why[lost], boxes[lost]
     x, cost, face_of = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
     return claims, (x, cost, face_of)
 
@@ -314,22 +311,22 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
     # the fix, all up to the margin above the fix must be found: in whole numbers, so that fixes of a batch ask alike
     above = np.where(gain > -LISTED_GAP, max(margin, AMBIGUOUS_GAP) - gain, max(margin, AMBIGUOUS_GAP))
     wanted = np.where(gain >= margin, 0.0, np.where(gain < 0.0, np.ceil(above), margin))
-    certificate, boxes = fill(len(seeds), unknown(LEFT.format(names))), np.zeros(len(seeds), dtype=np.int64)
+    proven = untried(len(seeds))
+    proven.write(np.arange(len(seeds)), unknown(LEFT.format(names)))
     for gap in np.unique(wanted[alone.answered]):
         items = np.flatnonzero(alone.answered & (wanted == gap))
         part = on.take(items)
         done = certified_freely(part, take(pool, items), None, float(gap), effort)
         done = _within_limits(part, done, limits, float(gap), effort)
         pool = pool.merge(items, done)
-        assert done.certificate is not None
-        certificate[items] = [claim or certificate[i] for i, claim in zip(items, done.certificate, strict=True)]
-    alone = judge(on, replace(pool, certificate=None))
+        assert done.proven is not None
+        tried = done.proven.tried
+        proven.write(items[tried], take(done.proven, tried))
+    alone = judge(on, replace(pool, proven=None))
     gain = _gain(alone.cost, fix.cost)
-    sure = np.array([_is_sure(claim, limits) for claim in certificate], dtype=bool)
-    gap = np.array([claim.margin if claim.unique else 0.0 for claim in certificate])
-    boxes = np.array([claim.boxes for claim in certificate], dtype=np.int64)
+    sure, gap = _is_sure(proven, limits), proven.margin
     least, rest = np.where(sure, gain, -np.inf), np.where(sure, gain + gap, -np.inf)
-    return Along(*_minima(alone), least, rest, boxes, column([claim.reason for claim in certificate]))
+    return Along(*_minima(alone), least, rest, proven.boxes, proven.reason)
 
 
 def _gain(cost: Array, best: Array) -> Array:
@@ -345,23 +342,22 @@ def _minima(fix: Fix) -> tuple[Array, Array]:
     return np.concatenate([fix.x[:, None], others.x], axis=1), np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _is_sure(claim: Certificate | None, limits: Array) -> bool:
-    """Return whether a claim is about all that a box admits, or about all positions."""
-    if claim is None:
-        return False
-    if claim.proof != "region" or claim.region is None:
-        return claim.proof == "global"
-    lower, upper = np.array(claim.region)
-    return bool((lower <= limits[0]).all() and (upper >= limits[1]).all())
+def _is_sure(claims: Claims, limits: Array) -> Array:
+    """Return which claims (n,) are about all that a box admits, or about all positions."""
+    out = np.asarray(claims.proof == GLOBAL)
+    for i in np.flatnonzero(claims.proof == REGION):
+        lower, upper = np.array(claims.region[i])
+        out[i] = (lower <= limits[0]).all() and (upper >= limits[1]).all()
+    return out
 
 
 def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, effort: int) -> Pool:
     """Return pools of which claims that cannot be made of all positions are about those that a box admits."""
-    assert pool.certificate is not None
-    open_ones = np.flatnonzero([not _is_sure(claim, limits) for claim in pool.certificate])
+    assert pool.proven is not None
+    open_ones = np.flatnonzero(~_is_sure(pool.proven, limits))
     if not len(open_ones) or not np.isfinite(limits).all():
         return pool
-    part = replace(take(pool, open_ones), certificate=None)
+    part = replace(take(pool, open_ones), proven=None)
     again = certified_freely(problem.take(open_ones), part, limits, margin, effort)
     return pool.merge(open_ones, again)
 

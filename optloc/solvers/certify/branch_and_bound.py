@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import repeat
-from operator import sub
 from time import perf_counter
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.records import overwrite, present, take
+from optloc.base.records import change, overwrite, present, take
 from optloc.base.types import Array, Certificate
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
 from optloc.problem.chart import quantile
+from optloc.problem.claims import GLOBAL, PROOFS, REGION, UNKNOWN, Claims, claim, untried
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked
@@ -63,64 +61,45 @@ RESTLESS = "minima kept turning up"
 MISMATCHED = "the cost of the proof is not that of the fix"
 
 
-def unknown(reason: str, boxes: int = 0) -> Certificate:
-    """Return the certificate of a fix of which nothing is proven, with the reason and the boxes that were looked at."""
-    return Certificate("unknown", reason, METHOD, boxes=boxes)
-
-
-def state_claim(cost: float, bound: float, margin: float, boxes: int, listed: int) -> Certificate:
-    """Return the certificate of a fix that is proven for all positions.
-
-    Parameters
-    ----------
-    cost, bound : float
-        Of the fix, and the certified lower bound.
-    margin : float
-        Proven gap to other minima; 0 for the value alone.
-    boxes : int
-        Boxes looked at.
-    listed : int
-        How many alternatives the claim leaves out, because they are listed.
-    """
-    return next(state_claims([cost], [bound], [margin], [boxes], [listed], [None]))
+def unknown(reason: str) -> Claims:
+    """Return the claim () about fixes of which nothing is proven, with the reason."""
+    return claim(Certificate("unknown", reason, METHOD))
 
 
 def state_claims(
-    cost: list[float],
-    bound: list[float],
-    margin: list[float],
-    boxes: list[int],
-    listed: list[int],
-    region: list[tuple[Corner, Corner] | None],
-    *,
-    asked: bool = False,
-) -> Iterator[Certificate]:
-    """Return the certificates of proven fixes, see `state_claim`.
-
-    Column by column: a batch has a claim for every fix, and a call of Python for each takes as long as a proof.
+    cost: Array, bound: Array, margin: Array, boxes: Array, listed: Array, everywhere: Array | bool = True
+) -> Claims:
+    """Return the claims (n,) about proven fixes, but for the regions of those that are not about all positions.
 
     Parameters
     ----------
-    cost, bound, margin, boxes, listed : list
-        As of `state_claim`, of each fix.
-    region : list of (lower, upper) or None
-        Corners of the region of each claim; None: all positions.
-    asked : bool
-        Whether somebody asked for these regions.
+    cost, bound : array (n,)
+        Of the fixes, and the certified lower bounds.
+    margin : array (n,)
+        Proven gaps to other minima; 0 for the value alone.
+    boxes : int array (n,)
+        Boxes looked at.
+    listed : int array (n,)
+        How many alternatives a claim leaves out, because they are listed.
+    everywhere : bool array (n,)
+        Whether a claim is about all positions.
     """
-    proof = ["global" if corners is None else "region" for corners in region]
-    sentence, unique = map(_sentence, margin, listed, region), [gap > 0.0 for gap in margin]
-    above = map(sub, cost, bound)
-    return map(Certificate, proof, sentence, repeat(METHOD), bound, above, unique, margin, boxes, region, repeat(asked))
+    out = replace(untried(len(cost)), bound=bound, gap=cost - bound, unique=margin > 0.0, margin=margin, boxes=boxes)
+    out.proof[:], out.method[:] = np.where(everywhere, GLOBAL, REGION), METHOD
+    # a batch has few different claims but many fixes
+    for gap in np.unique(margin):
+        for count in np.unique(listed[margin == gap]):
+            out.reason[(margin == gap) & (listed == count)] = sentence(float(gap), int(count), None)
+    return out
 
 
 # Coordinates of space.
 _SPACE = 3
 
 
-# A batch has few different claims but many fixes, and Python is slow to format numbers.
-@lru_cache(maxsize=256)
-def _sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
+@lru_cache(maxsize=256)  # fixes at once have few different ones, and Python is slow to format numbers
+def sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
+    """Return what is claimed of a proven fix: of all positions, or of a region; see `state_claims`."""
     where = "no position" if region is None else _where(*region)
     beside = "" if not listed else f", except the {'one' if listed == 1 else listed} listed,"
     if margin > 0.0:
@@ -139,13 +118,6 @@ def _where(lower: Corner, upper: Corner) -> str:
 
 def _text(corner: Corner) -> str:
     return "(" + ", ".join(f"{v:.6g}" for v in corner) + ")"
-
-
-def column(certificates: list[Certificate]) -> Array:
-    """Return certificates as an object array."""
-    out = np.empty(len(certificates), dtype=object)
-    out[:] = certificates
-    return out
 
 
 # Gaps to other minima that are tried to prove, one after the other; the last is the value alone. Where positions ever
@@ -177,8 +149,8 @@ class Work:
         Their candidates.
     fix : Fix
         The verdict of the pool.
-    certificate : object array (N,)
-        What is claimed of each; None where nothing was tried.
+    proven : Claims
+        What is claimed of each.
     pose : Posed or Runs
         Their costs over the position, equalities apart.
     ignored : array (N, h, d)
@@ -207,7 +179,7 @@ class Work:
     problem: Problem
     pool: Pool
     fix: Fix
-    certificate: Array
+    proven: Claims
     pose: Costs
     ignored: Array
     region: Array
@@ -234,7 +206,7 @@ class Work:
             problem,
             pool,
             fix,
-            fill(size, None) if pool.certificate is None else np.array(pool.certificate),
+            claims_before(pool),
             pose(problem),
             np.full((size, 0, d), np.nan),
             corners,
@@ -249,9 +221,9 @@ class Work:
 
     def summary(self) -> str:
         """Return what was proven, in a few words."""
-        claims = [own or other for own, other in zip(self.certificate, self.fix.certificate, strict=True)]
-        proofs = [claim.proof for claim in claims]
-        counts = [f"{proofs.count(name)} {name}" for name in ("global", "region", "unknown") if name in proofs]
+        proof = np.where(self.proven.tried, self.proven.proof, self.fix.claims.proof)
+        proofs = np.bincount(proof, minlength=len(PROOFS))
+        counts = [f"{proofs[k]} {PROOFS[k]}" for k in (GLOBAL, REGION, UNKNOWN) if proofs[k]]
         more = [f"{self.replaced} fixes replaced by better ones"] if self.replaced else []
         more += [f"{self.listed} other minima found"] if self.listed else []
         if self.mismatched:
@@ -281,9 +253,7 @@ def settle(work: Work) -> Work:
 
 def _compare(work: Work, items: Array) -> None:
     """Take back what was proven of another cost than that of a fix."""
-    # None where a fix was replaced by one that is no answer.
-    claims = [work.certificate[i] for i in items]
-    proven = items[np.array([c is not None and c.proof in ("global", "region") for c in claims], dtype=bool)]
+    proven = items[np.isin(work.proven.proof[items], (GLOBAL, REGION))]
     if not len(proven):
         return
     off = proven[~agrees(work.problem.take(proven), work.fix[proven], work.pose.take(proven))]
@@ -380,23 +350,26 @@ def _lower(work: Work, items: Array, why: str, *, remote: bool = False) -> None:
 
 
 def _give_up(work: Work, items: Array, why: str) -> None:
-    work.certificate[items] = column([unknown(why, boxes) for boxes in work.spent[items].tolist()])
+    work.proven.write(items, unknown(why))
+    work.proven.boxes[items] = work.spent[items]
     work.pending[items] = False
 
 
 def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array) -> None:
     """Write the certificates of those of some fixes that are proven."""
     proven, kappa = items[done], answer.gap[done]
-    bound, listed = answer.bound[done], work.fix.alternatives.gap[proven] < kappa[:, None]
-    region: list[tuple[Corner, Corner] | None] = [None] * len(done)
+    listed = (work.fix.alternatives.gap[proven] < kappa[:, None]).sum(1)
+    told = state_claims(
+        work.fix.cost[proven], answer.bound[done], kappa, answer.boxes[done], listed, answer.everywhere[done]
+    )
+    told.asked[:] = work.limited
     for k in np.flatnonzero(~answer.everywhere[done]).tolist():
         whole = np.isnan(asked.region[done[k], 0, 0])
         corners = (asked.fallback if whole else asked.region)[done[k]]
         low, high = corners[:, np.isfinite(corners).all(0)].tolist()  # what a known height says is not limited
-        region[k] = tuple(low), tuple(high)
-    numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
-    cost, low, gap, boxes, count = (values.tolist() for values in numbers)
-    work.certificate[proven] = column(list(state_claims(cost, low, gap, boxes, count, region, asked=work.limited)))
+        told.region[k] = region = tuple(low), tuple(high)
+        told.reason[k] = sentence(float(kappa[k]), int(listed[k]), region)
+    work.proven.write(proven, told)
     work.pending[proven] = False
 
 
@@ -527,30 +500,33 @@ def certified_freely(
     if not why and region is None and effort == 1:  # who calls `certify` wants what can be had
         why = unlimited(problem)
     if why or not answered.any():
-        certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
-        certificate[answered] = unknown(why)
-        return replace(
-            pool, certificate=certificate, stages=(*pool.stages, certify_stage(why or "nothing to prove", began))
-        )
+        proven = claims_before(pool)
+        proven.write(answered, unknown(why))
+        return replace(pool, proven=proven, stages=(*pool.stages, certify_stage(why or "nothing to prove", began)))
 
     work = Work.begin(problem, pool, fix, answered & ~proven_before, region, margin, effort)
     for i in np.flatnonzero(proven_before).tolist():
         assert pool.claims is not None
-        work.certificate[i] = pool.claims[i].certificate
+        work.proven.write(i, pool.claims[i].proven)
     work = settle(work)
     stages = (*pool.stages, certify_stage(work.summary(), began))
-    return replace(work.pool, certificate=work.certificate, stages=stages)
+    return replace(work.pool, proven=work.proven, stages=stages)
 
 
 def claimed(pool: Pool, fix: Fix, items: Array) -> Array | None:
     """Return what was tried to prove of some of the fixes (N,) of a pool, for `Pool.claims`; None where nothing was."""
-    if pool.certificate is None:
+    if pool.proven is None:
         return None
     out, listed = fill(len(items), None), _count_listed(fix)
     for k, i in enumerate(items.tolist()):
-        if pool.certificate[i] is not None:
-            out[k] = Claim(float(fix.cost[i]), int(listed[i]), pool.certificate[i])
+        if pool.proven.tried[i]:
+            out[k] = Claim(float(fix.cost[i]), int(listed[i]), take(pool.proven, i))
     return out
+
+
+def claims_before(pool: Pool) -> Claims:
+    """Return what was proven of a pool before, to be written anew."""
+    return untried(len(pool)) if pool.proven is None else change(pool.proven, lambda array, core: np.array(array))
 
 
 def _count_listed(fix: Fix) -> Array:
@@ -575,8 +551,8 @@ def _stands(claims: Array | None, fix: Fix) -> Array:
     if claims is None:
         return out
     listed, equal = _count_listed(fix), equal_cost(fix.cost)
-    for i, claim in enumerate(claims):
-        out[i] = claim is not None and claim.listed == listed[i] and abs(fix.cost[i] - claim.cost) <= equal[i]
+    for i, one in enumerate(claims):
+        out[i] = one is not None and one.listed == listed[i] and abs(fix.cost[i] - one.cost) <= equal[i]
     return out
 
 

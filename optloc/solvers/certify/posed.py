@@ -108,7 +108,7 @@ def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
 def is_free(problem: Problem, fix: Fix, items: Array) -> Array:
     """Return which of some fixes (n,) of a flat batch no constraint holds but its equalities, (n,)."""
     face = exact(problem)
-    if fix.active is None:
+    if fix.active is None or not problem.constraints:
         return np.full(len(items), not face)
     return np.array([len(found) == len(face) for found in fix.active[items]], dtype=bool)
 

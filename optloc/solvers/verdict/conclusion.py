@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Certificate, Status, first_status
+from optloc.problem.claims import claim
 from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
 from optloc.problem.problem import Problem
 
 _SHOWN = 4  # names in a sentence; more are not read
-_UNKNOWN = Certificate("unknown", "the data contradict each other", "none")
+_UNKNOWN = claim(Certificate("unknown", "the data contradict each other", "none"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,7 @@ def _contradictory(conclusion: Conclusion) -> Fix:
         code=np.array(int(Status.CONTRADICTORY), dtype=np.int8),
         marks=np.array(Status.CONTRADICTORY.mark, dtype=np.int32),
         reason=_object(reason),
-        claims=_object(_UNKNOWN),
+        claims=_UNKNOWN,
         local=None if whole.local is None else np.full_like(whole.local, np.nan),
         explanations=_object(()),
     )

@@ -15,12 +15,23 @@ from optloc.base.records import present, take
 from optloc.base.types import Array, Certificate, Status
 from optloc.linear.constraints import faces
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
+from optloc.problem.claims import GLOBAL, Claims, claim
 from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, NOTICED, REFUTED
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import one_position, rows_of_stations
 
+NO_PROOF = claim(
+    Certificate(
+        "local",
+        "a stationary point with a positive definite normal matrix; the best of all candidates refined",
+        "refinement",
+    )
+)
+"""The claim of a refined answer of which nobody has tried to prove more."""
+NO_ANSWER = claim(Certificate("unknown", "there is no refined answer to prove anything about", "none"))
+"""The claim where there is none."""
 NOT_TRIED = "no proof was tried"
 BENT_SENTENCE = {
     INVERSE_RANGE: "Gaussian in inverse range, not in metres",
@@ -117,23 +128,19 @@ def largest(dof: int, probability: float) -> float:
 
 def _is_unique(pool: Pool) -> Array:
     """Return where it is proven that no other minimum than those listed costs less than the gap more, (N,)."""
-    out = np.zeros(len(pool), dtype=bool)
-    if pool.certificate is None or pool.loss:  # what is proven of squares is not of a loss
-        return out
+    if pool.proven is None or pool.loss:  # what is proven of squares is not of a loss
+        return np.zeros(len(pool), dtype=bool)
     between = np.zeros(len(pool)) if pool.infinity is None else pool.infinity - pool.cost[:, 0]
-    for i, claim in enumerate(pool.certificate):
-        out[i] = isinstance(claim, Certificate) and is_proof_of_one(claim, between[i])
-    return out
+    return is_proof_of_one(pool.proven, between)
 
 
-def is_proof_of_one(claim: Certificate, infinity: float) -> bool:
-    """Return whether a certificate says that no other minimum than those listed costs less than the gap more.
+def is_proof_of_one(told: Claims, infinity: Array) -> Array:
+    """Return whether claims (...) say that no other minimum than those listed costs less than the gap more.
 
     Where infinity, which costs so much more, comes before the gap, up to there: what lies beyond is infinity's.
     """
-    if not (claim.unique and (claim.proof == "global" or claim.asked)):
-        return False
-    return claim.margin >= AMBIGUOUS_GAP or 0.0 < infinity < AMBIGUOUS_GAP
+    wide = (told.margin >= AMBIGUOUS_GAP) | ((infinity > 0.0) & (infinity < AMBIGUOUS_GAP))
+    return np.asarray(told.unique & ((told.proof == GLOBAL) | told.asked) & wide)
 
 
 def examine(problem: Problem, pool: Pool) -> Pool:
@@ -249,7 +256,7 @@ def chart_kind(metres: Any, inverse: Any) -> Any:
 # What applies, in sentences.
 
 
-def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: Array, reason: Array) -> None:
+def explain(problem: Problem, pool: Pool, code: Array, gap: Array, proven: Claims, reason: Array) -> None:
     """Write the reasons (N,) that belong to the statuses of finished answers, where there is none yet.
 
     Parameters
@@ -260,17 +267,15 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: 
         `Status` numbers.
     gap : array (N, r)
         Costs of the other minima less that of the best.
-    certificate : object array (N,)
+    proven : Claims
         What is proven.
     reason : object array (N,)
         Written where it is empty.
     """
     empty = reason == ""
     bulk = empty & (code == Status.UNPROVEN)
-    if pool.certificate is None:
-        reason[bulk] = NOT_TRIED
-    else:
-        reason[bulk] = [_unproven(claim) for claim in certificate[bulk]]
+    told = proven.reason[bulk]
+    reason[bulk] = NOT_TRIED if pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
     if pool.refuted:
         reason[empty & (code == Status.MISFIT)] = pool.refuted
     cost = pool.cost[:, 0]
@@ -294,12 +299,6 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: 
     if pool.searched is not None and pool.remark is not None:
         told = pool.searched & (code == Status.SEARCHED)
         reason[told] = pool.remark[told]
-
-
-def _unproven(claim: Certificate) -> str:
-    if claim.proof == "local" and not claim.margin:
-        return NOT_TRIED if claim.method == "refinement" else claim.reason
-    return claim.reason
 
 
 def _ambiguous(problem: Problem, gap: float) -> str:

@@ -14,6 +14,7 @@ from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.models import MODELS
 from optloc.models.layers import Layers
+from optloc.problem.claims import Claims, alike, claim, where
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
@@ -21,15 +22,8 @@ from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.least_squares_ranges import ranges
 from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.conclusion import conclude
-from optloc.solvers.verdict.findings import chart_of, examine, explain, is_improbable, mark
+from optloc.solvers.verdict.findings import NO_ANSWER, NO_PROOF, chart_of, examine, explain, is_improbable, mark
 from optloc.solvers.verdict.minima import station_direction, weak_direction
-
-LOCAL = Certificate(
-    "local",
-    "a stationary point with a positive definite normal matrix; the best of all candidates refined",
-    "refinement",
-)
-UNKNOWN = Certificate("unknown", "there is no refined answer to prove anything about", "none")
 
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
 
@@ -46,15 +40,15 @@ class Ruling:
         All that applies, a bit for each `Status`.
     reason : object array (N,)
         Sentences.
-    certificate : object array (N,)
-        `Certificate` of each.
+    proven : Claims
+        What is proven of each.
     gone : bool array (N,)
         Where there is no position to be shown.
     """
 
     marks: Array
     reason: Array
-    certificate: Array
+    proven: Claims
     gone: Array
 
 
@@ -98,18 +92,18 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
     marks = np.where(finished, mark(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
-    certificate = np.where(finished, _claims(pool), fill(len(pool), UNKNOWN))
+    proven = where(finished, _claims(pool), NO_ANSWER)
     if pool.free is not None:
         _hold_against_constraints(pool, cost, finished, marks, reason)
     code = first_status(marks)
-    explain(problem, pool, code, gap, certificate, reason)
+    explain(problem, pool, code, gap, proven, reason)
     if pool.hidden is not None:
         _name_hidden(pool.hidden, finished & (code == Status.MISFIT), reason)
     if pool.loss:
         _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, DOUBT), reason)
     if pool.asked:
         _weigh_redundancy(pool, finished, reason)
-    return Ruling(marks, reason, certificate, broken | few | missing | weak | far)
+    return Ruling(marks, reason, proven, broken | few | missing | weak | far)
 
 
 def fill(count: int, value: object) -> Array:
@@ -323,7 +317,7 @@ def standing(pool: Pool, fix: Fix) -> Array:
 
 def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     """Return the fixes of settled pools as if all of them were finished and near; without a status where none is."""
-    count, cost, certificate = len(pool), pool.cost[:, 0], _claims(pool)
+    count, cost, proven = len(pool), pool.cost[:, 0], _claims(pool)
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
     marks, reason, chart = np.zeros(count, dtype=np.int32), fill(count, ""), None
@@ -331,7 +325,7 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         marks, chart = mark(problem, pool, gap), chart_of(problem, pool.x[:, 0], curvature.covariance, curvature)
     code = first_status(marks)
     if pool.plain is not None:
-        explain(problem, pool, code, gap, certificate, reason)
+        explain(problem, pool, code, gap, proven, reason)
     return Fix(
         pool.x[:, 0],
         curvature.covariance,
@@ -339,7 +333,7 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         problem.frame,
         code,
         reason,
-        certificate,
+        proven,
         Alternatives(pool.x[:, 1:], gap),
         cost,
         pool.dof,
@@ -354,12 +348,11 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     )
 
 
-def _claims(pool: Pool) -> Array:
-    """Return the certificates (N,) of refined answers: what was proven of them, or that they are minima."""
-    local = fill(len(pool), LOCAL)
-    if pool.certificate is None:
-        return local
-    return np.where(present(pool.certificate), pool.certificate, local)
+def _claims(pool: Pool) -> Claims:
+    """Return the claims (N,) of refined answers: what was proven of them, or that they are minima."""
+    if pool.proven is None:
+        return alike(NO_PROOF, len(pool))
+    return where(pool.proven.tried, pool.proven, NO_PROOF)
 
 
 def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
@@ -377,7 +370,7 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
         code=first_status(ruling.marks),
         marks=ruling.marks,
         reason=ruling.reason,
-        claims=ruling.certificate,
+        claims=ruling.proven,
         cost=np.where(np.isfinite(fix.cost), fix.cost, np.nan),
         chart=chart_of(problem, x, covariance, pool.curvature),
     )
@@ -394,7 +387,7 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
         problem.frame,
         np.full(count, int(Status.UNAVAILABLE), dtype=np.int8),
         fill(count, "not refined"),
-        fill(count, Certificate("unknown", "a start, not refined", name)),
+        alike(claim(Certificate("unknown", "a start, not refined", name)), count),
         Alternatives(pool.x[:, 1:], np.full((count, pool.x.shape[1] - 1), np.nan)),
         np.full(count, np.nan),
         pool.dof,
@@ -414,7 +407,7 @@ def failed(problem: Problem, cause: str) -> Fix:
         problem.frame,
         code,
         fill(count, cause),
-        fill(count, UNKNOWN),
+        alike(NO_ANSWER, count),
         Alternatives(np.full((count, 0, size), np.nan), np.full((count, 0), np.inf)),
         np.full(count, np.nan),
         # nothing is computed here, since whatever is may fail again: without a cost no redundancy is of use

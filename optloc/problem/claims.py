@@ -1,0 +1,118 @@
+"""What is proven of many fixes: certificates in columns, for an object each takes as long as its proof."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from math import isnan
+from typing import Annotated
+
+import numpy as np
+
+from optloc.base.records import Axes
+from optloc.base.types import Array, Certificate
+
+PROOFS = ("", "unknown", "local", "region", "global")
+"""Names of the proofs by their numbers; the first stands where nobody has tried to prove anything."""
+UNTRIED, UNKNOWN, LOCAL, REGION, GLOBAL = range(5)
+
+_NONE = Certificate("", "", "").bound
+
+
+@dataclass(frozen=True, slots=True)
+class Claims:
+    """Certificates of a batch of fixes; each column is a field of `Certificate`, and the proof is told by its number.
+
+    Parameters
+    ----------
+    proof : int array (...)
+        Numbers in `PROOFS`.
+    reason, method : object array (...)
+        Sentences and words.
+    bound, gap : array (...)
+        Lower bounds of the costs, and the costs less these; NaN where none was computed.
+    unique : bool array (...)
+        Whether there is a gap to other minima.
+    margin : array (...)
+        That gap; 0 where there is none.
+    boxes : int array (...)
+        Boxes looked at.
+    region : object array (...)
+        Corners of the regions of the claims; None where they are not about one.
+    asked : bool array (...)
+        Whether somebody asked for that region.
+    """
+
+    proof: Annotated[Array, Axes(0, empty=UNTRIED)]
+    reason: Annotated[Array, Axes(0, empty="")]
+    method: Annotated[Array, Axes(0, empty="")]
+    bound: Annotated[Array, Axes(0)]
+    gap: Annotated[Array, Axes(0)]
+    unique: Annotated[Array, Axes(0, empty=False)]
+    margin: Annotated[Array, Axes(0, empty=0.0)]
+    boxes: Annotated[Array, Axes(0, empty=0)]
+    region: Annotated[Array, Axes(0, empty=None)]
+    asked: Annotated[Array, Axes(0, empty=False)]
+
+    @property
+    def tried(self) -> Array:
+        """Return where somebody has tried to prove something, (...)."""
+        return np.asarray(self.proof != UNTRIED)
+
+    def write(self, items: Array | int, other: Claims) -> None:
+        """Write others in the place of some: as many (n,), or one () for all."""
+        where = np.atleast_1d(items)  # an object array would take an array () for an object
+        for each in fields(self):
+            getattr(self, each.name)[where] = getattr(other, each.name)
+
+    def tell(self) -> Array:
+        """Return the certificates as an object array (...); None where nobody has tried."""
+        out = np.empty(self.proof.shape, dtype=object)
+        names = [each.name for each in fields(self)]
+        columns = (getattr(self, name).ravel().tolist() for name in names)
+        for i, values in zip(np.ndindex(out.shape), zip(*columns, strict=True), strict=True):
+            own = dict(zip(names, values, strict=True))
+            # one NaN, so that certificates without a bound are equal
+            none = {name: _NONE for name in ("bound", "gap") if isnan(own[name])}
+            out[i] = Certificate(**own | none | {"proof": PROOFS[own["proof"]]}) if own["proof"] else None
+        return out
+
+
+def claims_of(rows: list[tuple[object, ...]], shape: tuple[int, ...]) -> Claims:
+    """Return claims (...) of rows, each with the columns of `Claims` in their order."""
+    columns = zip(_KINDS, zip(*rows, strict=True), strict=True)
+    return Claims(*(_column(values, shape, kind) for kind, values in columns))
+
+
+_KINDS = (np.int8, object, object, float, float, np.bool_, float, np.int64, object, np.bool_)
+
+
+def _column(values: tuple[object, ...], shape: tuple[int, ...], kind: type) -> Array:
+    if kind is not object:
+        return np.array(values if shape else values[0], dtype=kind)
+    out = np.empty(len(values), dtype=object)
+    for i, value in enumerate(values):
+        out[i] = value
+    return out.reshape(shape)
+
+
+def claim(certificate: Certificate) -> Claims:
+    """Return a certificate as claims without batch axes."""
+    own = [getattr(certificate, each.name) for each in fields(Claims)]
+    return claims_of([(PROOFS.index(certificate.proof), *own[1:])], ())
+
+
+def untried(count: int) -> Claims:
+    """Return claims (count,) about fixes of which nobody has tried to prove anything, to be written."""
+    empty = (UNTRIED, "", "", np.nan, np.nan, False, 0.0, 0, None, False)
+    return Claims(*(np.full(count, value, dtype=kind) for value, kind in zip(empty, _KINDS, strict=True)))
+
+
+def alike(one: Claims, count: int) -> Claims:
+    """Return claims (count,) that are all the same; nobody can write into them."""
+    return Claims(*(np.broadcast_to(getattr(one, each.name), count) for each in fields(one)))
+
+
+def where(chosen: Array, one: Claims, other: Claims) -> Claims:
+    """Return claims (N,) of which those chosen are from one, and the rest from another, each (N,) or ()."""
+    pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
+    return Claims(*(np.where(chosen, *pair) for pair in pairs))

@@ -1,0 +1,56 @@
+"""Certificates in columns: what is written is told, whatever is done to the batch in between."""
+
+import numpy as np
+import pytest
+
+from optloc import Certificate
+from optloc.base.records import join, overwrite, take
+from optloc.problem.claims import alike, claim, untried, where
+
+GIVEN = [
+    Certificate("global", "no position costs less", "branch and bound", 1.0, 1e-9, True, 9.0, 57),
+    Certificate("region", "none of these", "branch and bound", 2.0, 1e-9, boxes=3, region=((0.0, 1.0), (2.0, 3.0))),
+    Certificate("local", "a minimum", "refinement"),
+    Certificate("unknown", "no answer", "none"),
+]
+
+
+def written():
+    """Return claims (5,): those given, and one that nobody has tried to prove."""
+    out = untried(5)
+    for i, certificate in enumerate(GIVEN):
+        out.write(i, claim(certificate))
+    return out
+
+
+def same(told, wanted):
+    """Return whether certificates are the same; NaN is NaN."""
+    return [repr(one) for one in told] == [repr(one) for one in wanted]
+
+
+@pytest.mark.parametrize("certificate", GIVEN)
+def test_one_is_told_as_it_was_written(certificate):
+    assert repr(claim(certificate).tell()[()]) == repr(certificate)
+
+
+def test_a_batch_tells_each_and_none_where_nobody_tried():
+    assert same(written().tell(), [*GIVEN, None])
+    assert list(written().tried) == [True] * 4 + [False]
+
+
+def test_it_is_taken_joined_and_overwritten_like_every_record():
+    some = take(written(), np.array([1, 4]))
+    assert same(some.tell(), [GIVEN[1], None])
+    assert same(join([some, written()], 7).tell(), [GIVEN[1], None, *GIVEN, None])
+    assert same(overwrite(written(), np.array([0, 2]), some).tell(), [GIVEN[1], GIVEN[1], None, GIVEN[3], None])
+
+
+def test_many_are_one_and_one_is_chosen_for_many():
+    assert same(alike(claim(GIVEN[1]), 3).tell(), [GIVEN[1]] * 3)
+    chosen = where(np.array([True, False, False, False, True]), claim(GIVEN[0]), written())
+    assert same(chosen.tell(), [GIVEN[0], *GIVEN[1:], GIVEN[0]])
+
+
+def test_rows_of_one_certificate_stay_one_row():
+    one = alike(claim(GIVEN[2]), 4)
+    assert join([one, one], 8).bound.strides == (0,)
