@@ -59,7 +59,7 @@ class Claims:
         return np.asarray(self.proof != UNTRIED)
 
     def write(self, items: Array | int, other: Claims) -> None:
-        """Write others in the place of some: as many (n,), or one () for all."""
+        """Write others in the place of some, by index or mask: as many (n,), or one () for all."""
         where = np.atleast_1d(items)  # an object array would take an array () for an object
         for each in fields(self):
             getattr(self, each.name)[where] = getattr(other, each.name)

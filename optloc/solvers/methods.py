@@ -20,7 +20,7 @@ from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, unsupported
 from optloc.solvers import stages
 from optloc.solvers.certify.admitted import certified, value_certified
-from optloc.solvers.certify.branch_and_bound import claimed, claims_before
+from optloc.solvers.certify.branch_and_bound import claims_before, tried_before
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP
@@ -294,11 +294,11 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     part, (first, *others) = problem.take(items), method.runs(len(items))
     start = first(part, None)
     # what was found competes: a branch never answers worse than the one before
-    new, claims = _beside(part, start, standing(take(pool, items), fix[items])), claimed(pool, fix, items)
+    new, before = _beside(part, start, standing(take(pool, items), fix[items])), tried_before(pool, fix, items)
     for stage in others:
         # a proof takes most of the time, and is not made again where all else found nothing new
-        new = stage(part, replace(new, claims=claims))
-    return replace(pool.merge(items, replace(new, claims=None)), stages=(*pool.stages, *new.stages))
+        new = stage(part, replace(new, before=before))
+    return replace(pool.merge(items, replace(new, before=None)), stages=(*pool.stages, *new.stages))
 
 
 def _beside(problem: Problem, start: Pool, x: Array) -> Pool:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from time import perf_counter
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 
@@ -59,21 +59,22 @@ class Curvature:
     kappa: Annotated[Array, Axes(1)] | None = None
 
 
-class Claim(NamedTuple):
-    """What was tried to prove of a fix, and of what it was tried.
+@dataclass(frozen=True, slots=True)
+class Before:
+    """What a branch before has tried to prove of N fixes, and of what it was tried.
 
     Parameters
     ----------
-    cost : float
-        Of the fix.
-    listed : int
+    cost : array (N,)
+        Of the fixes.
+    listed : int array (N,)
         How many other minima were known.
     proven : Claims
-        What came of it, without batch axes.
+        What came of it.
     """
 
-    cost: float
-    listed: int
+    cost: Annotated[Array, Axes(0)]
+    listed: Annotated[Array, Axes(0, empty=0)]
     proven: Claims
 
 
@@ -119,8 +120,8 @@ class Pool:
         What a stage has to say beside the status.
     proven : Claims, optional
         What is proven of the best candidates; None where nobody has tried for any.
-    claims : object array (N,), optional
-        What a branch before has tried to prove, a `Claim`: it stands where nothing new was found. None elsewhere.
+    before : Before, optional
+        What a branch before has tried to prove: it stands where nothing new was found.
     hidden : object array (N,), optional
         What lies behind the Earth, in words; "" where nothing does.
     asked : bool
@@ -148,7 +149,7 @@ class Pool:
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None
     proven: Claims | None = None
-    claims: Annotated[Array, Axes(0, empty=None)] | None = None
+    before: Before | None = None
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
     asked: bool = False
     refuted: str = ""

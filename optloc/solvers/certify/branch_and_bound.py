@@ -37,11 +37,11 @@ from optloc.solvers.certify.posed import (
 )
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
-from optloc.solvers.pool import Claim, Pool, offer, pack
+from optloc.solvers.pool import Before, Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import vectors
-from optloc.solvers.verdict.judge import fill, judge, standing
+from optloc.solvers.verdict.judge import judge, standing
 
 # What a proof lets a certificate say, in sentences.
 
@@ -505,23 +505,18 @@ def certified_freely(
         return replace(pool, proven=proven, stages=(*pool.stages, certify_stage(why or "nothing to prove", began)))
 
     work = Work.begin(problem, pool, fix, answered & ~proven_before, region, margin, effort)
-    for i in np.flatnonzero(proven_before).tolist():
-        assert pool.claims is not None
-        work.proven.write(i, pool.claims[i].proven)
+    if pool.before is not None:
+        work.proven.write(proven_before, take(pool.before.proven, proven_before))
     work = settle(work)
     stages = (*pool.stages, certify_stage(work.summary(), began))
     return replace(work.pool, proven=work.proven, stages=stages)
 
 
-def claimed(pool: Pool, fix: Fix, items: Array) -> Array | None:
-    """Return what was tried to prove of some of the fixes (N,) of a pool, for `Pool.claims`; None where nothing was."""
+def tried_before(pool: Pool, fix: Fix, items: Array) -> Before | None:
+    """Return what was tried to prove of some of the fixes (N,) of a pool, for `Pool.before`; None where nothing was."""
     if pool.proven is None:
         return None
-    out, listed = fill(len(items), None), _count_listed(fix)
-    for k, i in enumerate(items.tolist()):
-        if pool.proven.tried[i]:
-            out[k] = Claim(float(fix.cost[i]), int(listed[i]), take(pool.proven, i))
-    return out
+    return Before(fix.cost[items], _count_listed(fix)[items], take(pool.proven, items))
 
 
 def claims_before(pool: Pool) -> Claims:
@@ -538,22 +533,19 @@ def to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
     answered = fix.answered & np.isfinite(fix.cost)
     if pool.conclusion is not None:
         answered &= ~present(pool.conclusion)  # the rows are not all there
-    return answered, answered & _stands(pool.claims, fix)
+    return answered, answered & _stands(pool.before, fix)
 
 
-def _stands(claims: Array | None, fix: Fix) -> Array:
+def _stands(before: Before | None, fix: Fix) -> Array:
     """Return which claims are about the same minima as fixes (N,): what was shown, or not, of these holds still.
 
     The minima that were known compete in what is found later. As many of them, and a least one that costs the same, are
     therefore the same.
     """
-    out = np.zeros(len(fix.x), dtype=bool)
-    if claims is None:
-        return out
-    listed, equal = _count_listed(fix), equal_cost(fix.cost)
-    for i, one in enumerate(claims):
-        out[i] = one is not None and one.listed == listed[i] and abs(fix.cost[i] - one.cost) <= equal[i]
-    return out
+    if before is None:
+        return np.zeros(len(fix.x), dtype=bool)
+    alike = (before.listed == _count_listed(fix)) & (np.abs(fix.cost - before.cost) <= equal_cost(fix.cost))
+    return np.asarray(before.proven.tried & alike)
 
 
 def certify_stage(detail: str, began: float) -> Stage:
