@@ -107,9 +107,9 @@ def untried(count: int) -> Claims:
     return Claims(*(np.full(count, value, dtype=kind) for value, kind in zip(empty, _KINDS, strict=True)))
 
 
-def alike(one: Claims, count: int) -> Claims:
-    """Return claims (count,) that are all the same; nobody can write into them."""
-    return Claims(*(np.broadcast_to(getattr(one, each.name), count) for each in fields(one)))
+def alike(one: Claims, shape: int | tuple[int, ...]) -> Claims:
+    """Return claims (...) that are all the same; nobody can write into them."""
+    return Claims(*(np.broadcast_to(getattr(one, each.name), shape) for each in fields(one)))
 
 
 def where(chosen: Array, one: Claims, other: Claims) -> Claims:

@@ -7,22 +7,22 @@ takes the long way, which knows what to say of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import prod
 from threading import local
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
-from optloc.base.types import Array, Status, first_status
+from optloc.base.types import Array, Certificate, Status, first_status
+from optloc.compute.jit import usable
 from optloc.problem.chart import Chart, quantile
-from optloc.problem.claims import GLOBAL, claims_of
+from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.problem import Problem
@@ -39,7 +39,6 @@ from optloc.solvers.range_fixes import (
     LIMIT,
     TOLERANCE,
     Direct,
-    at_hand,
     direct,
     direct_stages,
     is_direct,
@@ -67,9 +66,10 @@ _SENTENCES: dict[tuple[Status, int | None], str] = {
     (Status.UNPROVEN, None): NOT_TRIED,
     **{(Status.CURVED, kind): sentence for kind, sentence in BENT_SENTENCE.items()},
 }
-# What a proof of all that an `ok` asks for claims, and the claim of an answer without one.
-_UNIQUE = sentence(LISTED_GAP, 0, None)
-_NO_PROOF = tuple(getattr(NO_PROOF, each.name).item() for each in fields(NO_PROOF))
+# What a proof of all that an `ok` asks for claims, but for its bound.
+_PROVEN = claim(Certificate("global", sentence(LISTED_GAP, 0, None), METHOD, unique=True, margin=LISTED_GAP))
+_NOTHING = np.empty((), dtype=object)
+_NOTHING[()] = ()
 # By how much of what counts as equal (`equal_cost`) the bound of a proof may be off the cost: it is one below.
 _APART = 3.0
 
@@ -96,6 +96,8 @@ class _Room:
         Of the proofs.
     centre : array (..., d)
         Of the charts.
+    claims : Claims
+        Of the fixes, without the bounds and boxes of proofs.
     kept : dict
         Fields of a fix that are the same for all measurements; nobody can write into them.
     many : Problem, optional
@@ -110,6 +112,7 @@ class _Room:
     asked: Asked
     answered: Answered
     centre: Array
+    claims: Claims
     kept: dict[str, Any]
     many: Problem | None
     checked: bool = False
@@ -165,7 +168,9 @@ class Single:
         from optloc.compute.range_start import Answer
 
         began, shape = perf_counter(), z.shape[:-1]
-        if not at_hand(n := prod(shape)) or (self.map is not None and lacks_code(n)):
+        n = prod(shape)
+        kernel = kernel_for(n, often=self.often)
+        if not usable(kernel, n) or (self.map is not None and lacks_code(n)):
             return None
         room = self._room(shape)
         room.z[:] = z
@@ -174,7 +179,6 @@ class Single:
         d = self.station.shape[-1]
         x, covariance = np.empty((n, self.plan.layout.size)), np.empty((n, d, d))
         answer = Answer(x, covariance, *room.found)
-        kernel = kernel_for(n, often=self.often)
         steps = kernel(self.model, room.z, self.station, TOLERANCE, LIMIT, False, answer)
         costs = answer.cost.tolist()
         for cost, settled, rival in zip(costs, answer.settled.tolist(), answer.rival_cost.tolist(), strict=True):
@@ -184,34 +188,32 @@ class Single:
             return None
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
-        claims: list[tuple[Any, ...]] | None = [_NO_PROOF] * n
         if self.map is not None:
-            claims = self._prove(self.map, x[:, :d], costs, room)
+            if not self._proves(self.map, x[:, :d], costs, room):
+                return None
             stages = (*stages, certify_stage(f"{n} global", fixed))
-        fix = None if claims is None else self._judge(shape, answer, costs, claims, stages, room)
+        fix = self._judge(shape, answer, costs, stages, room)
         if fix is not None and not room.checked:
             room.checked = self._agrees(fix, room)
             return fix if room.checked else None
         return fix
 
-    def _prove(self, posed: Affine, position: Array, costs: list[float], room: _Room) -> list[tuple[Any, ...]] | None:
-        """Return what is proven of all positions, or None where that is not all there is to prove."""
+    def _proves(self, posed: Affine, position: Array, costs: list[float], room: _Room) -> bool:
+        """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
         asked, answered = room.asked, room.answered
         for i, cost in enumerate(costs):
             posed.write(room.z[i], room.pose.w[i])
             asked.eps[i] = equal_cost(cost)
         asked.x[:] = position
         prove_here(room.pose, asked, answered)
-        out = []
-        told = zip(costs, *(array.tolist() for array in answered[:6]), strict=True)
-        for cost, verdict, boxes, bound, everywhere, shown, met in told:
+        told = zip(costs, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
+        for cost, verdict, bound, everywhere, shown, met in told:
             if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
-                return None
+                return False
             # a bound that is not that of this cost is one of another: the long way finds out which is wrong
             if not abs(cost - bound) <= _APART * equal_cost(cost):
-                return None
-            out.append((GLOBAL, _UNIQUE, METHOD, bound, cost - bound, True, LISTED_GAP, boxes, None, False))
-        return out
+                return False
+        return True
 
     def _agrees(self, fix: Fix, room: _Room) -> bool:
         """Return whether the posed costs are the problem's own, at the first fixes of a thread and beside them."""
@@ -223,38 +225,37 @@ class Single:
         shape: tuple[int, ...],
         answer: Any,
         costs: list[float],
-        claims: list[tuple[Any, ...]],
         stages: tuple[Stage, ...],
         room: _Room,
     ) -> Fix | None:
         """Return the fixes with their verdicts, or None where more stands against one than words without numbers."""
-        code, marks, kinds, reason, infinity = [], [], [], [], []
-        for i, (cost, bent, least) in enumerate(
-            zip(costs, answer.kappa.tolist(), answer.infinity.tolist(), strict=True)
-        ):
-            marks.append(
-                marks_of(cost > self.refuted, least - cost, self.region, np.inf, bent[0], self.map is not None)
-            )
-            code.append(_status(marks[i]))
+        marks, kinds = [], []
+        for cost, bent, least in zip(costs, answer.kappa.tolist(), answer.infinity.tolist(), strict=True):
+            more = least - cost
+            marks.append(marks_of(cost > self.refuted, more, self.region, np.inf, bent[0], self.map is not None))
             kinds.append(chart_kind(*bent))
-            infinity.append(least - cost)
-            sentence = _SENTENCES.get((code[i], kinds[i] if code[i] == Status.CURVED else None))
-            if sentence is None:
-                return None
-            reason.append(sentence)
+        told = _told(tuple(marks), tuple(kinds), shape)
+        if told is None:
+            return None
         x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
+        cost, claims = answer.cost.reshape(shape).copy(), room.claims
+        if self.map is not None:
+            bound, boxes = room.answered.bound.reshape(shape).copy(), room.answered.boxes.reshape(shape).copy()
+            claims = Claims(
+                claims.proof, claims.reason, claims.method, bound, cost - bound,
+                claims.unique, claims.margin, boxes, claims.region, claims.asked,
+            )  # fmt: skip
         return Fix(
             x,
             covariance,
-            code=_numbers(code, shape, np.int8),
-            reason=_objects(reason, shape),
-            claims=claims_of(claims, shape),
-            cost=_numbers(costs, shape),
+            code=told.code,
+            reason=told.reason,
+            claims=claims,
+            cost=cost,
             stages=stages,
-            active=_objects(_NOTHING[: len(costs)], shape),
-            marks=_numbers(marks, shape, np.int32),
-            chart=Chart(_numbers(kinds, shape, np.int8), x[..., : covariance.shape[-1]], covariance, room.centre),
-            infinity=_numbers(infinity, shape),
+            marks=told.marks,
+            chart=Chart(told.kind, x[..., : covariance.shape[-1]], covariance, room.centre),
+            infinity=answer.infinity.reshape(shape) - cost,
             **room.kept,
         )
 
@@ -306,28 +307,34 @@ class Single:
             # views that nobody can write into
             "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
             "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
+            "active": np.broadcast_to(_NOTHING, shape),  # constraints that hold fixes: none
         }
+        claims = alike(NO_PROOF if posed is None else _PROVEN, shape)
         many = self.problem.with_rows(z=np.zeros((n, m))) if self.problem.frame.geodetic else None
-        return _Room(np.empty((n, m)), found, pose, asked, empty_answer(n, d), centre, kept, many)
+        return _Room(np.empty((n, m)), found, pose, asked, empty_answer(n, d), centre, claims, kept, many)
 
 
-@lru_cache(maxsize=64)
-def _status(marks: int) -> Status:
-    return Status(int(first_status(np.array(marks))))
+class _Told(NamedTuple):
+    """What is said of fixes (...): their statuses, reasons, marks and kinds of chart; nobody can write into them."""
+
+    code: Array
+    reason: Array
+    marks: Array
+    kind: Array
 
 
-_NOTHING = [()] * MANY  # constraints that hold fixes: none
-
-
-def _objects(values: Sequence[object], shape: tuple[int, ...]) -> Array:
-    out = np.empty(len(values), dtype=object)
-    for i, value in enumerate(values):
-        out[i] = value
-    return out.reshape(shape)
-
-
-def _numbers(values: Sequence[Any], shape: tuple[int, ...], kind: Any = float) -> Array:
-    return np.array(values if shape else values[0], dtype=kind)
+@lru_cache(maxsize=256)  # few things are said of plain fixes
+def _told(marks: tuple[int, ...], kinds: tuple[int, ...], shape: tuple[int, ...]) -> _Told | None:
+    code = [Status(int(one)) for one in first_status(np.array(marks))]
+    curved = [kind if status == Status.CURVED else None for status, kind in zip(code, kinds, strict=True)]
+    said = [_SENTENCES.get(both) for both in zip(code, curved, strict=True)]
+    if None in said:
+        return None
+    told = zip((code, said, marks, kinds), (np.int8, object, np.int32, np.int8), strict=True)
+    out = _Told(*(np.array(values, dtype=kind).reshape(shape) for values, kind in told))
+    for array in out:
+        array.setflags(write=False)
+    return out
 
 
 def single(problem: Problem, method: Method, *, often: bool = True) -> Single | None:
