@@ -77,34 +77,20 @@ class Claims:
         return out
 
 
-def claims_of(rows: list[tuple[object, ...]], shape: tuple[int, ...]) -> Claims:
-    """Return claims (...) of rows, each with the columns of `Claims` in their order."""
-    columns = zip(_KINDS, zip(*rows, strict=True), strict=True)
-    return Claims(*(_column(values, shape, kind) for kind, values in columns))
-
-
-_KINDS = (np.int8, object, object, float, float, np.bool_, float, np.int64, object, np.bool_)
-
-
-def _column(values: tuple[object, ...], shape: tuple[int, ...], kind: type) -> Array:
-    if kind is not object:
-        return np.array(values if shape else values[0], dtype=kind)
-    out = np.empty(len(values), dtype=object)
-    for i, value in enumerate(values):
-        out[i] = value
-    return out.reshape(shape)
-
-
 def claim(certificate: Certificate) -> Claims:
     """Return a certificate as claims without batch axes."""
-    own = [getattr(certificate, each.name) for each in fields(Claims)]
-    return claims_of([(PROOFS.index(certificate.proof), *own[1:])], ())
+    out = untried(1)
+    out.proof[0] = PROOFS.index(certificate.proof)
+    for each in fields(out)[1:]:
+        getattr(out, each.name)[0] = getattr(certificate, each.name)
+    return Claims(*(getattr(out, each.name).reshape(()) for each in fields(out)))
 
 
 def untried(count: int) -> Claims:
     """Return claims (count,) about fixes of which nobody has tried to prove anything, to be written."""
     empty = (UNTRIED, "", "", np.nan, np.nan, False, 0.0, 0, None, False)
-    return Claims(*(np.full(count, value, dtype=kind) for value, kind in zip(empty, _KINDS, strict=True)))
+    kinds = (np.int8, object, object, float, float, np.bool_, float, np.int64, object, np.bool_)
+    return Claims(*(np.full(count, value, dtype=kind) for value, kind in zip(empty, kinds, strict=True)))
 
 
 def alike(one: Claims, shape: int | tuple[int, ...]) -> Claims:
