@@ -17,10 +17,11 @@ hypothesis.settings.load_profile("optloc")
 
 # Machine code is waited for, in this process and in those that tests begin: answers must not depend on what is on disk.
 os.environ.setdefault("OPTLOC_COMPILE", "wait")
-# Of several processes each has a processor: where the library of numpy starts as many threads as there are in each of
-# them, these wait for each other, and products of small matrices take ten times as long.
+# Of several processes each has a processor: where the library of numpy, or a batch, starts as many threads as there are
+# in each of them, these wait for each other, and products of small matrices take ten times as long.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OPTLOC_THREADS", "1")
 # What tests begin is the optloc that they test, not a checkout in the current folder, which has no machine code.
 os.environ["PYTHONSAFEPATH"] = "1"
 

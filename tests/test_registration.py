@@ -241,7 +241,7 @@ GAPS = {
 def test_gaps(name):
     problem, spoil = GAPS[name]
     # Where each trial has other rows, each is solved by itself.
-    settled(counted(Case(name, problem, spoil=spoil), 12 if "own" in name else 40))
+    settled(counted(Case(name, problem, spoil=spoil), 8 if "own" in name else 24))
 
 
 def test_stations_and_target_at_rest_leave_target_and_biases_open():

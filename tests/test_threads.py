@@ -289,3 +289,23 @@ def test_a_nonlinear_program_serves_several_threads_at_a_time():
         for found, other in zip(pool.map(lambda task: program.solve(*task), tasks), alone, strict=True):
             assert np.array_equal(found.x, other.x)
             assert (found.status, found.iterations) == (other.status, other.iterations)
+
+
+def test_a_batch_is_the_same_in_one_part_and_in_many_on_any_threads(monkeypatch):
+    """Parts flow through threads, and what a part shares out itself has its share of them."""
+    problem = simulate(
+        assemble(1e4 * np.eye(5, 3), measured("tdoa", a=[1, 2, 3, 4], b=0, sigma=9.0)),
+        [7e3, 5e3, 3e3],
+        5,
+        90,
+    )
+    found = []
+    for threads, most in (("1", 1000), ("3", 1000), ("1", 16), ("3", 16)):
+        monkeypatch.setenv("OPTLOC_THREADS", threads)
+        monkeypatch.setattr("optloc.solvers.PART", most)
+        found.append(solve(problem))
+    for fix in found[1:]:
+        assert np.array_equal(fix.x, found[0].x)
+        assert np.array_equal(fix.cov, found[0].cov)
+        assert list(fix.certificate) == list(found[0].certificate)
+        assert list(fix.reason) == list(found[0].reason)

@@ -150,15 +150,15 @@ def program():
 
 @pytest.mark.parametrize("start", ["below", "antipode", "centre", "random", "fix"])
 def test_polar_planes_lead_from_anywhere(program, start):
-    z, _, x = problems(100, SIGMA, 7)
+    z, _, x = problems(30, SIGMA, 7)
     rng = np.random.default_rng(8)
     starts = {
-        "below": np.tile(BELOW, (100, 1)),
-        "antipode": np.tile(-BELOW, (100, 1)),
-        "centre": np.tile([1e3 / EARTH, 0.0, 0.0], (100, 1)),
+        "below": np.tile(BELOW, (30, 1)),
+        "antipode": np.tile(-BELOW, (30, 1)),
+        "centre": np.tile([1e3 / EARTH, 0.0, 0.0], (30, 1)),
         # no gradient to scale by
         "fix": x,
-        "random": on_surface(rng.normal(size=(100, 3))),
+        "random": on_surface(rng.normal(size=(30, 3))),
     }[start]
     for first, data, y in zip(starts, z, x, strict=True):
         found = on_height(program, first, data, SATELLITES, WGS84, np.full(2, 1 / SIGMA))
@@ -215,7 +215,7 @@ def problem(z, *known):
 @pytest.mark.parametrize("planes", [False, True])
 def test_optloc_needs_no_planes_where_it_starts_from_the_quartic(planes):
     """The generic program with the height as a constraint finds the visible point from the stage `roots`."""
-    z, _, x = problems(100, SIGMA, 7)
+    z, _, x = problems(40, SIGMA, 7)
     horizon = sight(SATELLITES * EARTH) if planes else ()
     found = solve(problem(z, height(exactly=0.0) + horizon), method="roots+nlp")
     assert alone(found).all()

@@ -11,7 +11,7 @@ from verdicts import alone
 from optloc import rejected, solve
 from optloc.problem.loss import LOSSES
 
-DEFAULT, FULL = 60, 400
+DEFAULT, FULL = 40, 400
 # Name: kind, stations, wrong rows, their size in sigma, whether they are late.
 CASES = {
     f"{kind}, {stations} stations, {label}": (kind, stations, bad, size, late)

@@ -34,7 +34,7 @@ PLANAR, ANGLES, SPACE = (
 CASES = {
     case.name: case
     for case in (
-        Case("planar, 5 differences, 2 emitters", 2, PLANAR, every_set, 3),
+        Case("planar, 5 differences, 2 emitters", 2, PLANAR, every_set, 2),
         Case("planar, 5 differences, 3 emitters", 3, PLANAR, every_set, 2),
         Case("planar, 5 azimuths, 2 emitters", 2, ANGLES, every_set, 2),
         Case("planar, 5 azimuths, 3 emitters", 3, ANGLES, every_set, 2),

@@ -8,7 +8,7 @@ from optloc.compute.jit import enabled
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 from optloc.proof.search_space import cost_of, empty_box
 
-CASES, BUDGET_HERE = (24, 20_000) if enabled() else (3, 300)
+CASES, BUDGET_HERE = (12, 20_000) if enabled() else (3, 300)
 KAPPAS = (0.0, 9.0, 25.0)
 AROUND, AWAY = 1e5, 1e9
 

@@ -198,23 +198,23 @@ def inside(rng: np.random.Generator, axes: Axes, table, count: int) -> Array:
 
 def test_no_point_costs_less_than_its_box(seed):
     rng, told = np.random.default_rng([5, seed]), 0
-    for course, axes, table in boxes(rng, 50):
+    for course, axes, table in boxes(rng, 25):
         here = residual_at(course.rows, table.nodes, table.sheet)
         noise = blur_of(course.rows, 1e7, table.nodes)
         set_lines(course, table)
         low = least_length(course, table, here, False)
         set_bends(course, axes, table)
         low = max(low, least_length(course, table, here, True)) - noise
-        states = [state_off(course.ground, state) for state in inside(rng, axes, table, 50)]
+        states = [state_off(course.ground, state) for state in inside(rng, axes, table, 25)]
         cost = min(cost_of_state(course, state)[0] for state in states)
         assert low <= np.sqrt(cost) * (1.0 + 1e-9) + 1e-6
         told += low > 0.0
-    assert told > 12
+    assert told > 5
 
 
 def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
     rng, convex, empty = np.random.default_rng([6, seed]), 0, 0
-    for course, axes, table in boxes(rng, 50):
+    for course, axes, table in boxes(rng, 25):
         residual_at(course.rows, table.nodes, table.sheet)
         set_lines(course, table)
         set_bends(course, axes, table)
@@ -227,8 +227,8 @@ def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
             beyond = np.maximum(np.abs(bent - table.hessian) - table.change, 0.0)
             assert np.linalg.norm(beyond, 2) <= ball * (1.0 + 1e-6) + 1e-6 * np.abs(table.hessian).max()
         empty += has_no_minimum(table, ball, noise)
-    assert convex > 7
-    assert empty > 7
+    assert convex > 3
+    assert empty > 3
 
 
 def test_hessians_are_those_of_the_cost(seed):
