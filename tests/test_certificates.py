@@ -5,7 +5,7 @@ import pytest
 
 from optloc import Certificate
 from optloc.base.records import join, overwrite, take
-from optloc.problem.claims import alike, claim, untried, where
+from optloc.problem.claims import alike, choose, claim, untried
 
 GIVEN = [
     Certificate("global", "no position costs less", "branch and bound", 1.0, 1e-9, True, 9.0, 57),
@@ -47,7 +47,7 @@ def test_it_is_taken_joined_and_overwritten_like_every_record():
 
 def test_many_are_one_and_one_is_chosen_for_many():
     assert same(alike(claim(GIVEN[1]), 3).tell(), [GIVEN[1]] * 3)
-    chosen = where(np.array([True, False, False, False, True]), claim(GIVEN[0]), written())
+    chosen = choose(np.array([True, False, False, False, True]), claim(GIVEN[0]), written())
     assert same(chosen.tell(), [GIVEN[0], *GIVEN[1:], GIVEN[0]])
 
 

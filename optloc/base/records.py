@@ -176,7 +176,8 @@ class _Column:
 
 def _is_equal(a: Array, b: Array) -> bool:
     # NaN is not equal to itself, but what lies at the same place is
-    return np.may_share_memory(a, b) or np.array_equal(a, b)
+    same = a.ctypes.data == b.ctypes.data and (a.shape, a.strides, a.dtype) == (b.shape, b.strides, b.dtype)
+    return same or np.array_equal(a, b)
 
 
 @cache

@@ -130,7 +130,7 @@ def flow(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterat
     """Yield the function of every item in their order, several worked on side by side: for large parts of a batch.
 
     Unlike `mapped` it serves work whose Python takes as long as its machine code, since one part's is done while the
-    other's runs; and what is yielded may be forgotten: no more parts are held than there are threads.
+    other's runs; and what is yielded may be forgotten: one part more is held than there are threads, at most.
 
     Parameters
     ----------

@@ -60,9 +60,9 @@ class Claims:
 
     def write(self, items: Array | int, other: Claims) -> None:
         """Write others in the place of some, by index or mask: as many (n,), or one () for all."""
-        where = np.atleast_1d(items)  # an object array would take an array () for an object
+        places = np.atleast_1d(items)  # an object array would take an array () for an object
         for each in fields(self):
-            getattr(self, each.name)[where] = getattr(other, each.name)
+            getattr(self, each.name)[places] = getattr(other, each.name)
 
     def tell(self) -> Array:
         """Return the certificates as an object array (...); None where nobody has tried."""
@@ -98,7 +98,7 @@ def alike(one: Claims, shape: int | tuple[int, ...]) -> Claims:
     return Claims(*(np.broadcast_to(getattr(one, each.name), shape) for each in fields(one)))
 
 
-def where(chosen: Array, one: Claims, other: Claims) -> Claims:
+def choose(chosen: Array, one: Claims, other: Claims) -> Claims:
     """Return claims (N,) of which those chosen are from one, and the rest from another, each (N,) or ()."""
     pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
     return Claims(*(np.where(chosen, *pair) for pair in pairs))

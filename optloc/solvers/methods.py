@@ -297,8 +297,8 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     new, before = _beside(part, start, standing(take(pool, items), fix[items])), tried_before(pool, fix, items)
     for stage in others:
         # a proof takes most of the time, and is not made again where all else found nothing new
-        new = stage(part, replace(new, before=before))
-    return replace(pool.merge(items, replace(new, before=None)), stages=(*pool.stages, *new.stages))
+        new = stage(part, replace(new, tried_before=before))
+    return replace(pool.merge(items, replace(new, tried_before=None)), stages=(*pool.stages, *new.stages))
 
 
 def _beside(problem: Problem, start: Pool, x: Array) -> Pool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Status
-from optloc.problem.claims import Claims, untried, where
+from optloc.problem.claims import Claims, choose, untried
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Curvature, Pool, begin
@@ -117,7 +117,7 @@ def _lengths(explanations: Array) -> Array:
 def _claims(claims: Claims) -> Claims:
     """Return claims of which those that say nothing are as if nobody had tried."""
     nothing = (claims.reason == NO_PROOF.reason) | (claims.reason == NO_ANSWER.reason)
-    return where(nothing, untried(len(nothing)), claims)
+    return choose(nothing, untried(len(nothing)), claims)
 
 
 def _verbatim(fix: Fix, items: Array) -> Array:

@@ -60,7 +60,7 @@ class Curvature:
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
+class TriedBefore:
     """What a branch before has tried to prove of N fixes, and of what it was tried.
 
     Parameters
@@ -120,7 +120,7 @@ class Pool:
         What a stage has to say beside the status.
     proven : Claims, optional
         What is proven of the best candidates; None where nobody has tried for any.
-    before : Before, optional
+    tried_before : TriedBefore, optional
         What a branch before has tried to prove: it stands where nothing new was found.
     hidden : object array (N,), optional
         What lies behind the Earth, in words; "" where nothing does.
@@ -149,7 +149,7 @@ class Pool:
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None
     proven: Claims | None = None
-    before: Before | None = None
+    tried_before: TriedBefore | None = None
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
     asked: bool = False
     refuted: str = ""

@@ -84,8 +84,8 @@ def certified(
     began, stages, fix = perf_counter(), pool.stages, judge(problem, pool)
     proven = claims_before(pool)
     asked, same = to_prove(pool, fix)
-    if pool.before is not None:
-        proven.write(same, take(pool.before.proven, same))
+    if pool.tried_before is not None:
+        proven.write(same, take(pool.tried_before.proven, same))
     items, more = np.flatnonzero(asked & ~same), 0
     for _ in range(_ROUNDS):
         if not len(items):

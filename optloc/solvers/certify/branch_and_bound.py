@@ -37,7 +37,7 @@ from optloc.solvers.certify.posed import (
 )
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
-from optloc.solvers.pool import Before, Pool, offer, pack
+from optloc.solvers.pool import Pool, TriedBefore, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import vectors
@@ -505,18 +505,18 @@ def certified_freely(
         return replace(pool, proven=proven, stages=(*pool.stages, certify_stage(why or "nothing to prove", began)))
 
     work = Work.begin(problem, pool, fix, answered & ~proven_before, region, margin, effort)
-    if pool.before is not None:
-        work.proven.write(proven_before, take(pool.before.proven, proven_before))
+    if pool.tried_before is not None:
+        work.proven.write(proven_before, take(pool.tried_before.proven, proven_before))
     work = settle(work)
     stages = (*pool.stages, certify_stage(work.summary(), began))
     return replace(work.pool, proven=work.proven, stages=stages)
 
 
-def tried_before(pool: Pool, fix: Fix, items: Array) -> Before | None:
-    """Return what was tried to prove of some of the fixes (N,) of a pool, for `Pool.before`; None where nothing was."""
+def tried_before(pool: Pool, fix: Fix, items: Array) -> TriedBefore | None:
+    """Return what was tried to prove of some of the fixes (N,) of a pool, for `Pool.tried_before`; None where nothing was."""
     if pool.proven is None:
         return None
-    return Before(fix.cost[items], _count_listed(fix)[items], take(pool.proven, items))
+    return TriedBefore(fix.cost[items], _count_listed(fix)[items], take(pool.proven, items))
 
 
 def claims_before(pool: Pool) -> Claims:
@@ -533,10 +533,10 @@ def to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
     answered = fix.answered & np.isfinite(fix.cost)
     if pool.conclusion is not None:
         answered &= ~present(pool.conclusion)  # the rows are not all there
-    return answered, answered & _stands(pool.before, fix)
+    return answered, answered & _stands(pool.tried_before, fix)
 
 
-def _stands(before: Before | None, fix: Fix) -> Array:
+def _stands(before: TriedBefore | None, fix: Fix) -> Array:
     """Return which claims are about the same minima as fixes (N,): what was shown, or not, of these holds still.
 
     The minima that were known compete in what is found later. As many of them, and a least one that costs the same, are

@@ -14,7 +14,7 @@ from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.models import MODELS
 from optloc.models.layers import Layers
-from optloc.problem.claims import Claims, alike, claim, where
+from optloc.problem.claims import Claims, alike, choose, claim
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
@@ -92,7 +92,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
     marks = np.where(finished, mark(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
-    proven = where(finished, _claims(pool), NO_ANSWER)
+    proven = choose(finished, _claims(pool), NO_ANSWER)
     if pool.free is not None:
         _hold_against_constraints(pool, cost, finished, marks, reason)
     code = first_status(marks)
@@ -352,7 +352,7 @@ def _claims(pool: Pool) -> Claims:
     """Return the claims (N,) of refined answers: what was proven of them, or that they are minima."""
     if pool.proven is None:
         return alike(NO_PROOF, len(pool))
-    return where(pool.proven.tried, pool.proven, NO_PROOF)
+    return choose(pool.proven.tried, pool.proven, NO_PROOF)
 
 
 def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
