@@ -513,7 +513,7 @@ def certified_freely(
 
 
 def tried_before(pool: Pool, fix: Fix, items: Array) -> TriedBefore | None:
-    """Return what was tried to prove of some of the fixes (N,) of a pool, for `Pool.tried_before`; None where nothing was."""
+    """Return what was tried to prove of some of the fixes (N,) of a pool; None where nothing was."""
     if pool.proven is None:
         return None
     return TriedBefore(fix.cost[items], _count_listed(fix)[items], take(pool.proven, items))
