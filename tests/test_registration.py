@@ -120,9 +120,9 @@ LIMITS = {
 def test_a_limit_decides_between_the_branches(name):
     """The mirror image of the target lies 166 km below ground and flies at 215 m/s, the target itself at 100 m/s."""
     problem = replace(run(600, order=1), frame=Frame.enu(lat_deg=47.0, lon_deg=11.0))
-    many = simulate(problem, truth(problem), 9, trials=6)
+    many = simulate(problem, truth(problem), 9, trials=3)
     fix = solve(replace(many, constraints=LIMITS[name]), "searched")  # a proof of each run would be most of the time
-    best = refine(many, np.tile(truth(problem), (6, 1)))
+    best = refine(many, np.tile(truth(problem), (3, 1)))
     sigma = np.sqrt(np.diagonal(crlb(problem, truth(problem))))
     assert alone(fix).all(), fix.reason
     assert (np.abs(fix.x - best.x) < 0.01 * sigma).all()
@@ -184,7 +184,7 @@ ELSEWHERE = {
 @pytest.mark.parametrize("name", ELSEWHERE)
 def test_targets_elsewhere(name):
     """The optimum next to the truth is the answer or is listed; a cheaper one elsewhere is no failure."""
-    found = counted(Case(name, *ELSEWHERE[name]), 30)
+    found = counted(Case(name, *ELSEWHERE[name]), 15)
     assert not found.failed.any(), np.flatnonzero(found.failed)
     assert not (found.away & ~found.listed).any(), np.flatnonzero(found.away & ~found.listed)
 
@@ -241,7 +241,7 @@ GAPS = {
 def test_gaps(name):
     problem, spoil = GAPS[name]
     # Where each trial has other rows, each is solved by itself.
-    settled(counted(Case(name, problem, spoil=spoil), 8 if "own" in name else 24))
+    settled(counted(Case(name, problem, spoil=spoil), 4 if "own" in name else 16))
 
 
 def test_stations_and_target_at_rest_leave_target_and_biases_open():
@@ -303,7 +303,7 @@ def once(prior):
 
 
 @pytest.mark.parametrize("prior", few([None, 200.0], 1))
-@pytest.mark.parametrize("method", ["sdp+lsr", "roots+nlp+lsr", "gtrs+lsr"])
+@pytest.mark.parametrize("method", few(["sdp+lsr", "gtrs+lsr", "roots+nlp+lsr"], 2))
 def test_other_routes_reach_the_same_optimum(method, prior):
     problem, auto = once(prior)
     fix = solve(problem, method)

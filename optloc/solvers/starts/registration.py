@@ -89,15 +89,13 @@ def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> 
     blocks = average_blocks(straight, BLOCKS)
     x = _begin(blocks, begin)
     x = _around(blocks, _ANYWHERE) if x is None else x
-    pool = _minima(blocks, x)
-    # stations in a plane see the mirror image nearly as well: it is always tried
-    pool = _merge(pool, _minima(blocks, mirror_courses(blocks, pool[0][:, :1])))
+    pool = _with_mirror(blocks, _minima(blocks, x))
     # ring and valley only where something calls for them: they are most of the candidates
     doubtful = np.flatnonzero(~_is_settled(blocks, pool))
     if len(doubtful):
         part = blocks.take(doubtful)
         wider = _minima(part, np.concatenate([_around(part, _RADII), _valley(part, pool[0][doubtful, 0])], axis=1))
-        pool = _merge(pool, _scatter(wider, doubtful, len(x)))
+        pool = _merge(pool, _scatter(_with_mirror(part, wider), doubtful, len(x)))
     x = complete(straight, _best(blocks, *pool)[..., : straight.layout.n_shared])
     return x if straight is problem else _bend(problem, straight, x)
 
@@ -163,6 +161,11 @@ def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
         # unfinished ones compete: they are refined again on all epochs
         cost[item, slot] = np.where(np.isin(done.status, (Status.OK, Status.MAX_ITERATIONS)), done.cost, np.inf)
     return _sort(out, cost)
+
+
+def _with_mirror(blocks: Problem, pool: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return minima and the one that the mirror image of the best leads to: stations in a plane see it as well."""
+    return _merge(pool, _minima(blocks, mirror_courses(blocks, pool[0][:, :1])))
 
 
 def _merge(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
