@@ -6,6 +6,7 @@ that others will ask for; processes of their own do so side by side.
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -279,6 +280,10 @@ def _compile(part: Part) -> None:
                 os._exit(1)
 
     REPORTER.muted = True  # the process that began this one tells
+    # What a compiler makes is mostly kept: to look for garbage at each 700 new objects is a sixth of its time. At each
+    # 50 000, with what is imported left out, memory grows by a twentieth.
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
     with compiling(tell):
         for work in part.works:
             work()
