@@ -58,7 +58,7 @@ def agree(fix, value):
     assert float(fix.cost) == pytest.approx(value, rel=1e-5, abs=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", few(range(12), 6))
 def test_boxes(seed):
     rng = np.random.default_rng(seed)
     low = rng.uniform(0.0, 3e3, 2)
@@ -80,7 +80,7 @@ def above(x):
 
 
 @pytest.mark.parametrize("exact", [True, False])
-@pytest.mark.parametrize("seed", few(range(6), 2))
+@pytest.mark.parametrize("seed", few(range(6), 1))
 def test_heights(seed, exact):
     rng = np.random.default_rng(seed)
     truth = np.array([*rng.uniform(500.0, 4500.0, 2), rng.uniform(100.0, 2e3)])
@@ -96,7 +96,7 @@ def test_heights(seed, exact):
     assert low - 1e-2 <= float(above(fix.position)) <= high + 1e-2
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", few(range(12), 6))
 def test_polygons_that_are_not_convex(seed):
     rng = np.random.default_rng(seed)
     problem, cost = drawn(PLANE, rng.uniform(0.0, 5e3, 2), rng, polygon(ELL))
@@ -169,16 +169,16 @@ def test_covariance_at_an_exact_height_is_that_of_monte_carlo():
     truth = np.array([2e3, 1.5e3, 700.0])
     rows = measured("tdoa", np.zeros(4), a=[1, 2, 3, 4], b=0, arrival_sigma=5.0)
     blank = assemble(SPACE, rows, frame=ENU, constraints=[height(exactly=float(above(truth)))])
-    fix = solve(simulate(blank, truth, 11, 2000), "searched")  # of so many no proof is asked for
+    fix = solve(simulate(blank, truth, 11, 500), "searched")  # of so many no proof is asked for
     good = alone(fix)
     assert good.mean() > 0.99
     error = fix.position[good] - truth
     sampled, stated = np.cov(error.T), fix.cov[good].mean(0)
-    assert np.trace(sampled) == pytest.approx(np.trace(stated), rel=0.05)
+    assert np.trace(sampled) == pytest.approx(np.trace(stated), rel=0.15)
     u, s, _ = np.linalg.svd(stated)
     along = u[:, :2]
     spread = np.einsum("ni,ij,nj->n", error @ along, np.linalg.inv(along.T @ stated @ along), error @ along)
-    assert spread.mean() == pytest.approx(2.0, rel=0.05)
+    assert spread.mean() == pytest.approx(2.0, rel=0.15)
     assert s[2] < 1e-6 * s[0]
     assert np.sqrt(np.mean((error @ u[:, 2]) ** 2)) < 1e-2
 
@@ -228,7 +228,9 @@ def test_where_nothing_binds_the_fix_is_the_unconstrained_one():
     assert fix.status == free.status
 
 
-@pytest.mark.parametrize("side", [box((-2e3, -1e9, -1e9), (1e9,) * 3), height(3e3, 1e9)], ids=["plane", "height"])
+@pytest.mark.parametrize(
+    "side", few([height(3e3, 1e9), box((-2e3, -1e9, -1e9), (1e9,) * 3)], 1), ids=["height", "plane"]
+)
 def test_an_edge_is_too_dear_only_where_all_of_it_is(side):
     rng, levels = np.random.default_rng(4), np.linspace(0.5, 1.5, 11)
     for _ in range(3):

@@ -26,7 +26,20 @@ from optloc.compute.jit import enabled
 # Generated pages hold no code; the recipes of contributors have a test of their own.
 ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in ELSEWHERE]
-RUN = [page for page in PAGES if any(block.kind in ("python", "console", "sh") for block in blocks(page))]
+# What takes these pages seconds has tests of its own; full runs show that they print it still.
+LONG = (
+    "studies.md",
+    "tutorials/study.md",
+    "tutorials/anchors.md",
+    "recipes/direction-finding.md",
+    "recipes/uwb.md",
+    "howto/constraints.md",
+)
+RUN = [
+    pytest.param(page, marks=pytest.mark.full) if page in {DOCS / name for name in LONG} else page
+    for page in PAGES
+    if any(block.kind in ("python", "console", "sh") for block in blocks(page))
+]
 THEORY = DOCS / "theory"
 PICTURE = re.compile(r"!\[[^\]]*\]\(([^)]+)\)")
 

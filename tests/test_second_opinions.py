@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from cases import CASES
+from often import few
 from verdicts import alone
 
 import optloc
@@ -44,7 +45,7 @@ def nearest(fix: optloc.Fix, x: np.ndarray) -> np.ndarray:
     return np.nanmin(np.linalg.norm(points - x[:, None], axis=-1), axis=1)
 
 
-@pytest.mark.parametrize("count", [100, pytest.param(2000, marks=pytest.mark.full)])
+@pytest.mark.parametrize("count", few([50, 2000], 1))
 def test_three_satellites_and_a_height_find_every_visible_target(count):
     x, up = visible(count)
     template = assemble(

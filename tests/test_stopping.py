@@ -99,7 +99,7 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path):
     assert child.wait() == 141
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+@pytest.mark.parametrize("encoding", ["ascii", pytest.param("cp1252", marks=pytest.mark.full)])
 def test_any_encoding_and_any_width(encoding, tmp_path):
     names = "\U0001f4e1", "[/b]", r"$\frac{"
     places = ((0, 0), (900, 0), (0, 900))

@@ -6,6 +6,7 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
+from often import few
 from robust_cases import solve_apart, spoilt
 from scipy.stats import binom, chi2
 from typer.testing import CliRunner
@@ -242,7 +243,7 @@ def test_with_redundancy_one_a_bad_fit_is_not_ok():
 @pytest.mark.parametrize(
     ("noise", "batches"), [(2.0, 1), *(pytest.param(n, 4, marks=pytest.mark.full) for n in (2.0, 3.0))]
 )
-@pytest.mark.parametrize("kind", ["toa", "range", "azimuth"])
+@pytest.mark.parametrize("kind", few(["toa", "azimuth", "range"], 2))
 def test_noise_that_is_understated_is_the_suspect_and_no_station_is(kind, noise, batches):
     """Fifty fixes at a time: the level is named, nobody is accused more often than on clean data, and nothing is ok."""
     trials = 50
@@ -273,6 +274,7 @@ def test_sets_that_are_left_untried_explain_nothing(kind, stations, monkeypatch)
     assert told[0] == told[1]
 
 
+@pytest.mark.full
 def test_two_kinds_of_lengths_may_both_have_an_offset():
     """Then a set of two leaves out no row at all, among so many sets that they are looked at to first order."""
 
@@ -281,8 +283,8 @@ def test_two_kinds_of_lengths_may_both_have_an_offset():
         return problem(measured("range", a=EACH, sigma=sigma), sums)
 
     # errors half as large again as is stated: no rest is refuted, and none is so good that pairs need no look
-    loud = simulate(rows(15.0), TARGET, 6, trials=2).z
-    stated = simulate(rows(10.0), TARGET, 6, trials=2)
+    loud = simulate(rows(15.0), TARGET, 6, trials=1).z
+    stated = simulate(rows(10.0), TARGET, 6, trials=1)
     fix = solve_apart(stated.with_rows(z=loud))
     assert fix.answered.all()
     error = fix.position - TARGET

@@ -10,6 +10,7 @@ from contextvars import ContextVar
 
 import numpy as np
 import pytest
+from often import few
 
 from formulations.conic import Relaxation
 from formulations.moment_sdp import moment_problem
@@ -172,7 +173,7 @@ def test_a_cache_makes_a_value_once_whoever_asks():
         return cache.find(i % 50, lambda: make(i % 50))
 
     with restless(), ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(ask, range(4000))) == [(i % 50) ** 2 for i in range(4000)]
+        assert list(pool.map(ask, range(1500))) == [(i % 50) ** 2 for i in range(1500)]
     assert sorted(made) == list(range(50))
 
 
@@ -259,7 +260,7 @@ def solved_in_threads(problems: list[Problem], methods: tuple[str, ...], solves:
 
 
 def test_threads_solve_different_problems_as_one_thread_does():
-    solved_in_threads([varied(i) for i in range(42)], ("gtrs+lsr", "auto"), 170)  # three of each kind and dimension
+    solved_in_threads([varied(i) for i in range(42)], ("gtrs+lsr", "auto"), 100)  # three of each kind and dimension
 
 
 @pytest.mark.full
@@ -267,7 +268,7 @@ def test_threads_solve_many_different_problems_as_one_thread_does():
     solved_in_threads([varied(i) for i in range(400)], ("gtrs+lsr", "auto"), 5000)
 
 
-@pytest.mark.parametrize("methods", [("gtrs+nlp+lsr",), ("sdp+lsr", "socp+lsr"), ("sparse+lsr",)])
+@pytest.mark.parametrize("methods", few([("sdp+lsr", "socp+lsr"), ("gtrs+nlp+lsr",), ("sparse+lsr",)], 2))
 def test_threads_share_the_programs_of_back_ends(methods):
     """Twenty problems of four structures: a program of IPOPT or Clarabel serves several threads at a time."""
     problems = [

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from often import few
 
 from optloc import ECEF, InvalidProblem, Motion, Status, assemble, measured, station_array
 from optloc.linear.constraints import box, height
@@ -204,7 +205,7 @@ def test_a_lost_track_of_single_rows_ends():
     assert clean[170:].mean() > 0.9
 
 
-@pytest.mark.parametrize("wild", [0.0, 30.0])
+@pytest.mark.parametrize("wild", few([30.0, 0.0], 1))
 def test_single_rows_are_tracked_without_losing_the_track(wild):
     """Also where one in ten is wild: twenty scans tell that from a track that is lost."""
     problem, truth = lone(np.arange(0.0, 100.0, 0.25), wild=wild, seed=2)

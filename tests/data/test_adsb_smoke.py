@@ -13,7 +13,8 @@ pytestmark = pytest.mark.data
 README = (63.0, 314.0)
 
 
-@pytest.mark.parametrize("method", ["auto", pytest.param("gtrs+lsr", marks=pytest.mark.full)])
+@pytest.mark.full  # test_adsb.py has every message of five stations in every run
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
 def test_messages_are_fixed_as_one_batch(data_dir, method):
     data = adsb.load(data_dir / "locards_adsb")
     assert data.problem.epochs == 763

@@ -67,7 +67,7 @@ def test_a_replay_gives_the_numbers_of_fix(data_dir, tmp_path):
     fixed = run(app, ["fix", str(tmp_path / "adsb.toml"), "--out", str(tmp_path / "fixes.csv"), "-q"])
     assert fixed.exit_code in (0, 1), fixed.output
     fixes = pd.read_csv(tmp_path / "fixes.csv", dtype={"epoch": str}).set_index("epoch")
-    speed = max(10.0, (times[-1] - times[0]) / 3.0)
+    speed = max(10.0, (times[-1] - times[0]) / 1.5)
     words = ["live", str(tmp_path / "adsb.toml"), "--replay", str(tmp_path / "adsb.ndjson"), "--phases", "one", "-q"]
     streamed = run(app, [*words, "--speed", str(speed)])
     assert streamed.exit_code == 0, streamed.output

@@ -43,7 +43,7 @@ def flown(folder, flight):
     return Flown([entry.label for entry in entries], error[np.isfinite(error)], left_out)
 
 
-@pytest.mark.parametrize("flight", few(LIMIT, 2))
+@pytest.mark.parametrize("flight", few(LIMIT, 1))
 def test_flights_are_tracked_without_a_guess(data_dir, flight):
     found = flown(data_dir / "util_uwb_tdoa", flight)
     report(

@@ -65,7 +65,7 @@ def test_the_solver_sees_the_moments_and_nothing_else():
 def test_the_bound_is_the_global_minimum(kind, count, d):
     rng = np.random.default_rng([count, d])
     tight = solved = 0
-    for _ in range(6):
+    for _ in range(4):
         ranged, truth = drawn(rng, kind, count, d, 10.0 ** rng.uniform(-4.0, -2.5))
         x, cost = minimum(ranged, truth, rng)
         box = enclosure(ranged, x, cost + 0.1)
@@ -78,7 +78,7 @@ def test_the_bound_is_the_global_minimum(kind, count, d):
             tight += 1
             assert found.rank_ratio < 1e-4
             np.testing.assert_allclose(found.point, x, atol=2e-3)
-    assert solved >= 5
+    assert solved >= 3
     assert tight >= solved - 1
 
 
@@ -134,9 +134,9 @@ def test_wrong_minima_are_never_reached_by_the_bound(kind, count, d, sigma):
         wrong += 1
         assert np.abs(np.linalg.solve(box.axes, x - box.centre)).max() <= 1.0  # the better point is in the box
         assert moment_bound(ranged, box, cost + 0.1).bound <= least + 1e-7 * (1.0 + least)
-        if wrong == 8:
+        if wrong == 4:
             break
-    assert wrong == 8
+    assert wrong == 4
 
 
 def test_twins_are_two_points_of_one_cost():

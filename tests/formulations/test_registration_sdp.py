@@ -7,6 +7,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from monte_carlo.tables import write
+from often import few
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
@@ -202,7 +203,7 @@ def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clock
 @pytest.mark.parametrize(
     ("noise", "prices", "trials", "half", "most"),
     [
-        (3.0, PRICES, 3, 2000, 5000),
+        (3.0, PRICES, 2, 2000, 5000),
         (12.0, (10.0, 3.0, 1.0), 3, 4500, 12000),
         *(
             pytest.param(noise, (10.0, 3.0, 1.0, 0.3), 200, half, most, marks=pytest.mark.full)
@@ -291,7 +292,7 @@ def test_neither_unit_nor_origin_nor_axes_matter():
     np.testing.assert_allclose(turned.target @ turn, plain.target, atol=10.0)
 
 
-@pytest.mark.parametrize("prior", [50.0, 1000.0, 3000.0])
+@pytest.mark.parametrize("prior", few([1000.0, 50.0, 3000.0], 1))
 def test_the_ladder_serves_other_priors(prior):
     one = run(np.random.default_rng(5), 3.0)
     one.sigma[:] = prior

@@ -13,7 +13,7 @@ from scipy.stats import chi2, poisson
 
 from optloc import Status, crlb, solve
 
-DEFAULT, FULL, MANY = 100, 2000, 20_000
+DEFAULT, FULL, MANY = 60, 2000, 20_000
 # What a covariance promises: shares of the errors that its ellipsoids hold, and how far off they may be where there are
 # fixes enough to tell.
 LEVELS, PROMISED, ENOUGH = (0.95, 0.999), ((0.93, 0.97), (0.995, 1.0)), 1500

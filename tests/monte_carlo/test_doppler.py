@@ -18,7 +18,7 @@ PASSES = "one pass of a satellite"
 NINE = "passes of nine satellites"
 SATELLITES = "three satellites, TDOA + FDOA"
 # Fixes of a call; of mixtures each call has other kinds and stations.
-BATCH = 10
+BATCH = 6
 FULL = dict.fromkeys(FAMILIES, 200)
 FULL |= {name: 700 for name in FAMILIES if "bearing" in name} | {name: 250 for name in FAMILIES if "mixtures" in name}
 FULL |= {PASSES: 2000, SATELLITES: 2000, NINE: 100}

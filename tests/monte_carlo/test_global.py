@@ -8,7 +8,7 @@ from monte_carlo.trials import automatic, outcome, trials
 
 from optloc import Status
 
-DEFAULT, FULL = 100, 2000
+DEFAULT, FULL = 60, 2000
 HEADER = [
     "case",
     "reached",

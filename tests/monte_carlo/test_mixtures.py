@@ -8,7 +8,7 @@ from monte_carlo.tables import ledger
 
 from optloc import Status, solve
 
-DEFAULT, FULL = 40, 2000
+DEFAULT, FULL = 20, 2000
 HEADER = [
     "mixture",
     "global minimum",

@@ -21,7 +21,7 @@ SIGMA, GROSS, LEVEL = 10.0, 50.0, 0.01
 CASES = {"20 stations, 4 wrong": (20, 4, None), "20 stations, none wrong": (20, 0, None)} | {
     f"{s} stations, {bad} wrong": (s, bad, 3) for s, bad in ((10, 2), (10, 1), (8, 2), (8, 1), (8, 0))
 }
-DEFAULT, FULL = 100, 2000
+DEFAULT, FULL = 50, 2000
 HEADER = [
     "case",
     "l1: exact",

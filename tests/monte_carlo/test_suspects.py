@@ -19,7 +19,7 @@ SIGMA = 10.0
 PRICE, GAP, REFUTED = 16.0, 9.0, 1e-4
 # Scores that differ from the gap by less may fall on either side of it.
 EDGE = 1e-3
-DEFAULT, FULL, CLEAN = 12, 500, 5000
+DEFAULT, FULL, CLEAN = 8, 500, 5000
 HEADER = [
     "stations, bad, error",
     "same list",

@@ -87,6 +87,7 @@ def test_far_starts_order_the_filters():
     assert bound[-1] < 200.0
 
 
+@pytest.mark.full  # the reproduction has its table in every run
 def test_what_a_wrong_height_does():
     found = run_heights(60, 40, sequence(3))
     careless, honest = (found[f"constant error of 500 m, {how}"] for how in ("taken for white", "as a state"))

@@ -8,6 +8,7 @@ from io import StringIO
 import numpy as np
 import pytest
 from monte_carlo.tables import write
+from often import few
 
 pytest.importorskip("stonesoup", reason="Stone Soup is not installed: pip install 'optloc[stonesoup]'")
 
@@ -311,7 +312,7 @@ def test_all_initiators_and_filters():
     write("stonesoup", header, rows, f"seed {SEED}, {count} tracks of 30 scans")
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", few(FILTERS, 1))
 def test_every_filter_converges_from_our_initiator(name):
     found = compared("optloc", name, 8, scans=15)
     assert converged(found).all(), found

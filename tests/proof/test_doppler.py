@@ -55,8 +55,8 @@ def test_own_derivatives_are_those_of_own_values():
 
 @pytest.mark.skipif(not enabled(), reason="budgets of boxes are smaller in plain Python")
 def test_no_claim_of_a_doppler_fix_is_wrong(seed, record_property):
-    # mixtures of few rows first: what is solved before machine code is loaded is slow
-    counts = {name: attack(name, 1, seed, 0) for name in reversed(FAMILIES)}
+    # every other family, mixtures of few rows first: what is solved before machine code is loaded is slow
+    counts = {name: attack(name, 1, seed, 0) for name in [*reversed(FAMILIES)][seed % 2 :: 2]}
     record_property("claims", str(counts))
     total = sum(counts.values(), Counter())
     # Most is proven, and the rivals that the attack meets are other places than the answer.

@@ -144,7 +144,7 @@ def test_no_point_of_a_box_costs_less_than_its_bound(seed):
         run = pose_runs(problem).runs[0]
         for space, tables in spaces(problem, run, x):
             floor, box, sheet = floor_of(space, run.cost), tables.box, tables.sheet
-            for _ in range(many(60, 6)):
+            for _ in range(many(60, 4)):
                 at, half, piece = put(space, tables, rng, len(x))
                 if not place(space, tables, run.cost, at, half, piece):
                     continue
@@ -180,7 +180,7 @@ def test_no_point_of_a_box_has_a_hessian_beyond_its_bounds(seed):
                 whole = np.array([[sums[entry(k, m)] for m in range(3)] for k in range(3)])
                 return whole, np.array([[sums[C00 + entry(k, m)] for m in range(3)] for k in range(3)]), ball
 
-            for _ in range(many(40, 3)):
+            for _ in range(many(40, 2)):
                 at, half, piece = put(space, tables, rng, len(x))
                 centre, change, ball = hessian_at(at, half, piece)
                 if not ball < np.inf:

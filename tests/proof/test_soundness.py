@@ -114,8 +114,8 @@ def check_cell(name: str, trials: int, count: int, seed: int) -> int:
 
 
 def test_no_wrong_stationary_point_is_certified(seed):
-    found = sum(check_cell(name, counted(6), 6, seed) for name in HARD)
-    assert found >= 100 * SHARE
+    found = sum(check_cell(name, counted(4), 6, seed) for name in HARD)
+    assert found >= 50 * SHARE
 
 
 @pytest.mark.full
@@ -189,8 +189,8 @@ def check_candidates(name: str, trials: int, each: int, seed: int) -> int:
 
 
 def test_no_random_candidate_is_certified(seed):
-    total = sum(check_candidates(name, counted(5), 6, seed) for name in HARD)
-    assert total >= 450 * SHARE
+    total = sum(check_candidates(name, counted(3), 6, seed) for name in HARD)
+    assert total >= 250 * SHARE
 
 
 @pytest.mark.full

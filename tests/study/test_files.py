@@ -16,7 +16,8 @@ from optloc.study.plan import plan_of, shipped
 from optloc.study.trial import compute
 
 RUN = CliRunner()
-STUDIES = sorted(shipped())
+# networks: its methods are those of tests/study/test_networks.py, of which some take seconds
+STUDIES = [pytest.param(name, marks=pytest.mark.full) if name == "networks" else name for name in sorted(shipped())]
 BAD = {
     "method": ('"gtrs+lsr"', '"gtsr+lsr"', "unknown method 'gtsr'; did you mean 'gtrs'"),
     "baseline": ('method = "gtrs+lsr"', 'baseline = "tailor"', "unknown baseline 'tailor'; did you mean 'taylor'"),
@@ -142,7 +143,7 @@ def test_lists_show_what_studies_are_made_of():
         "solvers": ("CLARABEL", "ipopt", "sqpmethod", "scipy", "lsr", "version"),
         "baselines": ("taylor", "lifted-sdp"),
         "executors": ("dask", "processes"),
-        "studies": tuple(STUDIES),
+        "studies": tuple(shipped()),
         "methods": ("auto",),
     }.items():
         shown = RUN.invoke(app, ["list", what, "--json"]).stdout

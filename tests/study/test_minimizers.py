@@ -211,6 +211,7 @@ def test_what_breaks_a_constraint_has_no_cost_and_wins_against_nobody(tmp_path):
 NLOPT = files_of_the_page(DOCS / "studies.md")["others.py"]
 
 
+@pytest.mark.full
 @pytest.mark.skipif(find_spec("nlopt") is None, reason="needs nlopt: pip install nlopt")
 def test_nlopt_and_a_method_of_ones_own_are_one_file(mine, tmp_path):
     path = tmp_path / "others.py"

@@ -120,6 +120,7 @@ def package(tmp_path_factory):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is none on this system")
+@FULL
 def test_a_method_that_forks_answers_once(tmp_path):
     assert run_plan(plan(study(["fork"])), tmp_path / "out", executor("processes", 1)).counts == {"unproven": 6}
 
@@ -147,8 +148,8 @@ def check(folder, names):
 @pytest.mark.parametrize(
     ("jobs", "some"),
     [
-        (2, "answers"),
-        *(pytest.param(j, s, marks=FULL) for j, s in [(1, "answers"), (1, "processes"), (2, "processes")]),
+        (2, "few"),
+        *(pytest.param(j, some, marks=FULL) for j in (1, 2) for some in ("answers", "processes")),
     ],
 )
 def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_path, monkeypatch):
@@ -156,7 +157,8 @@ def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_
     monkeypatch.setattr(apart, "memory_of", lambda count: 3 << 30)
     deadly = {"exit", "exit-well", "segfault", "kill", "interrupt", "garbage", "small-memory"}
     names = [name for name in ROGUES if (name in deadly) == (some == "processes")]
-    found = run_plan(plan(study(names)), tmp_path / "out", executor("processes", jobs))
+    names = ["raise", "nan", "segfault"] if some == "few" else names
+    found = run_plan(plan(study(names, 1 if some == "few" else 3)), tmp_path / "out", executor("processes", jobs))
     assert found.complete
     check(tmp_path / "out", names)
     assert {method for method, _ in found.failures} == set(names)
@@ -185,9 +187,10 @@ def test_all_that_hang_are_given_up_after_a_few_limits(jobs, tmp_path):
     assert any(reason.startswith("given up") for reason in read_frame(tmp_path / "out")["reason"].astype(str))
 
 
-@pytest.mark.parametrize("way", ["die", pytest.param("hang", marks=FULL)])
+@FULL
+@pytest.mark.parametrize("way", ["die", "hang"])
 def test_of_many_trials_one_is_to_blame(way, tmp_path, monkeypatch):
-    made = plan(study(["once"], 10).replace("chunk = 2", "chunk = 8"))
+    made = plan(study(["once"], 8).replace("chunk = 2", "chunk = 4"))
     monkeypatch.setenv("BAD_WAY", way)
     monkeypatch.setenv("BAD_TRIAL", "0.0")
     whole = read_frame(run_here(made, tmp_path / "whole"))

@@ -16,7 +16,7 @@ from verdict.search import Judgement, judge
 import optloc
 from optloc import LOSSES, Status, solve
 
-SCENES, FEW = 40, 4
+SCENES, FEW = 24, 2
 IN_FULL = {"auto": 1000}  # scenes a seed, of ten; 100 of every other method
 # Others than `auto`; those of a loss can never be `ok`, and only that is looked at.
 METHODS = ("gtrs+lsr", "roots+lsr", "searched", "proven", "robust", "roots+lsr+widen+lsr+value", *LOSSES)
