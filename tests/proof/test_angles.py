@@ -6,6 +6,8 @@ from proof.sampling import axes, bounded, changes, curved, differences, halves, 
 
 from optloc.proof.nodes.angles import ALONE
 
+pytestmark = pytest.mark.usefixtures("form")
+
 KINDS = [("azimuth", 2), ("azimuth", 3), ("elevation", 3)]
 
 

@@ -9,6 +9,8 @@ from optloc.proof.box import cube
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, CURVE_WIDTH, ELEVATION, NODE_WIDTH, RANGE, RATIO
 
+pytestmark = pytest.mark.usefixtures("form")
+
 NAMES = {2: ("range", "azimuth", "groa"), 3: ("range", "azimuth", "groa", "elevation")}
 CODES = {"range": RANGE, "azimuth": AZIMUTH, "groa": RATIO, "elevation": ELEVATION}
 

@@ -7,6 +7,8 @@ from proof.sampling import bounded, changes, curved, differences, numbers, remai
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_height
 from optloc.proof.nodes.level import LEAST_RADIUS, geodetic
 
+pytestmark = pytest.mark.usefixtures("form")
+
 B = WGS84_A * (1.0 - WGS84_F)
 
 

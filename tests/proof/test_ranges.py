@@ -10,6 +10,8 @@ from optloc.proof.nodes.node import NODE_WIDTH, RANGE, greatest
 from optloc.proof.nodes.range import bound_ranges
 from optloc.proof.search_space import chart_at, cost_of, empty_box, place
 
+pytestmark = pytest.mark.usefixtures("form")
+
 BOXES, POINTS = (600, 250) if enabled() else (60, 250)
 
 

@@ -7,6 +7,8 @@ from proof.sampling import bounded, changes, differences, numbers, remainders, v
 
 from optloc.proof.nodes.rate import VELOCITY
 
+pytestmark = pytest.mark.usefixtures("form")
+
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_values_gradients_and_hessians_are_those_of_the_model(d):

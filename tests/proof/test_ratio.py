@@ -10,6 +10,8 @@ from optloc.proof.nodes.node import AZIMUTH, RANGE, RATIO
 from optloc.proof.nodes.ratio import MEASURED
 from optloc.proof.pose import mark_alone
 
+pytestmark = pytest.mark.usefixtures("form")
+
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_values_gradients_and_hessians_are_those_of_the_model(d):
