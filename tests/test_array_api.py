@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from cases import CASES, kitchen_sink, random_vector
+from often import few
 from runs import drawn, estimated, run, truth
 
 from optloc import InvalidProblem, gauss_newton, linearise, normal, predict, simulate, solve
@@ -55,7 +56,7 @@ def compare(problem, x0, xp):
     close(predict(moved, x), x, predict(problem, x0))
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("name", few(CASES, 20))
 def test_every_kind_and_mixture(name, xp):
     case = CASES[name]
     x0 = starts(case.truth, 5.0)

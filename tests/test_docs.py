@@ -26,17 +26,10 @@ from optloc.compute.jit import enabled
 # Generated pages hold no code; the recipes of contributors have a test of their own.
 ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in ELSEWHERE]
-# What takes these pages seconds has tests of its own; full runs show that they print it still.
-LONG = (
-    "studies.md",
-    "tutorials/study.md",
-    "tutorials/anchors.md",
-    "recipes/direction-finding.md",
-    "recipes/uwb.md",
-    "howto/constraints.md",
-)
+# Pages that take seconds: what they show has tests of its own, and they are run wherever the site is built (.ci/run).
+LONG = ("recipes", "tutorials", "studies.md", "howto/constraints.md", "howto/layers.md", "maps.md", "placement.md")
 RUN = [
-    pytest.param(page, marks=pytest.mark.full) if page in {DOCS / name for name in LONG} else page
+    pytest.param(page, marks=pytest.mark.full) if page.relative_to(DOCS).as_posix().startswith(LONG) else page
     for page in PAGES
     if any(block.kind in ("python", "console", "sh") for block in blocks(page))
 ]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from often import few
 from runs import drawn, estimated, run, truth
 
 import optloc
@@ -10,7 +11,7 @@ from optloc.base.types import Motion
 from optloc.problem.epochs import cut
 
 
-@pytest.mark.parametrize("case", ["fixed", "moving", "prior, gains", "eliminated"])
+@pytest.mark.parametrize("case", few(["moving", "eliminated", "fixed", "prior, gains"], 2))
 def test_updates_reach_the_whole_solution(case):
     problem = {
         "fixed": run(300),

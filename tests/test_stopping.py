@@ -9,6 +9,7 @@ import sys
 import time
 
 import pytest
+from often import few
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 
@@ -99,7 +100,7 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path):
     assert child.wait() == 141
 
 
-@pytest.mark.parametrize("encoding", ["ascii", pytest.param("cp1252", marks=pytest.mark.full)])
+@pytest.mark.parametrize("encoding", few(["ascii", "cp1252"], 1))
 def test_any_encoding_and_any_width(encoding, tmp_path):
     names = "\U0001f4e1", "[/b]", r"$\frac{"
     places = ((0, 0), (900, 0), (0, 900))

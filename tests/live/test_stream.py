@@ -455,6 +455,7 @@ def test_hard_proofs_do_not_hold_up_fixes(site):
     assert health["fix_latency_ms"]["p50"] <= 20.0  # its 99th percentile is the benchmark's: other work may be there
 
 
+@pytest.mark.full
 def test_under_load_proofs_are_skipped_and_said_to_be(site):
     out = Answers()
     _, lines = whole(site, PENDING + 200)

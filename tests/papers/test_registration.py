@@ -108,7 +108,7 @@ GHOSTS = [
 ]
 
 
-@pytest.mark.parametrize(("epochs", "place", "offset", "gap", "doubt", "noisy"), GHOSTS)
+@pytest.mark.parametrize(("epochs", "place", "offset", "gap", "doubt", "noisy"), few(GHOSTS, 3, 6))
 def test_the_image_in_the_plane_of_the_stations(epochs, place, offset, gap, doubt, noisy):
     found = ghost(PRINTED, epochs)
     assert np.abs(found.x[:3] / 1e3 - place).max() < 0.1
