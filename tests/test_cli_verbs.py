@@ -217,6 +217,7 @@ def test_verbose_tells_the_steps_on_standard_error(tmp_path):
     assert RUN.invoke(app, ["fix", "demo", "--json"]).stderr == ""
 
 
+@pytest.mark.slow
 def test_the_demo_walks_through_three_problems(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = RUN.invoke(app, ["demo"])

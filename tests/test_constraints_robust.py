@@ -78,7 +78,7 @@ REGIONS = {
 
 
 @pytest.mark.parametrize("method", few(["auto", "cauchy", "gtrs+lsr"], 2))
-@pytest.mark.parametrize("name", REGIONS)
+@pytest.mark.parametrize("name", few(REGIONS, 2))
 def test_a_region_that_the_data_contradict_is_named(name, method):
     fix = solve(REGIONS[name](), method)
     if (name, method) == ("speed", "cauchy") and fix.status in (Status.MAX_ITERATIONS, Status.STALLED):

@@ -134,14 +134,15 @@ def check(monkeypatch, method, place):
 
 
 @pytest.mark.parametrize(
-    ("methods", "least"), [(SHORT, 30), pytest.param(EVERY, 50, marks=pytest.mark.full)], ids=["short", "every"]
+    ("methods", "least"), [(SHORT, 15), pytest.param(EVERY, 50, marks=pytest.mark.full)], ids=["short", "every"]
 )
 def test_each_call_of_linear_algebra_may_fail_once(monkeypatch, methods, least):
-    """Each place in the code once, in the first method that comes there, and of each method the last place."""
+    """Each place in the code once, in the first method that comes there (of few methods every other place)."""
     seen, told = set(), 0
     for method in methods:
         found = places(monkeypatch, method)
-        for place in [place for place in found if place not in seen] or found[-1:]:
+        new = [place for place in found if place not in seen] or found[-1:]
+        for place in new[:: 2 if methods is SHORT else 1]:
             told += check(monkeypatch, method, place)
         seen |= set(found)
     assert len(seen) > 50, "whatever optloc calls is seen"

@@ -111,7 +111,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", few(CASES, 2))
 @pytest.mark.parametrize(
     "frame", few([Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0), ECEF], 1), ids=["enu", "ecef"]
 )

@@ -26,10 +26,10 @@ from optloc.compute.jit import enabled
 # Generated pages hold no code; the recipes of contributors have a test of their own.
 ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in ELSEWHERE]
-# Pages that take seconds: what they show has tests of its own, and they are run wherever the site is built (.ci/run).
+# Pages that take seconds.
 LONG = ("recipes", "tutorials", "studies.md", "howto/constraints.md", "howto/layers.md", "maps.md", "placement.md")
 RUN = [
-    pytest.param(page, marks=pytest.mark.full) if page.relative_to(DOCS).as_posix().startswith(LONG) else page
+    pytest.param(page, marks=pytest.mark.slow) if page.relative_to(DOCS).as_posix().startswith(LONG) else page
     for page in PAGES
     if any(block.kind in ("python", "console", "sh") for block in blocks(page))
 ]

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 # A module is entered where a function of it runs; what runs while modules are imported does not count.
 COUNT = """
 import sys, threading
@@ -34,6 +36,7 @@ finally:
 MOST = 72
 
 
+@pytest.mark.slow
 def test_a_simple_fix_enters_few_modules():
     run = subprocess.run([sys.executable, "-c", COUNT], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr

@@ -124,7 +124,7 @@ def test_what_is_no_problem_file_is_one_sentence(tmp_path, case):
     assert len(sentence) < 2000
 
 
-@pytest.mark.parametrize("case", few(["pipe", "rows", "parquet word", "columns", "lists"], 3))
+@pytest.mark.parametrize("case", few(["parquet word", "pipe", "rows", "columns", "lists"], 2))
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is told by /proc")
 def test_a_refusal_takes_neither_time_nor_memory(tmp_path, case):
     path = HOSTILE[case][0](tmp_path)

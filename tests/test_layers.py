@@ -115,11 +115,8 @@ def test_every_folder_has_a_layer():
     assert {room(name) for name in modules(ROOT)} - {""} <= LAYER.keys()
 
 
-def test_imports_go_down():
+def test_imports_go_down_and_in_no_circle():
     assert not wrong_arrows(ROOT)
-
-
-def test_no_circle():
     assert not circle(graph_of(ROOT))
 
 

@@ -21,6 +21,7 @@ def test_each_problem_has_its_own_stations(count):
     assert (np.abs(found.position - expected.position) <= 1e-4 * sigma).all()
 
 
+@pytest.mark.slow
 def test_a_long_run_ends_refined_on_all_its_epochs():
     """IPOPT sees block averages of it, whose minimum is another: least squares ends at that of all rows."""
     setting = Setting(SPATIAL, 2, 1, 0)

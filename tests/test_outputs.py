@@ -151,6 +151,7 @@ def test_places_that_are_none(place):
 
 
 @STREAMS
+@pytest.mark.slow
 def test_names_that_are_no_unicode(place):
     for name in ("site\udcff.toml", "toa\udcff.csv"):
         (place / name).write_bytes((place / name.replace("\udcff", "")).read_bytes())
@@ -220,6 +221,7 @@ main()
 """
 
 
+@pytest.mark.slow
 @STREAMS
 @pytest.mark.parametrize(
     "command",

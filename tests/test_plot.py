@@ -96,6 +96,7 @@ def orbit():
     return rates(position, velocity, truth.tolist(), ECEF, 1e4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", few([pair, orbit], 1))
 def test_isodopplers_are_drawn_without_moving_the_limits(scene, tmp_path):
     problem, fix = scene()

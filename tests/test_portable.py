@@ -99,6 +99,7 @@ def begun(setting):
     return subprocess.Popen(command, env=here | setting, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", [(SETTINGS[0], SETTINGS[-1]), pytest.param(SETTINGS, marks=pytest.mark.full)], ids=["ends", "all"]
 )

@@ -152,6 +152,7 @@ def test_threads_forks_and_workers_give_one_answer():
 
 
 @pytest.mark.parametrize("options", few([["-W", "error", "-X", "dev"], ["-OO", "-W", "error", "-X", "dev"]], 1))
+@pytest.mark.slow
 def test_a_stricter_python_gives_the_same_answer(options):
     ask = ["-m", "optloc.cli", "fix", "demo", "--json", "--method", "proven"]
     plain = CliRunner().invoke(app, ask[2:])

@@ -273,6 +273,7 @@ def test_an_unknown_name_is_answered_with_those_of_packages():
         optloc.from_table({"a": ["B"], "b": ["A"], "z": [1.0]}, {"A": (0, 0), "B": (9, 0)}, kind="rss_urbn", sigma=1.0)
 
 
+@pytest.mark.slow
 def test_other_processes_find_it_too(package, file):
     words = "['optloc', 'fix', sys.argv[1], '--allow', 'unproven', '--json']"
     code = f"import sys, optloc.cli; sys.argv = {words}; optloc.cli.main()"

@@ -300,6 +300,7 @@ def test_the_file_of_the_manual_is_that_which_is_shipped(tmp_path):
     assert load(known).motions[0].known.tolist() == [[[200e3, 300e3, 0.0]]]
 
 
+@pytest.mark.slow
 def test_the_programs_of_the_manual_run(capsys):
     exec("\n".join(blocks("python")), {})
     printed = capsys.readouterr().out

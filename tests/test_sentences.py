@@ -4,6 +4,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from sources import parsed
 
 from optloc.base.types import Status
@@ -64,6 +65,7 @@ def all_sentences() -> list[tuple[str, str]]:
     return [(f"{path.relative_to(ROOT)}:{line}", said) for path in paths for line, said in sentences(path) if said]
 
 
+@pytest.mark.slow
 def test_every_sentence_is_short():
     found = all_sentences()
     assert len(found) > 500  # the collection finds what it is for

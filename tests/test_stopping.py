@@ -100,6 +100,7 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path):
     assert child.wait() == 141
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", few(["ascii", "cp1252"], 1))
 def test_any_encoding_and_any_width(encoding, tmp_path):
     names = "\U0001f4e1", "[/b]", r"$\frac{"

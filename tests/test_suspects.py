@@ -274,7 +274,7 @@ def test_sets_that_are_left_untried_explain_nothing(kind, stations, monkeypatch)
     assert told[0] == told[1]
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_two_kinds_of_lengths_may_both_have_an_offset():
     """Then a set of two leaves out no row at all, among so many sets that they are looked at to first order."""
 

@@ -404,6 +404,7 @@ def test_other_equalities_are_refused():
         tracked(problem, polynomial(1))
 
 
+@pytest.mark.slow
 def test_pictures_of_tracks_in_space_and_on_earth(tmp_path):
     pytest.importorskip("matplotlib")
     from optloc.plot import plot_tracks, save

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from optloc.base.errors import InvalidProblem
@@ -38,6 +38,7 @@ EVERY = [(unit, quantity) for quantity, table in UNITS.items() for unit in table
 
 
 @pytest.mark.parametrize(("unit", "quantity"), EVERY)
+@settings(max_examples=30)
 @given(value=st.floats(-300, 300))
 def test_every_unit_comes_back_and_slope_is_the_derivative(unit, quantity, value):
     step = 1e-4

@@ -42,6 +42,7 @@ for seconds in (3.0, 1.2, 0.9):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not enabled(), reason="without numba nothing is compiled")
 @pytest.mark.skipif(os.name == "nt", reason="pipes cannot be waited for")
 def test_standard_error_is_never_quiet_for_long():

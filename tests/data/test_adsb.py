@@ -87,8 +87,8 @@ def _silent(fix, reference):
 
 def test_refraction_without_the_truth(folder):
     # The paths through air are those of the unknown place: nothing of the truth but the height is used.
-    data, air = adsb.heard(folder).take(np.arange(0, 763, 12)), Atmosphere(1e6 * adsb.REFRACTIVITY, adsb.SCALE_HEIGHT)
-    corrected = adsb.heard(folder, refraction=True).take(np.arange(0, 763, 12))
+    data, air = adsb.heard(folder).take(np.arange(0, 763, 20)), Atmosphere(1e6 * adsb.REFRACTIVITY, adsb.SCALE_HEIGHT)
+    corrected = adsb.heard(folder, refraction=True).take(np.arange(0, 763, 20))
     problems = (data.problem("exactly"), corrected.problem("exactly"), data.problem("exactly").in_medium(air))
     vacuum, known, own = (solve(problem, "gtrs+lsr").position for problem in problems)
     medians = [quantiles(truths.adsb_horizontal(data, place))[0] for place in (vacuum, known, own)]

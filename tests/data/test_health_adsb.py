@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 from optloc import health, solve
 from optloc.datasets import adsb
 
-pytestmark = [pytest.mark.data, pytest.mark.full]
+pytestmark = [pytest.mark.data, pytest.mark.slow]
 
 # Medians at the aircraft's own places in the set's README, metres, of the receivers with more than 180 messages.
 README = {"598": -8, "147": -14, "632": -5, "10": 11, "141": -21, "263": -3, "143": 20, "257": 47}

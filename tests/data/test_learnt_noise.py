@@ -80,6 +80,7 @@ def within_one_in_a_hundred(counts: list[tuple[int, int]]) -> None:
     assert far <= 0.01 * good
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", few([False, True], 1), ids=["from fixes", "at known places"])
 @pytest.mark.parametrize("name", EACH)
 def test_flights_by_what_each_anchor_is_off_in_a_window(data_dir, name, known):
@@ -96,6 +97,7 @@ def test_flights_without_what_is_left_out(data_dir):
 
 
 @pytest.mark.parametrize("method", few(["auto", "robust"], 1))
+@pytest.mark.slow
 def test_robots_by_what_an_epoch_has_in_common(data_dir, method):
     folder = data_dir / "mrclam_aoa2d"
     within_one_in_a_hundred([counted(f"MRCLAM {n}", robots(folder, n), "kind", method) for n in ROBOTS])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from data.registration import calibrating, corrected, fixed, learnt, lines, not_beaten, part, plausible
 from data.windows import report
+from often import few
 
 from optloc import solve, with_bias
 from optloc.bounds.observability import observability
@@ -44,8 +45,8 @@ def errors(data, messages, clocks):
     return data.horizontal(fix.position, messages)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("halves", [(ODD, EVEN), (EVEN, ODD)], ids=["odd", "even"])
+@pytest.mark.slow
+@pytest.mark.parametrize("halves", few([(ODD, EVEN), (EVEN, ODD)], 1), ids=["odd", "even"])
 def test_clocks_learnt_on_one_half_help_the_other(data, halves):
     first, second = halves
     clocks = {}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from data.registration import calibrating, corrected, fixed, learnt, lines, part
 from data.windows import report
+from often import few
 
 from optloc import Motion, Status, solve, with_bias
 from optloc.bounds.observability import observability
@@ -23,7 +24,7 @@ README = {
 WIDE, PRIOR = 20.0, 2.0
 
 
-@pytest.fixture(params=README)
+@pytest.fixture(params=few(README, 1))
 def session(request, data_dir):
     return request.param, gnss.load(data_dir / "gnss_static", request.param, "prc_if_m")
 

@@ -47,7 +47,7 @@ def mapped(data_dir):
     return bearings, replace(problem, priors=priors, noise=noise)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_exchanged_markers_and_wrong_detections_are_named(mapped):
     bearings, problem = mapped
     fix = solve(problem, "cauchy")

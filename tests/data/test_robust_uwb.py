@@ -39,6 +39,7 @@ def solved(data_dir):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flight", EACH)
 def test_no_guess_is_as_good_as_the_truth_as_a_guess(solved, flight):
     truth, problem, fix, best = solved(flight)

@@ -37,7 +37,7 @@ def test_three_satellites_and_the_height_are_tracked(data_dir, case, dynamics):
     assert off.max() < 10.0
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_all_filters_agree_from_a_fix(data_dir):
     problem = gnss.load(data_dir / "gnss_static", "K078", "prc_l1_m").three()
     ends = [collected(list(tracked(problem, polynomial(0), name)), 3).position[-1] for name in UPDATES]

@@ -27,7 +27,7 @@ def sublevel(ranged: Ranged, start: np.ndarray, level: float, rng, steps: int = 
 
 
 @pytest.mark.parametrize("d", few([3, 2], 1))
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", few(KINDS, 3))
 def test_no_point_of_low_cost_lies_outside(kind, d):
     rng = np.random.default_rng([KINDS.index(kind), d])
     reached, enclosed = [], 0

@@ -24,7 +24,7 @@ import optloc
 from optloc.cli import app
 
 HERE = Path(__file__).parent
-FEW, ALONE = 6, 1
+FEW, ALONE = 4, 1
 # Of a seed, of which there are ten in full: 20 000 cases in parts that take a minute or two.
 PARTS, PART = 4, 500
 

@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 from live.lines import EPOCH, SITE, Answers, answers, arrivals, differences, line, site_in, slowed, solved
+from often import few
 from typer.testing import CliRunner
 
 from optloc.cli import app
@@ -340,9 +341,7 @@ def killed(folder, kills, events, seed):
     return seen
 
 
-@pytest.mark.parametrize(
-    ("kills", "events"), [(1, 1000), pytest.param(20, 40_000, marks=pytest.mark.full)], ids=["one", "twenty"]
-)
+@pytest.mark.parametrize(("kills", "events"), few([(1, 400), (20, 40_000)], 1, 2), ids=["one", "twenty"])
 def test_what_was_not_answered_is_answered_after_a_kill(tmp_path, kills, events):
     seen = killed(tmp_path, kills, events, 7)
     assert set(seen) == {str(i) for i in range(events)}
@@ -435,6 +434,7 @@ def test_the_time_of_day_may_jump(fast, monkeypatch):
 # 5. Hard proofs beside the first phase.
 
 
+@pytest.mark.slow
 def test_hard_proofs_do_not_hold_up_fixes(site):
     slow, out = slowed(site), Answers()
     _, lines = whole(site, 60)
@@ -455,7 +455,7 @@ def test_hard_proofs_do_not_hold_up_fixes(site):
     assert health["fix_latency_ms"]["p50"] <= 20.0  # its 99th percentile is the benchmark's: other work may be there
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_under_load_proofs_are_skipped_and_said_to_be(site):
     out = Answers()
     _, lines = whole(site, PENDING + 200)
@@ -660,6 +660,7 @@ def test_a_site_whose_events_make_no_tracks_says_why(tmp_path):
     assert "emission times are unknown" in result.output
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_events_of_a_feed(tmp_path):
     site = site_in(tmp_path)
     z, lines = whole(site, 60)

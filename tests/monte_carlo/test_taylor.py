@@ -9,7 +9,7 @@ from verdicts import alone
 
 from optloc import Fix, Status, solve
 
-DEFAULT, FULL = 100, 2000
+DEFAULT, FULL = 50, 2000
 # An answer is finished within a thousandth of a standard deviation, and lies within 10 000 sizes of the array.
 STEP, FAR = 1e-3, 1e4
 HEADER = [

@@ -254,6 +254,7 @@ def report():
     return made
 
 
+@pytest.mark.slow
 def test_a_reproduction_has_every_table_and_figure(report):
     rows = {table.name: table.rows for table in report.tables}
     assert list(rows) == ["table-1", "ratios", "efficiency", "models", "choice", "association", "equations"]
@@ -272,12 +273,14 @@ def test_a_reproduction_has_every_table_and_figure(report):
     assert all(len(row) == len(table.header) for table in report.tables for row in table.rows)
 
 
+@pytest.mark.slow
 def test_every_number_of_the_essay_has_its_cell(report):
     essay = report.markdown().partition("## What is wrong in the paper")[2]
     assert ABSENT not in essay
     assert "equal weights cost 13 %" in " ".join(essay.split())
 
 
+@pytest.mark.slow
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     seeds = []
     cheap = Study(kinematic_tables.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)

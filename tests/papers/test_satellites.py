@@ -123,6 +123,7 @@ def report():
     return made
 
 
+@pytest.mark.slow
 def test_a_reproduction_has_every_table_and_figure(report):
     rows = {table.name: table.rows for table in report.tables}
     assert list(rows) == ["fixed", "relative", "starts", "pairs", "heights", "moving", "one-shot"]
@@ -134,6 +135,7 @@ def test_a_reproduction_has_every_table_and_figure(report):
     assert "nan" not in report.markdown()
 
 
+@pytest.mark.slow
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
     cheap = Study(satellites.STUDY.sizes, lambda _: 1, lambda *_: report)
     monkeypatch.setattr(satellites, "STUDY", cheap)

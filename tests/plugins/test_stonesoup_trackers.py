@@ -182,7 +182,7 @@ def test_point_processes_of_gaussian_mixtures(kind, seed):
     check(tracker.extracted_target_states)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("ortools") is None, reason="multi-frame assignment needs ortools, which is not installed")
 def test_several_frames_of_hypotheses(seed):
     """In a process of its own: ortools has a HiGHS of its own, and is not loaded after CasADi's."""

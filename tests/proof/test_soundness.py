@@ -160,7 +160,7 @@ def check_mixtures(least: int, trials: int, count: int, rng) -> int:
 
 
 def test_no_wrong_stationary_point_of_a_mixture_is_certified(seed):
-    assert check_mixtures(counted(120), counted(3), 5, np.random.default_rng([seed, 8])) >= 100 * SHARE
+    assert check_mixtures(counted(60), counted(3), 5, np.random.default_rng([seed, 8])) >= 50 * SHARE
 
 
 @pytest.mark.full
@@ -217,7 +217,7 @@ def check_starts(name: str, trials: int, starts: int, seed: int, more: int = 3) 
     return sum(c.proof == "global" for c in proofs), sum(c.unique for c in proofs)
 
 
-@pytest.mark.parametrize("name", few(HARD, 6))
+@pytest.mark.parametrize("name", few(HARD, 3))
 def test_twenty_starts_do_not_beat_a_proof(name, seed, record_property):
     proven, unique = check_starts(name, counted(12), 20, seed)
     record_property("global, unique", f"{proven}, {unique}")

@@ -52,6 +52,7 @@ def test_a_station_does_not_hide_in_its_own_fixes():
     assert plain[7] < 0.8 * (200.0 - BIAS.mean())
 
 
+@pytest.mark.slow
 def test_shares_of_outliers_and_noise():
     shares, noise = [], []
     for seed in range(4):
@@ -135,6 +136,7 @@ def run(*arguments, code=0):
     return result
 
 
+@pytest.mark.slow
 def test_check_tells_health_as_table_json_files_and_picture(tmp_path):
     path = written(tmp_path, biased(5, 40))
     assert "Health by station" in run("check", path).stdout

@@ -111,6 +111,7 @@ def told(*arguments):
     return " ".join(CliRunner().invoke(app, [str(one) for one in arguments]).stdout.split())
 
 
+@pytest.mark.slow
 def test_files_say_so(tmp_path):
     path = written(tmp_path, late(1, 0.2, 10.0, epochs=20)[0])
     assert "--late-from-data fixes with that" in told("check", path)

@@ -68,7 +68,7 @@ def test_is_the_maximum_of_the_restricted_likelihood(monkeypatch):
     np.testing.assert_allclose(found.factor, np.exp(0.5 * best.x), rtol=0.02)
 
 
-@pytest.mark.parametrize("make", [ranged, differences], ids=["arrivals", "differences"])
+@pytest.mark.parametrize("make", few([ranged, differences], 1), ids=["arrivals", "differences"])
 def test_levels_are_within_their_errors(make):
     off, told, inside = [], [], []
     for seed in range(12):
@@ -89,6 +89,7 @@ def test_levels_are_within_their_errors(make):
     assert np.mean(told) == pytest.approx(1.0 - 4.0 * 8.0 / (150.0 * 5.0), abs=0.03)
 
 
+@pytest.mark.slow
 def test_gross_errors_do_not_enlarge_the_noise():
     off = []
     for seed in range(2):

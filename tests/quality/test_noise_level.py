@@ -98,6 +98,7 @@ def told(*arguments):
     return " ".join(RUN.invoke(app, [str(one) for one in arguments]).stdout.split())
 
 
+@pytest.mark.slow
 def test_files_say_so_and_rescale(tmp_path):
     path = written(tmp_path, ranged(np.random.default_rng(1), 8, np.full(8, 25.0)))
     plain = json.loads(told("fix", path, "--method", "robust", "--json"))

@@ -80,10 +80,15 @@ def cluster(tmp_path_factory):
         yield address, worker, first
 
 
-def test_local_processes_and_a_cluster_give_the_same_table(undisturbed, cluster, tmp_path):
+def test_local_processes_give_the_same_table(undisturbed, tmp_path):
     text, expected = undisturbed
     assert run_plan(plan(text), tmp_path / "processes", executor("processes", 2)).complete
     assert_identical(expected, tmp_path / "processes")
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_table(undisturbed, cluster, tmp_path):
+    text, expected = undisturbed
     assert run_plan(plan(text), tmp_path / "dask", executor("dask", None, cluster[0])).complete
     assert_identical(expected, tmp_path / "dask")
 
@@ -151,6 +156,7 @@ BASELINES["mine"] = Baseline(same, "what is known", guess=False)
 """
 
 
+@pytest.mark.slow
 def test_a_plugin_of_the_command_line_is_known_to_the_processes_of_a_study(tmp_path):
     (tmp_path / "mine.py").write_text(PLUGIN)
     (tmp_path / "study.toml").write_text(

@@ -39,6 +39,7 @@ def whole(tmp_path_factory):
     return run_here(plan(QUICK), folder)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_a_sentence_and_the_same_command_goes_on(whole, tmp_path, monkeypatch):
     out, move, moved = tmp_path / "out", os.replace, []
 
@@ -76,6 +77,7 @@ def damage(path, how):
         store(path.parent.parent, Part(path.name.partition(".")[0], table.slice(1), {}))
 
 
+@pytest.mark.slow
 def test_damaged_parts_are_named_and_computed_again(whole, tmp_path):
     out, told = tmp_path / "out", []
     shutil.copytree(whole, out)

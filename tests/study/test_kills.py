@@ -15,7 +15,7 @@ psutil = pytest.importorskip("psutil")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="asks the system for the environment of processes")
 
 # Some parts a second for some seconds, so that kills hit between them.
-TEXT = QUICK.replace("trials = 60", "trials = 200")
+TEXT = QUICK.replace("trials = 60", "trials = 120")
 MARK = "OPTLOC_MARK"
 GONE = 5.0  # seconds after which nobody may be left
 
@@ -159,6 +159,7 @@ def test_killed_workers_change_nothing(options, whole, tmp_path):
     assert_identical(whole, out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", [False, pytest.param(True, marks=pytest.mark.full)])
 @pytest.mark.parametrize("options", [["-j", "2"], pytest.param(["-x", "dask", "-j", "2"], marks=pytest.mark.full)])
 def test_ctrl_c_is_one_sentence_and_ends_everybody(options, group, tmp_path):

@@ -120,7 +120,7 @@ def package(tmp_path_factory):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is none on this system")
-@FULL
+@pytest.mark.slow
 def test_a_method_that_forks_answers_once(tmp_path):
     assert run_plan(plan(study(["fork"])), tmp_path / "out", executor("processes", 1)).counts == {"unproven": 6}
 
@@ -215,6 +215,7 @@ def test_a_process_that_cannot_begin_is_a_sentence_and_stores_nothing(tmp_path, 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks the system for the environment of processes")
+@pytest.mark.slow
 def test_what_a_method_began_ends_with_it(tmp_path, monkeypatch):
     psutil = pytest.importorskip("psutil")
     monkeypatch.setenv("OPTLOC_MARK", str(tmp_path))
@@ -232,6 +233,7 @@ def mark_of(process):
         return None
 
 
+@pytest.mark.slow
 def test_methods_do_not_speak_on_standard_output(tmp_path):
     text = study(["raise"], 2).replace("baseline", 'method = "gtrs+nlp"\n[[method]]\nbaseline')
     (tmp_path / "s.toml").write_text(text)

@@ -179,7 +179,7 @@ def test_ten_epochs_of_a_target_that_stays():
     assert np.sqrt(U0 @ bound @ U0) / 1e3 == pytest.approx(0.295, abs=1e-3)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_two_hundred_epochs_of_a_slow_target():
     assert slow_numbers(100, 8) == pytest.approx([1.19, 0.136, 0.118], rel=0.15)
 
@@ -190,7 +190,7 @@ def test_numbers_of_many_trials():
     assert slow_numbers(1000, 1) == pytest.approx([1.19, 0.136, 0.118], rel=0.07)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_restarts_and_floors_follow_a_slow_target():
     drawn, exact = draw(200, 100, 9, slow=True), R0 * U0 + 199 * SPEED
     found = {

@@ -85,6 +85,7 @@ def test_a_banana_is_drawn_where_the_truth_is_in_it():
     assert held
 
 
+@pytest.mark.slow
 def test_pictures_say_what_they_draw():
     labels = {}
     for name in ("tdoa 2 5 0", "plane 50 400"):
