@@ -191,6 +191,7 @@ def lone_errors(problem, truth, **options):
     return labels(entries), np.linalg.norm(collected(entries, 2).position - truth, axis=-1)
 
 
+@pytest.mark.slow
 def test_a_lost_track_of_single_rows_ends():
     """For a while two rows of three are off: never five in succession, and the state goes elsewhere."""
     problem, truth = lone(np.arange(0.0, 60.0, 0.25))

@@ -95,6 +95,7 @@ def borrows(kernel, arguments):
     return not found.target_context.enable_nrt
 
 
+@pytest.mark.slow
 def test_only_what_makes_keeps_and_returns_no_array_borrows():
     pair, index = Pair(np.arange(3.0), np.ones((2, 3))), np.array([1, 0])
     assert borrows(total, (pair,))
@@ -103,6 +104,7 @@ def test_only_what_makes_keeps_and_returns_no_array_borrows():
         assert not borrows(kernel, (pair,)), kernel
 
 
+@pytest.mark.slow
 def test_references_are_as_many_afterwards_and_what_is_returned_lives_on():
     first, second, index = np.arange(3.0), np.ones((2, 3)), np.array([1, 0])
     through_all(Pair(first, second), index)

@@ -101,6 +101,7 @@ MACHINE = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("d", "machine"), [(2, False), pytest.param(2, True, marks=MACHINE), pytest.param(3, True, marks=MACHINE)]
 )
@@ -173,6 +174,7 @@ for _ in range(50):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
 def test_machine_code_asks_the_same_of_a_node_from_outside():
     path = os.pathsep.join([str(HERE), *sys.path])

@@ -8,6 +8,8 @@ from optloc.compute.jit import enabled
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 from optloc.proof.search_space import cost_of, empty_box
 
+# A form of the search that these tests alone call is made for them.
+pytestmark = pytest.mark.slow
 CASES, BUDGET_HERE = (12, 20_000) if enabled() else (3, 300)
 KAPPAS = (0.0, 9.0, 25.0)
 AROUND, AWAY = 1e5, 1e9

@@ -74,6 +74,7 @@ def shipped(tmp_path_factory):
     return write_report(folder)
 
 
+@pytest.mark.slow
 def test_tables_hold_the_numbers_of_the_study(site, made):
     frame = read_frame(site)
     with (site / "report" / "tables" / "success.csv").open(encoding="utf-8") as file:
@@ -96,6 +97,7 @@ def test_tables_hold_the_numbers_of_the_study(site, made):
     assert float(row["rmse"]) == pytest.approx(np.sqrt((part["error"][part["answered"]] ** 2).mean()))
 
 
+@pytest.mark.slow
 def test_every_figure_is_there_twice_and_every_table_too(site, made):
     folder = site / "report"
     assert made[0] == folder / "report.html"
@@ -120,6 +122,7 @@ def test_every_figure_is_there_twice_and_every_table_too(site, made):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_and_is_not_fooled_by_names(made):
     text = made[0].read_text(encoding="utf-8")
     assert "<script>alert(1)" not in text
@@ -155,6 +158,7 @@ def test_the_same_study_gives_the_same_figures(site, made, tmp_path):
         assert one.read_bytes() == two.read_bytes(), one.name
 
 
+@pytest.mark.slow
 def test_what_begins_at_the_truth_is_not_ranked(site, made):
     text = (site / "report" / "tables" / "ranking.csv").read_text(encoding="utf-8")
     assert "gtrs+lsr" in text
@@ -175,6 +179,7 @@ def browser():
         yield one
 
 
+@pytest.mark.slow
 @browsed
 @pytest.mark.parametrize("size", WIDTHS)
 @pytest.mark.parametrize("study", few(["made", "shipped"], 1))
@@ -199,6 +204,7 @@ def test_a_browser_shows_every_figure(browser, request, study, size):
     assert browser.run("document.querySelectorAll('tbody tr').length") > 10
 
 
+@pytest.mark.slow
 @browsed
 def test_a_method_stands_out_at_a_press(browser, made):
     browser.open(made[0])
@@ -212,6 +218,7 @@ def test_a_method_stands_out_at_a_press(browser, made):
     assert not browser.run("document.body.classList.contains('picked')")
 
 
+@pytest.mark.slow
 @browsed
 def test_the_map_tells_the_bound_and_moves(browser, site, made):
     browser.open(made[0])
@@ -235,6 +242,7 @@ def test_the_map_tells_the_bound_and_moves(browser, site, made):
     assert browser.run("document.querySelector('[data-layer=bound]').style.display") == "none"
 
 
+@pytest.mark.slow
 @browsed
 def test_it_prints_with_its_tables_open(browser, made):
     browser.open(made[0])
@@ -259,6 +267,7 @@ def test_a_study_that_is_not_finished_says_so(site, tmp_path):
     assert "not finished" in text
 
 
+@pytest.mark.slow
 def test_bad_places_are_sentences(site, tmp_path):
     empty = tmp_path / "empty"
     begin(plan_of(site.with_suffix(".toml")), empty)

@@ -114,6 +114,7 @@ def finish(folder, *options):
         assert not orphans(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [pytest.param("1", marks=pytest.mark.full), "2"])
 def test_a_killed_run_goes_on_to_the_same_table(jobs, whole, tmp_path):
     out = tmp_path / "out"
