@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from optloc.base.types import Motion, Stations
 from optloc.linear.constraints import box, height, speed
 from optloc.papers.registration import PRINTED, Setting, rms, wander
 from optloc.solvers.refine import refine
+from optloc.solvers.starts.registration import turn_courses
 
 TIE = 1e-3
 # The band that all cases of this file together meet with 99 %.
@@ -187,6 +189,44 @@ def test_targets_elsewhere(name):
     found = counted(Case(name, *ELSEWHERE[name]), 15)
     assert not found.failed.any(), np.flatnonzero(found.failed)
     assert not (found.away & ~found.listed).any(), np.flatnonzero(found.away & ~found.listed)
+
+
+# Seeds and numbers of targets that the mirror image of the first minimum misses: one whose mirror image only the wider
+# search leads to, and three that lie around the axis of the stations and cost 20 to 30 less than what was found before.
+HIDDEN = [
+    ("any speed", SEED, 14),
+    ("any speed, space", 708, 23),
+    ("any speed, space", 719, 55),
+    ("any speed, space", 721, 19),
+]
+
+
+@pytest.mark.parametrize(("name", "seed", "number"), HIDDEN)
+def test_images_lead_to_what_no_start_does(name, seed, number):
+    sequence = np.random.SeedSequence([seed, crc32(name.encode()), 0])
+    problem, x = drawn(Case(name, *ELSEWHERE[name]), sequence, 15 if seed == SEED else 60)
+    chosen = np.array([number])
+    fix, best = solve(problem.take(chosen), "searched"), refine(problem.take(chosen), x[chosen], limit=500)
+    places = np.concatenate([fix.position, *fix.alternatives.x[..., :3]])
+    assert fix.cost <= best.cost + TIE
+    assert np.linalg.norm(places - best.x[0, :3], axis=1).min() < 1.0
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_turns_about_a_line_of_stations_change_no_range(number):
+    """Stations on a line that stays parallel to itself see nothing of an angle about it, however they move."""
+    rng, epochs = np.random.default_rng([11, number]), np.arange(20)
+    axis, times = rng.normal(size=3), 5.0 * np.arange(20.0)
+    line = rng.uniform(-9e3, 9e3, (5, 1)) * axis + rng.uniform(-1e4, 1e4, 3)
+    place = line + times[:, None, None] * (rng.normal(0.0, 200.0, 3) + rng.normal(0.0, 20.0, (5, 1)) * axis)
+    rows = optloc.measured("range", a=np.tile(np.arange(5), 20), epoch=np.repeat(epochs, 5), sigma=1.0)
+    problem = optloc.assemble(Stations(place, tuple("ABCDE")), rows, times=times, motions=(Motion(1),))
+    x = np.concatenate([rng.uniform(-1e5, 1e5, 3), rng.normal(0.0, 200.0, 3)])
+    turned = turn_courses(problem.flat(), x[None, None])[0]
+    assert len(turned) == 7
+    assert np.linalg.norm(turned[:, None, :3] - np.vstack([x, turned])[:, :3], axis=-1).max() > 1e3
+    for other in turned:
+        np.testing.assert_allclose(optloc.predict(problem, other), optloc.predict(problem, x), atol=1e-5)
 
 
 @pytest.mark.parametrize("chosen", [[0, 3], [0, 1, 3]], ids=["two", "three"])
