@@ -1,9 +1,12 @@
 """Certificates in columns: what is written is told, whatever is done to the batch in between."""
 
+import copy
+
 import numpy as np
 import pytest
+from cases import CASES
 
-from optloc import Certificate
+from optloc import Certificate, simulate, solve
 from optloc.base.records import join, overwrite, take
 from optloc.problem.claims import alike, choose, claim, untried
 
@@ -54,3 +57,12 @@ def test_many_are_one_and_one_is_chosen_for_many():
 def test_rows_of_one_certificate_stay_one_row():
     one = alike(claim(GIVEN[2]), 4)
     assert join([one, one], 8).bound.strides == (0,)
+
+
+def test_certificates_are_told_once():
+    """A program that asks for one after the other does not wait for all of them each time."""
+    fix = solve(simulate(CASES["tdoa-3d"].problem, CASES["tdoa-3d"].truth, 1, trials=6))
+    assert fix.certificate[3] is fix.certificate[3]
+    assert not fix.certificate.flags.writeable
+    assert fix[2:5].certificate[1] == fix.certificate[3]
+    assert copy.deepcopy(fix).certificate.tolist() == fix.certificate.tolist()

@@ -65,7 +65,7 @@ class Claims:
             getattr(self, each.name)[places] = getattr(other, each.name)
 
     def tell(self) -> Array:
-        """Return the certificates as an object array (...); None where nobody has tried."""
+        """Return the certificates as an object array (...), not to be written to; None where nobody has tried."""
         out = np.empty(self.proof.shape, dtype=object)
         names = [each.name for each in fields(self)]
         columns = (getattr(self, name).ravel().tolist() for name in names)
@@ -74,6 +74,7 @@ class Claims:
             # one NaN, so that certificates without a bound are equal
             none = {name: _NONE for name in ("bound", "gap") if isnan(own[name])}
             out[i] = Certificate(**own | none | {"proof": PROOFS[own["proof"]]}) if own["proof"] else None
+        out.flags.writeable = False
         return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -215,6 +215,8 @@ class Fix:
     marks: Annotated[Array, Axes(0, empty=0)] | None = None
     chart: Chart | None = None
     infinity: Annotated[Array, Axes(0)] | None = None
+    # told once: a program may ask for one after the other
+    _certificates: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -229,7 +231,9 @@ class Fix:
     @property
     def certificate(self) -> Any:
         """Return the `Certificate` of a single fix, or the object array (...) of them of a batch."""
-        return self.claims.tell()[()]
+        if not self._certificates:
+            self._certificates.append(self.claims.tell())
+        return self._certificates[0][()]
 
     @property
     def position(self) -> Array:
