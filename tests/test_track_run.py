@@ -71,16 +71,17 @@ def test_a_run_is_tracked_without_a_guess():
     assert (track.count[1:] == 5).all()
 
 
-def test_errors_and_innovations_are_those_of_the_covariance():
-    """NEES and NIS of 30 runs: means within four standard deviations of their chi-squares."""
+@pytest.mark.parametrize("runs", few([30, 60], 1))
+def test_errors_and_innovations_are_those_of_the_covariance(runs):
+    """NEES and NIS of some runs: means within four standard deviations of their chi-squares."""
     nees, nis, rows = [], 0.0, 0
-    for seed in range(30):
+    for seed in range(runs):
         problem = run(np.arange(12.0), seed)
         track = collected(list(tracked(problem, polynomial(1, 1e-3), rules=Rules(gate=np.inf))), 3)
         off = track.mean[-1] - np.concatenate([truth(problem.times)[-1], SPEED])
         nees.append(off @ np.linalg.solve(track.cov[-1], off))
         nis, rows = nis + np.nansum(track.nis), rows + track.count[np.isfinite(track.nis)].sum()
-    assert np.mean(nees) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / 30))
+    assert np.mean(nees) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / runs))
     assert nis / rows == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / rows))
 
 

@@ -437,8 +437,8 @@ def test_the_time_of_day_may_jump(fast, monkeypatch):
 @pytest.mark.slow
 def test_hard_proofs_do_not_hold_up_fixes(site):
     slow, out = slowed(site), Answers()
-    _, lines = whole(site, 60)
-    stream = Stream(slow, Settings(deadline=0.2), out)
+    _, lines = whole(site, 100)
+    stream = Stream(slow, Settings(deadline=0.3), out)
     for each in lines:
         stream.inbox.put(stream.lines([each], "test"))
         time.sleep(0.005)
@@ -446,11 +446,11 @@ def test_hard_proofs_do_not_hold_up_fixes(site):
     assert stream.ended.wait(30.0)
     health = stream.health()
     records = out.records
-    assert sum(record["phase"] == "fix" for record in records) == 60
-    assert sum(record["phase"] == "proof" for record in records) == 60
-    # two and a half seconds of proofs in one: most are given up at their deadline, and all are told
+    assert sum(record["phase"] == "fix" for record in records) == 100
+    assert sum(record["phase"] == "proof" for record in records) == 100
+    # four seconds of proofs in one: most are given up at their deadline, and all are told
     why = [record.get("why") for record in records if record["phase"] == "proof"]
-    assert why.count("deadline") > 30
+    assert why.count("deadline") > 50
     assert set(why) <= {None, "deadline"}
     assert health["fix_latency_ms"]["p50"] <= 20.0  # its 99th percentile is the benchmark's: other work may be there
 

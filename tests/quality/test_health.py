@@ -138,7 +138,7 @@ def run(*arguments, code=0):
 
 @pytest.mark.slow
 def test_check_tells_health_as_table_json_files_and_picture(tmp_path):
-    path = written(tmp_path, biased(5, 40))
+    path = written(tmp_path, biased(5, 60))
     assert "Health by station" in run("check", path).stdout
     assert "Health" not in run("check", path, "--no-solve").stdout
     out, picture = tmp_path / "h.csv", tmp_path / "h.svg"

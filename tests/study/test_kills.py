@@ -15,7 +15,7 @@ psutil = pytest.importorskip("psutil")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="asks the system for the environment of processes")
 
 # Some parts a second for some seconds, so that kills hit between them.
-TEXT = QUICK.replace("trials = 60", "trials = 120")
+TEXT = QUICK.replace("trials = 60", "trials = 200")
 MARK = "OPTLOC_MARK"
 GONE = 5.0  # seconds after which nobody may be left
 

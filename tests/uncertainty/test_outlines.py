@@ -88,11 +88,12 @@ def test_a_banana_is_drawn_where_the_truth_is_in_it():
 @pytest.mark.slow
 def test_pictures_say_what_they_draw():
     labels = {}
-    for name in ("tdoa 2 5 0", "plane 50 400"):
+    for name in ("tdoa 2 5 0", "tdoa 2 5 30", "plane 50 400"):
         problem, _, fix = fixed(name, 0)
         figure = plot_fixes(problem, fix)
         labels[name] = set(figure.axes[0].get_legend_handles_labels()[1])
     assert "95 % ellipse" in labels["tdoa 2 5 0"]
+    assert "95 % region" in labels["tdoa 2 5 30"]
     assert "95 % region" in labels["plane 50 400"]
     assert "95 % ellipse" not in labels["plane 50 400"]
 

@@ -50,10 +50,11 @@ _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
 # which block averages blur into one. Few steps: each is refined on all epochs.
 _BLURRED = 2e-3
 _BESIDE = (-6.0, -2.0, 2.0, 6.0)
-# Images of the best minimum: turns by eighths of a circle about the axis of the stations, and rounds of images of what
-# images led to. Of 1 800 targets of any speed, with stations in space, 3 were lost with the mirror image alone.
+# Images of the best minimum: turns by eighths of a circle about the axis of the stations, and images of what images led
+# to, while that costs less by more than refinements of one minimum differ. Of 1 800 targets of any speed, with stations
+# in space, 3 were lost with the mirror image alone. Rounds end by themselves.
 _TURNS = 8
-_ROUNDS = 3
+_ROUNDS = 10
 _BETTER = 1e-3
 
 
@@ -174,14 +175,15 @@ def _with_images(blocks: Problem, pool: tuple[Array, Array]) -> tuple[Array, Arr
     Stations in a plane see the mirror image as well; a target that may have any speed in space is turned about the axis
     of the stations besides.
     """
-    turns = blocks.dimension == 3 and blocks.motions[0].order > 0
+    turns, items = blocks.dimension == 3 and blocks.motions[0].order > 0, np.arange(len(pool[0]))
     for _ in range(_ROUNDS):
-        best, cost = pool[0][:, :1], pool[1][:, 0]
-        images = mirror_courses(blocks, best)
+        part, best, cost = blocks.take(items), pool[0][items, :1], pool[1][items, 0]
+        images = mirror_courses(part, best)
         if turns:
-            images = np.concatenate([images, turn_courses(blocks, best)], axis=1)
-        pool = _merge(pool, _minima(blocks, images))
-        if not (pool[1][:, 0] < cost - _BETTER).any():
+            images = np.concatenate([images, turn_courses(part, best)], axis=1)
+        pool = _merge(pool, _scatter(_minima(part, images), items, len(pool[0])))
+        items = items[pool[1][items, 0] < cost - _BETTER]
+        if not len(items):
             break
     return pool
 
@@ -333,8 +335,7 @@ def turn_courses(blocks: Problem, x: Array) -> Array:
 
 def _apart(blocks: Problem) -> Array:
     """Return the places of the stations about their middle (N or 1, epochs, s, d)."""
-    place = blocks.stations.position
-    place = place if place.ndim == 4 else place[None]
+    place = _places(blocks)
     return np.asarray(place - place.mean(-2, keepdims=True))
 
 
@@ -354,8 +355,7 @@ def _map_courses(blocks: Problem, x: Array, maps: Array) -> Array:
     powers = np.stack([elapsed(blocks, 0) ** j / factorial(j) for j in range(order + 1)], axis=-1)
     slots = [blocks.layout.find(name)[0] for name in ("position", "velocity", "acceleration")[: order + 1]]
     state = np.stack([x[..., slot.start : slot.start + slot.size] for slot in slots], axis=-2)
-    place = blocks.stations.position
-    centre = (place if place.ndim == 4 else place[None]).mean(-2)[:, None, None]
+    centre = _places(blocks).mean(-2)[:, None, None]
     course = (powers @ state)[:, :, None]
     course = centre + ((course - centre)[..., None, :] @ np.swapaxes(maps, -1, -2)[:, None])[..., 0, :]
     # images in turning planes are no polynomial: the one with least squares next to them
@@ -466,8 +466,8 @@ def _most_common(values: Array) -> int:
     return int(found[count.argmax()]) if len(found) else 0
 
 
-def _places(problem: Problem, station: Array) -> Array:
-    """Return the positions (N or 1, k, s, d) of some stations."""
+def _places(problem: Problem, station: Array | slice = slice(None)) -> Array:
+    """Return the positions (N or 1, k, s, d) of stations, all of them by default."""
     place = problem.stations.position[..., station, :]
     place = place if place.ndim == 4 else place[None]
     return np.broadcast_to(place, (len(place), problem.epochs, *place.shape[2:]))
