@@ -76,6 +76,8 @@ def test_what_is_known_clocks_and_distances_are_read(folder):
         ('{ name = "A8" }', '{ name = "A7" }', "A7"),
         ('{ name = "A8" }', '{ name = "B8" }', "A8"),
         ("format = 1", "format = 1\nspeed = 3", "speed"),
+        ("format = 1", 'format = 2\nframe = { kind = "ecef" }', "optloc fix"),
+        ("format = 1", "format = 3", "format = 2"),
         ('{ name = "A8" }', '{ name = "A8", x = "far" }', "far"),
     ],
 )
@@ -85,6 +87,25 @@ def test_broken_files_are_refused_in_a_sentence(folder, old, new, told):
     assert done.exit_code == 2, done.output
     assert told in done.output
     assert "Traceback" not in done.output
+
+
+def test_problems_and_networks_are_told_apart(folder):
+    (folder / "known.toml").write_text(
+        'format = 2\nstations.rows = [{ name = "A", x = 0.0, y = 0.0 }, { name = "B", x = 9.0, y = 0.0 }]\n'
+        '[[measurements]]\nkind = "range"\nsigma = 1.0\nrows = [{ a = "A", z = 5.0 }, { a = "B", z = 6.0 }]\n'
+    )
+    for command, name, told in (("calibrate", "known.toml", "optloc fix"), ("fix", "hall.toml", "optloc calibrate")):
+        done = run(command, folder / name)
+        assert done.exit_code == 2
+        assert told in " ".join(done.output.split())
+
+
+def test_coordinates_of_a_network_may_name_their_unit(folder):
+    text = FILE.replace('{ name = "A1" }', '{ name = "A1", "X [cm]" = 100.0, y_m = 2.5 }')
+    (folder / "hall.toml").write_text(text)
+    net = read_network(folder / "hall.toml")
+    assert net.place[0] == pytest.approx([1.0, 2.5, 0.0])
+    assert net.place_sigma[0].tolist() == [0.0, 0.0, np.inf]
 
 
 def test_names_of_outputs_are_asked_for_before_the_search(folder, monkeypatch):

@@ -206,6 +206,19 @@ def test_a_data_frame_of_many_ranges_is_many_fixes():
         locate(stations, ranges=twice, sigma=0.05)
 
 
+@pytest.mark.parametrize(
+    ("columns", "metres"),
+    [(["x_m", "y_m", "z_m"], 1.0), (["x", "y", "z_km"], np.array([1.0, 1.0, 1e3])), (["X [ft]", "Y [ft]", "Z"], 0.3048)],
+)
+def test_coordinates_of_stations_may_name_their_unit(columns, metres):
+    at = np.array([[0.0, 0.0, 0.0], [900.0, 0.0, 20.0], [0.0, 700.0, 40.0], [900.0, 700.0, 300.0], [400.0, 300.0, 90.0]])
+    factor = np.broadcast_to(np.where([name == "Z" for name in columns], 1.0, metres), 3)
+    stations = pd.DataFrame(at / factor, columns=columns, index=list("ABCDE"))
+    truth = np.array([300.0, 400.0, 150.0])
+    fix = locate(stations, ranges=np.linalg.norm(at - truth, axis=-1), sigma=1.0)
+    assert fix.position == pytest.approx(truth, abs=1e-6)
+
+
 def test_pseudoranges_with_a_known_height():
     rng = np.random.default_rng(5)
     truth = place(48.1, 11.5, 520.0)
@@ -232,6 +245,10 @@ WRONG = {
     "nothing measured": ({"stations": ANCHORS, "sigma": 1.0}, "give one of toa"),
     "no stations": ({"ranges": [1.0], "sigma": 1.0}, "latlon="),
     "no sigma": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4]}, "how accurate the ranges are"),
+    "no coordinates": (
+        {"stations": pd.DataFrame({"east": [0.0, 1.0], "north": [0.0, 1.0]}), "ranges": [1.0, 1.0], "sigma": 1.0},
+        "no coordinates among",
+    ),
     "no such station": ({"stations": ANCHORS, "ranges": {"AA": 1.0}, "sigma": 1.0}, "'AA'"),
     "too few": ({"stations": ANCHORS, "ranges": [1.0, 2.0], "sigma": 1.0}, "2 values for 4 stations"),
     "one sigma for two kinds": (

@@ -15,7 +15,8 @@ from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.calibration.calibrated import Calibration
 from optloc.calibration.network import KINDS, Network, Slot, checked
-from optloc.files.schema import Amount, DataTable, Units, conform, join, name_of, parse_toml
+from optloc.files.roles import worded
+from optloc.files.schema import Amount, DataTable, ProblemFile, Units, conform, join, name_of, parse_toml
 from optloc.files.table import Table, distinct, table_of
 from optloc.files.writer import toml_text
 from optloc.models import MODELS, kind_named
@@ -62,8 +63,8 @@ class NetworkRows(DataTable):
 class NetworkFile(_Table):
     """A network whose stations are to be found."""
 
-    format: Literal[1]
-    """Version of the format."""
+    format: Literal[1, 2]
+    """Version of the format; nothing that a network holds differs between them."""
     title: str | None = None
     """What it is."""
     propagation_speed: Amount | None = None
@@ -81,9 +82,14 @@ def read_network(path: Path) -> Network:
         Naming the file, the row and the column or key.
     """
     source, folder = name_of(path), path.parent
-    file = conform(NetworkFile, parse_toml(read_text(path), source), source)
+    data = parse_toml(read_text(path), source, formats=(1, 2))
+    foreign = [key for key in ProblemFile.model_fields if key in data and key not in NetworkFile.model_fields]
+    if foreign:
+        what = f"the key {foreign[0]!r} is that of a problem whose stations are known, not of a network"
+        raise InvalidProblem(what, source, "use optloc fix, or see optloc new calibration")
+    file = conform(NetworkFile, data, source)
     speed = _speed(file.propagation_speed, source)
-    table = table_of(file.stations, folder, where := join(source, "[stations]"))
+    table = worded(table_of(file.stations, folder, where := join(source, "[stations]")), file.stations.unit)
     names = tuple(str(name) for name in table.labels("name"))
     place, place_sigma = _places(file.stations, table, where)
     rows: list[tuple[str, Array, Array, Array, Array, Array]] = []
@@ -91,6 +97,9 @@ def read_network(path: Path) -> Network:
     for i, section in enumerate(file.measurements):
         place_of = join(source, f"[[measurements]] {i + 1}")
         own = table_of(section, folder, place_of)
+        if section.kind != BETWEEN and not own.has("epoch"):
+            advice = "add a column epoch; of stations that are known, optloc fix takes the file"
+            raise InvalidProblem("the rows do not say of which pulse they are", own.source, advice)
         between = section.kind == BETWEEN
         kind = BETWEEN if between else kind_named(section.kind, place_of)
         if not between and kind not in KINDS:

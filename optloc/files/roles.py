@@ -204,14 +204,22 @@ def in_our_words(
 
 
 def worded(table: Table, unit: str) -> Table:
-    """Return a table of stations with its columns by our names; heights become those of the table's unit."""
-    found = {key: name for key in ("name", "lat_deg", "lon_deg", "height") if (name := _column(table, WORDS[key]))}
+    """Return a table of stations with its columns by our names; coordinates become those of the table's unit."""
+    words = {key: WORDS[key] for key in ("name", "lat_deg", "lon_deg", "height")}
+    found = {key: name for key, word in words.items() if (name := _column(table, word))}
+    # Of a table with latitudes, x is what it has besides.
+    if not any(key in found or table.has(key) for key in ("lat_deg", "lon_deg")):
+        axes = {key: name for key in "xyz" if (name := _column(table, key))}
+        found |= {key: name for key, name in axes.items() if _said(name) in (None, *UNITS["length"])}
     found = {key: name for key, name in found.items() if not table.has(key) and key not in table.names}
     # Latitudes in radians are none that could be read: the column stays unknown.
     named = {key: name for key, name in found.items() if not key.endswith("_deg") or _said(name) in (None, "deg")}
-    columns, own = dict(table.columns), unit_of(named.get("height", ""), UNITS["length"])
-    if own is not None and own != unit and unit in UNITS["length"]:
-        columns["height"] = table.numbers(named.pop("height")) * (UNITS["length"][own] / UNITS["length"][unit])
+    columns = dict(table.columns)
+    for key in ("height", *"xyz"):
+        name = named.get(key, "")
+        own = unit_of(name, UNITS["length"])
+        if own is not None and own != unit and unit in UNITS["length"]:
+            columns[name] = table.numbers(name, optional=True) * (UNITS["length"][own] / UNITS["length"][unit])
     return replace(table, columns=columns, names={**table.names, **named})
 
 

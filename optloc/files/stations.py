@@ -104,6 +104,10 @@ def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> t
             raise InvalidProblem(
                 "the frame is geodetic, but there are no columns lat_deg and lon_deg", table.source, "add them"
             )
+        if not plane:
+            what = f"there are no coordinates among {', '.join(map(str, table.columns))}"
+            advice = "call them x, y, z, or lat_deg, lon_deg, height; optloc calibrate finds places that nobody knows"
+            raise InvalidProblem(what, table.source, advice)
         d = wanted.dimension or (3 if table.has("z") else 2)
         return factor * np.stack([table.numbers(key) for key in _XYZ[:d]], axis=-1), _frame(wanted, where)
     lat, lon = (np.radians(table.numbers(key)) for key in _GEODETIC[:2])
