@@ -49,6 +49,8 @@ class Rules:
         standard deviation beyond the spread of the stations, and beyond the range of the target.
     speed, rate : float, optional
         Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, for starts.
+    starts : str
+        By which starts are solved, as `optloc.solve`: "robust" where rows may be gross errors.
     """
 
     gate: float = _USUAL
@@ -56,6 +58,7 @@ class Rules:
     gap: float | None = None
     speed: float | None = None
     rate: float | None = None
+    starts: str = "auto"
 
     @property
     def most(self) -> float:
@@ -172,7 +175,8 @@ class _Run:
         times, k = self.problem.times, 0
         while k < len(times):
             if course.state is None:
-                start_here = begin(self.problem, k, self.dynamics, self.rules.speed, self.rules.rate, ends=ends)
+                r = self.rules
+                start_here = begin(self.problem, k, self.dynamics, r.speed, r.rate, r.starts, ends=ends)
                 yield from self._starting(start_here, k, course.why)
                 k, course.state, course.missed = start_here.last + 1, start_here.state, 0
                 course.recent.begin(start_here)
@@ -202,10 +206,11 @@ class _Run:
             if i < begun.last or begun.state is None:
                 yield Entry(time, none, begun.waiting, self._bad(i), "starting", begun.reason)
                 continue
-            count = np.array(int((self.problem.weight[self.problem.epoch == i] > 0.0).sum()))
+            count = np.array(int((self.problem.weight[self.problem.epoch == i] > 0.0).sum()) - begun.left_out)
             done = replace(none, mean=begun.state.mean, cov=begun.state.cov, count=count)
             reason = "; ".join(filter(None, (why, begun.reason)))
-            yield Entry(time, done, begun.code, self._bad(i), "restarted" if why else "started", reason)
+            out = self._bad(i) + begun.left_out
+            yield Entry(time, done, begun.code, out, "restarted" if why else "started", reason)
 
     def _bad(self, k: int) -> int:
         """Return how many rows of a scan are not finite."""

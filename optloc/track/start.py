@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -42,6 +43,7 @@ def begun(
     epochs: int | None = None,
     speed: float | None = None,
     rate: float | None = None,
+    method: str = "auto",
 ) -> State:
     """Return the initial state of a run's target, without a guess.
 
@@ -58,6 +60,8 @@ def begun(
         Number of epochs to start from; None: the fewest that determine the state.
     speed, rate : float, optional
         Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero.
+    method : str
+        By which the epochs are solved, as `optloc.solve`; "robust" where rows may be gross errors.
 
     Returns
     -------
@@ -75,7 +79,7 @@ def begun(
     order = dynamics.order
     fix, used = None, 0
     for used in [epochs] if epochs is not None else counts(problem.epochs, order, speed, rate):
-        fix = first_fix(problem, dynamics, used, speed=speed, rate=rate)
+        fix = first_fix(problem, dynamics, used, speed=speed, rate=rate, method=method)
         if is_one_gaussian(fix):
             return state_of(problem, fix, used)
     if fix is None:
@@ -137,10 +141,16 @@ def counts(epochs: int, order: int, speed: float | None = None, rate: float | No
 
 
 def first_fix(
-    problem: Problem, dynamics: Dynamics, count: int, *, speed: float | None = None, rate: float | None = None
+    problem: Problem,
+    dynamics: Dynamics,
+    count: int,
+    *,
+    speed: float | None = None,
+    rate: float | None = None,
+    method: str = "auto",
 ) -> Fix:
     """Return the fix of the first epochs of a run, a target that moves by the order of the dynamics; as `begun`."""
-    return solve(_first(problem, count, dynamics.order, speed, rate))
+    return solve(_first(problem, count, dynamics.order, speed, rate), method)
 
 
 def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
@@ -216,6 +226,8 @@ class Beginning:
         A sentence where the status is not ok.
     fit : tuple of float and int
         Chi-square of the rows of the start, and its degrees of freedom.
+    left_out : int
+        Rows of the last scan that a robust start leaves out.
     """
 
     last: int
@@ -224,6 +236,7 @@ class Beginning:
     waiting: Status
     reason: str = ""
     fit: Fit = (0.0, 0)
+    left_out: int = 0
 
 
 class Undecided(Exception):  # noqa: N818  # no failure: more scans are to come
@@ -236,11 +249,13 @@ class Undecided(Exception):  # noqa: N818  # no failure: more scans are to come
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Scans that determine a state: their fix, the last of them, and the state there."""
+    """Scans that determine a state: fix, last scan, state there; rows left out, of all scans and of the last."""
 
     fix: Fix
     last: int
     state: State
+    left_out: int
+    left_out_last: int
 
     @property
     def p(self) -> float:
@@ -256,7 +271,13 @@ class _Stretch:
     @property
     def clean(self) -> bool:
         """Return whether a filter may begin with it."""
-        return self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
+        # With less redundancy than that other rows might be the wrong ones, see `optloc.suspects`.
+        sure = not self.left_out or int(self.fix.dof) > self.left_out
+        return sure and self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
+
+    def beginning(self, code: Status, reason: str = "") -> Beginning:
+        """Return it as a start."""
+        return Beginning(self.last, self.state, code, Status.OK, reason, self.fit, self.left_out_last)
 
 
 def begin(
@@ -265,6 +286,7 @@ def begin(
     dynamics: Dynamics,
     speed: float | None,
     rate: float | None,
+    method: str = "auto",
     *,
     ends: bool = True,
 ) -> Beginning:
@@ -283,6 +305,8 @@ def begin(
         Gives the order of the state.
     speed, rate : float, optional
         Prior standard deviations, see `begun`.
+    method : str
+        See `begun`.
     ends : bool
         Whether these are all scans. Otherwise what a start asks of scans that are still to come is `Undecided`.
     """
@@ -293,9 +317,13 @@ def begin(
         if i >= len(heard):
             raise Undecided(problem.epochs + 1)
         last = int(heard[i])
-        found, verdict = _stretch(problem, last, dynamics, speed, rate, ends)
+        run = cut(problem, last, problem.epochs)
+        # Of a run that goes on, the numbers up to the next one after what is there.
+        tries = counts(run.epochs if ends else 2 * run.epochs + 2, dynamics.order, speed, rate)
+        fixed = partial(first_fix, run, dynamics, speed=speed, rate=rate, method=method)
+        found, verdict = _stretch(run, last, tries, fixed)
         if found is not None and found.clean:
-            return Beginning(found.last, found.state, Status.OK, Status.OK, fit=found.fit)
+            return found.beginning(Status.OK)
         if found is not None:
             doubtful.append(found)
         elif verdict != Status.CONTRADICTORY:
@@ -319,7 +347,7 @@ def _doubtful(best: _Stretch) -> Beginning:
         code, reason = Status.AMBIGUOUS, f"the start has {others} alternative{'s' if others > 1 else ''}"
     else:
         code, reason = Status.CURVED, "the covariance of the start does not cover"
-    return Beginning(best.last, best.state, code, Status.OK, reason, best.fit)
+    return best.beginning(code, reason)
 
 
 def _slides(count: float) -> Iterator[int]:
@@ -332,26 +360,27 @@ def _slides(count: float) -> Iterator[int]:
 
 
 def _stretch(
-    problem: Problem, k: int, dynamics: Dynamics, speed: float | None, rate: float | None, ends: bool
+    run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]
 ) -> tuple[_Stretch | None, Status]:
-    """Return the first clear start from scan k on, else the first one that is answered, and the last verdict."""
-    run, ambiguous, verdict = cut(problem, k, problem.epochs), None, Status.TOO_FEW_ROWS
-    # Of a run that goes on, the numbers up to the next one after what is there.
-    for count in counts(run.epochs if ends else 2 * run.epochs + 2, dynamics.order, speed, rate):
+    """Return the first clear start of a run from scan k on, else the first that is answered, and the last verdict."""
+    ambiguous, verdict = None, Status.TOO_FEW_ROWS
+    for count in tries:
         if ambiguous is not None and count > _CLEAR:
             break
         if count > run.epochs:
             raise Undecided(k + count)
-        fix = first_fix(run, dynamics, count, speed=speed, rate=rate)
+        fix = fixed(count)
         verdict = Status(int(fix.code))
         # More scans do not mend rows that contradict each other; NaN without redundancy, where nothing does.
         contradicted = bool(fix.p_value < _PLAUSIBLE)
         state = state_of(run, fix, count) if bool(fix.answered) else None
-        if state is None or _is_vague(problem, state):
+        if state is None or _is_vague(run, state):
             if contradicted:
                 return ambiguous, Status.CONTRADICTORY
             continue
-        found = _Stretch(fix, k + count - 1, state)
+        used = cut(run, 0, count)
+        out = (used.weight > 0.0) & (fix.weights == 0.0)
+        found = _Stretch(fix, k + count - 1, state, int(out.sum()), int((out & (used.epoch == count - 1)).sum()))
         if contradicted:
             return ambiguous or found, verdict
         if found.clean:

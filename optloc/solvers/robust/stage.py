@@ -146,6 +146,26 @@ def _join(one: Pool, two: Pool) -> Pool:
     )
 
 
+def doubted_minima(problem: Problem, loss: Loss, most: int) -> list[tuple[Array, Array]]:
+    """Return the cheapest minima of a loss, found without a guess: vector (size,) and the rows (m,) hardly counted.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem.
+    loss : Loss
+        For instance ``LOSSES["truncated"]``.
+    most : int
+        Minima at most.
+    """
+    pool = Robust(loss)(problem, None)
+    order = np.argsort(pool.cost[0])[:most]
+    x = pool.x[0, order][np.isfinite(pool.cost[0, order])]
+    many = problem.take(np.zeros(len(x), dtype=int))
+    weights = _equations(many, loss, x)[1] if len(x) else np.zeros((0, problem.count))
+    return list(zip(x, weights < REJECTED * many.weight, strict=True))
+
+
 def rejected(problem: Problem, fix: Fix) -> Array:
     """Return which rows (..., m) that were present a fix hardly counts: their weight fell below a quarter.
 

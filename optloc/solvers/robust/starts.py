@@ -17,7 +17,8 @@ from optloc.solvers.pool import Pool, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
-from optloc.solvers.starts.position import one_position, rows_of_stations
+from optloc.solvers.starts.position import one_position, registrable, rows_of_stations
+from optloc.solvers.starts.registration import mirror_courses
 from optloc.solvers.verdict.judge import judge, standing
 
 # Subsets of a problem at most: each is a closed form and a few steps. Stations up to which three are left out (92 sets
@@ -106,9 +107,17 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
     if one_position(problem):
         parts.append(_leave_out(problem, loss))
     else:
-        item, slot = np.nonzero(np.isfinite(pool).all(-1))
-        parts.append(_cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True))
+        parts.append(_annealed(problem, pool, loss))
+        if registrable(problem):
+            # what gross errors have drawn to one side of the stations belongs to the other
+            parts.append(_annealed(problem, mirror_courses(problem, parts[-1]), loss))
     return pack(np.concatenate(parts, axis=1))
+
+
+def _annealed(problem: Problem, pool: Array, loss: Loss) -> Array:
+    """Return where starts (N, q, size) lead that doubt what does not fit them, the cheapest first."""
+    item, slot = np.nonzero(np.isfinite(pool).all(-1))
+    return _cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True)
 
 
 def _leave_out(problem: Problem, loss: Loss) -> Array:
@@ -134,8 +143,7 @@ def _start_subsets(problem: Problem, loss: Loss) -> Array:
     pair, slot = found.occupied
     x = refine(part, found.x[pair, slot], item=pair, limit=_FEW, face=exact(problem)).x
     pool = _cheapest(problem, x, item[pair], loss, _SCREENED, anneal=False)
-    first, slot = np.nonzero(np.isfinite(pool).all(-1))
-    return _cheapest(problem, pool[first, slot], first, loss, _KEPT, anneal=True)
+    return _annealed(problem, pool, loss)
 
 
 def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *, anneal: bool) -> Array:

@@ -21,20 +21,24 @@ from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Alternatives, Explanation, Fix, GroupKind, Stage, Suspect
 from optloc.problem.layout import Layout
+from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED
 from optloc.solvers.pool import Pool, begin, in_parts, offer
+from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.starts.position import complete
 from optloc.solvers.suspects.subsets import (
     Finding,
     Rest,
+    begin_without,
     enumerable,
     explain,
     fix_rest,
     fix_without,
     grow,
+    joined,
     leave_out_of,
     prove_rest,
     rest_of,
@@ -45,8 +49,22 @@ from optloc.solvers.verdict.judge import failed, fill, judge, standing
 # A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
 # that is tested, and who fits is taken back.
 _HALF = 0.5
+# Minima of a loss from which who is wrong is sought: an image in the plane of the stations has another beside it.
+_MINIMA = 4
 # No other choice of rows helps these.
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
+
+
+@dataclass(frozen=True, slots=True)
+class _Doubted:
+    """Rows (N, m) that a robust fix before rejected, and the vectors (N, size) at which it did."""
+
+    rows: Array
+    x: Array
+
+    def take(self, items: Array) -> _Doubted:
+        """Return those of some problems."""
+        return _Doubted(self.rows[items], self.x[items])
 
 
 def suspects(
@@ -106,12 +124,12 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
         )
     began = perf_counter()
     present = np.broadcast_to(problem.weight, (len(pool), problem.count))
-    rejected = np.asarray((pool.weights < _HALF) & (present > _HALF))
+    doubted = _Doubted(np.asarray((pool.weights < _HALF) & (present > _HALF)), judge(problem, pool).x)
     if not np.array_equal(pool.weights, present):
         # a robust fix has its minima elsewhere: the test is that of least squares with every row
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
     before = pool.stages
-    asked = partial(_explain, present=present, rejected=rejected, by=by)
+    asked = partial(_explain, present=present, doubted=doubted, by=by)
     found, refuted = _weigh(problem, judge(problem, pool), asked, together)
     pool = replace(pool, asked=True, refuted=refuted)
     fix, conclusion = judge(problem, pool), fill(len(pool), None)
@@ -144,7 +162,7 @@ def _weigh(
     return found, ""
 
 
-def _explain(problem: Problem, fix: Fix, present: Array, rejected: Array, by: Sequence[GroupKind]) -> _Explained:
+def _explain(problem: Problem, fix: Fix, present: Array, doubted: _Doubted, by: Sequence[GroupKind]) -> _Explained:
     """Return what explains those problems that show something: their numbers, what may be wrong, and what is."""
     with np.errstate(invalid="ignore"):
         # of a lower cost the cheapest set has a score beyond the gap whatever it leaves
@@ -152,7 +170,7 @@ def _explain(problem: Problem, fix: Fix, present: Array, rejected: Array, by: Se
     noticed |= problem.epochs > 1  # a few of many rows go unnoticed by the chi-square of all
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
     alike = [items[own] for own in _group_alike(present[items] > 0.0)]
-    return [(own, *_explain_pattern(problem.take(own), fix[own], rejected[own], by)) for own in alike]
+    return [(own, *_explain_pattern(problem.take(own), fix[own], doubted.take(own), by)) for own in alike]
 
 
 def _score(found: _Explained, fix: Fix, more: Array) -> float:
@@ -187,7 +205,7 @@ def _group_alike(present: Array) -> list[Array]:
 
 
 def _explain_pattern(
-    problem: Problem, fix: Fix, rejected: Array, by: Sequence[GroupKind]
+    problem: Problem, fix: Fix, doubted: _Doubted, by: Sequence[GroupKind]
 ) -> tuple[tuple[Group, ...], list[Finding]]:
     """Return what may be wrong in problems (N,) in which the same rows are present, and what explains each."""
     arrivals = as_arrivals(problem)
@@ -196,12 +214,12 @@ def _explain_pattern(
     groups = groups_of(work, present, by)
     # few sets: all are tried, and nothing masks anything; runs and many groups: one at a time
     if problem.epochs > 1 or not enumerable(groups, work.count, 1):
-        return groups, [_grow(work, groups, fix, i, rejected, None) for i in range(len(fix.x))]
+        return groups, [_grow(work, groups, fix, i, doubted, None) for i in range(len(fix.x))]
     findings = explain(work, groups, fix)
     # sets that were too many to be tried: group by group from the best that was found
     untried = [not own.rests and own.tried < dof - 1 for own, dof in zip(findings, fix.dof, strict=True)]
     for i in np.flatnonzero(untried).tolist():
-        more = _grow(work, groups, fix, i, rejected, findings[i].closest)
+        more = _grow(work, groups, fix, i, doubted, findings[i].closest)
         findings[i] = replace(more, p_value=findings[i].p_value | more.p_value)
     return groups, findings
 
@@ -218,8 +236,14 @@ def _conclude(
     return out
 
 
-def _grow(problem: Problem, groups: Sequence[Group], fix: Fix, i: int, rejected: Array, start: Rest | None) -> Finding:
-    """Return what explains the i-th of some problems, found group by group."""
+def _grow(
+    problem: Problem, groups: Sequence[Group], fix: Fix, i: int, doubted: _Doubted, start: Rest | None
+) -> Finding:
+    """Return what explains the i-th of some problems, found group by group.
+
+    The fix of all rows is where wrong ones have drawn it, perhaps to another minimum, from which the right ones look
+    wrong. Where it shows something, the minima of a loss that no error draws far are begun from as well.
+    """
     # the fix is of the problem as given; with arrivals for differences the layout has emission times besides
     one, own = problem.take(np.array([i])), fix[i]
     if own.layout != one.layout or not np.isfinite(own.x).all():
@@ -227,8 +251,15 @@ def _grow(problem: Problem, groups: Sequence[Group], fix: Fix, i: int, rejected:
         known = np.isfinite(own.x[:n]).all()
         near = complete(one, own.x[None, None, :n]) if known else None
         own = (fix_rest(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
-    mine = rejected[i] if one.count == rejected.shape[1] else np.zeros(one.count, dtype=bool)
-    return grow(one, groups, own, mine, start)
+    handed = doubted.rows.shape[1] == one.count and doubted.rows[i].any()
+    if handed:
+        start = begin_without(one, groups, doubted.rows[i], doubted.x[i])
+    first = grow(one, groups, own, start or rest_of(groups, (), own))
+    if not first.rests and not first.note:
+        return first
+    minima = doubted_minima(one, LOSSES["truncated"], _MINIMA)
+    begun = [begin_without(one, groups, rows, x) for x, rows in minima]
+    return joined([first, *(grow(one, groups, own, each) for each in begun)], groups)
 
 
 # From what explains the data of one problem to explanations: who is left out, how large an error, what evidence.

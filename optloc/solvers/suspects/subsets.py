@@ -319,7 +319,7 @@ _LARGE = 16
 _MOST_LEFT_OUT, _RIVALS = 8, 3
 
 
-def grow(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, start: Rest | None = None) -> Finding:
+def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Finding:
     """Return what explains one problem, found group by group.
 
     Parameters
@@ -330,17 +330,12 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, s
         What may be wrong.
     fix : Fix
         Of the problem, without batch axes.
-    rejected : bool array (m,)
-        Rows that a robust fix rejected: left out at the beginning.
-    start : Rest, optional
-        Where to begin else: the best that was found without a few groups.
+    start : Rest
+        Where to begin.
     """
     # Bonferroni: clean data are accused once in a hundred, whatever the number of groups
     level = float(np.log(NOTICED / len(groups)))
-    left = [i for i, group in enumerate(groups) if len(group.rows) == 1 and rejected[group.rows[0]]]
-    rest = fix_without(problem, groups, left, fix.x) if left else fix
-    if start is not None and not left:
-        left, rest = list(start.left), start.fix
+    left, rest = list(start.left), start.fix
     while (worst := _worst(problem, groups, left, rest, level)) is not None:
         # nothing would be left to agree
         if int(rest.dof) <= len(groups[worst].rows):
@@ -357,6 +352,18 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, s
     if passes(fix):
         found.append(rest_of(groups, (), fix))
     return Finding(listed(found, groups), {(): float(fix.p_value)})
+
+
+def joined(findings: Sequence[Finding], groups: Sequence[Group]) -> Finding:
+    """Return what explains one problem, found from several beginnings: the first one's where none explains it."""
+    rests = {rest.left: rest for finding in findings for rest in finding.rests}
+    return replace(findings[0], rests=listed([*rests.values()], groups)) if rests else findings[0]
+
+
+def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> Rest:
+    """Return one problem without some rows (m,), refined from a vector (size,): where `grow` may begin."""
+    left = tuple(i for i, group in enumerate(groups) if len(group.rows) == 1 and rows[group.rows[0]])
+    return rest_of(groups, left, fix_without(problem, groups, left, x))
 
 
 def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Fix:
@@ -415,7 +422,7 @@ def _take_back(
     problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float
 ) -> tuple[list[int], Fix]:
     """Return what is still left out, and the rest, once every group that fits the rest is taken back."""
-    while left:
+    while left and np.isfinite(rest.x).all():
         chosen = [groups[i] for i in left]
         # all errors jointly, to first order: the one that is most likely none is taken back if it does not stand out
         tail = [-error.log_tail for error in errors(influence(problem, rest.x), chosen)]
