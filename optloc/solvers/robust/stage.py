@@ -85,6 +85,8 @@ _WEIGHINGS = 30
 # Gap of a rival that leaves out no more than the cheapest candidate does: the loss alone is no evidence between them.
 # Not zero, so that the cheapest stays first.
 _CLOSE = 1e-2
+# Minima that cost more than twice as much as the cheapest doubt so many more rows that no search from them ends near it.
+_DEARER = 2.0
 # Content of the ellipsoid within which candidates are one answer with the same rows doubted a little differently.
 _ONE_ANSWER = 0.95
 
@@ -147,7 +149,7 @@ def _join(one: Pool, two: Pool) -> Pool:
 
 
 def doubted_minima(problem: Problem, loss: Loss, most: int) -> list[tuple[Array, Array]]:
-    """Return the cheapest minima of a loss, found without a guess: vector (size,) and the rows (m,) hardly counted.
+    """Return the cheap minima of a loss, found without a guess: vector (size,) and the rows (m,) hardly counted each.
 
     Parameters
     ----------
@@ -160,7 +162,8 @@ def doubted_minima(problem: Problem, loss: Loss, most: int) -> list[tuple[Array,
     """
     pool = Robust(loss)(problem, None)
     order = np.argsort(pool.cost[0])[:most]
-    x = pool.x[0, order][np.isfinite(pool.cost[0, order])]
+    cost = pool.cost[0, order]
+    x = pool.x[0, order][np.isfinite(cost) & (cost <= _DEARER * cost[0])]
     many = problem.take(np.zeros(len(x), dtype=int))
     weights = _equations(many, loss, x)[1] if len(x) else np.zeros((0, problem.count))
     return list(zip(x, weights < REJECTED * many.weight, strict=True))

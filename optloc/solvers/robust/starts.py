@@ -9,6 +9,7 @@ import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.linear.constraints import exact
+from optloc.linear.courses import elapsed
 from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import independent, variances
@@ -17,8 +18,8 @@ from optloc.solvers.pool import Pool, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
-from optloc.solvers.starts.position import one_position, registrable, rows_of_stations
-from optloc.solvers.starts.registration import mirror_courses
+from optloc.solvers.starts.position import one_position, registrable, rows_of_stations, vectors
+from optloc.solvers.starts.registration import mirror_courses, split_epochs
 from optloc.solvers.verdict.judge import judge, standing
 
 # Subsets of a problem at most: each is a closed form and a few steps. Stations up to which three are left out (92 sets
@@ -28,6 +29,8 @@ _MOST, _THREE, _ROWS = 80, 8, 12
 _SCREENED, _KEPT = 30, 12
 # Problems, and starts times rows, that are worked on at a time: some ten megabytes an array.
 _EACH, _NUMBERS = 64, 2**20
+# Epochs of a run that are fixed alone, spread over it, and places of each that are kept: two sides of flat stations.
+_EPOCHS, _SIDES = 12, 2
 # Starts whose residuals differ by less than this many sigma are one: they would doubt the same rows.
 _SAME = 0.5
 # Gauss-Newton steps before starts are compared: enough to leave the closed form's own weighting.
@@ -111,7 +114,31 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
         if registrable(problem):
             # what gross errors have drawn to one side of the stations belongs to the other
             parts.append(_annealed(problem, mirror_courses(problem, parts[-1]), loss))
+            parts.append(_through_epochs(problem, loss))
     return pack(np.concatenate(parts, axis=1))
+
+
+def _through_epochs(problem: Problem, loss: Loss) -> Array:
+    """Return the best starts (N, q, size) of runs that pass through the places where two epochs were fixed alone.
+
+    What is wrong in a few epochs does not touch the places of the others (as by samples that are as small as can be: M.
+    A. Fischler, R. C. Bolles, "Random sample consensus", Commun. ACM 24 (1981)); here all pairs of a few are tried.
+    """
+    size, d, order = problem.batch_shape[0], problem.dimension, problem.motions[0].order
+    epoch = np.unique(np.linspace(0, problem.epochs - 1, _EPOCHS).round().astype(int))
+    still = replace(problem.motions[0], order=0, reference=None)
+    alone = replace(split_epochs(problem), motions=(still,)).flat()
+    alone = alone.take((np.arange(size)[:, None] * problem.epochs + epoch).ravel())
+    place = _leave_out(alone, LOSSES["cauchy"])[:, :_SIDES, :d].reshape(size, len(epoch), -1, d)
+    if order:
+        i, j = np.triu_indices(len(epoch), 1)
+        time = elapsed(problem, 0)[epoch][:, None, None]
+        velocity = (place[:, j] - place[:, i]) / (time[j] - time[i])
+        rest = np.zeros((*velocity.shape[:-1], d * (order - 1)))
+        place = np.concatenate([place[:, i] - velocity * time[i], velocity, rest], axis=-1)
+    x = vectors(problem, place.reshape(size, -1, place.shape[-1]))
+    item, slot = np.nonzero(np.isfinite(x).all(-1))
+    return _annealed(problem, _cheapest(problem, x[item, slot], item, loss, _SCREENED, anneal=False), loss)
 
 
 def _annealed(problem: Problem, pool: Array, loss: Loss) -> Array:

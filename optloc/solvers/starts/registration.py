@@ -427,7 +427,7 @@ def place_states(problem: Problem, run: Run, state: Array, bias: Array) -> Array
 
 def run_of(problem: Problem) -> Run | None:
     """Return the range offsets of a flat batch of runs; None where no epoch has any."""
-    found = ranges(_split_epochs(problem).flat())
+    found = ranges(split_epochs(problem).flat())
     if found is None or not (found.free & (found.inside.sum(-1) > 1)).any():
         return None
     size, epochs = problem.batch_shape[0], problem.epochs
@@ -455,8 +455,8 @@ def run_of(problem: Problem) -> Run | None:
     return Run(course, column, origin, length, duration)
 
 
-def _split_epochs(problem: Problem) -> Problem:
-    """Return the epochs of a run as a batch (N, k), without its biases."""
+def split_epochs(problem: Problem) -> Problem:
+    """Return the epochs of a run as a batch (N, k), without its biases, priors and constraints."""
     return by_epoch(untied(replace(problem, biases=(), priors=(), constraints=())))
 
 
@@ -490,7 +490,7 @@ def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:
         # a batch whose items are the biases: each item's rows hold one unit of its bias and nothing else
         zero = tuple(replace(rows, correction=np.zeros(rows.count)) for rows in problem.rows)
         single = replace(problem.take(np.zeros(1, dtype=int)), rows=zero)
-        same = ranges(_split_epochs(single.with_rows(z=unit)).flat())
+        same = ranges(split_epochs(single.with_rows(z=unit)).flat())
         assert same is not None
         effect = same.offset.reshape(effect.shape)
     return column, effect
