@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from verdicts import alone
 
-from optloc import Fix, Problem, assemble, measured, solve
+from optloc import Fix, Motion, Problem, assemble, measured, solve
 from optloc.solvers.certify.admitted import certified
 from optloc.solvers.pool import in_parts
 from optloc.solvers.refine import refine
@@ -16,6 +16,8 @@ from optloc.solvers.suspects.stage import suspect
 from optloc.solvers.verdict.judge import verdict
 
 BOX, SIGMA, MILLIRADIANS = np.array([10e3, 10e3, 6e3]), 10.0, 3e-3
+# Kilometres: six stations in a plane but for some hundred metres, in which every place has an image.
+_NEARLY_FLAT = ((0.0, 0.0, 0.0), (9.0, 1.0, 0.2), (1.0, 8.0, 0.5), (8.0, 9.0, 0.3), (4.0, -3.0, 0.1), (-3.0, 4.0, 0.4))
 
 
 @dataclass(frozen=True)
@@ -100,3 +102,17 @@ def nees(fix: Fix, truth: np.ndarray) -> np.ndarray:
     solved = np.linalg.solve(fix.covariance()[claimed], error)
     out[claimed] = (np.swapaxes(error, 1, 2) @ solved)[:, 0, 0] / 3.0
     return out
+
+
+def wild_run(seed: int, epochs: int, share: float) -> tuple[Problem, np.ndarray, np.ndarray]:
+    """Return ranges to a target that moves in space, its places (k, 3), and which rows are 200 to 3000 m off."""
+    rng, stations = np.random.default_rng(seed), 1e3 * np.array(_NEARLY_FLAT)
+    start, velocity = rng.uniform([0.0, 0.0, 1e3], [8e3, 8e3, 3e3]), np.append(rng.uniform(-150.0, 150.0, 2), 0.0)
+    times = np.arange(epochs) * 1.0
+    places = start + times[:, None] * velocity
+    a, epoch = np.tile(np.arange(len(stations)), epochs), np.repeat(np.arange(epochs), len(stations))
+    z = np.linalg.norm(places[epoch] - stations[a], axis=1) + SIGMA * rng.standard_normal(len(a))
+    wild = rng.random(len(a)) < share
+    z[wild] += rng.choice([-1.0, 1.0], wild.sum()) * rng.uniform(200.0, 3000.0, wild.sum())
+    rows, motion = measured("range", z, a=a, sigma=SIGMA, epoch=epoch), Motion(1, reference=times[-1])
+    return assemble(stations, rows, times=times, motions=(motion,)), places, wild

@@ -208,10 +208,16 @@ def test_a_data_frame_of_many_ranges_is_many_fixes():
 
 @pytest.mark.parametrize(
     ("columns", "metres"),
-    [(["x_m", "y_m", "z_m"], 1.0), (["x", "y", "z_km"], np.array([1.0, 1.0, 1e3])), (["X [ft]", "Y [ft]", "Z"], 0.3048)],
+    [
+        (["x_m", "y_m", "z_m"], 1.0),
+        (["x", "y", "z_km"], np.array([1.0, 1.0, 1e3])),
+        (["X [ft]", "Y [ft]", "Z"], 0.3048),
+    ],
 )
 def test_coordinates_of_stations_may_name_their_unit(columns, metres):
-    at = np.array([[0.0, 0.0, 0.0], [900.0, 0.0, 20.0], [0.0, 700.0, 40.0], [900.0, 700.0, 300.0], [400.0, 300.0, 90.0]])
+    at = np.array(
+        [[0.0, 0.0, 0.0], [900.0, 0.0, 20.0], [0.0, 700.0, 40.0], [900.0, 700.0, 300.0], [400.0, 300.0, 90.0]]
+    )
     factor = np.broadcast_to(np.where([name == "Z" for name in columns], 1.0, metres), 3)
     stations = pd.DataFrame(at / factor, columns=columns, index=list("ABCDE"))
     truth = np.array([300.0, 400.0, 150.0])

@@ -7,7 +7,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 from often import few
-from robust_cases import solve_apart, spoilt
+from robust_cases import solve_apart, spoilt, wild_run
 from scipy.stats import binom, chi2
 from typer.testing import CliRunner
 from verdicts import alone
@@ -453,6 +453,19 @@ def test_a_run_names_wrong_priors_and_detections_one_by_one():
     assert fix.answered
     for i, place in enumerate(markers):
         assert np.linalg.norm(fix.take(f"position[{i}]") - place) < 5.0 * np.linalg.norm(fix.sigma(f"position[{i}]"))
+
+
+@pytest.mark.parametrize(("epochs", "share"), few([(8, 0.2), (4, 0.1), (8, 0.05)], 2, names=2))
+@pytest.mark.parametrize("trials", [4, pytest.param(40, marks=pytest.mark.full)])
+def test_a_moving_target_is_found_and_its_wild_rows_are_named(epochs, share, trials):
+    for seed in range(1000, 1000 + trials):
+        problem, places, wild = wild_run(seed, epochs, share)
+        fix = solve(problem, "robust")
+        assert fix.answered, (seed, fix.reason)
+        assert np.linalg.norm(fix.position - places[-1]) < 150.0, seed
+        # one at a few sigma may pass; of the good ones one in a hundred trials may not
+        assert (fix.weights[wild] == 0.0).mean() > 0.9 if wild.any() else True, seed
+        assert (fix.weights[~wild] == 0.0).sum() <= 1, seed
 
 
 def test_a_clean_run_accuses_nobody():

@@ -228,7 +228,7 @@ def track(
     """
     from optloc.cli.track import Wanted, rules, run_track
 
-    wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma, loss)
+    wanted = Wanted(model, filter_, noise, memory, rules(gate, gap, loss), start, start_sigma, loss)
     files = {"out": out, "plot": plot, "html": html}
     told = table_told(file, given)
     raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=told))

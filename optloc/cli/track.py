@@ -196,12 +196,12 @@ def dynamics_of(wanted: Wanted) -> Dynamics:
     return motion.make(motion.noise if wanted.noise is None else wanted.noise, wanted.memory)
 
 
-def rules(gate: float, gap: float | None) -> Rules:
-    """Return the rules of options; raise InvalidProblem for a gate or a gap that is none."""
+def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
+    """Return the rules of options; where rows are weighed by a loss, starts name gross ones, too; raise InvalidProblem for a gate or a gap that is none."""
     for value, where in ((gate, "--gate"), (gap, "--gap")):
         if value is not None and not value > 0.0:
             raise InvalidProblem(f"{value:g} is not positive", where, "give a positive number")
-    return Rules(gate=gate, gap=gap)
+    return Rules(gate=gate, gap=gap) if loss is None else Rules(gate=gate, gap=gap, starts="robust")
 
 
 def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:

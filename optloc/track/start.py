@@ -359,9 +359,7 @@ def _slides(count: float) -> Iterator[int]:
         i = max(i + 1, i * 3 // 2)
 
 
-def _stretch(
-    run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]
-) -> tuple[_Stretch | None, Status]:
+def _stretch(run: Problem, k: int, tries: Sequence[int], fixed: Callable[[int], Fix]) -> tuple[_Stretch | None, Status]:
     """Return the first clear start of a run from scan k on, else the first that is answered, and the last verdict."""
     ambiguous, verdict = None, Status.TOO_FEW_ROWS
     for count in tries:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from robust_cases import wild_run
 from scipy.optimize import minimize
 
 from optloc import LOSSES, InvalidProblem, Motion, assemble, measured, simulate
@@ -76,6 +77,29 @@ def test_wild_rows_do_a_track_no_harm():
         errors[name] = np.sqrt(np.mean((place - truth) ** 2))
     assert errors["plain"] > 20.0
     assert errors["robust"] < 6.0
+
+
+@pytest.mark.parametrize("trials", [3, pytest.param(20, marks=pytest.mark.full)])
+def test_tracks_begin_among_wild_rows(trials):
+    update, rules = reweighted("iekf", "cauchy"), Rules(starts="robust")
+    for seed in range(100, 100 + trials):
+        problem, places, _ = wild_run(seed, 30, 0.3)
+        entries = list(tracked(problem, polynomial(1, 1.0), update, rules=rules))
+        place = collected(entries, 3).mean[:, :3]
+        begun = np.isfinite(place).all(-1)
+        assert begun[12:].all(), seed
+        assert np.linalg.norm(place - places, axis=-1)[begun].max() < 300.0, seed
+
+
+def test_rows_that_a_start_leaves_out_are_counted():
+    problem, _, wild = wild_run(1, 6, 0.15)
+    entries = list(tracked(problem, polynomial(1, 1.0), "iekf", rules=Rules(starts="robust")))
+    first = next(i for i, entry in enumerate(entries) if entry.event == "started")
+    own = problem.epoch == first
+    assert (int(entries[first].updated.count), entries[first].rejected) == (
+        int((own & ~wild).sum()),
+        int((own & wild).sum()),
+    )
 
 
 def test_an_unknown_loss_is_named():
