@@ -197,7 +197,10 @@ def dynamics_of(wanted: Wanted) -> Dynamics:
 
 
 def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
-    """Return the rules of options; where rows are weighed by a loss, starts name gross ones, too; raise InvalidProblem for a gate or a gap that is none."""
+    """Return the rules of options; raise InvalidProblem for a gate or a gap that is none.
+
+    Where a loss weighs rows, some are expected to be gross errors: starts name them, too.
+    """
     for value, where in ((gate, "--gate"), (gap, "--gap")):
         if value is not None and not value > 0.0:
             raise InvalidProblem(f"{value:g} is not positive", where, "give a positive number")

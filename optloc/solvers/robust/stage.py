@@ -85,7 +85,7 @@ _WEIGHINGS = 30
 # Gap of a rival that leaves out no more than the cheapest candidate does: the loss alone is no evidence between them.
 # Not zero, so that the cheapest stays first.
 _CLOSE = 1e-2
-# Minima that cost more than twice as much as the cheapest doubt so many more rows that no search from them ends near it.
+# Minima that cost more than twice the least doubt so many more rows that no search from them ends near it.
 _DEARER = 2.0
 # Content of the ellipsoid within which candidates are one answer with the same rows doubted a little differently.
 _ONE_ANSWER = 0.95
