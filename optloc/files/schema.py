@@ -485,16 +485,12 @@ def schema() -> dict[str, Any]:
 # Read a TOML file and hold it against the schema; every complaint is one sentence with its place.
 
 
-# Keys of stations that a network has and no problem: see `optloc.calibration.network_file`.
-_UNKNOWN_PLACES = {"dimension", "synchronised"}
-
-
 def read_document(path: Path) -> ProblemFile:
     """Return the contents of a problem file, or of standard input; raise InvalidProblem where it is none."""
     source = name_of(path)
     data = parse_toml(read_text(path), source, formats=(1, 2))
-    stations = data.get("stations")
-    if isinstance(stations, dict) and _UNKNOWN_PLACES & set(stations):
+    # these two a network alone has: `optloc.calibration.network_file`
+    if isinstance(stations := data.get("stations"), dict) and {"dimension", "synchronised"} & set(stations):
         raise InvalidProblem("the stations of this file are yet to be found", source, "use optloc calibrate")
     return validate(data, source)
 
