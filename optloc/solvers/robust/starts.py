@@ -114,6 +114,7 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
         if registrable(problem):
             # what gross errors have drawn to one side of the stations belongs to the other
             parts.append(_annealed(problem, mirror_courses(problem, parts[-1]), loss))
+        if len(problem.motions) == 1 and problem.motions[0].known is None and problem.motions[0].span == "run":
             parts.append(_through_epochs(problem, loss))
     return pack(np.concatenate(parts, axis=1))
 

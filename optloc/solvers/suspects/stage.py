@@ -124,7 +124,8 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
         )
     began = perf_counter()
     present = np.broadcast_to(problem.weight, (len(pool), problem.count))
-    doubted = _Doubted(np.asarray((pool.weights < _HALF) & (present > _HALF)), judge(problem, pool).x)
+    rejected = np.asarray((pool.weights < _HALF) & (present > _HALF))
+    doubted = _Doubted(rejected, judge(problem, pool).x if rejected.any() else pool.x[:, 0])
     if not np.array_equal(pool.weights, present):
         # a robust fix has its minima elsewhere: the test is that of least squares with every row
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
