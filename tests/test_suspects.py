@@ -468,6 +468,21 @@ def test_a_moving_target_is_found_and_its_wild_rows_are_named(epochs, share, tri
         assert (fix.weights[~wild] == 0.0).sum() <= 1, seed
 
 
+@pytest.mark.parametrize("seed", [8, 42, 54])
+def test_a_run_of_differences_may_have_nobody_and_somebody_to_accuse(seed):
+    """The fix with nobody left out is one of arrivals where these were looked at."""
+    rng = np.random.default_rng(seed)
+    stations, place = rng.uniform(-5e3, 5e3, (6, 2)), rng.uniform(-7e3, 7e3, 2)
+    arrival = np.tile(np.linalg.norm(place - stations, axis=1), (2, 1)) + 10.0 * rng.standard_normal((2, 6))
+    arrival[:, rng.integers(6)] += rng.choice([-1, 1]) * 100.0 * rng.uniform(0.5, 1.5)
+    z, epoch = (arrival[:, 1:] - arrival[:, :1]).ravel(), np.repeat([0, 1], 5)
+    rows = measured("tdoa", z, a=np.tile(EACH[1:6], 2), b=0, arrival_sigma=10.0, epoch=epoch)
+    fix = solve(assemble(stations, rows, times=[0.0, 1.0], motions=(Motion(),)), "robust")
+    assert fix.answered
+    assert fix.weights.shape == (10,)
+    assert () in {tuple(one.names) for one in fix.explanations[()]}
+
+
 def test_a_clean_run_accuses_nobody():
     accused = 0
     made, markers = run()

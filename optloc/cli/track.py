@@ -204,7 +204,7 @@ def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
     for value, where in ((gate, "--gate"), (gap, "--gap")):
         if value is not None and not value > 0.0:
             raise InvalidProblem(f"{value:g} is not positive", where, "give a positive number")
-    return Rules(gate=gate, gap=gap) if loss is None else Rules(gate=gate, gap=gap, starts="robust")
+    return Rules(gate=gate, gap=gap, starts="auto" if loss is None else "robust")
 
 
 def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:

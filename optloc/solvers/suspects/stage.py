@@ -318,7 +318,8 @@ def conclude_case(case: Case, finding: Finding) -> Conclusion | None:
     elsewhere = [rest for rest in others if not _same_place(best.fix, rest.fix)]
     if not best.left and not elsewhere:
         return None
-    work = case.work if best.left else case.problem
+    # of nobody left out the fix may be that of the problem as given, or of its arrivals
+    work = case.problem if best.fix.layout == case.problem.layout else case.work
     if case.refuted:  # it was found by other noise than is stated
         best = rest_of(case.groups, best.left, fix_without(work, case.groups, best.left, best.fix.x))
     best = prove_rest(work, case.groups, best)
