@@ -392,9 +392,9 @@ def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:
 def _sigmas(told: Told, found: Sequence[Readings]) -> list[str | None]:
     """Return the standard deviation of each sort as it is written, None where the table has its own."""
     if told.sigma is None:
-        lacking = next((one for one in found if one.sigma is None), None)
-        if lacking is not None:
-            raise _no_sigma("20 ns", lacking.form.kind if len(found) > 1 else "rows")
+        for one in found:
+            if one.sigma is None:
+                raise _no_sigma("20 ns", one.form.kind if len(found) > 1 else "rows")
         return [None] * len(found)
     if "=" not in told.sigma:
         if len({one.form.quantity for one in found}) > 1:

@@ -326,6 +326,14 @@ def sorts_of(roles: Roles, told: Told) -> list[str]:
     return fitting or (["times"] if roles.find("station") and roles.find("time") else [])
 
 
+def _kind_at_end(column: str) -> str | None:
+    """Return the kind whose name and unit end the name of a column, such as "range" of "raw_range_m"; else None."""
+    words = re.split(r"[_.\s]+", bare(column))
+    unit = any_unit(column)
+    ends = ["_".join([*words[i:], unit]) for i in range(1, len(words))] if unit is not None else []
+    return next((role for end in ends if (role := role_of(end)) in MODELS), None)
+
+
 def as_angles(roles: Roles, told: Told) -> Roles:
     """Return roles in which a column `elevation` without a unit is an angle or a height, as the options say.
 
@@ -361,7 +369,7 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
         Whether only lengths and their rates can be measurements of the table.
     """
     kind = sigma_kind(column)
-    role = role_of(column)
+    role = role_of(column) or _kind_at_end(column)
     if kind is not None or role is None or (lengths and role in MODELS and MODELS[role].quantity == "angle"):
         return None
     # One or two letters without a unit are too little to suspect a measurement.

@@ -15,7 +15,8 @@ from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
 from optloc.files.columns import any_unit, check_unit, rank, role_named, role_of, stem, unit_of
-from optloc.files.foreign import read_table, records
+from optloc.files.foreign import read_table
+from optloc.files.records import records
 from optloc.files.schema import MeasurementsTable, ProblemFile, join
 from optloc.files.table import Table
 from optloc.models import BEARING, MODELS, kind_named
