@@ -331,7 +331,7 @@ def _kind_at_end(column: str) -> str | None:
     words = re.split(r"[_.\s]+", bare(column))
     unit = any_unit(column)
     ends = ["_".join([*words[i:], unit]) for i in range(1, len(words))] if unit is not None else []
-    return next((role for end in ends if (role := role_of(end)) in MODELS), None)
+    return next((role for end in ends if (role := role_of(end)) is not None and role in MODELS), None)
 
 
 def as_angles(roles: Roles, told: Told) -> Roles:
