@@ -397,6 +397,13 @@ def test_a_window_needs_the_unit_of_the_times_not_their_name(name, unit, told, t
             read(tmp_path, text, window="0.06 s", **{key: value for key, value in told.items() if key != "time_unit"})
 
 
+@pytest.mark.parametrize("epochs", [1, 3])
+def test_a_window_without_times_is_refused_before_repeats_are(epochs, tmp_path):
+    text = "stamp_ms,anchor,range_m\n" + "".join(f"{k},{n},{r}\n" for k in range(epochs) for n, r in FAR.items())
+    with pytest.raises(InvalidProblem, match="a window needs a column of times; name the column"):
+        read(tmp_path, text, window="0.2 s")
+
+
 @pytest.mark.parametrize(
     ("told", "words"),
     [
