@@ -258,6 +258,8 @@ def test_a_role_of_places_that_is_named_is_used_or_refused(tmp_path):
         "range_sum_m",
         "slant_range_m",
         "raw.range_m",
+        "dist_raw_m",
+        "az_mean_deg",
         "depth_m",
         "tdoa_us",
         "rssd_dB",
@@ -281,6 +283,14 @@ def test_other_columns_are_named_in_one_line(columns, tmp_path):
     plan = read(tmp_path, text, what="range")
     assert dict(plan.about)["not used"] == ", ".join(columns)
     assert fixed(plan) < 1e-5
+
+
+@pytest.mark.parametrize("column", ["dist_corr_m", "far [cm]", "range_raw", "twr2", "angle_deg", "level_dB"])
+def test_times_are_no_arrivals_beside_a_column_that_may_hold_the_readings(column, tmp_path):
+    text = rows(f"time_s,anchor,{column}", "{t}e-9,{n},{r:.9f}")
+    with pytest.raises(InvalidProblem, match=r"the readings may be in '.*', or be the times in 'time_s'; say --column"):
+        read(tmp_path, text)
+    assert fixed(read(tmp_path, rows("time_s,anchor,squawk", "{t}e-9,{n},7000"))) < 1e-5
 
 
 def test_what_is_ignored_must_be_there(tmp_path):
@@ -385,6 +395,13 @@ def test_a_window_needs_the_unit_of_the_times_not_their_name(name, unit, told, t
             InvalidProblem, match=r"unit of the times in column '.*' is not known; say it with --time-unit"
         ):
             read(tmp_path, text, window="0.06 s", **{key: value for key, value in told.items() if key != "time_unit"})
+
+
+@pytest.mark.parametrize("epochs", [1, 3])
+def test_a_window_without_times_is_refused_before_repeats_are(epochs, tmp_path):
+    text = "stamp_ms,anchor,range_m\n" + "".join(f"{k},{n},{r}\n" for k in range(epochs) for n, r in FAR.items())
+    with pytest.raises(InvalidProblem, match="a window needs a column of times; name the column"):
+        read(tmp_path, text, window="0.2 s")
 
 
 @pytest.mark.parametrize(
