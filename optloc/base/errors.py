@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.types import Status
 
-__all__ = ["NUMERICAL", "InvalidProblem", "NoSolution", "OptlocError", "alike", "nearest"]
+__all__ = ["NUMERICAL", "InvalidProblem", "NoSolution", "OptlocError", "nearest"]
 
 # What arithmetic raises where numbers are at fault and not the program: those of numpy and scipy, of floating point and
 # of solvers (`formulations.backend.SolverError`). All else is a programming error, and surfaces.
@@ -118,18 +118,13 @@ def nearest(word: str, known: Iterable[str]) -> str:
         ``"did you mean 'km'? known are m, km"``.
     """
     names = list(islice(known, _MANY))
-    close = [repr(name) for name in alike(word, names)]
+    word = str(word)[:_SHOWN]
+    folded = {name.lower(): name for name in names}
+    close = [repr(folded[name]) for name in _alike(word.lower(), folded)]
     hint = f"did you mean {' or '.join(close)}?" if close else ""
     more = f" and {len(names) - _FEW} more" if len(names) > 2 * _FEW else ""
     listed = "" if close and len(names) > _FEW else f"known are {', '.join(names[:_FEW] if more else names)}{more}"
     return " ".join(part for part in (hint, listed) if part)
-
-
-def alike(word: str, known: Iterable[str]) -> list[str]:
-    """Return up to two known names that a word was perhaps meant to be; case does not matter."""
-    word = str(word)[:_SHOWN].lower()
-    folded = {name.lower(): name for name in islice(known, _MANY)}
-    return [folded[name] for name in _alike(word, folded)]
 
 
 def _alike(word: str, known: Iterable[str]) -> list[str]:

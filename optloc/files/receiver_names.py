@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import NamedTuple
 
-from optloc.base.errors import InvalidProblem, alike, nearest
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.units import UNITS
 from optloc.files.columns import any_unit, bare, is_sigma, role_of, tokens
 from optloc.files.readings import Named, quoted
@@ -17,6 +18,9 @@ _BESIDE = frozenset(("message", "id", "time", "target", "x", "y", "z", "lat", "l
 # Letters up to which names with the same numbers of letters and digits are of one series, such as A1 and B7: longer
 # words of equal length, such as Lake and note, have nothing in common.
 _SERIES = 2
+# Share of equal letters from which a name is a misspelt one: that of wset and west. Half of them are chance: squawk
+# and Quarry.
+_CLOSE = 0.75
 
 
 class _Pattern(NamedTuple):
@@ -121,7 +125,8 @@ def _same_quantity(one: str | None, other: str | None) -> bool:
 
 def _is_like(name: str, stations: Sequence[str]) -> bool:
     """Return whether a name is nearly that of a station, or of their series."""
-    return bool(alike(name, stations)) or _shape(name) in {_shape(station) for station in stations} - {None}
+    close = get_close_matches(name.lower(), [station.lower() for station in stations], n=1, cutoff=_CLOSE)
+    return bool(close) or _shape(name) in {_shape(station) for station in stations} - {None}
 
 
 def _shape(name: str) -> str | None:
