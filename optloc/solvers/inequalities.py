@@ -11,8 +11,10 @@ from optloc.base.types import Array, Status
 from optloc.linear.constraints import TOLERANCE, Face, exact, faces, violation
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
+from optloc.problem.fix import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
 from optloc.solvers.refine import refine
 
@@ -151,10 +153,15 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     broken = _breaks(problem, pool)
     if not broken.any():
         return pool
+    return _keep_misfits(problem, pool, broken, _bound(problem, pool, broken, descend))
+
+
+def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Pool:
+    """Return the pool of `bound_pool` where some candidates (N, q) are broken."""
     sides = faces(problem)
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     needy = np.flatnonzero(broken[np.arange(len(first)), first])
-    refused = np.where(broken & (pool.code == Status.OK), pool.cost, np.inf)
+    refused = np.where(broken & (pool.code == Status.OK) & _fits(pool, pool.cost), pool.cost, np.inf)
     kept = replace(_without(pool, broken), hidden=_name_hidden(problem, pool.x, refused))
     # where the cheapest is feasible it is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
@@ -169,6 +176,7 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     beyond = np.full((size, width), np.inf)
     for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (beyond, 4)):
         array[needy] = np.concatenate([found[place] for found in on_faces], axis=1)
+    beyond = np.where(_fits(pool, beyond), beyond, np.inf)
     return replace(
         kept,
         hidden=_first_told(kept.hidden, _name_hidden(problem, x, beyond)),
@@ -177,6 +185,30 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
         code=np.concatenate([kept.code, code], axis=1),
         face=np.concatenate([kept.face, face], axis=1),
     )
+
+
+def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> Pool:
+    """Return a pool with minima that fit badly behind the Earth, where no minimum in sight was found.
+
+    A wrong row may move the best minimum of a good network there: then the misfit is the reason, not the horizon.
+    """
+    unseen = ~((pool.code == Status.OK) & np.isfinite(pool.cost)).any(1)
+    back = broken & unseen[:, None] & (before.code == Status.OK) & ~_fits(before, before.cost)
+    item, slot = np.nonzero(back & np.isfinite(before.x).all(-1))
+    if not len(item):
+        return pool
+    inside = violation(problem.take(item), before.x[item, slot]) <= TOLERANCE
+    item, slot = item[inside], slot[inside]
+    cost, code = pool.cost.copy(), pool.code.copy()
+    cost[item, slot], code[item, slot] = before.cost[item, slot], before.code[item, slot]
+    return replace(pool, cost=cost, code=code)
+
+
+def _fits(pool: Pool, cost: Array) -> Array:
+    """Return which costs (N, q) noise explains; all of a pool with a loss, whose costs have no such test."""
+    if pool.loss:
+        return np.ones(cost.shape, dtype=bool)
+    return ~(tail_probability(cost, pool.dof[:, None]) < REFUTED)
 
 
 def without_broken(problem: Problem, pool: Pool) -> Pool:
