@@ -12,7 +12,8 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Bias
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact, restore, tangent_at
-from optloc.linear.normal import Normal, degrees_of_freedom, marginal, step
+from optloc.linear.normal import Normal, marginal, step
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.problem.bias import Form, Per, family
 from optloc.problem.chart import quantile

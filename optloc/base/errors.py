@@ -130,6 +130,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
 def _alike(word: str, known: Iterable[str]) -> list[str]:
     """Return up to two names that a word was perhaps meant to be; none for a single letter, which may be anything."""
     names = list(known)
+    if word.strip() in names:  # it differs by case, or by blanks at its ends
+        return [word.strip()]
     begun = [name for name in names if len(word) > 2 and name.startswith(word)][:2]
     # Half of the letters alike is chance, but for names of one length, such as R5 and R6.
     same = [name for name in names if len(name) == len(word)]

@@ -43,6 +43,7 @@ from optloc.files.readings import (
     sorts_of,
     without,
 )
+from optloc.files.receiver_names import check_receivers
 from optloc.files.roles import Places, Roles, check_told, in_space, places_of, scaled
 from optloc.files.schema import ConstraintTable, Units
 from optloc.files.shapes import epochs_of, inline, long, sigma_column, sigma_of, wide
@@ -337,6 +338,7 @@ def _plan(
     epochs = epochs_of(roles, told, found)
     sigmas = _sigmas(told, found)
     uses = uses_of(roles, told, found, epochs, sigmas)
+    check_receivers(roles.table, uses, named, place.names)
     rest = left_over(roles, uses, named)
     sections = tuple(_section(one, epochs, sigma) for one, sigma in zip(found, sigmas, strict=True))
     notes = [*roles.table.notes, *([place.note] if place.note else [])]
@@ -349,24 +351,10 @@ def _plan(
     after: tuple[str, ...] = ()
     if told.window is not None and "epoch" not in epochs:
         after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
-    notes += _left_out(roles, told, found)
     height, note = _height(found, place)
     notes += [*_few(sections, told), *([note] if note else [])]
     read = [*about(roles, told, place, found, epochs, uses), *([("not used", ", ".join(rest))] if rest else [])]
     return Plan(source, sections, place, tuple(read), tuple(notes), lines, after, height, uses)
-
-
-def _left_out(roles: Roles, told: Told, found: Sequence[Readings]) -> list[str]:
-    """Return a remark on columns that are in the unit of those of receivers, but name none."""
-    used = {cell for one in found for cell in one.cells}
-    if told.stations is None or len(used) <= len(found):
-        return []
-    units = {unit_of(name, UNITS["length"]) for name in used} - {None}
-    like = [name for name in roles.table.columns if name not in used and unit_of(name, UNITS["length"]) in units]
-    like = [name for name in like if name not in {roles.find(role) for role in ("time", "message", "sigma")}]
-    return (
-        [f"{', '.join(map(repr, like))} may hold readings, but name no station of {told.stations.name}"] if like else []
-    )
 
 
 def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:

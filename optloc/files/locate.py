@@ -101,8 +101,10 @@ def locate(
 
     Measurements are mappings of a station's name to a value, arrays (..., s) in the order of the stations, pandas
     series, or data frames with one column for each station (each row is a fix of its own) or with the columns station,
-    value and, where wanted, epoch. What was not heard is NaN. Several kinds may be given together. As many coordinates
-    come out as go in: without altitudes a target on Earth is taken to be at the level of the stations, 0 m.
+    value and, where wanted, epoch. Every name must be that of a station, those of all columns of a frame with one for
+    each station included; an unknown one is refused. What was not heard is NaN. Several kinds may be given together. As
+    many coordinates come out as go in: without altitudes a target on Earth is taken to be at the level of the stations,
+    0 m.
 
     Parameters
     ----------
@@ -333,8 +335,9 @@ def _readings(word: str, given: Any, names: Sequence[str], reference: str | None
     if reference is not None and reference not in names:
         raise InvalidProblem(f"there is no station {reference!r}", "reference", nearest(str(reference), names))
     first = names[0] if reference is None else reference
+    given = _with_names(given)
     if hasattr(given, "columns") and hasattr(given, "index"):
-        found = _of_table(word, given, names)
+        found = _of_table(word, given, names, first)
     elif hasattr(given, "index") and hasattr(given, "to_numpy"):
         found = _Readings(_numbers(word, given.to_numpy()), list(given.index))
     elif isinstance(given, Mapping):
@@ -361,6 +364,17 @@ def _readings(word: str, given: Any, names: Sequence[str], reference: str | None
     return _Readings(found.values[..., kept], [ends[i] for i in kept], found.unit)
 
 
+def _with_names(given: Any) -> Any:
+    """Return a structured array as a mapping, and tables of polars, pyarrow and xarray as pandas has them.
+
+    Each of them names what its values belong to: an array alone would take them in the order of the stations.
+    """
+    fields = getattr(getattr(given, "dtype", None), "names", None)
+    if fields:
+        return {name: given[name] for name in fields}
+    return given.to_pandas() if hasattr(given, "to_pandas") else given
+
+
 def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[int, int]:
     """Return the numbers of the stations that a key names; -1 where there is one station only."""
     pair = key if isinstance(key, tuple) else (key,)
@@ -378,13 +392,38 @@ def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[in
     return one, other[0] if other else -1
 
 
-def _of_table(word: str, frame: Any, names: Sequence[str]) -> _Readings:
+def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: str) -> list[Any]:
+    """Return the columns of a data frame whose names are those of stations, or of pairs of them."""
+    found = []
+    for column in columns:
+        try:
+            _ends(word, column, names, reference)
+        except InvalidProblem:
+            continue
+        found.append(column)
+    return found
+
+
+def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> _Readings:
+    """Return the values of a data frame with one column for each station or pair; every column must be one."""
+    columns = list(frame.columns)
+    for column in columns:
+        try:
+            _ends(word, column, names, reference)
+        except InvalidProblem as error:
+            advice = f"{error.advice}; drop a column that holds no {_WORDS[word].noun}"
+            raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
+    # By number: two columns may have one name.
+    values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
+    return _Readings(np.stack(values, axis=-1), columns)
+
+
+def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> _Readings:
     """Return the values of a data frame: one column for each station, or one row for each value."""
-    wide = [
-        name for name in frame.columns if str(name) in names or (isinstance(name, tuple) and set(name) <= set(names))
-    ]
-    if wide:
-        return _Readings(np.stack([_numbers(word, frame[name].to_numpy()) for name in wide], axis=-1), wide)
+    columns = list(frame.columns)
+    wide = _named(word, columns, names, reference)
+    if wide and len(wide) == len(columns):
+        return _wide(word, frame, names, reference)
     stems = {stem(str(name)): name for name in reversed(list(frame.columns))}
     kind = _WORDS[word].kind
     value_words = [*WORDS["z"].split(), *(stem(each) for each in (word, word.rstrip("s"), kind, *MODELS[kind].aliases))]
@@ -393,11 +432,16 @@ def _of_table(word: str, frame: Any, names: Sequence[str]) -> _Readings:
         role: next((stems[each] for each in words if each in stems), None)
         for role, words in (("a", WORDS["a"].split()), ("b", WORDS["b"].split()), ("z", value_words))
     }
+    tidy = None not in (chosen["a"], chosen["z"]) and {*wide} <= {*chosen.values()}
+    if wide and not tidy:
+        return _wide(word, frame, names, reference)
     for role, text in (("a", "station"), ("z", "value")):
         if chosen[role] is None:
-            columns = ", ".join(str(name) for name in frame.columns)
+            listed = ", ".join(str(name) for name in columns)
             advice = "call columns by the stations, or use the columns station and value"
-            raise InvalidProblem(f"no column is a {text}; there are {columns}", word, advice)
+            if {str(label) for label in frame.index} <= {*names}:
+                advice = "its rows are the stations: give the transposed frame, .T"
+            raise InvalidProblem(f"no column is a {text}; there are {listed}", word, advice)
     epochs = next((stems[each] for each in ("epoch", "message", "msg", "pulse") if each in stems), None)
     ends = [str(name) for name in frame[chosen["a"]]]
     if word == "tdoa" and chosen["b"] is not None:

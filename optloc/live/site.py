@@ -34,6 +34,21 @@ _KEPT = 64
 _OWN = ("sigma", "weight", "correction")
 
 
+class UnknownName(InvalidProblem):
+    """A line names a station or a kind that the site does not have.
+
+    Attributes
+    ----------
+    event : str
+        The event of the line, "" where it is not known.
+    whole : bool
+        Whether the event consists of this line alone.
+    """
+
+    event: str = ""
+    whole: bool = True
+
+
 class Row(NamedTuple):
     """A row as an event names it.
 
@@ -177,8 +192,10 @@ class Site:
 
         Raises
         ------
-        InvalidProblem
+        UnknownName
             For a kind that the site has not, or a station that it does not know.
+        InvalidProblem
+            Where there is a station too many or too few.
         """
         known = self.index.get((kind, a, b))
         if known is not None:
@@ -186,14 +203,14 @@ class Site:
         alike = [row for row in self.rows if row.kind == kind]
         if not alike:
             kinds = list(dict.fromkeys(row.kind for row in self.rows))
-            raise InvalidProblem(f"the site has no rows of the kind {kind[:40]!r}", "kind", nearest(kind, kinds))
+            raise UnknownName(f"the site has no rows of the kind {kind[:40]!r}", "kind", nearest(kind, kinds))
         count = MODELS[kind].stations
         for key, name, needed in (("a", a, count > 0), ("b", b, count > 1)):
             if bool(name) != needed:
                 what = "the station is missing" if needed else "there is a station too many"
                 raise InvalidProblem(what, key, f"{kind} rows name {count} of them")
             if needed and name not in self.number:
-                raise InvalidProblem(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
+                raise UnknownName(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
         if a == b and count > 1:
             raise InvalidProblem(f"{kind} names station {a!r} twice", "b", "name two stations")
         return Row(alike[0].section, -1, kind, a, b)

@@ -23,7 +23,7 @@ from optloc.live.engine import BATCH, Engine
 from optloc.live.events import LINE, Events, parse
 from optloc.live.metrics import Metrics
 from optloc.live.queues import Inbox, Line, Outbox, Ticket
-from optloc.live.site import Site, read_site
+from optloc.live.site import Site, UnknownName, read_site
 from optloc.live.tracks import Following, Tracks
 
 LOG = logging.getLogger("optloc.live")
@@ -276,17 +276,20 @@ class Stream:
         refused = None
         if data:
             counts["lines"] += 1
+            track = self._settings.track if line.track is None else line.track
             try:
                 message = parse(data, self.site)
                 self._keep(data, line.stamp)
                 if message.command:
                     refused = self._obey(message.command)
                 else:
-                    track = self._settings.track if line.track is None else line.track
                     self._events.take(message, line.stamp, line.when, ticket, track=track)
             except Exception as error:  # a stream goes on, whatever one line brings to light
                 if not isinstance(error, InvalidProblem):
                     LOG.exception("line %d of %s failed", line.number, line.source)
+                if isinstance(error, UnknownName):
+                    self._keep(data, line.stamp)
+                    self._events.refuse(error, line.stamp, line.when, track=track)
                 counts["malformed"] += 1
                 refused = {"error": str(error), "line": line.number, "source": line.source}
                 if ticket is None:
@@ -424,6 +427,7 @@ def state_of(events: Events, unwritten: dict[str, of_events.Event]) -> Record:
         times = [[site.stations[i], str(value)] for i, value in event.times.items()]
         about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
         about |= {"when": None if event.when is None else str(event.when), "track": event.track}
+        about |= {"refused": event.refused} if event.refused else {}
         return {"event": event.name, "rows": rows, "times": times, **about}
 
     return {
@@ -472,7 +476,7 @@ def restore(path: Path, events: Events, now: float) -> None:
             event.revision, event.conflict = int(each["revision"]), bool(each["conflict"])
             # a checkpoint of before there were tracks has neither
             event.when = None if each.get("when") is None else int(each["when"])
-            event.track = bool(each.get("track"))
+            event.track, event.refused = bool(each.get("track")), str(each.get("refused", ""))
             events.open[event.name] = event
         events.metrics.counts.update({name: int(n) for name, n in found["counts"].items()})
     except (KeyError, TypeError, ValueError) as error:

@@ -15,7 +15,7 @@ from optloc.base.errors import NUMERICAL
 from optloc.base.records import Axes, join, overwrite
 from optloc.base.threads import flow
 from optloc.base.types import Array, Status
-from optloc.linear.normal import degrees_of_freedom
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models.layers import Layers
 from optloc.problem.claims import Claims
 from optloc.problem.fix import Fix, Stage

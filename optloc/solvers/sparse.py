@@ -14,6 +14,7 @@ from optloc.base import linalg
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
+from optloc.linear.redundancy import present_unknowns
 from optloc.models import MODELS
 from optloc.problem.arrivals import as_arrivals
 from optloc.problem.noise import variances
@@ -356,8 +357,7 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
 def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
     """Return the largest of the rows in error (N, m), so many that one row more than unknowns is left."""
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
-    unknown = problem.layout.n_shared + problem.layout.n_local * problem.epochs
-    most = np.maximum(present.sum(1, keepdims=True) - unknown - 1, 0)
+    most = np.maximum(present.sum(1, keepdims=True) - present_unknowns(problem)[:, None] - 1, 0)
     # argsort of argsort is the rank: 0 for the largest
     rank = np.argsort(np.argsort(-np.where(wrong, size, -np.inf), axis=1, kind="stable"), axis=1)
     return np.asarray(wrong & (rank < most))

@@ -21,7 +21,7 @@ from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
 from optloc.solvers.formulations import FORMULATIONS
-from optloc.solvers.inequalities import bound_pool, least_finished
+from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
@@ -239,6 +239,8 @@ def _answer(
     # where all that is known is hidden by the Earth, another minimum may be in sight
     hidden = np.zeros(len(fix.code), dtype=bool) if pool.hidden is None else pool.hidden != ""
     lost = ~fix.answered & (hidden | ~np.isin(fix.code, _SETTLED))
+    behind = np.flatnonzero(fix.answered & (fix.code == Status.MISFIT)) if problem.frame.geodetic else []
+    lost[behind] = is_hidden(problem.take(behind), fix.x[behind]) if len(behind) else False
     # unlinked groups have fewer equations than the count says: without redundancy any place would fit
     lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
     items = np.flatnonzero(lost)

@@ -432,7 +432,7 @@ def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
     broken, hidden = violation(part, x) > TOLERANCE, is_hidden(part, x)
     names = violation_names(work.problem)
     for item, breaks, behind in zip(items[barred], broken, hidden, strict=True):
-        why = f"a constraint forbids it ({names})" if breaks else "the Earth hides it from a satellite"
+        why = f"a constraint forbids it ({names})" if breaks else "the Earth hides it from a station"
         _give_up(work, np.array([item]), BARRED.format(why) if breaks or behind else LOST)
 
 

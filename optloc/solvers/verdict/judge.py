@@ -77,12 +77,17 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
     with np.errstate(invalid="ignore"):
-        lost = (code != Status.OK) | weak | is_improbable(cost, pool.dof, DOUBT)
-    far = answered & _runs_away(problem, curvature, distance, lost)
+        improbable = is_improbable(cost, pool.dof, DOUBT)
+    far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | improbable)
+    # No minimum in sight fits, and one that fits is hidden: that says more than where a refinement in sight broke off.
+    barred = answered & _has_hidden(pool) & ((code != Status.OK) | ((weak | far) & improbable))
+    far &= ~barred
     # far away every direction is weak: how far says more
-    weak &= ~far
+    weak &= ~(far | barred)
     code[broken], code[few], code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
-    code[weak] = Status.SINGULAR_GEOMETRY
+    code[weak], code[barred] = Status.SINGULAR_GEOMETRY, Status.INFEASIBLE
+    for i in np.flatnonzero(barred):
+        reason[i] = _hidden_or(pool, int(i), "")
     for i in np.flatnonzero(few):
         reason[i] = _lacking(-int(pool.dof[i]))
     for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
@@ -103,7 +108,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, DOUBT), reason)
     if pool.asked:
         _weigh_redundancy(pool, finished, reason)
-    return Ruling(marks, reason, proven, broken | few | missing | weak | far)
+    return Ruling(marks, reason, proven, broken | few | missing | barred | weak | far)
 
 
 def fill(count: int, value: object) -> Array:
@@ -152,10 +157,9 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
         return
     barred = items[code[items] == Status.INFEASIBLE]
     for i in barred:
-        hidden = "" if pool.hidden is None else pool.hidden[i]
         bounds = violation_names(problem)
         missed = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides all that was found"
-        reason[i] = hidden or missed
+        reason[i] = _hidden_or(pool, int(i), missed)
     items = np.setdiff1d(items, barred)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves
@@ -190,6 +194,16 @@ def _short(problem: Problem) -> str:
         if motion.known is None and motion.span == "run" and rows < needed:
             lacking.append(f"target {i} has {rows} measurement{'' if rows == 1 else 's'} for {needed} unknowns")
     return "; ".join(lacking[:_SHOWN]) if len(problem.motions) > 1 else ""
+
+
+def _has_hidden(pool: Pool) -> Array:
+    """Return where a minimum lies behind the Earth, (N,)."""
+    return np.zeros(len(pool), dtype=bool) if pool.hidden is None else np.asarray(pool.hidden != "", dtype=bool)
+
+
+def _hidden_or(pool: Pool, item: int, otherwise: str) -> str:
+    """Return the sentence on what lies behind the Earth of one problem; another one where there is none."""
+    return otherwise if pool.hidden is None else pool.hidden[item] or otherwise
 
 
 def _name_hidden(hidden: Array, items: Array, reason: Array) -> None:
