@@ -365,6 +365,15 @@ def ends_of(problem: Problem, by: By) -> Ends:
     if by not in GROUPINGS:
         raise InvalidProblem(f"unknown grouping {by!r}", "by", nearest(str(by), GROUPINGS))
     parts = [_ends(problem, rows.kind, rows.a, rows.b, by) for rows in problem.rows]
+    # Errors of compass bearings are clockwise; those of a group that is read both ways are anticlockwise.
+    azimuths = [
+        (rows.clockwise, name) for rows, (name, _) in zip(problem.rows, parts, strict=True) if rows.kind == "azimuth"
+    ]
+    other = {text for clockwise, name in azimuths if not clockwise for text in name.ravel().tolist()}
+    parts = [
+        (name, np.where(np.isin(name, list(other)), sign, rows.sense * sign) if rows.clockwise else sign)
+        for rows, (name, sign) in zip(problem.rows, parts, strict=True)
+    ]
     return Ends(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 

@@ -95,6 +95,9 @@ class Rows:
         1 for a row as measured, 0 for an absent one; between, its own variance is divided by the weight.
     correction : array (..., m)
         Known amount by which the measurement exceeds the model, for instance refraction.
+    clockwise : bool
+        Whether the azimuths were read clockwise, from a compass. `z` and `correction` are anticlockwise all the same;
+        errors of the readings (biases, residuals, suspects) are reported clockwise, in the sense of the readings.
     """
 
     kind: str
@@ -105,6 +108,12 @@ class Rows:
     target: Array
     weight: Array
     correction: Array
+    clockwise: bool = False
+
+    @property
+    def sense(self) -> float:
+        """Return -1 where errors are reported clockwise, else 1: the sign between them and errors of `z`."""
+        return -1.0 if self.clockwise else 1.0
 
     @property
     def count(self) -> int:
@@ -155,7 +164,8 @@ class Bias:
     row, member : int array (n,)
         Sparse design: which global rows are touched, and by which member.
     coefficient : float array (n,)
-        Sign or size of each touch, for instance +1 for station a and -1 for station b.
+        Sign or size of each touch, for instance +1 for station a and -1 for station b. Of compass bearings -1: their
+        bias is clockwise, like the readings.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         Added to the measurement; times the measured quantity; times seconds since the first target's reference time
         (by default the first epoch); or a turn of

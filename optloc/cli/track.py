@@ -269,8 +269,8 @@ def _one_after_another(parts: list[Rows]) -> Rows:
     def of(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    z, weight, correction = of("z"), of("weight"), of("correction")
-    return Rows(parts[0].kind, z, of("a"), of("b"), of("epoch"), of("target"), weight, correction)
+    columns = ("z", "a", "b", "epoch", "target", "weight", "correction")
+    return replace(parts[0], **{name: of(name) for name in columns})
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:

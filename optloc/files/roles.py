@@ -299,10 +299,15 @@ def _said(name: str) -> str | None:
 
 ASSUMED = " (no convention is named)"
 """What is said beside azimuths of format 1 that might be meant otherwise."""
-_OTHER = {"north-clockwise": "east-counterclockwise", "east-counterclockwise": "north-clockwise"}
+_OTHER = {
+    "north-clockwise": "east-counterclockwise",
+    "east-counterclockwise": "north-clockwise",
+    "north-counterclockwise": "north-clockwise",
+}
 _COUNTED = {
     "north-clockwise": "the compass, clockwise from north (+y)",
     "east-counterclockwise": "the axes, anticlockwise from east (+x)",
+    "north-counterclockwise": "north (+y), anticlockwise",
 }
 
 
