@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import Any, Literal
 
@@ -95,9 +95,6 @@ class Rows:
         1 for a row as measured, 0 for an absent one; between, its own variance is divided by the weight.
     correction : array (..., m)
         Known amount by which the measurement exceeds the model, for instance refraction.
-    clockwise : bool
-        Whether the azimuths were read clockwise, from a compass. `z` and `correction` are anticlockwise all the same;
-        errors of the readings (biases, residuals, suspects) are reported clockwise, in the sense of the readings.
     """
 
     kind: str
@@ -108,17 +105,30 @@ class Rows:
     target: Array
     weight: Array
     correction: Array
-    clockwise: bool = False
-
-    @property
-    def sense(self) -> float:
-        """Return -1 where errors are reported clockwise, else 1: the sign between them and errors of `z`."""
-        return -1.0 if self.clockwise else 1.0
 
     @property
     def count(self) -> int:
         """Return the number of rows."""
         return int(self.a.shape[0])
+
+    @property
+    def sense(self) -> float:
+        """Return the sign of errors of `z` in reports of biases, residuals and suspects: -1 of compass bearings."""
+        return 1.0
+
+    def clockwise(self) -> Rows:
+        """Return the same rows as compass bearings, whose errors are reported clockwise, as they were read."""
+        return CompassRows(*(getattr(self, one.name) for one in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class CompassRows(Rows):
+    """Azimuths that were read clockwise from north: `z` is anticlockwise from the first axis all the same."""
+
+    @property
+    def sense(self) -> float:
+        """Return -1."""
+        return -1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -269,8 +270,9 @@ def _one_after_another(parts: list[Rows]) -> Rows:
     def of(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    columns = ("z", "a", "b", "epoch", "target", "weight", "correction")
-    return replace(parts[0], **{name: of(name) for name in columns})
+    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
+    columns: dict[str, Any] = {name: of(name) for name in names}
+    return replace(parts[0], **columns)
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:

@@ -21,12 +21,24 @@ from optloc.base.inputs import at_most
 from optloc.base.outputs import claim, together, write_text
 from optloc.base.types import Array
 from optloc.base.units import UNITS
+from optloc.files.declination import angle_of, date_of
 from optloc.files.foreign import read_table
 from optloc.files.measurements import ESTIMATE
 from optloc.files.orbits import read_orbits
-from optloc.files.pseudoranges import is_gnss, received
+from optloc.files.pseudoranges import at_reception, is_gnss, received
 from optloc.files.reader import Loaded, read
-from optloc.files.readings import CARTESIAN, COMPASS, Named, Readings, Told, named_columns, sort_named, sorts_of
+from optloc.files.readings import (
+    CARTESIAN,
+    COMPASS,
+    CONVENTIONS,
+    COUNTER,
+    Named,
+    Readings,
+    Told,
+    named_columns,
+    sort_named,
+    sorts_of,
+)
 from optloc.files.roles import GUESSES, PLACE, Places, Roles, places_of, scaled, stem, unit_of
 from optloc.files.schema import ConstraintTable, Units
 from optloc.files.shapes import epochs_of, inline, long, wide
@@ -198,7 +210,7 @@ def _check_told(told: Told) -> None:
     for role in told.columns:
         if role not in GUESSES and role not in MODELS:
             raise InvalidProblem(f"there is no role {role!r}", "--column", nearest(role, GUESSES))
-    choices = {"frame": ("cartesian", "ecef"), "azimuth": (COMPASS, CARTESIAN), "positive": ("a-farther", "b-farther")}
+    choices = {"frame": ("cartesian", "ecef"), "azimuth": CONVENTIONS, "positive": ("a-farther", "b-farther")}
     for name, known in choices.items():
         given = getattr(told, name)
         if given not in (None, *known):
@@ -273,7 +285,10 @@ def _may_be(one: Named, told: Told) -> bool:
 def _plan(roles: Roles, told: Told, place: Places, source: Path, found: Sequence[Readings]) -> Plan:
     """Return what readings become."""
     epochs = epochs_of(roles, told, found)
-    sections = tuple(_section(one, epochs, sigma) for one, sigma in zip(found, _sigmas(told, found), strict=True))
+    sections = tuple(
+        _with_declination(_section(one, epochs, sigma), one, told)
+        for one, sigma in zip(found, _sigmas(told, found), strict=True)
+    )
     notes = [*roles.table.notes, *([place.note] if place.note else [])]
     notes += dict.fromkeys(note for one in found for note in one.notes)
     lines: tuple[str, ...] = ()
@@ -377,6 +392,18 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
 
 
+def _with_declination(section: Section, found: Readings, told: Told) -> Section:
+    """Return a section of bearings with the declination that is told."""
+    if told.declination is None or found.form.kind != "azimuth":
+        return section
+    if found.azimuth == CARTESIAN:
+        raise InvalidProblem("angles from the x axis have no declination", "--declination", "leave it out")
+    day = date_of(told.declination, "--declination")
+    angle_of(told.declination if day is None else 0.0, "rad" if day is not None else None, "--declination")
+    line = f"declination = {json.dumps(told.declination.strip())}"
+    return replace(section, lines=(*section.lines, line))
+
+
 def _share(sigma: str, unit: str) -> str:
     """Return the part of one station in the standard deviation of a difference, an amount as text."""
     number, own = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
@@ -420,6 +447,14 @@ def _few(sections: Sequence[Section], told: Told) -> list[str]:
     return []
 
 
+# What azimuths of each convention are.
+_ORIENTED = {
+    COMPASS: "bearings of a compass",
+    CARTESIAN: "angles from the x axis",
+    COUNTER: "angles from north, anticlockwise",
+}
+
+
 def _about(
     roles: Roles, told: Told, place: Places, found: Sequence[Readings], epochs: Mapping[str, Array]
 ) -> list[tuple[str, str]]:
@@ -430,9 +465,8 @@ def _about(
         cells = list(dict.fromkeys(one.cells))
         shown = ", ".join(cells[:_NAMED]) + (f" and {len(cells) - _NAMED} more columns" if len(cells) > _NAMED else "")
         unit = f" in {one.unit}" if one.unit != "1" else ""
-        text = {COMPASS: "bearings of a compass", CARTESIAN: "angles from the x axis"}.get(
-            str(one.azimuth), one.form.text
-        )
+        text = _ORIENTED.get(str(one.azimuth), one.form.text)
+        text = text if one.heading is None else f"bearings from the bow, plus {one.heading}"
         out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {text}"))
         if one.b is not None and one.form.kind != "range_sum":
             out.append(
@@ -442,6 +476,7 @@ def _about(
     wanted += PLACE if told.stations is None else ()
     wanted = tuple(role for role in wanted if role != "sigma" or any(one.sigma is not None for one in found))
     named = {role: column for role in wanted if (column := roles.find(role))}
+    named |= next(({"heading": one.heading} for one in found if one.heading is not None), {})
     if "epoch" in epochs:
         roles_ = ("message", "time") if told.window is None else ("time",)
         by = next((f"column {named[role]}" for role in roles_ if role in named), "row")
@@ -462,6 +497,10 @@ def _about(
 # A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
 
 
+# What a problem file says of satellites.
+_AT_RECEPTION = ("# Satellites are where they were when they sent, along the axes of the Earth at reception.",)
+
+
 def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
     """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
     if told.sigma is None:
@@ -473,18 +512,26 @@ def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
     place = np.stack([scaled(roles, axis, "length", length) for axis in "xyz"], axis=-1)
     _check_far(roles, place * UNITS["length"][length])
     _check_once(roles, epoch, satellite)
+    notes: tuple[str, ...] = ()
+    if not told.turned:
+        metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
+        place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
+        notes = (
+            "satellites are turned with the Earth during the flight of the signal; --turned takes them as they are",
+        )
     columns = {"epoch": epoch, "a": satellite, "z": z}
     named = roles.column("epoch")
     if stem(named) != "epoch" and "+" not in named:
         columns["time"] = roles.numbers("epoch")
     satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
     section = Section("toa", columns, unit, told.sigma, "the range and the receiver's clock")
+    when = "reception" if told.turned else "transmission"
     about = (
         ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('pseudorange')}, with a clock of each epoch"),
         ("epochs", f"{len(set(epoch.tolist()))} by column {named}"),
-        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF"),
+        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF at {when}"),
     )
-    return Plan(source, (section,), Places(satellites, "ecef", length), about)
+    return Plan(source, (section,), Places(satellites, "ecef", length), about, notes, _AT_RECEPTION)
 
 
 def _gnss(source: Path, told: Told) -> Plan:
@@ -494,7 +541,7 @@ def _gnss(source: Path, told: Told) -> Plan:
     columns["sigma"] = np.round(found.sigma, 3)
     places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
     section = Section("toa", columns, "m", None, "the range and the receiver's clock")
-    return Plan(source, (section,), Places(places, "ecef", "m"), found.about, found.notes)
+    return Plan(source, (section,), Places(places, "ecef", "m"), found.about, found.notes, _AT_RECEPTION)
 
 
 def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:

@@ -334,7 +334,8 @@ def _rows(
             "epoch": np.concatenate([index[i] for i in same]),
             "target": np.concatenate([target[i] for i in same]),
         }
-        rows.append(Rows(kind, **columns, **joined, clockwise=clockwise))
+        made = Rows(kind, **columns, **joined)
+        rows.append(made.clockwise() if clockwise else made)
         for i in same:
             numbers[i] = start + np.arange(len(chunks[i].z))
             start += len(chunks[i].z)

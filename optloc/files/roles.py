@@ -50,6 +50,7 @@ GUESSES = {
     "p": "p tp ptime ppick parrival",
     "s": "s ts stime spick sarrival",
     "sp": "sp sminusp spdifference stmp tstp",
+    "heading": "heading hdg trueheading headingtrue magneticheading headingmagnetic magheading",
     "satellite": "satellite sat prn sv svid satid",
     "pseudorange": "pseudorange pr prange rho c1c prm",
     "name": f"{WORDS['name']} user",
@@ -390,7 +391,9 @@ def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: 
 
 def _upwards(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
     """Return heights, None where there are none, and their unit; depths are heights that grow downwards."""
-    found = next((one for one in (role, "depth") if roles.find(one) is not None), None)
+    named = {one: column for one in (role, "depth") if (column := roles.find(one)) is not None}
+    # An elevation in degrees is an angle, not a height.
+    found = next((one for one, name in named.items() if _said(name) in (None, *UNITS["length"])), None)
     if found is None:
         return None, unit or "m"
     unit = unit or unit_of(roles.column(found), UNITS["length"]) or "m"

@@ -214,7 +214,7 @@ def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array
     """Refuse a bias of azimuths that are counted both ways, and a scale of those that are counted from north."""
     ends = np.cumsum([block.count for block in rows])
     touched = {int(i) for i in np.unique(np.searchsorted(ends, bias.row, side="right"))}
-    senses = {rows[i].clockwise for i in touched if rows[i].kind == "azimuth"}
+    senses = {rows[i].sense for i in touched if rows[i].kind == "azimuth"}
     if len(senses) > 1 and bias.form != "time":
         what = "it touches azimuths that are counted clockwise and others that are counted anticlockwise"
         advice = "count all of them one way, or name with members who is read which way"

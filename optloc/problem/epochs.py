@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -465,7 +466,7 @@ def _append(one: Rows, two: Rows) -> Rows:
         shape = batch if a.ndim > 1 or b.ndim > 1 else ()
         return np.concatenate([np.broadcast_to(v, (*shape, v.shape[-1])) for v in (a, b)], axis=-1)
 
-    arrays = {name: both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS}
+    arrays: dict[str, Any] = {name: both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS}
     return replace(one if one.count else two, **arrays)
 
 
