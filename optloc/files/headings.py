@@ -8,8 +8,9 @@ from decimal import Decimal
 from optloc.base.errors import InvalidProblem
 from optloc.base.units import UNITS
 from optloc.files.cells import numbers
+from optloc.files.columns import stem, unit_of
 from optloc.files.readings import BOW, COMPASS, Readings, Told, in_unit, marks_of
-from optloc.files.roles import Roles, stem, unit_of
+from optloc.files.roles import Roles
 
 # A turn in each unit, and the radians of one: an angle without unit that is larger is in degrees.
 _TURNS = {"deg": Decimal(360)}

@@ -16,9 +16,10 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Stations
 from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
+from optloc.files.columns import stem, unit_of
 from optloc.files.declination import angle_of, date_of, declinations
 from optloc.files.readings import CARTESIAN, COMPASS
-from optloc.files.roles import WORDS, stem, unit_of, worded
+from optloc.files.roles import WORDS, worded
 from optloc.files.schema import FrameTable, StationsTable, Units
 from optloc.files.stations import survey
 from optloc.files.table import Table, of_frame
