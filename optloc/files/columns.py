@@ -88,7 +88,7 @@ _FIXED = {
     "sp": _role("time from P to S", "sp sminusp spdifference stmp tstp", _CLOCK),
     "heading": _role(
         "heading of the vehicle, added to its bearings",
-        "heading hdg trueheading headingtrue magneticheading headingmagnetic magheading", _ANGLE,
+        "heading hdg trueheading headingtrue magneticheading headingmagnetic magheading headingmag", _ANGLE,
     ),
     "satellite": _role("satellite of the row", "satellite sat prn sv svid satid"),
     "x": _role("coordinate of a station", "x satx xecef ecefx xsat", _LENGTH),

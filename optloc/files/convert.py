@@ -252,8 +252,17 @@ def understood(source: Path, told: Told) -> Plan:
         For what is wrong, and for what may mean two things: naming the option that says which.
     """
     _check_told(told)
-    if is_gnss(source):
-        return _gnss(source, told)
+    plan = _gnss(source, told) if is_gnss(source) else _of_table(source, told)
+    azimuths = any(section.kind == "azimuth" for section in plan.sections)
+    if told.declination is not None and not azimuths:
+        raise InvalidProblem("the table has no bearings", "--declination", "leave it out")
+    if told.turned and _AT_RECEPTION != plan.lines:
+        raise InvalidProblem("the table has no satellites", "--turned", "leave it out")
+    return plan
+
+
+def _of_table(source: Path, told: Told) -> Plan:
+    """Return what a table is."""
     table = without(read_table(source), told.ignore)
     own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
     roles = Roles.of(table, own)
@@ -341,8 +350,9 @@ def _plan(
     rest = left_over(roles, uses, named)
     parts = zip(found, sigmas, strict=True)
     sections = tuple(_with_declination(_section(one, epochs, sigma), one, told) for one, sigma in parts)
-    notes = [*roles.table.notes, *([place.note] if place.note else [])]
-    notes += dict.fromkeys(note for one in found for note in one.notes)
+    notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
+    notes += [place.note] if place.note else []
+    notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
     lines: tuple[str, ...] = ()
     if any(one.form.value == "sp" for one in found):
         speed = _sp_speed(told)

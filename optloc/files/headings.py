@@ -85,9 +85,9 @@ def from_bow(found: Readings, roles: Roles, column: str, told: Told) -> Readings
     if found.unit in _TURNS:
         turn = _TURNS[found.unit]
         sums = [(value % turn + turn) % turn for value in sums]
-    note = f"bearings are taken clockwise from the bow, and {column!r} is added"
+    note = f"bearings are taken clockwise from the bow of the vehicle, and its heading was added, column {column!r}"
     note += "" if told.azimuth == BOW else f"; --azimuth {COMPASS} takes them as true bearings"
-    return replace(found, values=sums, azimuth=COMPASS, heading=column, notes=(*found.notes, note))
+    return replace(found, values=sums, azimuth=COMPASS, heading=column, notes=(note, *found.notes))
 
 
 def _unit(column: str, held: list[Decimal], told: Told, where: str) -> str:
