@@ -144,6 +144,24 @@ def test_a_declination_without_bearings_from_north_is_refused(tmp_path):
         fixed(path, sigma="1 m", declination="4 deg")
 
 
+def test_stations_of_a_table_may_have_headings(tmp_path):
+    path, sites = tmp_path / "seen.csv", tmp_path / "sites.csv"
+    lines, rows = ["station,bearing_deg"], ["name,lat,lon,heading_deg"]
+    for k, (lat, lon, course) in enumerate(COURSE):
+        lines.append(f"S{k},{(true_bearing(lat, lon) - course) % 360.0!r}")
+        rows.append(f"S{k},{lat},{lon},{course}")
+    path.write_text("\n".join(lines) + "\n")
+    sites.write_text("\n".join(rows) + "\n")
+    plan = understood(path, Told(sigma="1 deg", stations=sites))
+    assert off(solve(plan.read().problem)) < 0.1
+    assert "bearings are taken from the headings of the stations" in plan.notes[0]
+    sites.write_text("\n".join(rows).replace(",65.0", ",") + "\n")
+    with pytest.raises(InvalidProblem, match="station 'S2' has no heading"):
+        understood(path, Told(sigma="1 deg", stations=sites))
+    path.write_text(path.read_text().replace("bearing_deg", "range_m"))
+    assert "heading_deg" not in understood(path, Told(sigma="1 m", stations=sites)).places.columns
+
+
 def test_json_and_range_beside_the_bearing(tmp_path):
     rows = []
     for lat, lon, course in COURSE:

@@ -25,6 +25,7 @@ from optloc.files.cells import moments
 from optloc.files.columns import PLACE, role_named, role_of, unit_of
 from optloc.files.declination import angle_of, date_of
 from optloc.files.foreign import read_table
+from optloc.files.headings import stations_turned
 from optloc.files.measurements import ESTIMATE
 from optloc.files.orbits import read_orbits
 from optloc.files.pseudoranges import at_reception, is_gnss, received
@@ -344,6 +345,7 @@ def _plan(
 ) -> Plan:
     """Return what readings become; `named` are the columns that are called after stations."""
     place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
+    place, turn = stations_turned(place, found)
     epochs = epochs_of(roles, told, found)
     sigmas = _sigmas(told, found)
     uses = uses_of(roles, told, found, epochs, sigmas)
@@ -351,7 +353,7 @@ def _plan(
     parts = zip(found, sigmas, strict=True)
     sections = tuple(_with_declination(_section(one, epochs, sigma), one, told) for one, sigma in parts)
     notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
-    notes += [place.note] if place.note else []
+    notes += [note for note in (turn, place.note) if note]
     notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
     lines: tuple[str, ...] = ()
     if any(one.form.value == "sp" for one in found):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
+
+import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.units import UNITS
 from optloc.files.cells import numbers
 from optloc.files.columns import stem, unit_of
 from optloc.files.readings import BOW, COMPASS, Readings, Told, in_unit, marks_of
-from optloc.files.roles import Roles
+from optloc.files.roles import Places, Roles
 
 # A turn in each unit, and the radians of one: an angle without unit that is larger is in degrees.
 _TURNS = {"deg": Decimal(360)}
@@ -88,6 +91,39 @@ def from_bow(found: Readings, roles: Roles, column: str, told: Told) -> Readings
     note = f"bearings are taken clockwise from the bow of the vehicle, and its heading was added, column {column!r}"
     note += "" if told.azimuth == BOW else f"; --azimuth {COMPASS} takes them as true bearings"
     return replace(found, values=sums, azimuth=COMPASS, heading=column, notes=(note, *found.notes))
+
+
+def stations_turned(place: Places, found: Sequence[Readings]) -> tuple[Places, str]:
+    """Return stations with the headings of their table where bearings are read from them, and a remark.
+
+    Parameters
+    ----------
+    place : Places
+        Stations, with a column of headings where their table has one.
+    found : sequence of Readings
+        All readings.
+
+    Raises
+    ------
+    InvalidProblem
+        For a station without a heading that measures a bearing, and for headings of stations and of a vehicle.
+    """
+    if "heading_deg" not in place.columns:
+        return place, ""
+    headings = place.columns["heading_deg"]
+    bearings = [one for one in found if one.form.kind == "azimuth"]
+    if not bearings:
+        kept = {name: column for name, column in place.columns.items() if name != "heading_deg"}
+        return replace(place, columns=kept), ""
+    if any(one.heading is not None for one in bearings):
+        what = "the headings of stations and the headings of a vehicle are both given"
+        raise InvalidProblem(what, "--stations", "leave one of the columns out")
+    used = {str(name) for one in bearings for name in one.a.tolist()}
+    lacking = next((n for n, v in zip(place.names, headings, strict=True) if n in used and np.isnan(v)), None)
+    if lacking is not None:
+        raise InvalidProblem(f"station {lacking!r} has no heading", "--stations", "give one to each, 0 for north")
+    note = "bearings are taken from the headings of the stations, which their table gives"
+    return replace(place, columns={**place.columns, "heading_deg": np.nan_to_num(headings)}), note
 
 
 def _unit(column: str, held: list[Decimal], told: Told, where: str) -> str:

@@ -346,7 +346,12 @@ def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> Places:
     else:
         roles = Roles.of(read_table(path), told)
     found = placed(roles, frame)
-    check_told(roles, ("name", *place_roles(roles)))
+    column = roles.find("heading")
+    if column is not None:
+        factor = UNITS["angle"][unit_of(column, UNITS["angle"]) or "deg"] / UNITS["angle"]["deg"]
+        headings = {"heading_deg": factor * roles.table.numbers(column, optional=True)}
+        found = replace(found, columns={**found.columns, **headings})
+    check_told(roles, ("name", "heading", *place_roles(roles)))
     return found
 
 
