@@ -210,8 +210,10 @@ def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int, 
         what = f"no epoch has {least} satellites that fix a place"
         raise InvalidProblem(what, source.name, "see whether both files are of one day, or name another --system")
     # an epoch without one is near its neighbours
-    nearest = np.abs(np.arange(count)[:, None] - good).argmin(1) if len(good) < count else np.arange(count)
-    return found[good[nearest]] if len(good) < count else found
+    after = np.searchsorted(good, np.arange(count)).clip(max=len(good) - 1)
+    before = (after - 1).clip(min=0)
+    nearer = np.arange(count) - good[before] <= good[after] - np.arange(count)
+    return found[good[np.where(nearer & (good[before] <= np.arange(count)), before, after)]]
 
 
 # Passes that turn satellites of a table: the first is off by what the Earth turns in a flight, 150 m, the second by

@@ -325,7 +325,9 @@ def _rows(
     """Return the rows of each kind, and the global number of each row of each chunk."""
     # A problem has one block of rows for each kind, in the order of appearance; numbers lead back to the chunks.
     # Compass bearings beside other azimuths have a block of their own, as their errors are clockwise.
-    kinds = dict.fromkeys((chunk.kind, chunk.units.clockwise) for chunk in chunks)
+    order = list(dict.fromkeys(chunk.kind for chunk in chunks))
+    distinct = dict.fromkeys((chunk.kind, chunk.units.clockwise) for chunk in chunks)
+    kinds = sorted(distinct, key=lambda pair: order.index(pair[0]))
     rows, numbers, start = [], [np.zeros(0, dtype=np.int64)] * len(chunks), 0
     for kind, clockwise in kinds:
         same = [i for i, chunk in enumerate(chunks) if (chunk.kind, chunk.units.clockwise) == (kind, clockwise)]
