@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import Any, Literal
 
@@ -111,6 +111,25 @@ class Rows:
         """Return the number of rows."""
         return int(self.a.shape[0])
 
+    @property
+    def sense(self) -> float:
+        """Return the sign of errors of `z` in reports of biases, residuals and suspects: -1 of compass bearings."""
+        return 1.0
+
+    def clockwise(self) -> Rows:
+        """Return the same rows as compass bearings, whose errors are reported clockwise, as they were read."""
+        return CompassRows(*(getattr(self, one.name) for one in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class CompassRows(Rows):
+    """Azimuths that were read clockwise from north: `z` is anticlockwise from the first axis all the same."""
+
+    @property
+    def sense(self) -> float:
+        """Return -1."""
+        return -1.0
+
 
 @dataclass(frozen=True, slots=True)
 class Motion:
@@ -155,7 +174,8 @@ class Bias:
     row, member : int array (n,)
         Sparse design: which global rows are touched, and by which member.
     coefficient : float array (n,)
-        Sign or size of each touch, for instance +1 for station a and -1 for station b.
+        Sign or size of each touch, for instance +1 for station a and -1 for station b. Of compass bearings -1: their
+        bias is clockwise, like the readings.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         Added to the measurement; times the measured quantity; times seconds since the first target's reference time
         (by default the first epoch); or a turn of

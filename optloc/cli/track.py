@@ -277,8 +277,9 @@ def _one_after_another(parts: list[Rows]) -> Rows:
     def of(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    z, weight, correction = of("z"), of("weight"), of("correction")
-    return Rows(parts[0].kind, z, of("a"), of("b"), of("epoch"), of("target"), weight, correction)
+    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
+    columns: dict[str, Any] = {name: of(name) for name in names}
+    return replace(parts[0], **columns)
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:

@@ -73,7 +73,8 @@ class Suspect:
         Global numbers of the rows it takes part in; empty for a prior.
     error : array (q,)
         Estimated error, measured less true: of the station's arrival time times c (positive: late) where the rows
-        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians or ratios.
+        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians (clockwise of
+        compass bearings) or ratios.
     sigma : array (q,)
         Standard deviations of `error`; infinite where nothing else tells how large it is.
     p_with : float
