@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from formulations.backend import count
+from formulations.backend import count, failures
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
@@ -73,8 +73,38 @@ def start_with(word: str) -> Solver:
             x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: start(one, None)))
         return offer(whole, x, pool, word, began)
 
-    return start
+    return lambda problem, pool: explain_absence(problem, start(problem, pool), word)
 
+
+def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
+    """Return a pool of starts that says why a word of a method found none for rows that have some of other words.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    pool : Pool
+        Their starts.
+    word : str
+        What made them: a key of the starts of a formulation, or the name of a stage.
+    """
+    items = np.flatnonzero(pool.empty)
+    if not len(items) or word in _COMPLETE:
+        return pool
+    part = problem.take(items)
+    needs = [form.needs(part) for form in FORMULATIONS.values() if word in (*form.starts, *form.words)]
+    told = next((why for why in needs if why), "")
+    if told and all(needs):
+        return pool.without(items, f"{word} {told}: use 'auto'", Status.UNAVAILABLE)
+    if failures():  # not the rows are the reason
+        return pool
+    # a method that takes rows of all kinds knows whether it is the rows that determine nothing
+    some = ~roots(part, None).empty
+    return pool.without(items[some], f"{word} finds no start from these rows: use 'auto'", Status.UNAVAILABLE)
+
+
+# Words whose starts serve all rows that any closed form serves.
+_COMPLETE = ("gtrs", "roots")
 
 gtrs, roots = start_with("gtrs"), start_with("roots")
 
@@ -342,7 +372,7 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         count("lsr", int(done.iterations.sum()))
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
     # on the face without inequalities, number 0; `bound_pool` adds those on others
-    refined = Pool(x, cost, code, np.zeros(shape, dtype=int), weights, pool.dof, pool.stages)
+    refined = Pool(x, cost, code, np.zeros(shape, dtype=int), weights, pool.dof, pool.stages, missing=pool.missing)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
     return settle(problem, refined, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))

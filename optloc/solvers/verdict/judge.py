@@ -148,6 +148,10 @@ def _open(problem: Problem, information: Array) -> str:
 
 def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, reason: Array) -> None:
     """Write the status of problems without any candidate: what keeps every closed form from a start."""
+    if pool.missing is not None:
+        told = items[pool.missing.reason[items] != ""]
+        code[told], reason[told] = pool.missing.code[told], pool.missing.reason[told]
+        items = np.setdiff1d(items, told)
     if not len(items):
         return
     barred = items[code[items] == Status.INFEASIBLE]
@@ -288,7 +292,7 @@ def judge(problem: Problem, pool: Pool) -> Fix:
     problem : Problem
         N problems.
     pool : Pool
-        Their candidates; starts that nobody has refined get the status `unavailable`.
+        Their candidates; starts that nobody has refined get the status `unrefined`.
     """
     if pool.curvature is None:
         return _show_starts(problem, pool)
@@ -377,16 +381,18 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
 
 
 def _show_starts(problem: Problem, pool: Pool) -> Fix:
-    """Return starts as fixes whose status says that they are not refined."""
+    """Return starts as fixes whose status says that they are not refined, or why there is none."""
     count, n = len(pool), problem.layout.n_shared
     name = pool.stages[-1].name if pool.stages else "start"
+    code, reason = np.full(count, int(Status.UNREFINED), dtype=np.int8), fill(count, "not refined")
+    _explain_missing(problem, pool, np.flatnonzero(pool.empty), code, reason)
     return Fix(
         pool.x[:, 0],
         np.full((count, n, n), np.nan),
         problem.layout,
         problem.frame,
-        np.full(count, int(Status.UNAVAILABLE), dtype=np.int8),
-        fill(count, "not refined"),
+        code,
+        reason,
         alike(claim(Certificate("unknown", "a start, not refined", name)), count),
         Alternatives(pool.x[:, 1:], np.full((count, pool.x.shape[1] - 1), np.nan)),
         np.full(count, np.nan),
