@@ -91,7 +91,12 @@ def _needs_bearings(problem: Problem) -> str:
     """Return what is needed where fewer than two stations measure whole bearings."""
     wanted = ("azimuth", "elevation")[: problem.dimension - 1]
     seen = [
-        {(int(a), int(epoch)) for rows in problem.rows if rows.kind == kind for a, epoch in zip(rows.a, rows.epoch)}
+        {
+            (int(a), int(epoch))
+            for rows in problem.rows
+            if rows.kind == kind
+            for a, epoch in zip(rows.a, rows.epoch, strict=True)
+        }
         for kind in wanted
     ]
     if len(set.intersection(*seen)) > 1:

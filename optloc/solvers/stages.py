@@ -40,7 +40,7 @@ from optloc.solvers.starts.position import (
 from optloc.solvers.starts.registration import step_beside
 from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.verdict.judge import judge, standing
-from optloc.solvers.verdict.minima import settle
+from optloc.solvers.verdict.minima import is_measured, settle
 
 Solver = Callable[[Problem, Pool | None], Pool]
 
@@ -91,16 +91,16 @@ def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
     items = np.flatnonzero(pool.empty)
     if not len(items) or word in _COMPLETE:
         return pool
-    part = problem.take(items)
-    needs = [form.needs(part) for form in FORMULATIONS.values() if word in (*form.starts, *form.words)]
-    told = next((why for why in needs if why), "")
-    if told and all(needs):
-        return pool.without(items, f"{word} {told}: use 'auto'", Status.UNAVAILABLE)
     if failures():  # not the rows are the reason
         return pool
-    # a method that takes rows of all kinds knows whether it is the rows that determine nothing
-    some = ~roots(part, None).empty
-    return pool.without(items[some], f"{word} finds no start from these rows: use 'auto'", Status.UNAVAILABLE)
+    part = problem.take(items)
+    # of what starts nowhere else, and determines nothing, the verdict knows more
+    items = items[~roots(part, None).empty | is_measured(part)]
+    forms = FORMULATIONS.values()
+    own = [form for form in forms if word in form.starts] or [form for form in forms if word in form.words]
+    needs = [form.needs(problem) for form in own]
+    told = needs[0] if needs and all(needs) else "finds no start from these rows"
+    return pool.without(items, f"{word} {told}: use 'auto'", Status.UNAVAILABLE)
 
 
 # Words whose starts serve all rows that any closed form serves.

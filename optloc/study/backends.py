@@ -77,7 +77,7 @@ def version_of(package: str) -> str:
 
 @cache
 def installed() -> dict[str, Backend]:
-    """Return every back end that its library lists here, whether it works or not, by the name that a study file uses."""
+    """Return every back end that its library lists here, whether it works or not, by the name in study files."""
     import casadi
     import cvxpy
     from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC

@@ -25,6 +25,23 @@ from optloc.study.draws import Drawn
 from optloc.study.minimizers import baseline_of, code_of, load_minimizer
 from optloc.study.networks import CALIBRATE, Found, Networks, calibrated
 
+# Back ends stand in a module of their own; studies know them from here.
+__all__ = [
+    "SETTINGS",
+    "Method",
+    "Nonsense",
+    "Run",
+    "Setting",
+    "added",
+    "backend_kind",
+    "backends",
+    "check_settings",
+    "methods_of",
+    "require_program",
+    "run",
+    "version_of",
+]
+
 
 @dataclass(frozen=True, slots=True)
 class Method:

@@ -23,7 +23,7 @@ from optloc.solvers.starts.least_squares_ranges import ranges
 from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.conclusion import conclude
 from optloc.solvers.verdict.findings import NO_ANSWER, NO_PROOF, chart_of, examine, explain, is_improbable, mark
-from optloc.solvers.verdict.minima import station_direction, weak_direction
+from optloc.solvers.verdict.minima import is_measured, station_direction, unmeasured_direction, weak_direction
 
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
 
@@ -164,6 +164,7 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves
     found = ranges(problem.take(items)) if single and len(items) else None
+    measured = is_measured(problem.take(items)) if len(items) else ()
     for place, i in enumerate(items):
         groups = () if found is None else found.groups[int(found.pattern[place])]
         if len(groups) > 1:
@@ -175,13 +176,16 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
         elif isinstance(problem.medium, Layers):
             code[i] = Status.INFEASIBLE
             reason[i] = "no place was found within the layers that direct rays lead from to all stations of the rows"
-        elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows):
+        elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows) or measured[place]:
             code[i] = Status.UNAVAILABLE
-            reason[i] = "no closed form starts from " + " and ".join(rows.kind for rows in problem.rows)
+            tried = any(stage.name == "search" for stage in pool.stages)
+            kinds = " and ".join(dict.fromkeys(rows.kind for rows in problem.rows))
+            reason[i] = f"no closed form starts from these rows of {kinds}"
+            reason[i] += ", and a search found nothing" if tried else ": use 'auto', which searches"
         else:
             code[i] = Status.SINGULAR_GEOMETRY
             one = problem.take(np.array([i]))
-            reason[i] = _short(one) or station_direction(one)
+            reason[i] = _short(one) or unmeasured_direction(one) or station_direction(one)
 
 
 def _short(problem: Problem) -> str:
