@@ -531,7 +531,7 @@ def ellipses(panel: Axes, scene: Scene, view: View, size: float, **style: Any) -
         around = [] if region is None else [np.append(place + line, [[np.nan] * 2], axis=0) for line in region.lines]
         label = "local ellipse: it does not cover" if local[i] else "95 % ellipse"
         if region is not None:
-            label = "95 % region, cut off: it goes on" if region.cut else "95 % region"
+            label = "95 % region, cut off" if region.cut else "95 % region"
         dashes = {"linestyle": ":"} if local[i] else {}
         line = np.concatenate(around) if around else place + ring(covariance[np.ix_(view, view)])
         if around or np.isfinite(line).all():

@@ -12,7 +12,7 @@ import optloc
 from optloc.cli.file_fixes import fix_file, results_of
 from optloc.files import read
 from optloc.plot import plot_fixes
-from optloc.plot.outlines import hull, pieces_of, polygons
+from optloc.plot.outlines import outlines_of
 from optloc.problem.chart import quantile
 from optloc.report.formats.marks import geojson
 from optloc.report.map import fixed_spots
