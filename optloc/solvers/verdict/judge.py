@@ -68,8 +68,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     assert curvature is not None
     code, reason = np.array(pool.code[:, 0]), fill(len(pool), "")
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
-    # a row that is absent may hold anything
-    broken = ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), code.shape)
+    broken = _is_broken(problem, len(pool))
     few = (pool.dof < 0) & ~broken
     missing = ~np.isfinite(cost) & ~broken & ~few
     answered = ~(broken | few | missing)
@@ -104,6 +103,12 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     if pool.asked:
         _weigh_redundancy(pool, finished, reason)
     return Ruling(marks, reason, proven, broken | few | missing | weak | far)
+
+
+def _is_broken(problem: Problem, count: int) -> Array:
+    """Return which of so many problems have a measurement that is no number, (N,)."""
+    # a row that is absent may hold anything
+    return ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), (count,))
 
 
 def fill(count: int, value: object) -> Array:
@@ -389,7 +394,12 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
     count, n = len(pool), problem.layout.n_shared
     name = pool.stages[-1].name if pool.stages else "start"
     code, reason = np.full(count, int(Status.UNREFINED), dtype=np.int8), fill(count, "not refined")
-    _explain_missing(problem, pool, np.flatnonzero(pool.empty), code, reason)
+    empty, broken = pool.empty, _is_broken(problem, count)
+    few = (pool.dof < 0) & empty & ~broken
+    code[broken & empty], code[few], reason[broken & empty] = Status.REJECTED, Status.TOO_FEW_ROWS, ""
+    for i in np.flatnonzero(few):
+        reason[i] = _lacking(-int(pool.dof[i]))
+    _explain_missing(problem, pool, np.flatnonzero(empty & ~broken & ~few), code, reason)
     return Fix(
         pool.x[:, 0],
         np.full((count, n, n), np.nan),
