@@ -33,9 +33,9 @@ def drawn(template, truth):
 def problem_of(name):
     """Return a problem: its dimension, then its kinds, of which a number at the end says how many stations have it."""
     if name.startswith("satellites"):
-        rows = (
-            measured("tdoa", a=[0, 0], b=[1, 2], sigma=15.0) if "tdoa" in name else measured("toa", a=[0, 1, 2], sigma=15.0)
-        )  # fmt: skip
+        rows = measured("toa", a=[0, 1, 2], sigma=15.0)
+        if "tdoa" in name:
+            rows = measured("tdoa", a=[0, 0], b=[1, 2], sigma=15.0)
         height = optloc.constraints.height(exactly=100.0)
         return drawn(assemble(SATELLITES, rows, frame=optloc.ECEF, constraints=[height]), BELOW)
     dimension, *kinds = name.split()

@@ -88,8 +88,8 @@ def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
     word : str
         What made them: a key of the starts of a formulation, or the name of a stage.
     """
-    items = np.flatnonzero(pool.empty)
-    if not len(items) or word in _COMPLETE:
+    items = np.zeros(0, dtype=int) if word in _COMPLETE else np.flatnonzero(pool.empty)
+    if not len(items):
         return pool
     if failures():  # not the rows are the reason
         return pool

@@ -2,7 +2,7 @@
 
 A library that lists a solver does not say that it works: some end the process, some raise an error of their own for
 every program, some never end where there is no solution, some call that a success. So each is tried once, in a process
-apart, on programs with and without a solution (`optloc.study.backend_trial`), and only those that pass are listed.
+apart, on programs with and without a solution (`formulations.backend_trial`), and only those that pass are listed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -26,8 +26,8 @@ from optloc.compute.manifest import digest_of
 
 # Seconds in which a solver ends on programs of two unknowns, which take milliseconds; and to begin a process.
 _PATIENCE, _START = 5.0, 60.0
-# How lines of the trial begin: solvers print lines of their own.
-PASSED, FAILED = "optloc-passed", "optloc-failed"
+# How lines of the trial begin, as in `formulations.backend_trial`.
+_SAID = ("backend-passed", "backend-failed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +141,7 @@ def _faults(kinds: tuple[tuple[str, str], ...]) -> dict[str, str]:
             kept = json.loads(file.read_text(encoding="utf-8"))
             if isinstance(kept, dict) and set(kept) == {name for name, _ in kinds}:
                 return {str(name): str(fault) for name, fault in kept.items()}
-    found = try_apart(name for name, _ in kinds)
+    found = try_apart(dict(kinds))
     if file is not None:
         with suppress(OSError):
             own = file.with_suffix(f".{os.getpid()}")
@@ -150,7 +150,7 @@ def _faults(kinds: tuple[tuple[str, str], ...]) -> dict[str, str]:
     return found
 
 
-def faults_of(kinds: dict[str, str]) -> dict[str, str]:
+def faults_of(kinds: Mapping[str, str]) -> dict[str, str]:
     """Return what is wrong with each back end, given by name and kind; empty where it works."""
     return dict(_faults(tuple(sorted(kinds.items()))))
 
@@ -158,39 +158,42 @@ def faults_of(kinds: dict[str, str]) -> dict[str, str]:
 def _key(kinds: tuple[tuple[str, str], ...]) -> str:
     """Return what the outcome depends on, as a digest: names, versions, and the programs of the trial."""
     here = Path(__file__).parent
-    programs = [here / "backend_trial.py", *(here.parents[1] / "formulations").glob("*.py")]
+    programs = list((here.parents[1] / "formulations").glob("*.py"))
     libraries = [version_of(name) for name in ("casadi", "cvxpy", "numpy")]
     versions = [entry.version for entry in installed().values()]
     text = json.dumps([kinds, versions, libraries, digest_of(programs, here.parents[1]), sys.version])
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def try_apart(names: Iterable[str]) -> dict[str, str]:
-    """Return what is wrong with back ends after a trial in a process apart; a new one begins behind whoever ends it."""
-    left, found = list(names), dict[str, str]()
+def try_apart(kinds: dict[str, str]) -> dict[str, str]:
+    """Return what is wrong with back ends, given by name and kind, after a trial in a process apart.
+
+    A new process begins behind a solver that ends one.
+    """
+    left, found = dict(kinds), dict[str, str]()
     while left:
         done = _one_process(left)
         found |= done
-        left = [name for name in left if name not in found]
+        left = {name: kind for name, kind in left.items() if name not in found}
         if left and not done:  # nobody was reached: what is wrong is not a solver
             found |= dict.fromkeys(left, "it could not be tried")
             break
     return found
 
 
-def _one_process(names: list[str]) -> dict[str, str]:
+def _one_process(kinds: dict[str, str]) -> dict[str, str]:
     """Return the outcomes of those that one process reaches; the one in which it ends is named with how."""
     root = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join([root, *(place for place in sys.path if place)])
     process = subprocess.Popen(  # noqa: S603  (this interpreter, and a module of this package)
-        [sys.executable, "-m", "optloc.study.backend_trial", str(_PATIENCE), *names],
+        [sys.executable, "-m", "formulations.backend_trial", str(_PATIENCE), *(f"{k}:{n}" for n, k in kinds.items())],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         stdin=subprocess.DEVNULL,
         env=os.environ | {"PYTHONPATH": path},
     )
     try:
-        output, _ = process.communicate(timeout=_START + 2.0 * _PATIENCE * len(names))
+        output, _ = process.communicate(timeout=_START + 2.0 * _PATIENCE * len(kinds))
     except subprocess.TimeoutExpired:
         process.kill()
         output, _ = process.communicate()
@@ -198,9 +201,9 @@ def _one_process(names: list[str]) -> dict[str, str]:
     for line in output.decode(errors="replace").splitlines():
         word, _, rest = line.partition(" ")
         name, _, fault = rest.partition(" ")
-        if word in (PASSED, FAILED) and name in names:
+        if word in _SAID and name in kinds:
             found[name] = fault
-    ended = next((name for name in names if name not in found), None)
+    ended = next((name for name in kinds if name not in found), None)
     if ended is not None and process.returncode:
         found[ended] = f"it ends the process (exit code {process.returncode})"
     return found

@@ -164,7 +164,7 @@ def _promising(values: Array, mask: Array) -> Array | None:
     """Return the nodes of a grid of half the step near which the set may be, or None where they are too many."""
     from scipy.ndimage import binary_dilation
 
-    around = np.ones((3, 3))
+    around = np.ones((3, 3), dtype=bool)
     for limit in _LIMITS:
         near = values < limit
         if near.any():
@@ -191,7 +191,7 @@ def _evaluate(value: Value, grid: _Grid, mask: Array) -> Array:
 # Marching squares: the corners of a square that are inside decide which of its edges a line joins, the inside on its
 # left. Corners have the bits 1, 2, 4, 8 from the lower left one, counter-clockwise; edges are those below (B), right
 # (R), above (T) and left (L). Squares with two opposite corners are told by their middle.
-_JOINS = {
+_JOINS: dict[int, tuple[str, ...]] = {
     1: ("BL",),
     2: ("RB",),
     3: ("RL",),
@@ -205,8 +205,8 @@ _JOINS = {
     13: ("BR",),
     14: ("LB",),
 }
-_APART = {5: ("BL", "TR"), 10: ("RB", "LT")}
-_TOGETHER = {5: ("BR", "TL"), 10: ("LB", "RT")}
+_APART: dict[int, tuple[str, ...]] = {5: ("BL", "TR"), 10: ("RB", "LT")}
+_TOGETHER: dict[int, tuple[str, ...]] = {5: ("BR", "TL"), 10: ("LB", "RT")}
 # An edge is its lower or left node, and whether it goes along the second axis.
 _EDGES = {"B": (0, 0, 0), "T": (0, 1, 0), "L": (0, 0, 1), "R": (1, 0, 1)}
 
@@ -241,8 +241,8 @@ def _loops(values: Array) -> list[list[Edge]]:
         joins = _JOINS.get(own)
         if joins is None:
             joins = (_TOGETHER if values[i : i + 2, j : j + 2].mean() < 0.0 else _APART)[own]
-        for begin, end in joins:
-            (a, b, c), (d, e, f) = _EDGES[begin], _EDGES[end]
+        for join in joins:
+            (a, b, c), (d, e, f) = _EDGES[join[0]], _EDGES[join[1]]
             following[i + a, j + b, c] = (i + d, j + e, f)
     loops = []
     while following:

@@ -169,7 +169,8 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves
     found = ranges(problem.take(items)) if single and len(items) else None
-    measured = is_measured(problem.take(items)) if len(items) else ()
+    straight = bool(len(items)) and not isinstance(problem.medium, Layers)
+    measured = is_measured(problem.take(items)) if straight else np.zeros(len(items), dtype=bool)
     for place, i in enumerate(items):
         groups = () if found is None else found.groups[int(found.pattern[place])]
         if len(groups) > 1:

@@ -1,4 +1,4 @@
-"""The trial of back ends in a process apart: ``python -m optloc.study.backend_trial SECONDS NAME...``.
+"""The trial of back ends in a process apart: ``python -m formulations.backend_trial SECONDS KIND:NAME...``.
 
 Each solves programs of two unknowns whose solution is known, and others that have none. It prints one line for each. A
 solver that does not end in time ends the process: nothing else stops machine code.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from threading import Timer
 from typing import Any
 
@@ -16,7 +17,9 @@ import numpy as np
 
 from formulations.algebra import Array
 from formulations.backend import Choice, SolverError, using
-from optloc.study.backends import FAILED, PASSED, kind_of
+
+PASSED, FAILED = "backend-passed", "backend-failed"
+"""How the lines begin that say what came of it: solvers print lines of their own."""
 
 # Three ranges to a place, one of which has to be left by the constraints.
 _STATION = np.array([[0.0, 0.0], [1.0, 0.1], [0.2, 0.9]])
@@ -86,15 +89,24 @@ def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **con
         return str(trouble).partition("\n")[0]
 
 
-def _tried(name: str) -> str:
+def _tried(kind: str, name: str) -> str:
+    """Return what is wrong with a solver of a kind, "conic" or "nonlinear"; empty where nothing is."""
     try:
-        return _conic(name) if kind_of(name) == "conic" else _nonlinear(name)
+        return _conic(name) if kind == "conic" else _nonlinear(name)
     except Exception as trouble:  # noqa: BLE001  (whatever a solver raises is what is wrong with it)
         return f"{type(trouble).__name__}: {trouble}".partition("\n")[0]
 
 
-def main(seconds: float, names: list[str]) -> None:
-    """Try back ends one after the other, and print what is wrong with each."""
+def main(seconds: float, choices: list[str]) -> None:
+    """Try back ends one after the other, and print what is wrong with each.
+
+    Parameters
+    ----------
+    seconds : float
+        Time that each has for all programs.
+    choices : list of str
+        Kind and name of each, joined by a colon.
+    """
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
 
     def say(word: str, name: str, fault: str) -> None:
@@ -106,12 +118,12 @@ def main(seconds: float, names: list[str]) -> None:
         say(FAILED, name, f"it does not end within {seconds:g} s on a program of two unknowns")
         os._exit(0)
 
-    kind_of(names[0])  # the libraries are loaded outside the time of a solver
-    for name in names:
+    for kind, _, name in (choice.partition(":") for choice in choices):
+        import_module("cvxpy" if kind == "conic" else "casadi")  # outside the time of the solver
         timer = Timer(seconds, stop, (name,))
         timer.daemon = True
         timer.start()
-        fault = _tried(name)
+        fault = _tried(kind, name)
         timer.cancel()
         say(FAILED if fault else PASSED, name, fault)
 
