@@ -298,6 +298,7 @@ class Status(IntEnum):
     MISFIT = 14
     UNPROVEN = 15
     CURVED = 16
+    UNREFINED = 17
 
     def __str__(self) -> str:
         """Return the label: what `print` shows."""
@@ -339,9 +340,10 @@ _SENTENCES: dict[Status, str] = {
     Status.INFEASIBLE: "No position meets the constraints.",
     Status.UNBOUNDED: "Positions ever farther away explain the data about as well: they say a direction and a least "
     "range; add a station farther off, a bearing or a known height.",
-    Status.NUMERICAL: "A solver failed numerically; check the scale and the units of the input.",
+    Status.NUMERICAL: "A solver failed, and the reason names it; check the scale and the units of the input, or choose "
+    "another solver.",
     Status.REJECTED: "A measurement is not a finite number; remove the row or give it weight zero.",
-    Status.UNAVAILABLE: "The method does not apply to these kinds of rows; choose another or 'auto'.",
+    Status.UNAVAILABLE: "The method gives no start for these rows; the reason says why, and 'auto' takes all kinds.",
     Status.DISCONNECTED: "The station pairs fall into groups without a common station; add a pair that links them.",
     Status.CONTRADICTORY: "The measurements contradict each other, and leaving few of them out does not help, or they "
     "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
@@ -351,6 +353,7 @@ _SENTENCES: dict[Status, str] = {
     "'auto' tries to, the certificate says what is missing, and whoever can do without allows this status.",
     Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
     "optloc.likelihood_region.",
+    Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
 }
 
 PRECEDENCE = (
@@ -359,6 +362,7 @@ PRECEDENCE = (
     Status.TOO_FEW_ROWS,
     Status.DISCONNECTED,
     Status.UNAVAILABLE,
+    Status.UNREFINED,
     Status.INFEASIBLE,
     Status.NUMERICAL,
     Status.SINGULAR_GEOMETRY,
