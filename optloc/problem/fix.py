@@ -237,17 +237,23 @@ class Fix:
 
     @property
     def position(self) -> Array:
-        """Return the position (..., d) of the only target, or of each epoch (..., k, d), metres."""
-        return self.layout.take(self.x, "position")
+        """Return the position (..., d) of the only unknown target, or of each epoch (..., k, d), metres."""
+        return self.take("position")
 
     @property
     def velocity(self) -> Array:
         """Return the velocity like `position`, metres per second."""
-        return self.layout.take(self.x, "velocity")
+        return self.take("velocity")
 
     def take(self, name: str) -> Array:
         """Return a named part of the estimate, for instance "position[1]" or "clock"."""
-        return self.layout.take(self.x, name)
+        return self.layout.take(self.x, self._slot(name))
+
+    def _slot(self, name: str) -> str:
+        """Return the name of a part: "position" is that of the only target whose place is not known beforehand."""
+        slots = [slot.name for slot in (*self.layout.shared, *self.layout.local)]
+        numbered = [slot for slot in slots if slot.partition("[")[0] == name]
+        return numbered[0] if name in _STATES and len(numbered) == 1 else name
 
     @property
     def bias(self) -> Mapping[str, Array]:
@@ -261,7 +267,7 @@ class Fix:
 
     def covariance(self, name: str = "position") -> Array:
         """Return the covariance of a named part: (..., q, q), or (..., k, q, q) of a state at each epoch."""
-        slot, shared = self.layout.find(name)
+        slot, shared = self.layout.find(self._slot(name))
         part = slice(slot.start, slot.start + slot.size)
         if shared:
             return self.cov[..., part, part]

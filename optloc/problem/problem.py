@@ -83,7 +83,7 @@ class Problem:
     def starts(self) -> tuple[int, ...]:
         """Return the global number of the first row of each kind."""
         counts = [block.count for block in self.rows]
-        return tuple(int(n) for n in np.cumsum([0, *counts[:-1]]))
+        return tuple(int(n) for n in np.cumsum([0, *counts])[:-1])
 
     @property
     def emitting(self) -> tuple[int, ...]:
@@ -126,7 +126,7 @@ class Problem:
     @property
     def epoch(self) -> Array:
         """Return the epoch of each row, (m,)."""
-        return np.concatenate([block.epoch for block in self.rows])
+        return np.concatenate([block.epoch for block in self.rows] or [np.zeros(0, dtype=np.int64)])
 
     @cached_property
     def batch_shape(self) -> tuple[int, ...]:
