@@ -130,7 +130,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
             )
         return Message("", {}, {}, whole=False, command=command)
     event = _event(found)
-    target = _text(found["target"], "target") if "target" in found else ""
+    target = name_in(found["target"], "target") if "target" in found else ""
     ways: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
     ways += ["z"] if "z" in found and "kind" not in found else []
     if len(ways) != 1 and ways != ["rows", "arrivals"]:
@@ -139,16 +139,16 @@ def _general(found: dict[str, Any], site: Site) -> Message:
     rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
     if "rows" in ways:
         for entry in _list(found["rows"], "rows"):
-            _row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
+            take_row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
     if "arrivals" in ways:
         for entry in _list(found["arrivals"], "arrivals"):
-            _arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
+            take_arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
     if "z" in ways:
         rows = _values(_list(found["z"], "z"), site)
     elif "station" in ways:
-        _arrival(found, site, times)
+        take_arrival(found, site, times)
     elif "kind" in ways:
-        _row(found, site, rows, sigmas)
+        take_row(found, site, rows, sigmas)
     more = found.get("more", ways[0] in ("station", "kind"))
     if type(more) is not bool:
         raise InvalidProblem("it is neither true nor false", "more", "say true where more rows are to come")
@@ -159,10 +159,11 @@ def _event(found: Mapping[str, Any]) -> str:
     if "event" not in found:
         raise InvalidProblem("the line has no event", None, 'give every line an id: "event": "1"')
     name = found["event"]
-    return str(name) if type(name) is int and abs(name) < _LATEST else _text(name, "event")
+    return str(name) if type(name) is int and abs(name) < _LATEST else name_in(name, "event")
 
 
-def _text(given: Any, key: str) -> str:
+def name_in(given: Any, key: str) -> str:
+    """Return the name that stands under a key; raise InvalidProblem where it is none."""
     if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
         raise InvalidProblem(f"{str(given)[:40]!r} is no name", key, f"give 1 to {_NAME} printable characters")
     return given
@@ -177,7 +178,10 @@ def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
         raise InvalidProblem(f"the line has {' and '.join(given)}", given[0], "give one of them")
     value = found[given[0]]
     if type(value) is float:  # of a track a quarter of a microsecond is enough, of an arrival it is not
-        return round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
+        value = round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
+        if abs(value) >= _LATEST:
+            raise _beyond_clocks(found[given[0]], given[0])
+        return value
     return picoseconds(value, given[0])
 
 
@@ -213,7 +217,8 @@ def _values(given: list[Any], site: Site) -> dict[Key, float]:
     return {i: _number(value, "z") for i, value in enumerate(given) if value is not None}
 
 
-def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: dict[Key, float]) -> None:
+def take_row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: dict[Key, float]) -> None:
+    """Add a row to those of its event; raise InvalidProblem where it is none of the site."""
     if "z" not in found:
         raise InvalidProblem("a row has no value", "z", "give a number")
     words = [found.get(key, "") for key in ("kind", "a", "b")]
@@ -230,7 +235,8 @@ def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: d
         sigmas[key] = sigma
 
 
-def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
+def take_arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
+    """Add an arrival to those of its event; raise InvalidProblem where it is none of the site."""
     station = found.get("station")
     if not site.arriving:
         what = "the site has neither toa nor tdoa rows, so that it cannot take arrivals"
@@ -273,8 +279,12 @@ def picoseconds(given: Any, key: str) -> int:
         advice = "send a whole number as time_ns or time_ps, or a decimal number in quotes"
         raise InvalidProblem(f"{str(given)[:40]} is no exact time", key, advice)
     if abs(value) >= _LATEST:
-        raise InvalidProblem(f"the time {str(given)[:40]} is beyond all clocks", key, "check its unit")
+        raise _beyond_clocks(given, key)
     return value
+
+
+def _beyond_clocks(given: Any, key: str) -> InvalidProblem:
+    return InvalidProblem(f"the time {str(given)[:40]} is beyond all clocks", key, "check its unit")
 
 
 # Events: open until they are whole, then answered, then remembered.

@@ -232,6 +232,17 @@ class Problem:
         return replace(self, rows=tuple(rows))
 
 
+def at_rest(problem: Problem) -> Problem:
+    """Return the problem with velocities of its stations where a row needs them: stations without stay where they are.
+
+    Each step from a start to a proof then finds the same zeros.
+    """
+    stations = problem.stations
+    if stations.velocity is not None or not any(MODELS[rows.kind].velocity for rows in problem.rows):
+        return problem
+    return replace(problem, stations=replace(stations, velocity=np.zeros((1, stations.count, problem.dimension))))
+
+
 def check_medium(problem: Problem) -> None:
     """Refuse media that the frame does not fit, and stations outside them."""
     medium, frame = problem.medium, problem.frame.kind
