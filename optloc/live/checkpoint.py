@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import Budget, access, json_of, read_text
 from optloc.live.answers import Record
-from optloc.live.events import Event, Events, Key, name_in, picoseconds, take_arrival, take_row
+from optloc.live.events import Event, Events, name_under, picoseconds, rows_and_arrivals
 from optloc.live.metrics import COUNTS
 from optloc.live.site import Site
 
@@ -74,7 +74,7 @@ def restore(path: Path, events: Events, now: float) -> None:
         raise InvalidProblem("this is no checkpoint of a stream", str(path), "name another file, or remove it")
     where = str(path)
     try:
-        closed = [name_in(name, "closed") for name in _typed(found.get("closed"), list, "closed")]
+        closed = [name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
         counts = _counts(found.get("counts"))
         taken, opened = set(closed), dict[str, Event]()
         for number, each in enumerate(_typed(found.get("open"), list, "open"), 1):
@@ -95,21 +95,20 @@ def restore(path: Path, events: Events, now: float) -> None:
 def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     """Return an open event of another name than those taken; raise InvalidProblem, whose place is a key, for none."""
     each = _typed(found, dict, "open")
-    rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
-    for entry in _typed(each.get("rows"), list, "rows"):
-        kind, a, b, value, sigma = _parts(entry, 5, "rows")
-        take_row(
-            {"kind": kind, "a": a, "b": b, "z": value} | ({} if sigma is None else {"sigma": sigma}), site, rows, sigmas
-        )
-    for entry in _typed(each.get("times"), list, "times"):
-        station, time = _parts(entry, 2, "times")
-        take_arrival({"station": station, "time_ps": time}, site, times)
+    entries = [_parts(entry, 5, "rows") for entry in _typed(each.get("rows"), list, "rows")]
+    given = [
+        {"kind": kind, "a": a, "b": b, "z": value} | ({} if sigma is None else {"sigma": sigma})
+        for kind, a, b, value, sigma in entries
+    ]
+    entries = [_parts(entry, 2, "times") for entry in _typed(each.get("times"), list, "times")]
+    heard = [{"station": station, "time_ps": time} for station, time in entries]
+    rows, sigmas, times = rows_and_arrivals(given, heard, site)
     if not rows and not times:
         raise InvalidProblem("an event has no rows", "rows")
-    name, target = name_in(each.get("event"), "event"), _typed(each.get("target"), str, "target")
+    name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
         raise InvalidProblem(f"the event {name!r} is there twice", "event")
-    event = Event(name, rows, times, now, now, sigmas, target and name_in(target, "target"))
+    event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))
     event.revision = _count(each.get("revision"), "revision")
     event.conflict = _typed(each.get("conflict"), bool, "conflict")
     # checkpoints from before there were tracks have neither

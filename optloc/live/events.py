@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 from zlib import crc32
@@ -130,7 +130,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
             )
         return Message("", {}, {}, whole=False, command=command)
     event = _event(found)
-    target = name_in(found["target"], "target") if "target" in found else ""
+    target = _text(found["target"], "target") if "target" in found else ""
     ways: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
     ways += ["z"] if "z" in found and "kind" not in found else []
     if len(ways) != 1 and ways != ["rows", "arrivals"]:
@@ -139,16 +139,16 @@ def _general(found: dict[str, Any], site: Site) -> Message:
     rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
     if "rows" in ways:
         for entry in _list(found["rows"], "rows"):
-            take_row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
+            _row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
     if "arrivals" in ways:
         for entry in _list(found["arrivals"], "arrivals"):
-            take_arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
+            _arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
     if "z" in ways:
         rows = _values(_list(found["z"], "z"), site)
     elif "station" in ways:
-        take_arrival(found, site, times)
+        _arrival(found, site, times)
     elif "kind" in ways:
-        take_row(found, site, rows, sigmas)
+        _row(found, site, rows, sigmas)
     more = found.get("more", ways[0] in ("station", "kind"))
     if type(more) is not bool:
         raise InvalidProblem("it is neither true nor false", "more", "say true where more rows are to come")
@@ -159,11 +159,10 @@ def _event(found: Mapping[str, Any]) -> str:
     if "event" not in found:
         raise InvalidProblem("the line has no event", None, 'give every line an id: "event": "1"')
     name = found["event"]
-    return str(name) if type(name) is int and abs(name) < _LATEST else name_in(name, "event")
+    return str(name) if type(name) is int and abs(name) < _LATEST else _text(name, "event")
 
 
-def name_in(given: Any, key: str) -> str:
-    """Return the name that stands under a key; raise InvalidProblem where it is none."""
+def _text(given: Any, key: str) -> str:
     if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
         raise InvalidProblem(f"{str(given)[:40]!r} is no name", key, f"give 1 to {_NAME} printable characters")
     return given
@@ -217,8 +216,7 @@ def _values(given: list[Any], site: Site) -> dict[Key, float]:
     return {i: _number(value, "z") for i, value in enumerate(given) if value is not None}
 
 
-def take_row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: dict[Key, float]) -> None:
-    """Add a row to those of its event; raise InvalidProblem where it is none of the site."""
+def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: dict[Key, float]) -> None:
     if "z" not in found:
         raise InvalidProblem("a row has no value", "z", "give a number")
     words = [found.get(key, "") for key in ("kind", "a", "b")]
@@ -235,8 +233,7 @@ def take_row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigma
         sigmas[key] = sigma
 
 
-def take_arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
-    """Add an arrival to those of its event; raise InvalidProblem where it is none of the site."""
+def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
     station = found.get("station")
     if not site.arriving:
         what = "the site has neither toa nor tdoa rows, so that it cannot take arrivals"
@@ -251,6 +248,23 @@ def take_arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) ->
     value, number = picoseconds(found[given[0]], given[0]), site.number[station]
     if times.setdefault(number, value) != value:
         raise InvalidProblem(f"station {station!r} has two arrivals", "arrivals", "send one")
+
+
+def rows_and_arrivals(
+    rows: Sequence[Mapping[str, Any]], arrivals: Sequence[Mapping[str, Any]], site: Site
+) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
+    """Return values, standard deviations and arrivals of the entries that a line may have; errors as of `parse`."""
+    values, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
+    for entry in rows:
+        _row(entry, site, values, sigmas)
+    for entry in arrivals:
+        _arrival(entry, site, times)
+    return values, sigmas, times
+
+
+def name_under(key: str, given: Any) -> str:
+    """Return the name that is given under a key; raise InvalidProblem where it is none."""
+    return _text(given, key)
 
 
 def picoseconds(given: Any, key: str) -> int:
