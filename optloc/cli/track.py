@@ -242,7 +242,11 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         # A file without times has one epoch: any time serves.
         times = loaded.times if np.isfinite(loaded.times).all() else problem.times
         run = alone(problem, kept, times)
-        yield name, differences(run) if run.emitting else run, tuple(loaded.epochs[k] for k in epochs)
+        run = differences(run) if run.emitting else run
+        if not run.count:
+            what = f"every epoch of {name} has a single arrival, which says nothing without its emission time"
+            raise InvalidProblem(what, source, "give arrivals at two stations or more of each emission")
+        yield name, run, tuple(loaded.epochs[k] for k in epochs)
 
 
 def differences(run: Problem) -> Problem:

@@ -458,7 +458,10 @@ def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:
             d = values.shape[-1]
             position = values.reshape(-1, d)
             # Positions of single epochs of a run have no covariance unless it was asked for.
-            covariance = flat.covariance(slot.name) if shared else np.full((len(position), d, d), np.nan)
+            covariance = np.full((len(position), d, d), np.nan)
+            if shared:  # an axis that is not determined has no ellipse, and the others keep theirs
+                wild = flat.undetermined(slot.name)
+                covariance = np.where(wild[:, :, None] | wild[:, None, :], np.nan, flat.covariance(slot.name))
             found.append((position, covariance, np.repeat(flat.code == Status.OK, len(position) // len(flat))))
     return found
 

@@ -83,7 +83,7 @@ class Problem:
     def starts(self) -> tuple[int, ...]:
         """Return the global number of the first row of each kind."""
         counts = [block.count for block in self.rows]
-        return tuple(int(n) for n in np.cumsum([0, *counts[:-1]]))
+        return tuple(int(n) for n in np.cumsum([0, *counts])[:-1])
 
     @property
     def emitting(self) -> tuple[int, ...]:
@@ -126,7 +126,7 @@ class Problem:
     @property
     def epoch(self) -> Array:
         """Return the epoch of each row, (m,)."""
-        return np.concatenate([block.epoch for block in self.rows])
+        return np.concatenate([block.epoch for block in self.rows] or [np.zeros(0, dtype=np.int64)])
 
     @cached_property
     def batch_shape(self) -> tuple[int, ...]:
@@ -230,6 +230,17 @@ class Problem:
         for block, values, importance in zip(self.rows, zs, weights, strict=True):
             rows.append(replace(block, z=values, weight=importance))
         return replace(self, rows=tuple(rows))
+
+
+def at_rest(problem: Problem) -> Problem:
+    """Return the problem with velocities of its stations where a row needs them: stations without stay where they are.
+
+    Each step from a start to a proof then finds the same zeros.
+    """
+    stations = problem.stations
+    if stations.velocity is not None or not any(MODELS[rows.kind].velocity for rows in problem.rows):
+        return problem
+    return replace(problem, stations=replace(stations, velocity=np.zeros((1, stations.count, problem.dimension))))
 
 
 def check_medium(problem: Problem) -> None:

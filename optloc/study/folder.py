@@ -254,12 +254,29 @@ def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
     from pyarrow import ArrowException, parquet
 
     try:
-        if path.name.split(".")[1:-1] == [_digest(read_bytes(path))]:
+        if path.name.split(".")[1:-1] == [_digest(read_bytes(path))] and _is_part(parquet.read_schema(path), columns):
             # Not from bytes of Python: threads of Arrow that free such while the interpreter ends abort the process.
             return parquet.read_table(path, columns=columns, partitioning=None)
     except (InvalidProblem, OSError, ArrowException):
         pass
     raise InvalidProblem("the part is damaged", str(path), "run the study again, and it is made again")
+
+
+def _is_whole(path: Path, rows: int) -> bool:
+    """Return whether a part file has all its columns and so many rows."""
+    from pyarrow import parquet
+
+    try:
+        return bool(read_part(path, ["status"]).num_rows == rows and _is_part(parquet.read_schema(path), None))
+    except InvalidProblem:
+        return False
+
+
+def _is_part(found: Any, columns: Sequence[str] | None) -> bool:
+    """Return whether a file has the columns of a part, or some of them, with their types."""
+    wanted = arrow_schema()
+    names = wanted.names if columns is None else columns
+    return all(found.get_field_index(name) >= 0 and found.field(name).type == wanted.field(name).type for name in names)
 
 
 def finished_parts(folder: Path, manifest: Manifest, say: Callable[[str], None]) -> dict[str, Path]:
@@ -281,11 +298,7 @@ def finished_parts(folder: Path, manifest: Manifest, say: Callable[[str], None])
     """
     done = part_files(folder)
     for key, path in list(done.items()):
-        try:
-            whole = read_part(path, ["status"]).num_rows == manifest.chunks[key]
-        except InvalidProblem:
-            whole = False
-        if not whole:
+        if not _is_whole(path, manifest.chunks[key]):
             del done[key]
             say(f"{path}: the part is damaged, and is made again")
             try:

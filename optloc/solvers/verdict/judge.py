@@ -22,7 +22,16 @@ from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.least_squares_ranges import ranges
 from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.conclusion import conclude
-from optloc.solvers.verdict.findings import NO_ANSWER, NO_PROOF, chart_of, examine, explain, is_improbable, mark
+from optloc.solvers.verdict.findings import (
+    NO_ANSWER,
+    NO_PROOF,
+    chart_of,
+    examine,
+    explain,
+    is_improbable,
+    mark,
+    reach_of,
+)
 from optloc.solvers.verdict.minima import is_measured, station_direction, unmeasured_direction, weak_direction
 
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
@@ -373,6 +382,7 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         marks,
         chart,
         np.full(count, np.nan) if pool.infinity is None else pool.infinity - cost,
+        reach_of(problem, pool.x[:, 0]),
     )
 
 
