@@ -16,7 +16,7 @@ from optloc.adequacy.noise_level import CommonLevel, LateSignals, common_level_a
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import together
 from optloc.base.types import Array, Bias, Stations
-from optloc.cli.file_fixes import CHUNK
+from optloc.cli.file_fixes import CHUNK, table_json
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.from_table import read_problem
 from optloc.cli.output import (
@@ -70,7 +70,7 @@ def run_check(
         more = {} if checked is None else {"health": _health_json(checked)}
         more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
         more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
-        write_text(Path("-"), dumps(found | more | {"advice": advice_json(told)}))
+        write_text(Path("-"), dumps(found | table_json(loaded) | more | {"advice": advice_json(told)}))
     elif not quiet:
         sheet = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():

@@ -65,6 +65,13 @@ _OPTIONS: dict[str, Any] = {
             "--column",
         ),
     ],
+    "ignore": Annotated[
+        list[str] | None,
+        _option("COLUMN", "Column that is left out although it may be a measurement. Once for each.", "--ignore"),
+    ],
+    "time_unit": Annotated[
+        _TEXT, _option("UNIT", "Of the column of times, where its name does not end in it.", "--time-unit")
+    ],
     "unit": Annotated[_TEXT, _option("UNIT", "Of the values, where the column's name does not end in it.", "--unit")],
     "what": Annotated[
         _TEXT,
@@ -103,7 +110,8 @@ def takes_table(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def taking(**values: Any) -> None:
         given = {name: values.pop(name) for name in _OPTIONS}
-        command(**values, given=given | {"columns": columns_of(given["columns"])})
+        named = {"columns": columns_of(given["columns"]), "ignore": tuple(given["ignore"] or ())}
+        command(**values, given=given | named)
 
     kept = [entry for entry in own.parameters.values() if entry.name != "given"]
     more = [
@@ -171,7 +179,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         plan.read()
         say_next(console, f"Nothing is written: --out names the problem file, and optloc fix {file} fixes it as it is.")
         if as_json:
-            write_text(Path("-"), dumps({"understood": _pairs(plan.about), "notes": list(plan.notes)}))
+            write_text(Path("-"), dumps(plan.as_read))
         return 0
     found = written(file, out, told, tell=lambda plan: _tell(plan, console))
     if as_json:
@@ -206,16 +214,12 @@ def _tell(plan: Plan, console: Console) -> None:
     say_all(console, plan.notes)
 
 
-def _pairs(about: Sequence[tuple[str, str]]) -> list[list[str]]:
-    return [list(pair) for pair in about]
-
-
 def _json(found: Converted) -> dict[str, Any]:
     about: dict[str, Any] = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
     if found.loaded is None:
         return about
     problem = found.loaded.problem
-    about["understood"] = _pairs(found.about)
+    about |= found.as_read
     return about | {"stations": problem.stations.count, "epochs": problem.epochs, "rows": problem.count}
 
 
@@ -230,7 +234,7 @@ def table_told(file: Path, given: Mapping[str, Any]) -> Told | None:
         return Told(**given)
     said = [name for name, value in given.items() if value]
     if said:
-        flag = {"what": "--as", "columns": "--column"}.get(said[0], f"--{said[0]}")
+        flag = {"what": "--as", "columns": "--column"}.get(said[0], f"--{said[0].replace('_', '-')}")
         what = f"it is for a table; {file.name} is a problem file"
         raise InvalidProblem(what, flag, "write it in the file, or name a table that ends in .csv, .json or .parquet")
     return None

@@ -15,7 +15,8 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Stations
 from optloc.base.units import SPEED_OF_LIGHT, Conversion, Quantity, conversion
-from optloc.files.roles import WORDS, stem, unit_of, worded
+from optloc.files.columns import stem, unit_of
+from optloc.files.roles import WORDS, worded
 from optloc.files.schema import FrameTable, StationsTable, Units
 from optloc.files.stations import survey
 from optloc.files.table import Table, of_frame

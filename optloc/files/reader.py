@@ -76,6 +76,8 @@ class Loaded:
         Unit of the file that people read each bias in, and its SI size with sign; those read in SI are left out.
     azimuths : str
         From where azimuths are counted, and how the file would say otherwise; empty where there are none.
+    table : mapping
+        How a foreign table was read, as a JSON value; empty of a problem file.
     """
 
     problem: Problem
@@ -88,6 +90,7 @@ class Loaded:
     levels: NoiseLevels | None = None
     bias_units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     azimuths: str = ""
+    table: Mapping[str, Any] = field(default_factory=dict)
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the unit that people read an unknown in and its SI size: the file's, or what its slot says."""
