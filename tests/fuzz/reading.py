@@ -143,7 +143,7 @@ def melted(frame, stations, given, told):
             word, unit = parted(name)
             hits = {asked or "tdoa": pairs[word]} if word in pairs and (asked or "-" in name) else {}
             for kind, (_, words) in KINDS.items() if not hits else ():
-                cut = [re.sub(f"^{w}|{w}$", "", word) for w in words.split()]
+                cut = [rest for w in words.split() for rest in (word.removeprefix(w), word.removesuffix(w))]
                 hits |= {kind: pairs[rest] for rest in cut if rest in pairs and rest != word and asked in (None, kind)}
             for kind, ends in hits.items():
                 own = unit or given.get("--unit")

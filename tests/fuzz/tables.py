@@ -10,6 +10,7 @@ import io
 import json
 import math
 import random
+import re
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -611,7 +612,8 @@ def nested(rng, sheet, rows, *, wide):
     sheet.about.append(how)
     if how == "wrapped":
         return {"recorded": "2026-04-06", "campaign": "north", "data": rows}
-    shared = [name for name in columns if name.split("_")[0].split()[0] in {*MESSAGE, *TARGET, "time", "t", "timestamp"}]
+    shared = {*MESSAGE, *TARGET, "time", "t", "timestamp", "stamp"}
+    shared = [name for name in columns if re.sub(r"[ _(/\[]+(s|ms|us|ns)[\])]?$", "", name) in shared]
     groups = {}
     for row in rows:
         groups.setdefault(tuple(str(row.get(name)) for name in shared), []).append(row)

@@ -203,7 +203,7 @@ def near(one, two):
 
 def run_part(seed, first, count):
     """Return the faults of some tables, and counts of what became of all."""
-    counts, faults = Counter(), []
+    counts, faults, refused = Counter(), [], []
     for number in range(first, first + count):
         table = made(seed, number)
         with tempfile.TemporaryDirectory() as folder:
@@ -217,9 +217,8 @@ def run_part(seed, first, count):
             faults.append(f"{table.name}: {said}")
             sys.stderr.write(f"{faults[-1]}\n")
             sys.stderr.flush()
-        if word == "refused":
-            counts[said.partition(":")[2].split("; ")[0][:0]] += 0
-    return faults, counts
+        refused += [f"{table.name}: {said}"] if word == "refused" else []
+    return faults, counts, refused
 
 
 def main():
@@ -231,8 +230,8 @@ def main():
             Path(name).write_bytes(data)
         sys.stdout.write(f"optloc fix {' '.join(map(repr, table.arguments))}\n{table.about}\n")
         return
-    faults, counts = run_part(int(seed), int(first), int(more[0]))
-    sys.stdout.write(json.dumps({"faults": faults, "counts": counts}) + "\n")
+    faults, counts, refused = run_part(int(seed), int(first), int(more[0]))
+    sys.stdout.write(json.dumps({"faults": faults, "counts": counts, "refused": refused}) + "\n")
 
 
 if __name__ == "__main__":
