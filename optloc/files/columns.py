@@ -120,14 +120,14 @@ def roles() -> Mapping[str, Role]:
 @lru_cache(maxsize=4)
 def _roles(models: tuple[tuple[str, Model], ...]) -> Mapping[str, Role]:
     kinds = {kind: _of_kind(kind, model) for kind, model in models if model.stations}
-    every = tuple(unit for units in UNITS.values() for unit in units)
+    every = dict.fromkeys(unit for units in UNITS.values() for unit in units)
     return _FIXED | {"sigma": _role("standard deviation of the row", _SIGMA, every)} | kinds
 
 
 def _of_kind(kind: str, model: Model) -> Role:
     units = tuple(UNITS[model.quantity])  # type: ignore[index]  # models hold known quantities only
     by_unit = _ANGLES_BY_UNIT.get(kind, "").split()
-    names = [*map(stem, (kind, *model.aliases)), *_SHORT.get(kind, "").split()]
+    names = dict.fromkeys([*map(stem, (kind, *model.aliases)), *_SHORT.get(kind, "").split()])
     return Role(model.summary, tuple(name for name in names if name not in by_unit), units, tuple(by_unit))
 
 
@@ -189,7 +189,7 @@ def sigma_kind(column: str) -> str | None:
     role = _by_name(tuple(MODELS.items())).get(("".join(rest), None))
     role = role or next((kind for kind, by_unit in _ANGLES_BY_UNIT.items() if "".join(rest) in by_unit.split()), None)
     role = "elevation" if role == "height" and any_unit(column) in _ANGLE else role
-    return role if role in MODELS else None
+    return role if role is not None and role in MODELS else None
 
 
 def is_sigma(word: str) -> bool:

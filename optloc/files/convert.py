@@ -348,9 +348,6 @@ def _plan(
         notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range: straight rays, one speed")
     after: tuple[str, ...] = ()
     if told.window is not None and "epoch" not in epochs:
-        if "time" not in epochs:
-            advice = "name the column of times with --column time=NAME, and its unit at the end of its name"
-            raise InvalidProblem("a window needs a column of times", "--window", advice)
         after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
     notes += _left_out(roles, told, found)
     height, note = _height(found, place)

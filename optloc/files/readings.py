@@ -322,16 +322,29 @@ def sorts_of(roles: Roles, told: Told) -> list[str]:
         return ["sp"]
     fitting = [name for name in _SEEN if roles.find(name)]
     fitting += ["arrivals"] if roles.find("toa") else []
-    # A column of times holds the arrivals only where no other column is a reading.
-    return fitting or (["times"] if roles.find("station") and roles.find("time") else [])
+    if fitting or not (roles.find("station") and roles.find("time")):
+        return fitting
+    _check_times_alone(roles)
+    return ["times"]
 
 
-def _kind_at_end(column: str) -> str | None:
-    """Return the kind whose name and unit end the name of a column, such as "range" of "raw_range_m"; else None."""
-    words = re.split(r"[_.\s]+", bare(column))
-    unit = any_unit(column)
-    ends = ["_".join([*words[i:], unit]) for i in range(1, len(words))] if unit is not None else []
-    return next((role for end in ends if (role := role_of(end)) in MODELS), None)
+def _check_times_alone(roles: Roles) -> None:
+    """Raise InvalidProblem where a column beside the times may hold the readings: then the times are no arrivals."""
+    taken = {part for name in roles.by_role.values() for part in name.split("+")}
+    for column in [*roles.table.columns, *roles.table.others]:
+        other = column not in taken and role_of(column) is None
+        if other and (any_unit(column) is not None or _kind_within(column, None) is not None):
+            what = f"the readings may be in {column!r}, or be the times in {roles.find('time')!r}"
+            advice = f"say --column range={quoted(column)} or another kind, or --as arrivals for the times"
+            raise InvalidProblem(what, roles.table.source, advice)
+
+
+def _kind_within(column: str, unit: str | None) -> str | None:
+    """Return the kind that words of a column's name and a unit suggest, such as "range" of "dist_raw_m"; else None."""
+    words = [word for word in tokens(bare(column)) if not word.isdigit()]
+    parts = ["_".join(words[i:j]) for i in range(len(words)) for j in range(len(words), i, -1)]
+    named = [part if unit is None else f"{part}_{unit}" for part in parts if len(part) >= _LETTERS]
+    return next((role for name in named if (role := role_of(name)) is not None and role in MODELS), None)
 
 
 def as_angles(roles: Roles, told: Told) -> Roles:
@@ -369,11 +382,12 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
         Whether only lengths and their rates can be measurements of the table.
     """
     kind = sigma_kind(column)
-    role = role_of(column) or _kind_at_end(column)
+    unit = any_unit(column)
+    role = role_of(column) or (None if unit is None else _kind_within(column, unit))
     if kind is not None or role is None or (lengths and role in MODELS and MODELS[role].quantity == "angle"):
         return None
     # One or two letters without a unit are too little to suspect a measurement.
-    short = any_unit(column) is None and len(stem(column)) <= _LETTERS
+    short = unit is None and len(stem(column)) <= _LETTERS
     if role in MODELS and not short:
         return MODELS[role].summary
     return MODELS["height"].summary if role in ("height", "depth") and not short else None

@@ -387,6 +387,8 @@ def epochs_of(roles: Roles, told: Told, found: Sequence[Readings]) -> dict[str, 
     message, when = (None if (name := roles.find(role)) in taken else name for role in ("message", "time"))
     if told.window is not None and found[0].form.kind == "toa" and when is None and long:
         return out | {"epoch": _clusters(found[0], told.window, table.count)}
+    if told.window is not None and when is None:
+        raise _no_times()
     if message is not None and told.window is None:
         out["epoch"] = roles.labels("message")
     time = None if when is None else moments(roles, when, told.zone, told.time_unit)
@@ -402,11 +404,15 @@ def epochs_of(roles: Roles, told: Told, found: Sequence[Readings]) -> dict[str, 
     return out
 
 
+def _no_times() -> InvalidProblem:
+    advice = "name the column of times with --column time=NAME, and its unit with --time-unit"
+    return InvalidProblem("a window needs a column of times", "--window", advice)
+
+
 def _clusters(found: Readings, window: str, count: int) -> Array:
     """Return the message (n,) of each row of arrivals: of the same are those less than a window apart."""
     if found.unit not in UNITS["time"]:
-        advice = "name the column of times with --column time=NAME"
-        raise InvalidProblem("a window needs a column of times", "--window", advice)
+        raise _no_times()
     factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / Decimal(repr(UNITS["length"][found.unit]))
     out, label, last = np.full(count, "", dtype=object), 0, None
     for i in sorted(range(len(found.values)), key=lambda i: found.values[i]):
