@@ -411,9 +411,10 @@ def _no_times() -> InvalidProblem:
 
 def _clusters(found: Readings, window: str, count: int) -> Array:
     """Return the message (n,) of each row of arrivals: of the same are those less than a window apart."""
-    if found.unit not in UNITS["time"]:
-        raise _no_times()
-    factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / Decimal(repr(UNITS["length"][found.unit]))
+    # Arrivals in metres are times that the speed of light has multiplied.
+    seconds = Decimal(repr(UNITS["length"][found.unit]))
+    seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))
+    factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / seconds
     out, label, last = np.full(count, "", dtype=object), 0, None
     for i in sorted(range(len(found.values)), key=lambda i: found.values[i]):
         label += last is None or found.values[i] - last > factor
