@@ -22,7 +22,11 @@ DOCUMENT = ("bytes", "tokens", "tokens", "structure", "structure", *("graft",) *
 TABLE = ("bytes", "tokens", "columns", "columns", "columns", "columns")
 PLAIN, TREE = ("bytes", "tokens", "tokens"), ("bytes", "tokens", "tokens", *("structure",) * 4, "rows")
 LINES = ("jsonl", "ndjson")
-LEVELS = dict.fromkeys(("csv", "tsv"), TABLE) | dict.fromkeys(("json", "geojson", "state", *LINES), TREE) | {"toml": DOCUMENT}
+LEVELS = (
+    dict.fromkeys(("csv", "tsv"), TABLE)
+    | dict.fromkeys(("json", "geojson", "state", *LINES), TREE)
+    | {"toml": DOCUMENT}
+)
 
 COMMANDS = (
     *[(("fix", "--json"), ())] * 8,

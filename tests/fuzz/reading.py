@@ -38,7 +38,9 @@ ROLES = {
     "height": (LENGTH, "height alt altitude elevation"),
 }  # fmt: skip
 ALL_UNITS = {unit.lower(): unit for unit in {*LENGTHS, *ANGLE, *SPEED, *LEVEL}}
-ENDING = re.compile(rf"(.*?)\s*[_ \[(/]\s*({'|'.join(sorted(map(re.escape, ALL_UNITS), key=len, reverse=True))})[\])]?", re.I)
+ENDING = re.compile(
+    rf"(.*?)\s*[_ \[(/]\s*({'|'.join(sorted(map(re.escape, ALL_UNITS), key=len, reverse=True))})[\])]?", re.I
+)
 
 
 def frame_of(path):
@@ -135,7 +137,10 @@ def melted(frame, stations, given, told):
         if name is not None and (stations is None or ends[0] is not None):
             names = [frame[end] if end else [None] * len(frame) for end in ends]
             unit = parted(name)[1] or given["--unit"]
-            out += [(kind, i, text, unit, a, b, name) for i, text, a, b in zip(frame.index, frame[name], *names, strict=True)]
+            out += [
+                (kind, i, text, unit, a, b, name)
+                for i, text, a, b in zip(frame.index, frame[name], *names, strict=True)
+            ]
     if not out and stations is not None:
         short = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in stations}
         pairs = {a + b: (short[a], short.get(b, given.get("--reference"))) for a in short for b in ["", *short]}
@@ -160,6 +165,7 @@ def rows_of(folder, arguments):
     spots = places(frame, told, frame.index) if inline else stations
     readings = melted(frame, stations, given, told)
     rest = frame.drop(columns={row[-1] for row in readings})
+    told = {role: name for role, name in told.items() if name in rest}
     when, label, target, spread = (column(rest, role, told) for role in ("time", "message", "target", "sigma"))
     epochs = epochs_of(frame, label, when, given, readings)
     out = []
@@ -190,7 +196,9 @@ def epochs_of(frame, label, when, given, readings):
     if "--window" in given:
         amount, unit = given["--window"].split()
         width = Fraction(amount) * Fraction(repr(TIME[unit]))
-        own = {i: Fraction(text) * Fraction(repr(TIME.get(u, 1 / C))) for kind, i, text, u, *_ in readings if kind == "toa"}
+        own = {
+            i: Fraction(text) * Fraction(repr(TIME.get(u, 1 / C))) for kind, i, text, u, *_ in readings if kind == "toa"
+        }
         times = own or {i: Fraction(cell) * Fraction(repr(TIME[parted(when)[1]])) for i, cell in frame[when].items()}
         order = pd.Series(times).sort_values()
         group = (order.diff().fillna(0) > width).cumsum()

@@ -30,7 +30,9 @@ OF_TABLES = (
 
 RX = "name,lat,lon,alt_m\nLake,47.812,11.183,612\nChapel,47.861,11.246,701\nQuarry,47.843,11.121,655\n"
 RX += "Summit,47.764,11.262,1410\nMill,47.751,11.148,640\nTower,47.790,11.310,842\n"
-HEARD = dict(zip("Lake Chapel Quarry Summit Mill Tower".split(), (14221, 14691, 25540, 30224, 37037, 30664), strict=True))
+HEARD = dict(
+    zip("Lake Chapel Quarry Summit Mill Tower".split(), (14221, 14691, 25540, 30224, 37037, 30664), strict=True)
+)
 NET = "station,latitude,longitude,elevation_m\nAQU,42.354,13.405,710\nFIAM,42.268,13.117,1070\nTERO,42.623,13.604,673\n"
 NET += "CAMP,42.536,13.409,1283\nFAGN,42.266,13.584,761\nINTR,42.011,13.904,924\n"
 PICKS = "station,P,S\nAQU,2026-04-06T01:32:41.73Z,2026-04-06T01:32:42.99Z\nFIAM,2026-04-06T01:32:44.31Z,2026-04-06T01:32:47.48Z\n"
@@ -72,7 +74,11 @@ def nested_ranges():
     """Return ranges of two scans as a tree, some of them missing."""
     scans = []
     for k in range(3):
-        heard = [{"anchor": {"id": f"A{i + 1}"}, "range_m": 3.1 + i + 0.1 * k, "rssi": -60} for i in range(3) if (i, k) != (1, 2)]
+        heard = [
+            {"anchor": {"id": f"A{i + 1}"}, "range_m": 3.1 + i + 0.1 * k, "rssi": -60}
+            for i in range(3)
+            if (i, k) != (1, 2)
+        ]
         scans.append({"t_s": 0.5 * k, "pose": {"yaw": 0.1}, "readings": heard})
     return json.dumps({"robot": "r1", "log": {"scans": scans}})
 
@@ -93,7 +99,9 @@ def phone():
     """Return two epochs of the real RINEX file as Android's GnssLogger writes them."""
     from optloc.files.rinex import read_observations
 
-    head = "Raw,utcTimeMillis,TimeNanos,LeapSecond,FullBiasNanos,BiasNanos,Svid,TimeOffsetNanos,State,ReceivedSvTimeNanos,"
+    head = (
+        "Raw,utcTimeMillis,TimeNanos,LeapSecond,FullBiasNanos,BiasNanos,Svid,TimeOffsetNanos,State,ReceivedSvTimeNanos,"
+    )
     head += "ReceivedSvTimeUncertaintyNanos,CarrierFrequencyHz,ConstellationType,HardwareClockDiscontinuityCount"
     seen, week = read_observations(HERE.parent / "gnss" / "kamakura.rnx", "G"), 604_800 * 10**9
     noon = round(float(seen.time[0]))
@@ -191,9 +199,13 @@ def recording():
     for k in range(3):
         z = [far(k)[name] - far(k)["A"] for name in "BCDE"]
         lines.append({"event": f"e{k}", "z": z, "target": "t1", "time": 10.0 + k, "received": float(k)})
-    lines += [{"event": "r", "kind": "tdoa", "a": a, "b": "A", "z": far(4)[a] - far(4)["A"], "received": 3.0} for a in "BCDE"]
+    lines += [
+        {"event": "r", "kind": "tdoa", "a": a, "b": "A", "z": far(4)[a] - far(4)["A"], "received": 3.0} for a in "BCDE"
+    ]
     start = 1_700_000_000_000_000_000
-    lines += [{"event": "h", "station": n, "time_ns": start + round(v / C * 1e9), "received": 4.0} for n, v in far(5).items()]
+    lines += [
+        {"event": "h", "station": n, "time_ns": start + round(v / C * 1e9), "received": 4.0} for n, v in far(5).items()
+    ]
     lines += [{"event": "few", "station": "A", "time_ns": start}, {"event": "two", "z": [1.0, None, 2.0, None]}]
     return "\n".join(map(json.dumps, lines)) + "\n"
 

@@ -157,7 +157,9 @@ def made(seed, number):
     sheet = Sheet(about=[what, "odd" if scene.odd else "plain"])
     exact = rng.random() < 0.8
     readings = readings_of(scene, exact=exact)
-    wide = len(scene.kinds) == 1 and not scene.inline and what not in ("anchors", "rss_difference") and rng.random() < 0.4
+    wide = (
+        len(scene.kinds) == 1 and not scene.inline and what not in ("anchors", "rss_difference") and rng.random() < 0.4
+    )
     files = {}
     if wide:
         wide_sheet(sheet, scene, readings)
@@ -301,7 +303,11 @@ def ideal(scene, kind, a, b, truth):
 
 def instant(scene, start, far):
     """Return the arrival of a signal in seconds, to a thousandth of a picosecond, in the seconds of today or of a run."""
-    return (Decimal(1_790_000_000) if scene.size > 300.0 else Decimal(12)) + start + Decimal(repr(far / C)).quantize(Decimal("1e-15"))
+    return (
+        (Decimal(1_790_000_000) if scene.size > 300.0 else Decimal(12))
+        + start
+        + Decimal(repr(far / C)).quantize(Decimal("1e-15"))
+    )
 
 
 def instant_later(value, metres):
@@ -348,7 +354,12 @@ def when_columns(rng, sheet, scene, message, *, wide=False):
     elif window:
         unit, count = rng.choice(["s", "ms", "us", "ns"]), iter(range(10**6))
         late = lambda row: Decimal(repr(row.epoch)) + Decimal(next(count) % 16) / 1000  # noqa: E731  (one after the other)
-        makers.append((titled(rng, rng.choice("time t timestamp stamp".split()), unit), lambda row: f"{(late(row) / Decimal(repr(TIME[unit]))).normalize():f}"))
+        makers.append(
+            (
+                titled(rng, rng.choice("time t timestamp stamp".split()), unit),
+                lambda row: f"{(late(row) / Decimal(repr(TIME[unit]))).normalize():f}",
+            )
+        )
     elif first is not None:
         unit = rng.choice(["s", "s", "ms", "us"])
         form = rng.choice(["unit", "unit", "unit", "date"])
@@ -452,9 +463,7 @@ def inline_columns(sheet, scene):
     if not scene.earth:
         unit = rng.choice(["m", "m", "cm", "km"])
         heads = [titled(rng, axis, unit) if unit != "m" or rng.random() < 0.5 else axis for axis in "xyz"]
-        return lambda name: {
-            head: repr(v / LENGTH[unit]) for head, v in zip(heads, scene.shown[name], strict=False)
-        }
+        return lambda name: {head: repr(v / LENGTH[unit]) for head, v in zip(heads, scene.shown[name], strict=False)}
     lat, lon = rng.choice([("lat", "lon"), ("latitude", "longitude"), ("lat_deg", "lon_deg")])
     unit = rng.choice(["m", "m", "ft"])
     word = rng.choice(["alt", "height", "altitude", *(["elevation"] * 3 if scene.odd else [])])
@@ -544,7 +553,9 @@ def station_file(sheet, scene):
         word = rng.choice(["alt", "height", "altitude", "elevation"])
         for name in scene.names:
             shown = scene.shown[name]
-            rows.append({head: name, lat: repr(shown[0]), lon: repr(shown[1]), f"{word}_{unit}": repr(shown[2] / LENGTH[unit])})
+            rows.append(
+                {head: name, lat: repr(shown[0]), lon: repr(shown[1]), f"{word}_{unit}": repr(shown[2] / LENGTH[unit])}
+            )
     else:
         unit = rng.choice(["m", "m", "cm", "km", "ft"])
         bare = unit == "m" and rng.random() < 0.5
@@ -594,7 +605,9 @@ def written(rng, sheet, *, wide):
         return "t.tsv", csv_of(rows, "\t")
     if form == "parquet":
         return "t.parquet", parquet_of(rows)
-    held = [{name: number(cell) for name, cell in row.items() if cell is not None or rng.random() < 0.5} for row in rows]
+    held = [
+        {name: number(cell) for name, cell in row.items() if cell is not None or rng.random() < 0.5} for row in rows
+    ]
     if form == "jsonl":
         return "t.jsonl", "\n".join(raw_json(row) for row in held).encode()
     if form == "nested":
@@ -699,7 +712,9 @@ def satellites(rng, which):
             way, rise = math.tau * (i + rng.random()) / count, math.radians(rng.uniform(15, 85))
             line = [math.sin(way) * math.cos(rise), math.cos(way) * math.cos(rise), math.sin(rise)]
             far = rng.uniform(2.0e7, 2.5e7)
-            received = [p + far * sum(v * axis[d] for v, axis in zip(line, axes, strict=True)) for d, p in enumerate(receiver)]
+            received = [
+                p + far * sum(v * axis[d] for v, axis in zip(line, axes, strict=True)) for d, p in enumerate(receiver)
+            ]
             sent = turned(received, -far / C)
             value = math.dist(receiver, received) + clock
             rows.append(Row("toa", value, tuple(received), None, sigma, t, None))

@@ -88,7 +88,10 @@ def differences(own, loaded):
         label = "" if label == "target" else label
         a, b = (first_alike(problem, epoch, end) for end in (a, b))
         if weight > 0.0:
-            theirs[kind, epoch, label, *turned_round(kind, a, b)] = (-z if is_turned(kind, a, b) else z, math.sqrt(variance))
+            theirs[kind, epoch, label, *turned_round(kind, a, b)] = (
+                -z if is_turned(kind, a, b) else z,
+                math.sqrt(variance),
+            )
     if mine.keys() != theirs.keys():
         lacking, more = sorted(mine.keys() - theirs.keys()), sorted(theirs.keys() - mine.keys())
         return f"rows {lacking[:2]} are not read, {more[:2]} are, of stations {names}"
@@ -99,7 +102,10 @@ def differences(own, loaded):
     for key, (z, sigma) in mine.items():
         other, spread = theirs[key]
         if key[0] == "toa":
-            z, other = float(z - least[key[1:3]]) * (C if isinstance(z, reading.Fraction) else 1.0), other - base[key[1:3]]
+            z, other = (
+                float(z - least[key[1:3]]) * (C if isinstance(z, reading.Fraction) else 1.0),
+                other - base[key[1:3]],
+            )
         off = abs(z - other)
         off = abs(math.remainder(z - other, math.tau)) if key[0] == "azimuth" else off
         # Differences of floats keep what these have.
@@ -131,7 +137,10 @@ def keyed(rows, problem):
             if off[near] > (FLIGHT if satellite else PLACE * max(np.linalg.norm(spot), 1.0)):
                 return f"a station at {spot} is {off[near]:.3g} m off"
             ends.append(near)
-        found[kind, epoch, target, *turned_round(kind, *ends)] = (-row.z if is_turned(kind, *ends) else row.z, row.sigma)
+        found[kind, epoch, target, *turned_round(kind, *ends)] = (
+            -row.z if is_turned(kind, *ends) else row.z,
+            row.sigma,
+        )
     return found
 
 
@@ -154,7 +163,9 @@ def turned_round(kind, a, b):
 
 def epoch_of(row, loaded):
     """Return the number of the epoch of a row, None where there is no such."""
-    known = [k for k in range(len(loaded.epochs)) if not loaded.own_epochs or loaded.targets[k] == (row.target or "target")]
+    known = [
+        k for k in range(len(loaded.epochs)) if not loaded.own_epochs or loaded.targets[k] == (row.target or "target")
+    ]
     if isinstance(row.epoch, str):
         return next((k for k in known if plainly(loaded.epochs[k]) == plainly(row.epoch)), None)
     if row.epoch is None:
