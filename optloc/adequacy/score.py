@@ -13,7 +13,6 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Bias
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import Normal
-from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.problem.bias import Form, Per, family
 from optloc.problem.chart import quantile

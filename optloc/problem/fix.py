@@ -293,11 +293,11 @@ class Fix:
         return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
 
     def undetermined(self, name: str = "position") -> Array:
-        """Return which entries (..., q) of a named part the data leave open, whatever number stands there.
+        """Return a mark for each entry (..., q) of a named part that the data do not determine.
 
-        An entry is open where its standard deviation is more than 100 times the size of stations and target together, a
-        speed where it is more than that of light. Symmetry leaves such entries: the height over a plane of stations, for
-        instance, where the target is in that plane. Tables and texts call them "not determined".
+        The standard deviation of such an entry is more than 100 times the size of stations and target together, that of
+        a speed more than the speed of light. Symmetry causes such entries, such as the height of a target in the plane
+        of the stations. Tables and texts call them "not determined".
 
         Parameters
         ----------

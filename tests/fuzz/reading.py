@@ -39,7 +39,7 @@ ROLES = {
 }  # fmt: skip
 ALL_UNITS = {unit.lower(): unit for unit in {*LENGTHS, *ANGLE, *SPEED, *LEVEL}}
 ENDING = re.compile(
-    rf"(.*?)\s*[_ \[(/]\s*({'|'.join(sorted(map(re.escape, ALL_UNITS), key=len, reverse=True))})[\])]?", re.I
+    rf"(.*?)\s*[_ \[(/]\s*({'|'.join(sorted(map(re.escape, ALL_UNITS), key=len, reverse=True))})[\])]?", re.IGNORECASE
 )
 
 
