@@ -278,6 +278,7 @@ class Status(IntEnum):
     MISFIT = 14
     UNPROVEN = 15
     CURVED = 16
+    UNCHECKED = 17
 
     def __str__(self) -> str:
         """Return the label: what `print` shows."""
@@ -331,6 +332,7 @@ _SENTENCES: dict[Status, str] = {
     "'auto' tries to, the certificate says what is missing, and whoever can do without allows this status.",
     Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
     "optloc.likelihood_region.",
+    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
 }
 
 PRECEDENCE = (
@@ -356,6 +358,9 @@ PRECEDENCE = (
 )
 """Which of all that applies to a fix is its status: the first of these."""
 
+NOTES = (Status.UNCHECKED,)
+"""Findings that are never a status: they stand beside one, `ok` included."""
+
 ANSWERED = (
     Status.OK,
     Status.CURVED,
@@ -369,7 +374,7 @@ ANSWERED = (
 
 
 def first_status(marks: Array) -> Array:
-    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing does."""
+    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing but notes does."""
     marks = np.asarray(marks)
     code = np.full(marks.shape, int(Status.OK), dtype=np.int8)
     anywhere = int(np.bitwise_or.reduce(marks, axis=None))  # few statuses occur in a batch
