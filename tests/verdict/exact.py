@@ -187,6 +187,8 @@ def courses(rng: Rng) -> Scene:
     return Scene(f"{kind}, moving target, {epochs} epochs, size {size:.2g}", build, truth)
 
 
+COUNT = 50
+"""Scenes of one seed of a test in full."""
 FAMILIES = (ground, ground, ground, satellites, satellites, airspace, rates, courses)
 
 

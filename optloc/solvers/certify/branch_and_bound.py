@@ -52,8 +52,8 @@ METHOD = "branch and bound"
 UNFINISHED = "the proof was not finished within its budget of boxes"
 LACKS_CODE = "; machine code, which takes minutes to make once, would go on: run `optloc compile`"
 FINE = (
-    "the stated noise is finer than the rounding of the rows: double precision does not tell positions apart so "
-    "finely; state a larger noise, or count coordinates and measurements from nearby"
+    "the stated noise is finer than the rounding of ranges and coordinates, so that no proof can tell positions apart; "
+    "state a larger noise, or an origin nearby"
 )
 AROUND = "the region reaches around the Earth, and the proof is for one side of it"
 UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
