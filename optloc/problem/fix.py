@@ -475,16 +475,15 @@ class Fix:
         InvalidProblem
             For an unknown status or a redundancy that is no whole number.
         """
-        if isinstance(redundancy, bool) or not isinstance(redundancy, int | np.integer) or redundancy < 0:
-            raise InvalidProblem(f"{redundancy!r} is no redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")
+        wanted = _whole(redundancy)
         passing = [Status.OK, *(one if isinstance(one, Status) else status_named(one) for one in allow)]
         bad = np.flatnonzero(~np.isin(np.ravel(self.code), passing))
         if len(bad):
             flat = self.flat()
             raise NoSolution(None, flat[int(bad[0])])
-        weak = np.flatnonzero(np.ravel(self.dof) < redundancy)
+        weak = np.flatnonzero(np.ravel(self.dof) < wanted)
         if len(weak):
-            raise NoSolution(None, self.flat()[int(weak[0])], _too_weak(self, weak, int(redundancy)))
+            raise NoSolution(None, self.flat()[int(weak[0])], _too_weak(self, weak, wanted))
         return self
 
     def flat(self) -> Fix:
@@ -502,6 +501,13 @@ class Fix:
     def __len__(self) -> int:
         """Return the length of the first batch axis."""
         return int(self.x.shape[0])
+
+
+def _whole(redundancy: Any) -> int:
+    """Return a redundancy that is asked for; raise InvalidProblem where it is no whole number."""
+    if isinstance(redundancy, bool) or not isinstance(redundancy, int | np.integer) or redundancy < 0:
+        raise InvalidProblem(f"{redundancy!r} is no redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")
+    return int(redundancy)
 
 
 def _too_weak(fix: Fix, weak: Array, wanted: int) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from optloc import Frame, Motion, Prior, Problem, Stations, assemble, constraints, measured, with_bias
+from optloc.linear.constraints import exact, restore
 from optloc.linear.evaluate import predict
 from optloc.models import MODELS
 from optloc.problem.noise import variances
@@ -187,9 +188,32 @@ def courses(rng: Rng) -> Scene:
     return Scene(f"{kind}, moving target, {epochs} epochs, size {size:.2g}", build, truth)
 
 
+def over_ground(rng: Rng) -> Scene:
+    """An aircraft that keeps a known height over the Earth, seen by a network for some minutes."""
+    kind = str(rng.choice(["tdoa", "range", "azimuth"]))
+    epochs, count, reach = int(rng.integers(4, 7)), 5, 10.0 ** rng.uniform(4.3, 5.3)
+    times = np.linspace(0.0, reach / 300.0, epochs)
+    place = np.column_stack([rng.uniform(-reach, reach, (count, 2)), rng.uniform(0.0, 500.0, count)])
+    frame = Frame.enu(lat_deg=rng.uniform(-80.0, 80.0), lon_deg=rng.uniform(-180.0, 180.0))
+    level = float(rng.uniform(100.0, 12e3))
+    start = np.array([*rng.uniform(-reach, reach, 2), level, *rng.uniform(-100.0, 100.0, 2), 0.0])
+    held = constraints.height(exactly=level)
+    sides = constraints.box([-3.0 * reach, -3.0 * reach, -np.inf], [3.0 * reach, 3.0 * reach, np.inf])
+    limits = (*sides, *constraints.speed(400.0), *held)
+
+    def build(share: float) -> Problem:
+        rows = rows_of(kind, count, share, reach, np.arange(epochs))
+        motion = Motion(1, reference=float(times.mean()), over="ground")
+        return assemble(place, *rows, times=times, frame=frame, motions=(motion,), constraints=limits)
+
+    made = build(1e-3).flat()
+    truth = restore(made, exact(made), start[None])[0]
+    return Scene(f"{kind}, course over ground, {epochs} epochs, reach {reach:.2g}", build, truth)
+
+
 COUNT = 50
 """Scenes of one seed of a test in full."""
-FAMILIES = (ground, ground, ground, satellites, satellites, airspace, rates, courses)
+FAMILIES = (ground, ground, ground, satellites, satellites, airspace, rates, courses, over_ground)
 
 
 def draw(seed: int) -> Scene:
