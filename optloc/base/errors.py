@@ -68,7 +68,7 @@ def _shown(text: str, most: int = _SHOWN) -> str:
 
 
 class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
-    """A fix was required but its status is not a clean one.
+    """A fix was required but its status is not a clean one, or it has too little redundancy.
 
     Parameters
     ----------
@@ -76,19 +76,26 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         The problem that was to be solved.
     fix : Fix
         The fix that was refused; its status, alternatives and certificate say why.
+    why : str, optional
+        Why a fix with a clean status was refused.
 
     Notes
     -----
-    ``str(error)`` is the sentence of ``fix.status``, with its advice; a batch gives each distinct one once.
+    ``str(error)`` is `why`, or else the sentence of ``fix.status``, with its advice; a batch gives each distinct one
+    once.
     """
 
-    def __init__(self, problem: Any, fix: Any) -> None:
-        super().__init__(problem, fix)
+    def __init__(self, problem: Any, fix: Any, why: str = "") -> None:
+        # Only positional arguments survive pickling on their way back from a worker process.
+        super().__init__(problem, fix, why)
         self.problem = problem
         self.fix = fix
+        self.why = why
 
     def __str__(self) -> str:
-        """Return the sentence of the status; of a batch, one sentence a distinct status."""
+        """Return why, or the sentence of the status; of a batch, one sentence a distinct status."""
+        if self.why:
+            return self.why
         status = getattr(self.fix, "status", None)
         if status is None:
             return "There is no fix."

@@ -299,6 +299,7 @@ class Status(IntEnum):
     UNPROVEN = 15
     CURVED = 16
     UNREFINED = 17
+    UNCHECKED = 18
 
     def __str__(self) -> str:
         """Return the label: what `print` shows."""
@@ -354,6 +355,7 @@ _SENTENCES: dict[Status, str] = {
     Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
     "optloc.likelihood_region.",
     Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
+    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
 }
 
 PRECEDENCE = (
@@ -380,6 +382,9 @@ PRECEDENCE = (
 )
 """Which of all that applies to a fix is its status: the first of these."""
 
+NOTES = (Status.UNCHECKED,)
+"""Findings that are never a status: they stand beside one, `ok` included."""
+
 ANSWERED = (
     Status.OK,
     Status.CURVED,
@@ -393,7 +398,7 @@ ANSWERED = (
 
 
 def first_status(marks: Array) -> Array:
-    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing does."""
+    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing but notes does."""
     marks = np.asarray(marks)
     code = np.full(marks.shape, int(Status.OK), dtype=np.int8)
     anywhere = int(np.bitwise_or.reduce(marks, axis=None))  # few statuses occur in a batch

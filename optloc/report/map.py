@@ -18,6 +18,7 @@ from optloc.plot.outlines import level_planes
 from optloc.plot.style import figure_class, is_local, regions_of, states_of, thinned
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.report.columns import UNCHECKED
 from optloc.uncertainty.outline import Outline
 
 # Coastlines for maps without a network.
@@ -326,7 +327,11 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
     """Return the marks of fixes; labels name them where there are as many."""
     parts = [part for fix in fixes for part in states_of(fix)]
     position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
-    status = [Status(int(code)).label for fix in fixes for code in np.ravel(fix.code)]
+    status = [
+        f"{Status(int(code)).label} ({UNCHECKED})" if alone else Status(int(code)).label
+        for fix in fixes
+        for code, alone in zip(np.ravel(fix.code), np.ravel(fix.unchecked), strict=True)
+    ]
     named = list(labels) if len(labels) == len(position) > 1 else [""] * len(position)
     told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))

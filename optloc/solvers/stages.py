@@ -269,7 +269,8 @@ def _answer(
     # where all that is known is hidden by the Earth, another minimum may be in sight
     hidden = np.zeros(len(fix.code), dtype=bool) if pool.hidden is None else pool.hidden != ""
     lost = ~fix.answered & (hidden | ~np.isin(fix.code, _SETTLED))
-    behind = np.flatnonzero(fix.answered & (fix.code == Status.MISFIT)) if problem.frame.geodetic else []
+    refuted = fix.answered & (fix.code == Status.MISFIT) & problem.frame.geodetic
+    behind: Array = np.flatnonzero(refuted)
     lost[behind] = is_hidden(problem.take(behind), fix.x[behind]) if len(behind) else False
     # unlinked groups have fewer equations than the count says: without redundancy any place would fit
     lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)

@@ -114,7 +114,7 @@ def _free(surface: Surface, cells: Array, plane: Array, level: float) -> Outline
 
     def value(points: Array) -> Array:
         beyond = np.sqrt(((points - centre) ** 2).sum(-1)) / reach - 1.0
-        return np.maximum((profile(points) - surface.least) / q - 1.0, beyond)
+        return np.asarray(np.maximum((profile(points) - surface.least) / q - 1.0, beyond))
 
     polygons = trace(value, (cells - surface.position) @ plane.T)
     far = max((np.sqrt(((line - centre) ** 2).sum(-1)).max() for each in polygons for line in each), default=0.0)

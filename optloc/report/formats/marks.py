@@ -16,7 +16,7 @@ from optloc.base.types import Array, Status
 from optloc.problem.chart import CARTESIAN, NAMES
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report.columns import Columns, records
+from optloc.report.columns import UNCHECKED, Columns, records
 
 if TYPE_CHECKING:
     from optloc.uncertainty.outline import Outline
@@ -242,7 +242,7 @@ class Results:
             target=str(row.get("target", "target")),
             time=float(number.get("time", np.nan)),
             others=others,
-            reason=row["reason"] or "",
+            reason="; ".join(part for part in (row["reason"], UNCHECKED if row.get("unchecked") else "") if part),
         )
 
     def _name(self, row: dict[str, Any]) -> str:
