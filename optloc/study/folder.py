@@ -17,10 +17,11 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import json_of, read_bytes
 from optloc.base.outputs import written
+from optloc.base.types import Status
 from optloc.study.baselines import BASELINES
 from optloc.study.methods import version_of
 from optloc.study.plan import Plan, planned
-from optloc.study.trial import COLUMNS, EXPLAINED, GAP, Part, arrow_schema, machine, versions
+from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 MANIFEST = "manifest.json"
 FORMAT = 2
 _LOCK = ".lock"
+
+
+# Statuses of trials without a position whose reasons are shown: back ends and methods are their cause.
+EXPLAINED = (*FAILED, Status.NUMERICAL.label, Status.UNAVAILABLE.label)
 
 
 @dataclass(frozen=True, slots=True)

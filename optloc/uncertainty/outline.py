@@ -110,11 +110,11 @@ def _free(surface: Surface, cells: Array, plane: Array, level: float) -> Outline
     """Return the outline of a region that cells (m, v, d) hold."""
     q, centre = quantile(level, 2), (surface.chart.centre - surface.position) @ plane.T
     reach = FAR * float(surface.chart.distance)
-    profile = _profile(surface, cells, plane)
+    cost = _profile(surface, cells, plane)
 
     def value(points: Array) -> Array:
         beyond = np.sqrt(((points - centre) ** 2).sum(-1)) / reach - 1.0
-        return np.asarray(np.maximum((profile(points) - surface.least) / q - 1.0, beyond))
+        return np.asarray(np.maximum((cost(points) - surface.least) / q - 1.0, beyond))
 
     polygons = trace(value, (cells - surface.position) @ plane.T)
     far = max((np.sqrt(((line - centre) ** 2).sum(-1)).max() for each in polygons for line in each), default=0.0)

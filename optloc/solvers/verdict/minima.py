@@ -141,7 +141,7 @@ def unmeasured_direction(problem: Problem) -> str:
     x = _corners(problem)[0]
     with np.errstate(all="ignore"):
         information, _, _ = marginal(equations_at(problem.take(np.zeros(len(x), dtype=int)), x))
-    dead = (np.diagonal(information, axis1=-2, axis2=-1) <= _DEAD).all(0)
+    dead = np.asarray((np.diagonal(information, axis1=-2, axis2=-1) <= _DEAD).all(0))
     return "nothing measures " + ", ".join(np.array(problem.layout.labels())[: len(dead)][dead]) if dead.any() else ""
 
 
