@@ -397,6 +397,16 @@ def test_a_window_needs_the_unit_of_the_times_not_their_name(name, unit, told, t
             read(tmp_path, text, window="0.06 s", **{key: value for key, value in told.items() if key != "time_unit"})
 
 
+@pytest.mark.parametrize(
+    ("head", "size"), [("rx,toa_us", 1e-6), ("rx,pseudorange_km", 1e3 / 299792458.0), ("rx,arrival [ns]", 1e-9)]
+)
+def test_a_window_puts_arrivals_together_by_their_gaps(head, size, tmp_path):
+    lines = "".join(f"{n},{(0.5 * k + 1e-9 * r / C) / size!r}\n" for k in range(3) for n, r in FAR.items())
+    plan = read(tmp_path, f"{head}\n{lines}", window="1 ms")
+    assert plan.read().problem.epochs == 3
+    assert fixed(plan) < 1e-3
+
+
 @pytest.mark.parametrize("epochs", [1, 3])
 def test_a_window_without_times_is_refused_before_repeats_are(epochs, tmp_path):
     text = "stamp_ms,anchor,range_m\n" + "".join(f"{k},{n},{r}\n" for k in range(epochs) for n, r in FAR.items())

@@ -8,11 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from optloc.adequacy.equalities import Equalities, spare_rows
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Bias
 from optloc.compute.sums import equations_at
-from optloc.linear.constraints import exact, restore, tangent_at
-from optloc.linear.normal import Normal, marginal, step
+from optloc.linear.normal import Normal
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.problem.bias import Form, Per, family
@@ -130,7 +130,7 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
     C. R. Rao, "Large sample tests of statistical hypotheses concerning several parameters with applications to problems
     of estimation", Math. Proc. Cambridge Philos. Soc. 44 (1948) 50-57.
     """
-    dof = int(degrees_of_freedom(problem)[0])
+    dof = int(spare_rows(problem)[0])
     found = candidates(problem)
     if dof < 2 or not found or not np.isfinite(x).all():
         return ()
@@ -332,9 +332,9 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
     inside = np.concatenate([np.arange(part.start, part.stop) for part in own])
     rest = np.setdiff1d(np.arange(layout.n_shared), inside)
     space = np.eye(layout.n_shared)[:, rest]
-    if face := exact(problem):
+    if (held := Equalities.of(problem)).lasting:
         # along the equalities only: the other unknowns cannot leave them
-        along = tangent_at(problem, face, x).along[0]
+        along = held.lasting_space(x)[0]
         old = [layout.find(slot.name)[0].start + i for slot in problem.layout.shared for i in range(slot.size)]
         space = np.zeros((layout.n_shared, along.shape[1]))
         space[old] = along
@@ -354,7 +354,7 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
 
 def _shared(problem: Problem, x: Array) -> tuple[Array, Array]:
     """Return information (n, n) and vector (n,) of the shared unknowns of one problem, local ones eliminated."""
-    information, vector, _ = marginal(equations_at(problem, x))
+    information, vector = Equalities.of(problem).shared(equations_at(problem, x), x)
     return information[0], vector[0]
 
 
@@ -421,9 +421,7 @@ def _fitted(problem: Problem, x: Array, one: Candidate, scored: tuple[float, Arr
 def _sigma(problem: Problem, x: Array, part: slice) -> Array:
     """Return the standard deviations (q,) of a part of the shared unknowns."""
     information, _ = _shared(problem, x)
-    space = np.eye(len(information))
-    if face := exact(problem):
-        space = tangent_at(problem, face, x).along[0]
+    space = Equalities.of(problem).lasting_space(x)[0]
     root = space @ _root(space.T @ information @ space)
     return np.asarray(np.sqrt((root[part] ** 2).sum(-1)))
 
@@ -454,17 +452,16 @@ def descend(problem: Problem, x: Array, steps: int = 30) -> tuple[Array, Array]:
     steps : int
         Greatest number of steps.
     """
-    face = exact(problem)
+    held = Equalities.of(problem)
     with np.errstate(all="ignore"):
-        x = restore(problem, face, x) if face else np.array(x)
+        x = held.restore(np.array(x))
         equations = equations_at(problem, x)
         damping, over = np.full(len(x), _DAMPING), ~np.isfinite(equations.cost)
         for _ in range(steps):
             if over.all():
                 break
-            move, _ = step(equations, damping, tangent_at(problem, face, x) if face else None)
-            trial = np.where(over[:, None] | ~np.isfinite(move), x, x + move)
-            trial = restore(problem, face, trial) if face else trial
+            move, _ = held.step(equations, damping, x)
+            trial = held.restore(np.where(over[:, None] | ~np.isfinite(move), x, x + move))
             new = equations_at(problem, trial)
             better = (new.cost < equations.cost) & ~over
             over = over | (better & (equations.cost - new.cost <= _SMALL * (1.0 + new.cost))) | (damping > _STUCK)

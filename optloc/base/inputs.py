@@ -361,8 +361,11 @@ def _refused(error: Exception, language: str, source: str) -> InvalidProblem:
     return InvalidProblem(what, source, "write numbers with 17 digits at most")
 
 
-# Characters that move a terminal's cursor, end its lines or turn its writing round; breaks and tabs are text.
-_CONTROLS = re.compile("[\\x00-\\x08\\x0b\\x0c\\x0e-\\x1f\\x7f-\\x9f\\u2028\\u2029\\u202a-\\u202e\\u2066-\\u2069]")
+# Characters that move a terminal's cursor, end its lines or turn its writing round, and halves of characters, which no
+# file can hold; breaks and tabs are text.
+_CONTROLS = re.compile(
+    "[\\x00-\\x08\\x0b\\x0c\\x0e-\\x1f\\x7f-\\x9f\\u2028\\u2029\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff]"
+)
 
 
 def has_controls(text: str) -> bool:

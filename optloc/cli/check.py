@@ -272,7 +272,7 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
         # A wrong word is the user's error; data that cannot tell are a sentence of the answer.
         if error.where in ("by", "method"):
             raise
-        return Checked(None, f"station health could not be told: {error}".removesuffix("."))
+        return Checked(None, f"station health could not be told: {error.what}; {error.advice}")
 
 
 def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:

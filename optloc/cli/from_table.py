@@ -59,9 +59,9 @@ _OPTIONS: dict[str, Any] = {
         list[str] | None,
         _option(
             "ROLE=NAME",
-            "Column of a role that its name does not tell: message, station, time, target, reference, sigma, or a "
-            "kind; epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Once for each; "
-            "message=set+msg joins two.",
+            "Column of a role that its name does not tell: message, station, time, target, reference, sigma, heading, "
+            "or a kind; epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Once for "
+            "each; message=set+msg joins two.",
             "--column",
         ),
     ],
@@ -86,7 +86,19 @@ _OPTIONS: dict[str, Any] = {
     ],
     "average": Annotated[bool, _flag("Take the mean of several readings of the same.", "--average")],
     "azimuth": Annotated[
-        _TEXT, _option("CONVENTION", "Of bearings: north-clockwise or east-counterclockwise.", "--azimuth")
+        _TEXT,
+        _option(
+            "CONVENTION",
+            "Of bearings: north-clockwise, north-counterclockwise, east-counterclockwise, or bow-clockwise, to which "
+            "the column of headings is added.",
+            "--azimuth",
+        ),
+    ],
+    "declination": Annotated[
+        _TEXT,
+        _option(
+            "ANGLE|DATE", "Magnetic declination of bearings, east positive: '4 deg', or 2026-06-01.", "--declination"
+        ),
     ],
     "positive": Annotated[_TEXT, _option("a-farther|b-farther", "Where differences are positive.", "--positive")],
     "reference": Annotated[_TEXT, _option("STATION", "The other station of all differences.", "--reference")],
@@ -99,8 +111,14 @@ _OPTIONS: dict[str, Any] = {
         Path | None, _option("FILE", "RINEX navigation beside RINEX observations or Android's log.", "--navigation")
     ],
     "system": Annotated[_TEXT, _option("G|E|J", "Satellites that are taken; GPS by default.", "--system")],
+    "turned": Annotated[
+        bool, _flag("Satellites of a table are along ECEF at reception, not transmission.", "--turned")
+    ],
     "mask": Annotated[_TEXT, _option("ANGLE", "Lowest elevation of satellites; 10 deg by default.", "--mask")],
 }
+
+
+_FLAGS = ("average", "still", "turned")
 
 
 def takes_table(command: Callable[..., None]) -> Callable[..., None]:
@@ -115,9 +133,7 @@ def takes_table(command: Callable[..., None]) -> Callable[..., None]:
 
     kept = [entry for entry in own.parameters.values() if entry.name != "given"]
     more = [
-        Parameter(
-            name, Parameter.KEYWORD_ONLY, default=False if name in ("average", "still") else None, annotation=kind
-        )
+        Parameter(name, Parameter.KEYWORD_ONLY, default=False if name in _FLAGS else None, annotation=kind)
         for name, kind in _OPTIONS.items()
     ]
     taking.__signature__ = own.replace(parameters=[*kept, *more])  # type: ignore[attr-defined]  # what typer reads

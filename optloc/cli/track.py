@@ -242,7 +242,11 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         # A file without times has one epoch: any time serves.
         times = loaded.times if np.isfinite(loaded.times).all() else problem.times
         run = alone(problem, kept, times)
-        yield name, differences(run) if run.emitting else run, tuple(loaded.epochs[k] for k in epochs)
+        run = differences(run) if run.emitting else run
+        if not run.count:
+            what = f"every epoch of {name} has a single arrival, which says nothing without its emission time"
+            raise InvalidProblem(what, source, "give arrivals at two stations or more of each emission")
+        yield name, run, tuple(loaded.epochs[k] for k in epochs)
 
 
 def differences(run: Problem) -> Problem:
@@ -277,8 +281,9 @@ def _one_after_another(parts: list[Rows]) -> Rows:
     def of(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    z, weight, correction = of("z"), of("weight"), of("correction")
-    return Rows(parts[0].kind, z, of("a"), of("b"), of("epoch"), of("target"), weight, correction)
+    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
+    columns: dict[str, Any] = {name: of(name) for name in names}
+    return replace(parts[0], **columns)
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:

@@ -86,6 +86,10 @@ _FIXED = {
     "p": _role("arrival of the P wave", "p tp ptime ppick parrival", _CLOCK),
     "s": _role("arrival of the S wave", "s ts stime spick sarrival", _CLOCK),
     "sp": _role("time from P to S", "sp sminusp spdifference stmp tstp", _CLOCK),
+    "heading": _role(
+        "heading of the vehicle, added to its bearings",
+        "heading hdg trueheading headingtrue magneticheading headingmagnetic magheading headingmag", _ANGLE,
+    ),
     "satellite": _role("satellite of the row", "satellite sat prn sv svid satid"),
     "x": _role("coordinate of a station", "x satx xecef ecefx xsat", _LENGTH),
     "y": _role("coordinate of a station", "y saty yecef ecefy ysat", _LENGTH),

@@ -23,15 +23,17 @@ from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.cells import moments
 from optloc.files.columns import PLACE, role_named, role_of, unit_of
+from optloc.files.declination import angle_of, date_of
 from optloc.files.foreign import read_table
+from optloc.files.headings import stations_turned
 from optloc.files.measurements import ESTIMATE
 from optloc.files.orbits import read_orbits
-from optloc.files.pseudoranges import is_gnss, received
+from optloc.files.pseudoranges import at_reception, is_gnss, received
 from optloc.files.reader import Loaded, read
 from optloc.files.reading_report import about, left_over, uses_of
 from optloc.files.readings import (
     CARTESIAN,
-    COMPASS,
+    CONVENTIONS,
     Named,
     Readings,
     Told,
@@ -221,7 +223,7 @@ def _check_told(told: Told) -> None:
     """Refuse roles, frames and conventions that there are none of."""
     for role in told.columns:
         role_named(role)
-    choices = {"frame": ("cartesian", "ecef"), "azimuth": (COMPASS, CARTESIAN), "positive": ("a-farther", "b-farther")}
+    choices = {"frame": ("cartesian", "ecef"), "azimuth": CONVENTIONS, "positive": ("a-farther", "b-farther")}
     for name, known in choices.items():
         given = getattr(told, name)
         if given not in (None, *known):
@@ -252,8 +254,17 @@ def understood(source: Path, told: Told) -> Plan:
         For what is wrong, and for what may mean two things: naming the option that says which.
     """
     _check_told(told)
-    if is_gnss(source):
-        return _gnss(source, told)
+    plan = _gnss(source, told) if is_gnss(source) else _of_table(source, told)
+    azimuths = any(section.kind == "azimuth" for section in plan.sections)
+    if told.declination is not None and not azimuths:
+        raise InvalidProblem("the table has no bearings", "--declination", "leave it out")
+    if told.turned and _AT_RECEPTION != plan.lines:
+        raise InvalidProblem("the table has no satellites", "--turned", "leave it out")
+    return plan
+
+
+def _of_table(source: Path, told: Told) -> Plan:
+    """Return what a table is."""
     table = without(read_table(source), told.ignore)
     own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
     roles = Roles.of(table, own)
@@ -335,14 +346,17 @@ def _plan(
 ) -> Plan:
     """Return what readings become; `named` are the columns that are called after stations."""
     place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
+    place, turn = stations_turned(place, found)
     epochs = epochs_of(roles, told, found)
     sigmas = _sigmas(told, found)
     uses = uses_of(roles, told, found, epochs, sigmas)
     check_receivers(roles.table, uses, named, place.names)
     rest = left_over(roles, uses, named)
-    sections = tuple(_section(one, epochs, sigma) for one, sigma in zip(found, sigmas, strict=True))
-    notes = [*roles.table.notes, *([place.note] if place.note else [])]
-    notes += dict.fromkeys(note for one in found for note in one.notes)
+    parts = zip(found, sigmas, strict=True)
+    sections = tuple(_with_declination(_section(one, epochs, sigma), one, told) for one, sigma in parts)
+    notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
+    notes += [note for note in (turn, place.note) if note]
+    notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
     lines: tuple[str, ...] = ()
     if any(one.form.value == "sp" for one in found):
         speed = _sp_speed(told)
@@ -430,6 +444,17 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
 
 
+def _with_declination(section: Section, found: Readings, told: Told) -> Section:
+    """Return a section of bearings with the declination that is told."""
+    if told.declination is None or found.form.kind != "azimuth":
+        return section
+    if found.azimuth == CARTESIAN:
+        raise InvalidProblem("angles from the x axis have no declination", "--declination", "leave it out")
+    if date_of(told.declination, "--declination") is None:
+        angle_of(told.declination, None, "--declination")
+    return replace(section, lines=(*section.lines, f"declination = {json.dumps(told.declination.strip())}"))
+
+
 def _share(sigma: str, unit: str) -> str:
     """Return the part of one station in the standard deviation of a difference, an amount as text."""
     number, own = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
@@ -476,6 +501,11 @@ def _few(sections: Sequence[Section], told: Told) -> list[str]:
 # A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
 
 
+# What a problem file says of satellites, and what is said of those that were turned.
+_AT_RECEPTION = ("# Satellites are where they were when they sent, along the axes of the Earth at reception.",)
+_TURNED = "satellites are turned with the Earth during the flight of the signal; --turned takes them as they are"
+
+
 def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
     """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
     form = sort_named("arrivals")
@@ -490,6 +520,11 @@ def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
     place = np.stack([scaled(roles, axis, "length", length) for axis in "xyz"], axis=-1)
     _check_far(roles, place * UNITS["length"][length])
     _check_once(roles, epoch, satellite)
+    notes = roles.table.notes
+    if not told.turned:
+        metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
+        place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
+        notes += (_TURNED,)
     columns = {"epoch": epoch, "a": satellite, "z": z}
     when = roles.find("time")
     if when is not None:
@@ -503,14 +538,16 @@ def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
     rest = left_over(roles, uses, (), lengths=True)
     satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
     section = Section("toa", columns, unit, told.sigma, "the range and the receiver's clock")
+    when_ = "reception" if told.turned else "transmission"
     read = [
         ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('toa')}, with a clock of each epoch"),
         ("epochs", f"{len(set(epoch.tolist()))} by column {roles.column(by)}"),
-        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF"),
+        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF at {when_}"),
     ]
     read += [("sigma", f"of pseudoranges, from column {own}")] if "sigma" in columns else []
     read += [("not used", ", ".join(rest))] if rest else []
-    return Plan(source, (section,), Places(satellites, "ecef", length), tuple(read), roles.table.notes, uses=uses)
+    places = Places(satellites, "ecef", length)
+    return Plan(source, (section,), places, tuple(read), notes, _AT_RECEPTION, uses=uses)
 
 
 def _gnss(source: Path, told: Told) -> Plan:
@@ -523,7 +560,7 @@ def _gnss(source: Path, told: Told) -> Plan:
     columns["sigma"] = np.round(found.sigma, 3)
     places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
     section = Section("toa", columns, "m", None, "the range and the receiver's clock")
-    return Plan(source, (section,), Places(places, "ecef", "m"), found.about, found.notes)
+    return Plan(source, (section,), Places(places, "ecef", "m"), found.about, found.notes, _AT_RECEPTION)
 
 
 def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import decoded, json_of, read_bytes
@@ -68,10 +67,7 @@ def _parquet(path: Path) -> Table:
 
 
 def _kraken(text: str, source: str) -> Table:
-    """Return the bearings of a KrakenSDR log: clockwise from north once the heading of its array is added.
-
-    The bearing field is told clockwise from the front of the array, the heading clockwise from north.
-    """
+    """Return the bearings of a KrakenSDR log, clockwise from the front of the array, and the headings of the array."""
     rows = []
     for number, line in enumerate(text.splitlines()):
         if not line.strip():
@@ -80,14 +76,8 @@ def _kraken(text: str, source: str) -> Table:
         place = f"{source}, row {number + 1}"
         if len(cells) <= len(_FIELDS):
             raise InvalidProblem(f"the row has {len(cells)} fields", place, "a row of KrakenSDR has 17 and more")
-        row: dict[str, Any] = dict(zip(_FIELDS, cells, strict=False))
-        try:
-            turned = (float(row["bearing_deg"]) + float(row.pop("heading_deg"))) % 360.0
-        except ValueError:
-            raise InvalidProblem("the bearing or the heading is not a number", place, "correct the row") from None
-        rows.append(row | {"bearing_deg": f"{turned:.6g}"})
-    note = "bearings of KrakenSDR are taken clockwise from the front of the array, and its heading was added"
-    return replace(of_rows(rows, source, {}), notes=(note,))
+        rows.append(dict(zip(_FIELDS, cells, strict=False)))
+    return of_rows(rows, source, {})
 
 
 _LOGS: tuple[tuple[re.Pattern[bytes], Callable[[str, str], Table]], ...] = ((_KRAKEN, _kraken),)

@@ -9,11 +9,27 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.readings import CARTESIAN, COMPASS, Named, Readings, Told, quoted, sort_named, unused_measurement
+from optloc.files.readings import (
+    CARTESIAN,
+    COMPASS,
+    COUNTER,
+    Named,
+    Readings,
+    Told,
+    quoted,
+    sort_named,
+    unused_measurement,
+)
 from optloc.files.roles import Places, Roles, check_told, place_roles
 
 # Names of columns that one line repeats of a list.
 _NAMED = 4
+# What azimuths of each convention are.
+_ORIENTED = {
+    COMPASS: "bearings of a compass",
+    CARTESIAN: "angles from the x axis",
+    COUNTER: "angles from north, anticlockwise",
+}
 
 
 def uses_of(
@@ -58,6 +74,7 @@ def uses_of(
         column = roles.find(role)
         for part in () if column is None else column.split("+"):
             out.setdefault(part, role)
+    out |= {one.heading: "heading" for one in found if one.heading is not None}
     for one, sigma in zip(found, sigmas, strict=True):
         for column in one.errors if sigma is None else ():
             out.setdefault(column, f"sigma_{one.form.kind}")
@@ -112,7 +129,8 @@ def about(
         cells = list(dict.fromkeys(one.cells))
         shown = ", ".join(cells[:_NAMED]) + (f" and {len(cells) - _NAMED} more columns" if len(cells) > _NAMED else "")
         unit = f" in {one.unit}" if one.unit != "1" else ""
-        text = {COMPASS: "bearings of a compass", CARTESIAN: "angles from the x axis"}.get(str(one.azimuth))
+        text = _ORIENTED.get(str(one.azimuth))
+        text = text if one.heading is None else f"bearings from the bow, plus {one.heading}"
         ranges = one.form.kind == "toa" and one.unit not in UNITS["time"]
         text = text or ("pseudoranges, with a clock of each epoch" if ranges else one.form.text)
         out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {text}"))

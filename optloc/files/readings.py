@@ -73,6 +73,9 @@ _LETTERS = 2
 # Radians of a turn: what is beyond is in degrees.
 _TURN = Decimal("6.2832")
 COMPASS, CARTESIAN = "north-clockwise", "east-counterclockwise"
+COUNTER, BOW = "north-counterclockwise", "bow-clockwise"
+CONVENTIONS = (COMPASS, CARTESIAN, COUNTER, BOW)
+"""Conventions of azimuths in tables: those of a problem file, and from the bow of a vehicle, whose heading is added."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +109,9 @@ class Told:
     average : bool
         Whether several readings of the same become their mean; by default they are refused.
     azimuth : str, optional
-        Convention of azimuths, as in a problem file.
+        Convention of azimuths, as in a problem file, or "bow-clockwise"; with a column of headings that by default.
+    declination : str, optional
+        Magnetic declination of bearings, east positive: "4 deg", or a date such as "2026-06-01".
     positive : str, optional
         Sign of differences, as in a problem file.
     reference : str, optional
@@ -125,6 +130,8 @@ class Told:
         Letter of the system whose satellites are taken: "G", "E" or "J"; GPS.
     mask : str, optional
         Elevation below which satellites are left out, such as "15 deg"; 10 degrees.
+    turned : bool
+        Whether the satellites of a table are along the axes of the Earth at reception; by default at transmission.
     """
 
     stations: Path | None = None
@@ -139,6 +146,7 @@ class Told:
     missing: str | None = None
     average: bool = False
     azimuth: str | None = None
+    declination: str | None = None
     positive: str | None = None
     reference: str | None = None
     vp: str | None = None
@@ -149,6 +157,7 @@ class Told:
     navigation: Path | None = None
     system: str | None = None
     mask: str | None = None
+    turned: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +182,8 @@ class Readings:
         Sign of differences.
     azimuth : str, optional
         Convention of azimuths.
+    heading : str, optional
+        Column of headings that are part of the values.
     sigma : array (m,), optional
         Standard deviations in the same unit.
     errors : tuple of str
@@ -190,6 +201,7 @@ class Readings:
     b: Array | None = None
     positive: str = "a-farther"
     azimuth: str | None = None
+    heading: str | None = None
     sigma: Array | None = None
     errors: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

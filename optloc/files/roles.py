@@ -287,10 +287,15 @@ def _column(table: Table, words: str) -> str | None:
 
 ASSUMED = " (no convention is named)"
 """What is said beside azimuths of format 1 that might be meant otherwise."""
-_OTHER = {"north-clockwise": "east-counterclockwise", "east-counterclockwise": "north-clockwise"}
+_OTHER = {
+    "north-clockwise": "east-counterclockwise",
+    "east-counterclockwise": "north-clockwise",
+    "north-counterclockwise": "north-clockwise",
+}
 _COUNTED = {
     "north-clockwise": "the compass, clockwise from north (+y)",
     "east-counterclockwise": "the axes, anticlockwise from east (+x)",
+    "north-counterclockwise": "north (+y), anticlockwise",
 }
 
 
@@ -341,7 +346,12 @@ def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> Places:
     else:
         roles = Roles.of(read_table(path), told)
     found = placed(roles, frame)
-    check_told(roles, ("name", *place_roles(roles)))
+    column = roles.find("heading")
+    if column is not None:
+        factor = UNITS["angle"][unit_of(column, UNITS["angle"]) or "deg"] / UNITS["angle"]["deg"]
+        headings = {"heading_deg": factor * roles.table.numbers(column, optional=True)}
+        found = replace(found, columns={**found.columns, **headings})
+    check_told(roles, ("name", "heading", *place_roles(roles)))
     return found
 
 

@@ -14,6 +14,7 @@ from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.files.cells import instants, is_dated, moments, numbers
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
+from optloc.files.headings import from_bow, heading_of
 from optloc.files.readings import (
     CARTESIAN,
     COMPASS,
@@ -317,6 +318,8 @@ def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: in
     found = _with_digits(found, table)
     keys = _keys(found, roles, told)
     found = without_gaps(found, [keys[row] for row in found.row.tolist()], told, table, empty)
+    if found.form.kind == "azimuth" and (heading := heading_of(found, roles, told)) is not None:
+        found = from_bow(found, roles, heading, told)
     if not told.still:
         found = without_repeats(found, [keys[row] for row in found.row.tolist()], told, table)
     signed = found.form.stations > 1 and found.form.kind != "range_sum"
@@ -353,6 +356,8 @@ def _with_digits(found: Readings, table: Table) -> Readings:
 def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readings:
     """Return azimuths with their convention: as told, as their name says, or, on Earth, that of a compass."""
     named = any(word in stem(found.cells[0]) for word in (BEARING, "brg", "compass", "heading"))
+    if found.heading is not None:
+        return found
     if told.azimuth is not None or named:
         return replace(found, azimuth=told.azimuth or COMPASS)
     if place.frame == "cartesian":
@@ -411,9 +416,10 @@ def _no_times() -> InvalidProblem:
 
 def _clusters(found: Readings, window: str, count: int) -> Array:
     """Return the message (n,) of each row of arrivals: of the same are those less than a window apart."""
-    if found.unit not in UNITS["time"]:
-        raise _no_times()
-    factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / Decimal(repr(UNITS["length"][found.unit]))
+    # Arrivals in metres are times that the speed of light has multiplied.
+    seconds = Decimal(repr(UNITS["length"][found.unit]))
+    seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))
+    factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / seconds
     out, label, last = np.full(count, "", dtype=object), 0, None
     for i in sorted(range(len(found.values)), key=lambda i: found.values[i]):
         label += last is None or found.values[i] - last > factor

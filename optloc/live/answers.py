@@ -53,7 +53,8 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
     """
     position, covariance = fix.position, fix.covariance()
     known = np.asarray(np.isfinite(position).all(-1))
-    spread = np.asarray(known & np.isfinite(covariance).all((-1, -2)))
+    wild = fix.undetermined()
+    spread = np.asarray(known & np.isfinite(covariance).all((-1, -2)) & ~wild.any(-1))
     columns: dict[str, list[Any]] = {} if phase is None else {"phase": [phase] * len(events)}
     columns |= {
         "status": [_LABELS[code] for code in fix.code.tolist()],
@@ -75,6 +76,8 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
         record["alternatives"] = others.get(i, [])
         if fix.reason[i]:
             record["reason"] = fix.reason[i]
+        if wild[i].any():
+            record["undetermined"] = ["xyz"[axis] for axis in np.flatnonzero(wild[i])]
         _mark(record, event)
     return made
 

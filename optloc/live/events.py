@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 from zlib import crc32
@@ -189,7 +189,10 @@ def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
         raise InvalidProblem(f"the line has {' and '.join(given)}", given[0], "give one of them")
     value = found[given[0]]
     if type(value) is float:  # of a track a quarter of a microsecond is enough, of an arrival it is not
-        return round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
+        value = round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
+        if abs(value) >= _LATEST:
+            raise _beyond_clocks(found[given[0]], given[0])
+        return value
     return picoseconds(value, given[0])
 
 
@@ -257,6 +260,23 @@ def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> Non
         raise InvalidProblem(f"station {station!r} has two arrivals", "arrivals", "send one")
 
 
+def rows_and_arrivals(
+    rows: Sequence[Mapping[str, Any]], arrivals: Sequence[Mapping[str, Any]], site: Site
+) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
+    """Return values, standard deviations and arrivals of the entries that a line may have; errors as of `parse`."""
+    values, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
+    for entry in rows:
+        _row(entry, site, values, sigmas)
+    for entry in arrivals:
+        _arrival(entry, site, times)
+    return values, sigmas, times
+
+
+def name_under(key: str, given: Any) -> str:
+    """Return the name that is given under a key; raise InvalidProblem where it is none."""
+    return _text(given, key)
+
+
 def picoseconds(given: Any, key: str) -> int:
     """Return a time as picoseconds: a whole number, or a decimal number in quotes, of the unit that its key says.
 
@@ -283,8 +303,12 @@ def picoseconds(given: Any, key: str) -> int:
         advice = "send a whole number as time_ns or time_ps, or a decimal number in quotes"
         raise InvalidProblem(f"{str(given)[:40]} is no exact time", key, advice)
     if abs(value) >= _LATEST:
-        raise InvalidProblem(f"the time {str(given)[:40]} is beyond all clocks", key, "check its unit")
+        raise _beyond_clocks(given, key)
     return value
+
+
+def _beyond_clocks(given: Any, key: str) -> InvalidProblem:
+    return InvalidProblem(f"the time {str(given)[:40]} is beyond all clocks", key, "check its unit")
 
 
 # Events: open until they are whole, then answered, then remembered.

@@ -18,8 +18,9 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array
 from optloc.base.units import Conversion
+from optloc.files.propagation import speed_of
 from optloc.files.reader import Draft, assemble
-from optloc.files.schema import ProblemFile, join, name_of, read_document, speed_of
+from optloc.files.schema import ProblemFile, join, name_of, read_document
 from optloc.files.table import Table, table_of
 from optloc.files.unknowns import FREE, places_of
 from optloc.models import MODELS

@@ -1,4 +1,4 @@
-"""A stream: lines from anywhere through one bounded queue, one thread that answers, one that writes; checkpoints."""
+"""A stream: lines from anywhere through one bounded queue, one thread that answers, one that writes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from time import monotonic
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import access, json_of, read_text
+from optloc.base.inputs import access
 from optloc.base.outputs import Growing, write_text
 from optloc.compute.jit import enabled
 from optloc.linear.simulate import simulate
 from optloc.live import events as of_events
 from optloc.live.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
+from optloc.live.checkpoint import restore, state_of
 from optloc.live.engine import BATCH, Engine
 from optloc.live.events import LINE, Events, parse
 from optloc.live.metrics import Metrics
@@ -133,6 +134,9 @@ class Stream:
         self._engine = self._new_engine(site)
         self._events = Events(site, self.metrics, self._emit, settings.wait, settings.revise, settings.part)
         self._unwritten: dict[str, of_events.Event] = {}
+        # first of all files: a checkpoint that is refused leaves no other one behind
+        if settings.state is not None and settings.state.exists():
+            restore(settings.state, self._events, self._time())
         self._record = None if settings.record is None else Growing(settings.record)
         self._recorded = bytearray()
         self._reload = False
@@ -144,8 +148,6 @@ class Stream:
         }
         self.ended = Event()
         self.error: Exception | None = None
-        if settings.state is not None and settings.state.exists():
-            restore(settings.state, self._events, self._time())
         warm_up(site, settings.phases)
         Thread(target=self._run, name="optloc stream", daemon=True).start()
 
@@ -405,84 +407,6 @@ def warm_up(site: Site, phases: str) -> None:
         ready.fast(z[:count])
         if phases != "fix":
             ready.full(z[:count])
-
-
-# Checkpoints: open events, and the ids of those that were answered.
-
-
-def state_of(events: Events, unwritten: dict[str, of_events.Event]) -> Record:
-    """Return what a stream must know to go on where it was.
-
-    Parameters
-    ----------
-    events : Events
-        Of the stream.
-    unwritten : dict of str to Event
-        Closed events whose answers may not have been written: they count as open.
-    """
-    site = events.site
-
-    def spelled(event: of_events.Event) -> Record:
-        rows = [[*site.row(key)[2:5], value, event.sigmas.get(key)] for key, value in event.rows.items()]
-        times = [[site.stations[i], str(value)] for i, value in event.times.items()]
-        about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
-        about |= {"when": None if event.when is None else str(event.when), "track": event.track}
-        about |= {"refused": event.refused} if event.refused else {}
-        return {"event": event.name, "rows": rows, "times": times, **about}
-
-    return {
-        "format": "optloc live 1",
-        "site": site.source,
-        "open": [spelled(event) for event in (*unwritten.values(), *events.open.values())],
-        "closed": [name for name in events.closed if name not in unwritten],
-        "counts": dict(events.metrics.counts),
-    }
-
-
-def restore(path: Path, events: Events, now: float) -> None:
-    """Take over what a checkpoint holds.
-
-    Parameters
-    ----------
-    path : Path
-        The checkpoint.
-    events : Events
-        A stream's, before its first line.
-    now : float
-        By the clock of the stream.
-
-    Raises
-    ------
-    InvalidProblem
-        Where it is none, or names what the site has not.
-    """
-    site = events.site
-    with access(anew=True):  # it is written again, which a file that was read must not be
-        found = json_of(read_text(path), path.name)
-    if not isinstance(found, dict) or found.get("format") != "optloc live 1":
-        raise InvalidProblem("this is no checkpoint of a stream", str(path), "name another file, or remove it")
-    try:
-        for name in found["closed"]:
-            events.remember(str(name), None)
-        for each in found["open"]:
-            rows, sigmas = {}, {}
-            for kind, a, b, value, sigma in each["rows"]:
-                key = site.find(kind, a, b)
-                rows[key] = float(value)
-                if sigma is not None:
-                    sigmas[key] = float(sigma)
-            times = {site.number[station]: int(value) for station, value in each["times"]}
-            event = of_events.Event(str(each["event"]), rows, times, now, now, sigmas, str(each["target"]))
-            event.revision, event.conflict = int(each["revision"]), bool(each["conflict"])
-            # a checkpoint of before there were tracks has neither
-            event.when = None if each.get("when") is None else int(each["when"])
-            event.track, event.refused = bool(each.get("track")), str(each.get("refused", ""))
-            events.open[event.name] = event
-        events.metrics.counts.update({name: int(n) for name, n in found["counts"].items()})
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InvalidProblem):
-            raise InvalidProblem(error.what, str(path), "it belongs to another site; name another file") from None
-        raise InvalidProblem("this checkpoint is damaged", str(path), "remove it") from None
 
 
 # Sources that are files: standard input, and recordings.

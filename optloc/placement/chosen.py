@@ -244,6 +244,8 @@ def _answer(posed: Posed, task: Task, found: Searched, checked: Draws | None, ba
     told = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
     reason = told if found.closed else f"the time was up: {told}; give it more time, or accept a larger gap"
     new = (chosen == 1) & (posed.state != 1)
+    if plan.choose is not None and (count := int(new.sum())) < plan.choose:
+        reason += f"; {count} of the {plan.choose} sites that were asked for: more exceed the budget, or do not help"
     return Placement(
         _named(names, new),
         _named(names, posed.state == 1),

@@ -13,6 +13,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Prior
 from optloc.linear.normal import Normal, linearise, with_priors
 from optloc.models import MODELS
+from optloc.placement.counts import check_groups
 from optloc.problem.arrivals import as_arrivals
 from optloc.problem.layout import emission_name
 from optloc.problem.noise import variances
@@ -66,7 +67,7 @@ class Plan:
     weights : array (p,), optional
         How much each place counts, positive; alike by default.
     choose : int, optional
-        How many sites to take beyond those that are kept.
+        How many sites to take beyond those that are kept; with a budget, at most so many.
     budget : float, optional
         What the sites that are taken may cost together, kept ones not counted.
     cost : array (s,), optional
@@ -371,8 +372,15 @@ def _rules(plan: Plan, names: tuple[str, ...], site: Array) -> tuple[Array, Arra
     if plan.budget is not None:
         rules.append(_costs(plan, n, site) * free)
         limits.append(float(plan.budget))
-    for i, group in enumerate(plan.groups):
-        members = np.isin(np.arange(n), where(group.members, f"groups, entry {i + 1}")).astype(float)
+    own = [np.isin(np.arange(n), where(g.members, f"groups, entry {i + 1}")) for i, g in enumerate(plan.groups)]
+    inside = np.array(own, dtype=bool).reshape(-1, n)
+    check_groups(plan.groups, inside, names, state, plan.choose)
+    if plan.choose is not None and plan.budget is None and plan.groups:
+        # one site more is always better, but for groups: there so many sites are a rule of their own
+        rules.append(-free)
+        limits.append(-float(plan.choose))
+    for group, taken in zip(plan.groups, inside, strict=True):
+        members = taken.astype(float)
         if group.most is not None:
             rules.append(members)
             limits.append(float(group.most))

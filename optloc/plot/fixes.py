@@ -16,12 +16,12 @@ from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS, RAY, Point
 from optloc.models.layers import Layers
 from optloc.plot import style
-from optloc.plot.outlines import rings
 from optloc.plot.style import (
     BLACK,
     BLUE,
     GREEN,
     GREY,
+    HEIGHT,
     ORANGE,
     PLAN,
     PURPLE,
@@ -39,6 +39,7 @@ from optloc.plot.style import (
     xy,
 )
 from optloc.problem.fix import Fix
+from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     panels = figure.subplots(1, count, squeeze=False)[0]
     sizes = [_overview(panels[0], scene, PLAN)]
     if spatial:
-        _overview(panels[1], scene, (0, 2))
+        _overview(panels[1], scene, HEIGHT)
     if near:
         sizes.append(_close(panels[-1], scene))
     if len(every) == 1 and every[0].code.size == 1 and np.isfinite(scene.fixes).all():
@@ -199,14 +200,14 @@ def _shift(scene: Scene, centre: Array) -> Scene:
 
 
 def _reach(scene: Scene, known: Array, centre: Array) -> float:
-    outlined = np.array([bool(pieces) for pieces in scene.outlines] or [False] * len(known))
+    outlined = np.array([bool(regions) for regions in scene.outlines] or [False] * len(known))
     semi_axes, _ = error_ellipse(scene.covariances[known & ~outlined][:, :2, :2])
     largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)
-    for fix, pieces in zip(scene.fixes, scene.outlines, strict=False):
-        for line in rings([piece[:, :2] for piece in pieces]):
+    for fix, regions in zip(scene.fixes, scene.outlines, strict=False):
+        for line in regions[PLAN].lines if regions else []:
             # The part around the fix, whole; other parts are other positions, which the overview shows.
-            if (line.min(0) <= fix[:2]).all() and (fix[:2] <= line.max(0)).all():
-                largest = max(float(largest), float(np.abs(line - centre).max()) / _SPREAD)
+            if (line.min(0) <= 0.0).all() and (line.max(0) >= 0.0).all():
+                largest = max(float(largest), float(np.abs(fix[:2] + line - centre).max()) / _SPREAD)
     away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
     reach = _SEMI_AXES * float(largest) + _SPREAD * float(np.quantile(away, 0.95))
     return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)
@@ -225,6 +226,8 @@ class PositionLine(NamedTuple):
 
 def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> bool:
     """Draw where each row alone would put the target, in a plan whose origin is a centre; return whether there are."""
+    if _only_target(problem.flat(), fix.flat()) is None:
+        return False
     (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
     middle, half = np.array([west + east, south + north]) / 2.0, _WIDE * max(east - west, north - south) / 2.0
     corners = size * np.stack([middle - half, middle + half]) + centre
@@ -258,7 +261,7 @@ def lines_of_position(problem: Problem, fix: Fix, x: Array, y: Array, places: Ar
     Parameters
     ----------
     problem : Problem
-        With one target.
+        With one target that is not known.
     fix : Fix
         Its fix.
     x, y : array (n,), (m,)
@@ -267,28 +270,38 @@ def lines_of_position(problem: Problem, fix: Fix, x: Array, y: Array, places: Ar
         Its points in the problem's frame, metres; NaN where there is none.
     """
     flat, answer = problem.flat(), fix.flat()
-    moving = [motion for motion in flat.motions if motion.known is None]
-    alone = len(moving) == 1 == len(flat.motions) and flat.batch_shape == (1,)
-    if not alone or not np.isfinite(answer.x).all() or not flat.layout.shares("position"):
+    target = _only_target(flat, answer)
+    if target is None:
         return []
-    if flat.count > _LINES or (moving[0].order > 0 and flat.epochs > 1):
+    count = sum(int((rows.target == target).sum()) for rows in flat.rows)
+    if count > _LINES or (flat.motions[target].order > 0 and flat.epochs > 1):
         return [PositionLine("isodoppler", name, line) for name, line in isodopplers(problem, fix, x, y, places)]
-    slot, _ = flat.layout.find("position")
+    slot, _ = flat.layout.find(state_names(target, len(flat.motions), 0)[0])
     vectors = np.tile(answer.x[0], (len(places), 1))
     vectors[:, slot.start : slot.start + slot.size] = places[:, : slot.size]
     with np.errstate(all="ignore"):
         residual = differentiate(flat, vectors)[0]
     found: list[PositionLine] = []
     for rows, start in zip(flat.rows, flat.starts, strict=True):
-        found += _lines_of(flat, rows, residual[:, start : start + rows.count], x, y)
+        found += _lines_of(flat, rows, target, residual[:, start : start + rows.count], x, y)
     return found
 
 
-def _lines_of(problem: Problem, rows: Rows, residual: Array, x: Array, y: Array) -> list[PositionLine]:
-    """Return the lines of rows of one kind, where their residuals (n, m) on a grid are zero."""
+def _only_target(flat: Problem, answer: Fix) -> int | None:
+    """Return the number of the only target that is not known, None where there are several or it has no one fix."""
+    sought = [i for i, motion in enumerate(flat.motions) if motion.known is None]
+    single = flat.batch_shape == (1,) and bool(np.isfinite(answer.x).all())
+    if len(sought) != 1 or not single or flat.motions[sought[0]].span == "epoch":
+        return None
+    return sought[0]
+
+
+def _lines_of(problem: Problem, rows: Rows, target: int, residual: Array, x: Array, y: Array) -> list[PositionLine]:
+    """Return the lines of a target's rows of one kind, where their residuals (n, m) on a grid are zero."""
     from contourpy import contour_generator
 
-    model, names, present = MODELS[rows.kind], problem.stations.names, rows.weight.reshape(-1, rows.count)[0] > 0.0
+    model, names = MODELS[rows.kind], problem.stations.names
+    present = (rows.weight.reshape(-1, rows.count)[0] > 0.0) & (rows.target == target)
     found = []
     for i in np.flatnonzero(present).tolist():
         values, ends = residual[:, i], [names[k] for k in (rows.a[i], rows.b[i]) if k >= 0]
@@ -313,7 +326,7 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
     Parameters
     ----------
     problem : Problem
-        With one target.
+        With one target that is not known.
     fix : Fix
         Its fix.
     x, y : array (n,), (m,)
@@ -331,15 +344,14 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
 
     flat, answer = problem.flat(), fix.flat()
     rates = [rows for rows in flat.rows if MODELS[rows.kind].velocity]
-    moving = [motion for motion in flat.motions if motion.known is None]
-    alone = len(moving) == 1 == len(flat.motions) and flat.batch_shape == (1,)
-    if not (rates and alone and np.isfinite(answer.x).all() and (moving[0].order == 0 or flat.epochs == 1)):
+    target = _only_target(flat, answer)
+    if target is None or not rates or (flat.motions[target].order > 0 and flat.epochs > 1):
         return []
     # The fix is the last point: what it has is the level of its curve.
     places = np.concatenate([places, answer.position.reshape(1, -1)])
-    velocity = answer.velocity.reshape(-1) if moving[0].order else np.zeros(flat.dimension)
+    velocity = answer.velocity.reshape(-1) if flat.motions[target].order else np.zeros(flat.dimension)
     found = []
-    for rows, row in _spread(rates):
+    for rows, row in _spread(rates, target):
         value = _rate(flat, rows, row, places, velocity)
         excess = np.ma.masked_invalid((value[:-1] - value[-1]).reshape(len(y), len(x)))
         ends = " – ".join(flat.stations.names[k] for k in (rows.a[row], rows.b[row]) if k >= 0)
@@ -348,9 +360,10 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
     return found
 
 
-def _spread(rates: Sequence[Rows]) -> list[tuple[Rows, int]]:
-    """Return rows that count, evenly chosen where they are many."""
-    every = [(rows, i) for rows in rates for i in np.flatnonzero(rows.weight.reshape(-1, rows.count)[0] > 0.0).tolist()]
+def _spread(rates: Sequence[Rows], target: int) -> list[tuple[Rows, int]]:
+    """Return a target's rows that count, evenly chosen where they are many."""
+    present = [(rows.weight.reshape(-1, rows.count)[0] > 0.0) & (rows.target == target) for rows in rates]
+    every = [(rows, i) for rows, own in zip(rates, present, strict=True) for i in np.flatnonzero(own).tolist()]
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(_CURVES, len(every))).astype(int)).tolist()]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -76,8 +77,29 @@ def by_epoch(problem: Problem) -> Problem:
             return out
 
         rows.append(
-            Rows(old.kind, spread(old.z), a, b, np.zeros_like(a), target, spread(old.weight), spread(old.correction))
+            replace(
+                old,
+                z=spread(old.z),
+                a=a,
+                b=b,
+                epoch=np.zeros_like(a),
+                target=target,
+                weight=spread(old.weight),
+                correction=spread(old.correction),
+            )
         )
+    noise = _noise(problem, where, int(starts[-1]))
+    return replace(states_by_epoch(problem), rows=tuple(rows), noise=noise)
+
+
+def states_by_epoch(problem: Problem) -> Problem:
+    """Return the batch of `by_epoch` without rows and biases: states, stations, priors and constraints of every epoch.
+
+    Parameters
+    ----------
+    problem : Problem
+        As of `by_epoch`.
+    """
     motions = tuple(
         replace(m, span="run", known=None if m.known is None else _split(m.known, 3), rise=None)
         for m in problem.motions
@@ -93,12 +115,12 @@ def by_epoch(problem: Problem) -> Problem:
     )
     priors = tuple(replace(p, mean=_same(p.mean, 1), covariance=_same(p.covariance, 2)) for p in problem.priors)
     constraints = tuple(_spread(c, problem.motions[c.target].rise) for c in problem.constraints)
-    noise = _noise(problem, where, int(starts[-1]))
     return replace(
         problem,
         stations=stations,
-        rows=tuple(rows),
-        noise=noise,
+        rows=(),
+        noise=Noise(()),
+        biases=(),
         times=np.zeros(1),
         motions=motions,
         priors=priors,
@@ -167,9 +189,11 @@ def _cut(block: Block, epoch: Array) -> list[Block]:
 def _noise(problem: Problem, where: Array, size: int) -> Noise:
     """Return the noise of the batch: groups of rows that are correlated in some epoch stay together."""
     epoch, k = problem.epoch, problem.epochs
+    cut = group([part for block in problem.noise.blocks for part in _cut(block, epoch)]).blocks
+    if all(block.row.shape[1] == 1 for block in cut):
+        return _alone(cut, where, epoch, size, k)
     # Rows of the batch that are correlated in any epoch end with one label: groups are merged member by member.
     label = np.arange(size)
-    cut = group([part for block in problem.noise.blocks for part in _cut(block, epoch)]).blocks
     for block in cut:
         for members in where[block.row]:
             joined = np.isin(label, label[members])
@@ -179,6 +203,17 @@ def _noise(problem: Problem, where: Array, size: int) -> Noise:
         members = np.flatnonzero(label == name)
         blocks.append(_gather(cut, where, epoch, members, k))
     return group(blocks)
+
+
+def _alone(cut: tuple[Block, ...], where: Array, epoch: Array, size: int, k: int) -> Noise:
+    """Return the noise of a batch whose rows are all independent: what long runs mostly have, in one operation."""
+    shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in cut))
+    # A row that an epoch lacks has weight zero; a variance of one keeps it regular.
+    out = np.ones((*shape, k, size, 1, 1))
+    for block in cut:
+        rows = block.row[:, 0]
+        out[..., epoch[rows], where[rows], :, :] = block.covariance
+    return Noise((Block(np.arange(size)[:, None], out),))
 
 
 def _gather(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, k: int) -> Block:
@@ -368,7 +403,7 @@ def _inside(epoch: Array, first: int, last: int) -> slice | Array:
 
 
 def _rows(block: Rows, kept: slice | Array) -> Rows:
-    return Rows(block.kind, *(getattr(block, name)[..., kept] for name in _ROW_ARRAYS))
+    return replace(block, **{name: getattr(block, name)[..., kept] for name in _ROW_ARRAYS})
 
 
 def _touches(problem: Problem, bias: Bias, number: _Numbers, inside: Callable[[Array], slice | Array]) -> Bias:
@@ -456,7 +491,8 @@ def _append(one: Rows, two: Rows) -> Rows:
         shape = batch if a.ndim > 1 or b.ndim > 1 else ()
         return np.concatenate([np.broadcast_to(v, (*shape, v.shape[-1])) for v in (a, b)], axis=-1)
 
-    return Rows(one.kind, *(both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS))
+    arrays: dict[str, Any] = {name: both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS}
+    return replace(one if one.count else two, **arrays)
 
 
 def _stations(problem: Problem, more: Problem) -> Stations:

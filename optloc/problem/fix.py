@@ -17,6 +17,13 @@ from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
 
 _STATES = ("position", "velocity", "acceleration")
+# Sizes of stations and target together, beyond which a standard deviation of a position says nothing: a fix is not
+# Gaussian from one on, and what symmetry leaves open is wider by many decades.
+_OPEN = 100.0
+# The same of all else, by SI unit, and of positions whose stations are not known: light, turns, a hundredfold error of
+# scale, and for lengths the distance of the outer planets.
+_OPEN_BY_UNIT = {"m/s": 299_792_458.0, "m/s^2": 299_792_458.0, "rad": 1e3, "1": 100.0, "s": 1e4}
+_OPEN_LENGTH = 1e12
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +80,8 @@ class Suspect:
         Global numbers of the rows it takes part in; empty for a prior.
     error : array (q,)
         Estimated error, measured less true: of the station's arrival time times c (positive: late) where the rows
-        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians or ratios.
+        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians (clockwise of
+        compass bearings) or ratios.
     sigma : array (q,)
         Standard deviations of `error`; infinite where nothing else tells how large it is.
     p_with : float
@@ -195,6 +203,8 @@ class Fix:
         In which coordinates each is Gaussian; None for problems that are not of one position.
     infinity : array (...), optional
         Least cost of positions infinitely far away less that of the fix; NaN where nobody has looked.
+    reach : array (...), optional
+        Greatest distance of a station, and of a target without a chart, from the middle of the stations, metres.
     """
 
     x: Annotated[Array, Axes(1)]
@@ -215,6 +225,7 @@ class Fix:
     marks: Annotated[Array, Axes(0, empty=0)] | None = None
     chart: Chart | None = None
     infinity: Annotated[Array, Axes(0)] | None = None
+    reach: Annotated[Array, Axes(0)] | None = None
     # told once: a program may ask for one after the other
     _certificates: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 
@@ -237,17 +248,23 @@ class Fix:
 
     @property
     def position(self) -> Array:
-        """Return the position (..., d) of the only target, or of each epoch (..., k, d), metres."""
-        return self.layout.take(self.x, "position")
+        """Return the position (..., d) of the only unknown target, or of each epoch (..., k, d), metres."""
+        return self.take("position")
 
     @property
     def velocity(self) -> Array:
         """Return the velocity like `position`, metres per second."""
-        return self.layout.take(self.x, "velocity")
+        return self.take("velocity")
 
     def take(self, name: str) -> Array:
         """Return a named part of the estimate, for instance "position[1]" or "clock"."""
-        return self.layout.take(self.x, name)
+        return self.layout.take(self.x, self._slot(name))
+
+    def _slot(self, name: str) -> str:
+        """Return the name of a part: "position" is that of the only target whose place is not known beforehand."""
+        slots = [slot.name for slot in (*self.layout.shared, *self.layout.local)]
+        numbered = [slot for slot in slots if slot.partition("[")[0] == name]
+        return numbered[0] if name in _STATES and len(numbered) == 1 else name
 
     @property
     def bias(self) -> Mapping[str, Array]:
@@ -261,7 +278,7 @@ class Fix:
 
     def covariance(self, name: str = "position") -> Array:
         """Return the covariance of a named part: (..., q, q), or (..., k, q, q) of a state at each epoch."""
-        slot, shared = self.layout.find(name)
+        slot, shared = self.layout.find(self._slot(name))
         part = slice(slot.start, slot.start + slot.size)
         if shared:
             return self.cov[..., part, part]
@@ -274,6 +291,33 @@ class Fix:
     def sigma(self, name: str = "position") -> Array:
         """Return the standard deviations of a named part: (..., q), or (..., k, q) of a state at each epoch."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
+
+    def undetermined(self, name: str = "position") -> Array:
+        """Return which entries (..., q) of a named part the data leave open, whatever number stands there.
+
+        An entry is open where its standard deviation is more than 100 times the size of stations and target together, a
+        speed where it is more than that of light. Symmetry leaves such entries: the height over a plane of stations, for
+        instance, where the target is in that plane. Tables and texts call them "not determined".
+
+        Parameters
+        ----------
+        name : str
+            Part of the estimate, as of `sigma`.
+        """
+        sigma, limit = self.sigma(name), self.widest(name)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(sigma > limit.reshape(*limit.shape, *(1,) * (sigma.ndim - limit.ndim)))
+
+    def widest(self, name: str = "position") -> Array:
+        """Return the standard deviation (...) beyond which entries of a named part are not determined, SI units."""
+        slot, _ = self.layout.find(self._slot(name))
+        limit = np.full(self.shape, _OPEN_BY_UNIT.get(slot.unit, _OPEN_LENGTH))
+        if slot.name.partition("[")[0] != "position" or self.reach is None:
+            return limit
+        away = 0.0 if self.chart is None else np.nan_to_num(self.chart.distance)
+        size = np.nan_to_num(self.reach) + away
+        # a single station that stays has no size, and a target on it no distance
+        return np.where(size > 0.0, _OPEN * size, limit)
 
     @property
     def p_value(self) -> Array:

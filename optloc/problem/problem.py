@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.arrays import library, placed
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Array, Band, Bias, CompassRows, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
 from optloc.models.medium import Atmosphere, Medium
@@ -83,7 +83,7 @@ class Problem:
     def starts(self) -> tuple[int, ...]:
         """Return the global number of the first row of each kind."""
         counts = [block.count for block in self.rows]
-        return tuple(int(n) for n in np.cumsum([0, *counts[:-1]]))
+        return tuple(int(n) for n in np.cumsum([0, *counts])[:-1])
 
     @property
     def emitting(self) -> tuple[int, ...]:
@@ -126,7 +126,7 @@ class Problem:
     @property
     def epoch(self) -> Array:
         """Return the epoch of each row, (m,)."""
-        return np.concatenate([block.epoch for block in self.rows])
+        return np.concatenate([block.epoch for block in self.rows] or [np.zeros(0, dtype=np.int64)])
 
     @cached_property
     def batch_shape(self) -> tuple[int, ...]:
@@ -232,6 +232,17 @@ class Problem:
         return replace(self, rows=tuple(rows))
 
 
+def at_rest(problem: Problem) -> Problem:
+    """Return the problem with velocities of its stations where a row needs them: stations without stay where they are.
+
+    Each step from a start to a proof then finds the same zeros.
+    """
+    stations = problem.stations
+    if stations.velocity is not None or not any(MODELS[rows.kind].velocity for rows in problem.rows):
+        return problem
+    return replace(problem, stations=replace(stations, velocity=np.zeros((1, stations.count, problem.dimension))))
+
+
 def check_medium(problem: Problem) -> None:
     """Refuse media that the frame does not fit, and stations outside them."""
     medium, frame = problem.medium, problem.frame.kind
@@ -287,6 +298,7 @@ def _join(parts: list[Array]) -> Array:
 _NUMBERS: dict[type, dict[str, int]] = {
     Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3, "velocity_covariance": 3},
     Rows: {"z": 1, "weight": 1, "correction": 1},
+    CompassRows: {"z": 1, "weight": 1, "correction": 1},
     Block: {"covariance": 3},
     Motion: {"known": 3, "rise": 2},
     Prior: {"mean": 1, "covariance": 2},

@@ -17,7 +17,7 @@ from optloc.models.surfaces import SURFACES
 from optloc.problem.clocks import check_changing
 from optloc.problem.epochs import separable, tied, untied
 from optloc.problem.noise import Noise
-from optloc.problem.problem import Problem, check_medium
+from optloc.problem.problem import Problem, at_rest, check_medium
 
 
 def checked(problem: Problem) -> Problem:
@@ -31,7 +31,8 @@ def checked(problem: Problem) -> Problem:
     Returns
     -------
     Problem
-        The same; a noise block that holds several uncorrelated epochs is cut.
+        The same; a noise block that holds several uncorrelated epochs is cut, and stations without velocities are at
+        rest where a row is a rate.
 
     Raises
     ------
@@ -58,7 +59,7 @@ def checked(problem: Problem) -> Problem:
     for prior in problem.priors:
         _check_covariance(prior.covariance[..., None, :, :], f"prior on {prior.name}", None)
     check_constraints(problem)
-    return _cut_noise(problem)
+    return _cut_noise(at_rest(problem))
 
 
 def _cut_noise(problem: Problem) -> Problem:

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from optloc.adequacy.elements import By, Elements, batch_of, elements, ends_of
 from optloc.adequacy.evidence import NOTICEABLE
 from optloc.adequacy.variance_components import Tested, snooped, tested
+from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS
@@ -45,7 +46,8 @@ class Health:
     """What many fixes say of G stations (pairs, kinds), in SI units and radians; NaN where they say nothing.
 
     Residuals are left-out ones: the measurement less what the rest of its fix, without this station, predicts, with the
-    offsets of the others taken out. A station's error is not absorbed by the fix that it is compared with.
+    offsets of the others taken out. A station's error is not absorbed by the fix that it is compared with. Of compass
+    bearings biases and residuals are clockwise.
 
     Parameters
     ----------
@@ -153,6 +155,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     """
     kept, x = fixed
     made = elements(batch.take(kept), x, by)
+    _check_redundancy(made)
     # Gross errors are looked for when noise and offsets are known: a bias is not an outlier of every fix.
     levels, offsets = _settle(made, by)
     found = snooped(
@@ -189,6 +192,15 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
         outlying=outlying,
         sentences=(*levels.sentences, *_sentences(offsets, made.names, used)),
     )
+
+
+def _check_redundancy(made: Elements) -> None:
+    """Raise InvalidProblem where no measurement of any fix is checked by the others."""
+    tests = tested(made, np.ones(()))
+    size = np.diagonal(tests.matrix[:, tests.errors :, tests.errors :], axis1=-2, axis2=-1)
+    if not ((size > 0.0) & (made.of_offset >= 0)).any():
+        what = "no fix has redundancy, so that nothing checks its measurements"
+        raise InvalidProblem(what, "health", "add stations, or state what is known: a height, a bias, a prior")
 
 
 def _settle(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:

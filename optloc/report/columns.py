@@ -150,6 +150,9 @@ def _of_target(
     columns = dict(labels(target, spread))
     position = position.reshape(n * count, d)
     covariance = fix.covariance(names[0]).reshape(n * count, d, d) if told else np.full((n * count, d, d), np.nan)
+    open_ = fix.undetermined(names[0]).reshape(n * count, d) if told else np.zeros((n * count, d), dtype=bool)
+    local = geodetic_columns(fix.frame, position, covariance)
+    covariance, lost = without_open(covariance, open_, "xyz")
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     columns |= _repeat(count, status=[Status(int(code)).label for code in fix.code], reason=list(fix.reason))
     columns |= {axis: position[:, i] for i, axis in enumerate("xyz"[:d])}
@@ -158,16 +161,54 @@ def _of_target(
     for name in names[1:] if estimated else ():
         letter = _RATES[name.partition("[")[0]]
         own = fix.sigma(name).reshape(n * count, d) if told else np.full((n * count, d), np.nan)
+        if told:
+            wild = fix.undetermined(name).reshape(n * count, d)
+            own, lost = np.where(wild, np.nan, own), _named_open(wild, [f"{letter}{axis}" for axis in "xyz"], lost)
         for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (own, f"sigma_{letter}")):
             columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
-    columns |= geodetic_columns(fix.frame, position, covariance)
+    if "cov_ee" in local:
+        limit = np.repeat(fix.widest(names[0]), count) if estimated else np.full(n * count, np.inf)
+        local, lost = _without_open_level(local, limit, lost)
+    columns |= local
     semi_axes, _ = error_ellipse(covariance)
     # Longest axis first.
     columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}
     for name, numbers in {"cost": fix.cost, "dof": fix.dof, "p_value": np.asarray(fix.p_value)}.items():
         columns[name] = np.repeat(numbers, count)
     columns["alternatives"] = np.repeat(np.isfinite(fix.alternatives.gap).sum(-1), count)
+    columns |= {"undetermined": np.array(lost, dtype=object)} if any(lost) else {}
     return columns | _repeat(count, **words)
+
+
+def without_open(covariance: Array, wild: Array, axes: str) -> tuple[Array, list[str]]:
+    """Return covariances (n, d, d) without the entries (n, d) that are not determined, NaN, and their names (n)."""
+    hidden = np.where(wild[:, :, None] | wild[:, None, :], np.nan, covariance)
+    return hidden, _named_open(wild, axes, [""] * len(wild))
+
+
+def _named_open(wild: Array, names: Sequence[str], before: Sequence[str]) -> list[str]:
+    """Return the names of entries (n, d) that are not determined behind those that were found before."""
+    if not wild.any():
+        return list(before)
+    told = [[names[i] for i in np.flatnonzero(row).tolist()] for row in wild]
+    return ["; ".join([*([old] if old else []), *new]) for old, new in zip(before, told, strict=True)]
+
+
+_LEVEL = {"e": "east", "n": "north", "u": "up"}
+
+
+def _without_open_level(local: Columns, limit: Array, lost: Sequence[str]) -> tuple[Columns, list[str]]:
+    """Return geodetic columns without the level axes whose variance is beyond a limit (n,), and the names of all."""
+    axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
+    with np.errstate(invalid="ignore"):
+        wild = np.stack([local[f"cov_{axis}{axis}"] > limit**2 for axis in axes], axis=-1)
+    if not wild.any():
+        return local, list(lost)
+    pairs = {f"cov_{a}{b}": wild[:, i] | wild[:, i + j] for i, a in enumerate(axes) for j, b in enumerate(axes[i:])}
+    hidden = {
+        name: np.where(pairs[name], np.nan, values) if name in pairs else values for name, values in local.items()
+    }
+    return hidden, _named_open(wild, [_LEVEL[axis] for axis in axes], lost)
 
 
 def level_covariance(columns: Columns, i: int) -> Array:
@@ -232,11 +273,13 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
     for slot in fix.layout.shared:
         if not slot.members:
             continue
-        values, sigmas = fix.take(slot.name), fix.sigma(slot.name)
+        values, sigmas = fix.take(slot.name), np.where(fix.undetermined(slot.name), np.nan, fix.sigma(slot.name))
         shares = np.full(slot.size, np.nan) if seen is None else seen.from_data[slot.start : slot.start + slot.size]
         for member, value, sigma, share in zip(slot.entries, values, sigmas, shares, strict=True):
             record = {"name": slot.name, "member": member, "value": float(value), "sigma": float(sigma)}
             found.append(record | {"unit": slot.unit, "from_data": float(share)})
+        for i in np.flatnonzero(fix.undetermined(slot.name)).tolist():
+            found[len(found) - slot.size + i]["undetermined"] = True
     return found
 
 
@@ -282,6 +325,6 @@ def _chart_json(fix: Fix) -> dict[str, Any] | None:
     if chart.kind == INVERSE_RANGE:
         told |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
         told |= {"mean": chart.mean, "covariance": chart.spread}
-    if chart.kind != CURVED:
+    if chart.kind != CURVED and not fix.undetermined().any():
         told["range95"] = fix.interval("range")
     return told

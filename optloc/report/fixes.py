@@ -49,6 +49,10 @@ _NO_GAP = 1e-3
 _WIDTH = 100
 
 
+NOT_DETERMINED = "not determined"
+"""What is said of an entry that the data leave open, in the place of a number; see `optloc.Fix.undetermined`."""
+
+
 def with_sigma(value: float, sigma: float, unit: str) -> str:
     """Return a number with its standard deviation, rounded to it; a constraint may leave it none."""
     unit = unit if unit != "1" else ""
@@ -58,7 +62,8 @@ def with_sigma(value: float, sigma: float, unit: str) -> str:
         return f"{value:.6g} {unit}"
     # Two digits of the standard deviation, none behind the point of one above 10.
     digits = int(max(0, 1 - np.floor(np.log10(sigma))))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
+    text = f"{value:.{digits}f}"
+    return f"{text if text.strip('-0.') else text.lstrip('-')} ± {sigma:.{digits}f} {unit}"
 
 
 # In words: one sheet of a fix, and those of its biases, of what was left out and of its alternatives.
@@ -99,8 +104,8 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Shee
     # Errors of single epochs, such as clocks, are too many to list: their size is told.
     for name, values in fix.bias.items():
         slot, shared = fix.layout.find(name)
-        if not shared:
-            spread = np.sqrt(np.mean(values**2))
+        if not shared and np.isfinite(values).any():
+            spread = np.sqrt(np.nanmean(values**2))
             told.append((name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip()))
     told += [("constraint", _held(active)) for active in active_of(fix)]
     told += _extents(fix)
@@ -130,20 +135,26 @@ def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
     """Return what is said of the state of one target at one epoch."""
     if not np.isfinite(columns["x"][i]):
         return []
-    axes = [axis for axis in "xyz" if axis in columns]
-    told = [(f"{axis}{whose}", with_sigma(columns[axis][i], columns[f"sigma_{axis}"][i], "m")) for axis in axes]
+    axes, lost = [axis for axis in "xyz" if axis in columns], _lost(columns, i)
+    numbers = [with_sigma(columns[axis][i], columns[f"sigma_{axis}"][i], "m") for axis in axes]
+    told = [(f"{a}{whose}", NOT_DETERMINED if a in lost else text) for a, text in zip(axes, numbers, strict=True)]
     if "lat_deg" in columns:
-        told.append((f"latitude{whose}", f"{columns['lat_deg'][i]:.7f} deg"))
-        told.append((f"longitude{whose}", f"{columns['lon_deg'][i]:.7f} deg"))
+        lat, lon = f"{columns['lat_deg'][i]:.7f} deg", f"{columns['lon_deg'][i]:.7f} deg"
+        told.append((f"latitude{whose}", NOT_DETERMINED if "north" in lost else lat))
+        told.append((f"longitude{whose}", NOT_DETERMINED if "east" in lost else lon))
         local = [columns[f"cov_{axis}{axis}"][i] for axis in "enu" if f"cov_{axis}{axis}" in columns]
         held = " (held)" if len(local) == 3 and local[2] < (_HELD * _EARTH) ** 2 else ""
-        told.append((f"height{whose}", f"{columns['height'][i] + 0.0:.2f} m{held}".replace("-0.00", "0.00")))
-        names = ", ".join(("east", "north", "up")[: len(local)])
-        told.append((f"sigma {names}", ", ".join(_sizes(np.sqrt(np.maximum(local, 0.0)))) + " m"))
+        height = f"{columns['height'][i] + 0.0:.2f} m{held}".replace("-0.00", "0.00")
+        told.append((f"height{whose}", NOT_DETERMINED if "up" in lost else height))
+        known = [(word, v) for word, v in zip(("east", "north", "up"), local, strict=False) if word not in lost]
+        if known:
+            sizes = _sizes(np.sqrt(np.maximum([v for _, v in known], 0.0)))
+            told.append((f"sigma {', '.join(word for word, _ in known)}", ", ".join(sizes) + " m"))
     for letter, word, unit in (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²")):
         for axis in (axis for axis in axes if f"{letter}{axis}" in columns):
             value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
-            told.append((f"{word} {axis}{whose}", with_sigma(value, sigma, unit)))
+            text = NOT_DETERMINED if f"{letter}{axis}" in lost else with_sigma(value, sigma, unit)
+            told.append((f"{word} {axis}{whose}", text))
     semi = [columns[f"ellipse95_{j + 1}"][i] for j in range(len(axes))]
     if np.isfinite(semi).all() and columns["chart"][i] in {"", NAMES[CARTESIAN]}:
         name = "95 % ellipse" if len(axes) == 2 else "95 % ellipsoid"
@@ -151,6 +162,12 @@ def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
         if len(columns["x"]) == 1:
             told += _accuracy(level_covariance(columns, i))
     return told
+
+
+def _lost(columns: Columns, i: int) -> set[str]:
+    """Return the names of what is not determined of a row: coordinates, rates, level axes."""
+    told = columns["undetermined"][i] if "undetermined" in columns else ""
+    return set(told.split("; ")) if isinstance(told, str) else set()
 
 
 def _sizes(lengths: Iterable[float]) -> list[str]:
@@ -216,6 +233,7 @@ def bias_sheet(
         share = f"{100.0 * row['from_data']:.3g} %" if np.isfinite(row["from_data"]) else "-"
         unit, size = (row["unit"], 1.0) if unit_of is None else unit_of(row["name"], row["unit"])
         told = with_sigma(row["value"] / size, row["sigma"] / abs(size), unit)
+        told = NOT_DETERMINED if row.get("undetermined") else told
         rows.append((row["name"], row["member"], told.strip(), share))
     if len(records) > _BIASES:
         rows.append(("...", f"{len(records) - _BIASES} more", "--json prints all", ""))

@@ -19,6 +19,7 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
+from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.compute.jit import usable
 from optloc.problem.chart import Chart, quantile
@@ -308,6 +309,7 @@ class Single:
             "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
             "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
             "active": np.broadcast_to(_NOTHING, shape),  # constraints that hold fixes: none
+            "reach": np.broadcast_to(centre_and_spread(self.problem.stations.places)[1].reshape(()), shape),
         }
         claims = alike(NO_PROOF if posed is None else _PROVEN, shape)
         many = self.problem.with_rows(z=np.zeros((n, m))) if self.problem.frame.geodetic else None

@@ -20,7 +20,7 @@ from optloc.base.outputs import written
 from optloc.study.baselines import BASELINES
 from optloc.study.methods import version_of
 from optloc.study.plan import Plan, planned
-from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
+from optloc.study.trial import COLUMNS, EXPLAINED, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -254,12 +254,29 @@ def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
     from pyarrow import ArrowException, parquet
 
     try:
-        if path.name.split(".")[1:-1] == [_digest(read_bytes(path))]:
+        if path.name.split(".")[1:-1] == [_digest(read_bytes(path))] and _is_part(parquet.read_schema(path), columns):
             # Not from bytes of Python: threads of Arrow that free such while the interpreter ends abort the process.
             return parquet.read_table(path, columns=columns, partitioning=None)
     except (InvalidProblem, OSError, ArrowException):
         pass
     raise InvalidProblem("the part is damaged", str(path), "run the study again, and it is made again")
+
+
+def _is_whole(path: Path, rows: int) -> bool:
+    """Return whether a part file has all its columns and so many rows."""
+    from pyarrow import parquet
+
+    try:
+        return bool(read_part(path, ["status"]).num_rows == rows and _is_part(parquet.read_schema(path), None))
+    except InvalidProblem:
+        return False
+
+
+def _is_part(found: Any, columns: Sequence[str] | None) -> bool:
+    """Return whether a file has the columns of a part, or some of them, with their types."""
+    wanted = arrow_schema()
+    names = wanted.names if columns is None else columns
+    return all(found.get_field_index(name) >= 0 and found.field(name).type == wanted.field(name).type for name in names)
 
 
 def finished_parts(folder: Path, manifest: Manifest, say: Callable[[str], None]) -> dict[str, Path]:
@@ -281,11 +298,7 @@ def finished_parts(folder: Path, manifest: Manifest, say: Callable[[str], None])
     """
     done = part_files(folder)
     for key, path in list(done.items()):
-        try:
-            whole = read_part(path, ["status"]).num_rows == manifest.chunks[key]
-        except InvalidProblem:
-            whole = False
-        if not whole:
+        if not _is_whole(path, manifest.chunks[key]):
             del done[key]
             say(f"{path}: the part is damaged, and is made again")
             try:
@@ -397,7 +410,8 @@ class Progress:
     methods : dict of (str, str) to int
         How many rows of which method have which status.
     failures : dict of (str, str) to str
-        Why a trial of a method has a status that only those without a fix have.
+        Why a trial of a method has no fix, by statuses whose reason says it: of the study, of a back end that failed,
+        of a method that does not start such rows.
     """
 
     manifest: Manifest
@@ -428,7 +442,7 @@ def progress(folder: Path) -> Progress:
         for row in table.group_by(["method", "status"], use_threads=False).aggregate([([], "count_all")]).to_pylist():
             method, status = str(row["method"]), str(row["status"])
             methods[method, status] += int(row["count_all"])
-            if status in FAILED and (method, status) not in failures:
+            if status in EXPLAINED and (method, status) not in failures:
                 own = pc.and_(pc.equal(table["method"], method), pc.equal(table["status"], status))
                 failures[method, status] = str(table["reason"].filter(own)[0])
     counts: Counter[str] = Counter()

@@ -158,3 +158,11 @@ def test_broken_plans_are_one_sentence(folder, name):
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stderr.count("\n") <= 1
+
+
+def test_groups_that_allow_fewer_sites_are_one_sentence(folder):
+    (folder / "plan.toml").write_text(PLAN + '[[groups]]\ngroup = "a"\nmost = 1\n[[groups]]\ngroup = "b"\nmost = 2\n')
+    done = run()
+    assert done.exit_code == 2
+    assert "5 sites are wanted, and the groups allow 3 at most" in " ".join(done.output.split())
+    assert "Traceback" not in done.output

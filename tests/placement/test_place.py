@@ -213,7 +213,7 @@ BAD = {
     "kept and forbidden": ({"kept": ("S1",), "forbidden": ("S1",)}, "kept and forbidden"),
     "groups that contradict k": (
         {"groups": (Group(tuple(f"S{i}" for i in range(12)), least=6),)},
-        "no set of sites meets",
+        "the groups need 6 at least",
     ),
     "criterion": ({"criterion": "trace"}, "there is no criterion 'trace'"),
     "gap": ({"gap": 0.0}, "the gap 0 is not between"),

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from optloc.adequacy.shape import BENT, cost_at_infinity, departure
-from optloc.base.linalg import centre_of_points
+from optloc.base.linalg import centre_and_spread, centre_of_points
 from optloc.base.records import present, take
 from optloc.base.types import Array, Certificate, Status
 from optloc.linear.constraints import faces
@@ -214,6 +214,28 @@ def centre_of(problem: Problem) -> Array:
     heard = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
     # a station that moves counts wherever it is in the course of the run
     return centre_of_points(places, np.tile(heard, places.shape[-2] // problem.stations.count))
+
+
+def reach_of(problem: Problem, x: Array) -> Array:
+    """Return the greatest distance (N,) of a station, and of a target without a chart, from the stations' middle.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    x : array (N, size)
+        Fixes.
+    """
+    centre, spread = centre_and_spread(problem.stations.places)
+    reach = np.broadcast_to(spread, (len(x),))
+    if problem.layout.shares("position"):  # its chart knows how far away it is
+        return reach
+    slots = (*problem.layout.shared, *problem.layout.local)
+    for name in (slot.name for slot in slots if slot.name.partition("[")[0] == "position"):
+        places = problem.layout.take(x, name).reshape(len(x), -1, problem.dimension)
+        away = np.sqrt(((places - centre.reshape(-1, 1, problem.dimension)) ** 2).sum(-1))
+        reach = np.fmax(reach, np.fmax.reduce(away, axis=-1, initial=0.0))
+    return np.asarray(reach)
 
 
 def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature) -> Chart | None:

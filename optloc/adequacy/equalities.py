@@ -1,0 +1,173 @@
+"""Equalities of a run: those of states that last, and those that every epoch's own state keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.linalg import Tangent, tangent
+from optloc.base.types import Array, Band, Polygon
+from optloc.linear.constraints import Face, exact, levels, restore, tangent_at
+from optloc.linear.normal import Normal, degrees_of_freedom, marginal, step
+from optloc.problem.epochs import states_by_epoch
+from optloc.problem.problem import Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Equalities:
+    """The equalities of a flat batch of M problems.
+
+    Parameters
+    ----------
+    problem : Problem
+        The batch: runs of k epochs with l unknowns local to each.
+    lasting : Face
+        Equalities of states that are shared by all epochs.
+    single : Problem, optional
+        An epoch: its states, and its equalities with bounds (M or 1, k or 1); None where no epoch has one of its own.
+    each : Face
+        Equalities that hold in every epoch, of `single`.
+    """
+
+    problem: Problem
+    lasting: Face
+    single: Problem | None
+    each: Face
+
+    @classmethod
+    def of(cls, problem: Problem) -> Equalities:
+        """Return the equalities of a problem."""
+        face = exact(problem)
+        own = {i for level in face if problem.motions[_target(problem, i := level.constraint)].span == "epoch"}
+        lasting = tuple(level for level in face if level.constraint not in own)
+        if not own:
+            return cls(problem, lasting, None, ())
+        kept = replace(problem, priors=(), constraints=tuple(problem.constraints[i] for i in sorted(own)))
+        single = states_by_epoch(kept)
+        return cls(problem, lasting, single, exact(single))
+
+    def restore(self, x: Array) -> Array:
+        """Return vectors (M, size) moved onto the equalities along the shortest way."""
+        x = restore(self.problem, self.lasting, x) if self.lasting else x
+        if self.single is None:
+            return x
+        return self._put(x, restore(self._single(x), self.each, self._states(x)))
+
+    def step(self, equations: Normal, damping: Array, x: Array) -> tuple[Array, Array]:
+        """Return the damped steps (M, size) that keep the equalities to first order, and where they exist (M,).
+
+        Parameters
+        ----------
+        equations : Normal
+            Of the batch at `x`.
+        damping : array (M,)
+            As of `optloc.linear.normal.step`.
+        x : array (M, size)
+            Where the steps begin.
+        """
+        space = tangent_at(self.problem, self.lasting, x) if self.lasting else None
+        if self.single is None:
+            return step(equations, damping, space)
+        basis = self._own_space(x).along
+        move, ok = step(_within(equations, basis), damping, space)
+        n, (m, k, _, free) = self.problem.layout.n_shared, basis.shape
+        local = (basis @ move[:, n:].reshape(m, k, free, 1))[..., 0] if free else np.zeros(basis.shape[:-1])
+        return np.concatenate([move[:, :n], local.reshape(m, -1)], axis=1), ok
+
+    def shared(self, equations: Normal, x: Array) -> tuple[Array, Array]:
+        """Return information (M, n, n) and vector (M, n) of shared unknowns; local ones keep their equalities."""
+        if self.single is not None:
+            equations = _within(equations, self._own_space(x).along)
+        information, vector, _ = marginal(equations)
+        return information, vector
+
+    def lasting_space(self, x: Array) -> Array:
+        """Return a basis (M, n, n - c) of the shared unknowns along their equalities."""
+        if not self.lasting:
+            return np.broadcast_to(np.eye(n := self.problem.layout.n_shared), (len(x), n, n))
+        return tangent_at(self.problem, self.lasting, x).along
+
+    def _own_space(self, x: Array) -> Tangent:
+        """Return the tangent spaces of the local unknowns (M, k, l, ...) of every epoch."""
+        layout = self.problem.layout
+        _, gradients = levels(self._single(x), self.each, self._states(x))
+        local = np.zeros((*gradients.shape[:2], layout.n_local))
+        for here, there in self._slots():
+            local[..., here] = gradients[..., there]
+        found = tangent(local, np.ones((len(local), layout.n_local)))
+        shape = (len(x), self.problem.epochs)
+        return Tangent(*(part.reshape(*shape, *part.shape[1:]) for part in (found.along, found.across)))
+
+    def _single(self, x: Array) -> Problem:
+        """Return the epochs of vectors (M, size) as problems (M k,) of one epoch each."""
+        shape = (len(x), self.problem.epochs)
+        return replace(self._epoch, constraints=tuple(_spread(band, shape) for band in self._epoch.constraints))
+
+    @property
+    def _epoch(self) -> Problem:
+        assert self.single is not None  # callers have looked
+        return self.single
+
+    def _slots(self) -> list[tuple[slice, slice]]:
+        """Return where the states stand among the local unknowns of the run, and in the vector of an epoch."""
+        own = {slot.name: slice(slot.start, slot.start + slot.size) for slot in self._epoch.layout.shared}
+        local = [slot for slot in self.problem.layout.local if slot.name in own]
+        return [(slice(slot.start, slot.start + slot.size), own[slot.name]) for slot in local]
+
+    def _states(self, x: Array) -> Array:
+        """Return the states of every epoch as vectors (M k, size of an epoch)."""
+        _, local = self.problem.layout.split(x)
+        out = np.zeros((local.shape[0] * local.shape[1], self._epoch.layout.size))
+        for here, there in self._slots():
+            out[:, there] = local.reshape(len(out), -1)[:, here]
+        return out
+
+    def _put(self, x: Array, states: Array) -> Array:
+        """Return vectors (M, size) with the states of their epochs in the place of their own."""
+        shared, local = self.problem.layout.split(x)
+        local = local.reshape(len(states), -1).copy()
+        for here, there in self._slots():
+            local[:, here] = states[:, there]
+        return np.concatenate([shared, local.reshape(len(x), -1)], axis=1)
+
+
+def spare_rows(problem: Problem) -> Array:
+    """Return the degrees of freedom (N,) of a flat batch; an equality of an epoch's own state counts in every epoch."""
+    found = degrees_of_freedom(problem)
+    own = sum(problem.motions[_target(problem, level.constraint)].span == "epoch" for level in exact(problem))
+    if not own or problem.epochs == 1:
+        return found
+    # an epoch without a row has no unknowns to hold
+    weight = np.atleast_2d(problem.weight)
+    heard = np.zeros((len(weight), problem.epochs), dtype=bool)
+    for i, row in enumerate(weight > 0.0):
+        heard[i, problem.epoch[row]] = True
+    return np.asarray(found + own * (heard.sum(1) - 1))
+
+
+def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
+    """Return an equality with one bound for each of M problems and k epochs, in one row."""
+    if isinstance(band, Polygon):
+        return band
+    lower, upper = (b if b.ndim == 0 else np.broadcast_to(b, shape).ravel() for b in (band.lower, band.upper))
+    c = band.coefficients
+    c = c if c.ndim == 1 else np.broadcast_to(c, (*shape, c.shape[-1])).reshape(-1, c.shape[-1])
+    return replace(band, lower=lower, upper=upper, coefficients=c)
+
+
+def _target(problem: Problem, constraint: int) -> int:
+    return problem.constraints[constraint].target
+
+
+def _within(equations: Normal, basis: Array) -> Normal:
+    """Return normal equations whose local unknowns move along a basis (M, k, l, l - c) only."""
+    turned = np.swapaxes(basis, -1, -2)
+    return Normal(
+        equations.shared,
+        turned @ equations.local @ basis,
+        equations.cross @ basis,
+        equations.shared_vector,
+        (turned @ equations.local_vector[..., None])[..., 0],
+        equations.cost,
+    )

@@ -1,0 +1,151 @@
+"""Checkpoints of a stream: its open events, the ids of those that were answered, and its counts, as one JSON object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.inputs import Budget, access, json_of, read_text
+from optloc.live.answers import Record
+from optloc.live.events import Event, Events, name_under, picoseconds, rows_and_arrivals
+from optloc.live.metrics import COUNTS
+from optloc.live.site import Site
+
+_FORMAT = "optloc live 1"
+# Bytes of a checkpoint: as many as the largest state has, 4096 open events of 64 kB and 65 536 ids.
+_BUDGET = Budget(text=1 << 29)
+# Of a count: a million a second for 30 000 years, far below what a float rounds.
+_MOST = 1 << 60
+# Characters that are repeated of what is refused.
+_SHOWN = 40
+_NAMES: dict[type, str] = {list: "list", dict: "object", str: "text", int: "whole number", bool: "true or false"}
+T = TypeVar("T")
+
+
+def state_of(events: Events, unwritten: dict[str, Event]) -> Record:
+    """Return what a stream must know to go on where it was.
+
+    Parameters
+    ----------
+    events : Events
+        Of the stream.
+    unwritten : dict of str to Event
+        Closed events whose answers may not have been written: they count as open.
+    """
+    site = events.site
+
+    def spelled(event: Event) -> Record:
+        rows = [[*site.row(key)[2:5], value, event.sigmas.get(key)] for key, value in event.rows.items()]
+        times = [[site.stations[i], str(value)] for i, value in event.times.items()]
+        about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
+        about |= {"when": None if event.when is None else str(event.when), "track": event.track}
+        about |= {"refused": event.refused} if event.refused else {}
+        return {"event": event.name, "rows": rows, "times": times, **about}
+
+    return {
+        "format": _FORMAT,
+        "site": site.source,
+        "open": [spelled(event) for event in (*unwritten.values(), *events.open.values())],
+        "closed": [name for name in events.closed if name not in unwritten],
+        "counts": dict(events.metrics.counts),
+    }
+
+
+def restore(path: Path, events: Events, now: float) -> None:
+    """Take over what a checkpoint holds: all of it, or nothing.
+
+    Parameters
+    ----------
+    path : Path
+        The checkpoint.
+    events : Events
+        A stream's, before its first line.
+    now : float
+        By the clock of the stream.
+
+    Raises
+    ------
+    InvalidProblem
+        Where it is none, is damaged, or names what the site has not.
+    """
+    with access(anew=True, budget=_BUDGET):  # it is written again, which a file that was read must not be
+        found = json_of(read_text(path), path.name)
+    if not isinstance(found, dict) or found.get("format") != _FORMAT:
+        raise InvalidProblem("this is no checkpoint of a stream", str(path), "name another file, or remove it")
+    where = str(path)
+    try:
+        closed = [name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
+        counts = _counts(found.get("counts"))
+        taken, opened = set(closed), dict[str, Event]()
+        for number, each in enumerate(_typed(found.get("open"), list, "open"), 1):
+            where = f"{path}, open event {number}"
+            event = _event(each, events.site, now, taken)
+            taken.add(event.name)
+            opened[event.name] = event
+    except InvalidProblem as error:
+        if error.where in ("kind", "a", "b", "station"):
+            raise InvalidProblem(error.what, where, "it belongs to another site; name another file") from None
+        raise InvalidProblem(f"this checkpoint is damaged ({error.where}: {error.what})", where, "remove it") from None
+    for name in closed:
+        events.remember(name, None)
+    events.open.update(opened)
+    events.metrics.counts.update(counts)
+
+
+def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
+    """Return an open event of another name than those taken; raise InvalidProblem, whose place is a key, for none."""
+    each = _typed(found, dict, "open")
+    entries = [_parts(entry, 5, "rows") for entry in _typed(each.get("rows"), list, "rows")]
+    given = [
+        {"kind": kind, "a": a, "b": b, "z": value} | ({} if sigma is None else {"sigma": sigma})
+        for kind, a, b, value, sigma in entries
+    ]
+    entries = [_parts(entry, 2, "times") for entry in _typed(each.get("times"), list, "times")]
+    heard = [{"station": station, "time_ps": time} for station, time in entries]
+    rows, sigmas, times = rows_and_arrivals(given, heard, site)
+    refused = _typed(each.get("refused", ""), str, "refused")
+    if not rows and not times and not refused:
+        raise InvalidProblem("an event has no rows", "rows")
+    name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
+    if name in taken:
+        raise InvalidProblem(f"the event {name!r} is there twice", "event")
+    event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))
+    event.revision = _count(each.get("revision"), "revision")
+    event.conflict = _typed(each.get("conflict"), bool, "conflict")
+    # checkpoints from before there were tracks have neither
+    event.when = None if each.get("when") is None else picoseconds(each["when"], "time_ps")
+    event.track = _typed(each.get("track", False), bool, "track")
+    event.refused = refused
+    return event
+
+
+def _typed(found: Any, kind: type[T], where: str) -> T:
+    """Return a value of a type; raise InvalidProblem for another one. True is no number."""
+    if type(found) is not kind:
+        raise InvalidProblem(f"{str(found)[:_SHOWN]!r} is no {_NAMES[kind]}", where)
+    return found
+
+
+def _parts(found: Any, count: int, where: str) -> list[Any]:
+    entry = _typed(found, list, where)
+    if len(entry) != count:
+        raise InvalidProblem(f"an entry has {len(entry)} values, {count} are needed", where)
+    return entry
+
+
+def _count(found: Any, where: str) -> int:
+    """Return a number of things that were counted."""
+    number = _typed(found, int, where)
+    if not 0 <= number <= _MOST:
+        raise InvalidProblem(f"{str(number)[:_SHOWN]} is no count", where)
+    return number
+
+
+def _counts(found: Any) -> dict[str, int]:
+    """Return what was counted, by the names of `optloc.live.metrics.COUNTS`."""
+    counts = _typed(found, dict, "counts")
+    unknown = counts.keys() - COUNTS.keys()
+    if unknown:
+        raise InvalidProblem(f"nothing is counted as {min(unknown)[:_SHOWN]!r}", "counts")
+    return {name: _count(number, "counts") for name, number in counts.items()}

@@ -1,0 +1,104 @@
+"""How many sites the groups of a placement allow and need: a count that cannot be met is refused before a search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+
+if TYPE_CHECKING:
+    from optloc.placement.sites import Group
+
+# Members of a group, and groups, that are named; the others are counted.
+_NAMED, _GROUPS = 8, 3
+
+
+def check_groups(
+    groups: Sequence[Group], members: Array, names: Sequence[str], state: Array, choose: int | None
+) -> None:
+    """Refuse groups that no set of sites meets, and a number of sites that is too large or too small for them.
+
+    Parameters
+    ----------
+    groups : sequence of Group
+        The rules.
+    members : bool array (G, n)
+        Which sites belong to each.
+    names : sequence of n str
+        Of the sites.
+    state : int array (n,)
+        -1 for free sites, 0 and 1 for those that are left out and taken.
+    choose : int, optional
+        How many free sites are wanted; None: as many as the budget allows.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the groups and how many sites are possible.
+    """
+    for i, group in enumerate(groups):
+        _check_one(f"groups, entry {i + 1}", group, members[i], names, state)
+    most, least = (_count(groups, members, state, sign) for sign in (-1.0, 1.0))
+    if most is None or least is None:
+        what = f"no set of sites meets all of the groups {_told(groups)}"
+        raise InvalidProblem(what, "groups", "allow more sites of a group, or ask for fewer")
+    if choose is None:
+        return
+    if choose > most:
+        cause = _binding(groups, members, state, most)
+        rules = " and ".join(f"at most {groups[i].most} of {_listed(members[i], names)}" for i in cause[:_GROUPS])
+        rules += f" and {len(cause) - _GROUPS} more groups" if len(cause) > _GROUPS else ""
+        what = f"{choose} sites are wanted, and the groups allow {most} at most ({rules})"
+        raise InvalidProblem(what, "choose", f"ask for {most} or fewer, or allow more sites of a group")
+    if choose < least:
+        what = f"{choose} sites are wanted, and the groups need {least} at least"
+        raise InvalidProblem(what, "choose", f"ask for {least} or more, or ask for fewer sites of a group")
+
+
+def _check_one(where: str, group: Group, own: Array, names: Sequence[str], state: Array) -> None:
+    """Refuse a group that cannot be met whatever the others say."""
+    kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _listed(own, names)
+    if group.most is not None and kept > group.most:
+        what = f"at most {group.most} of {who} may be taken, and {kept} of them are kept"
+        raise InvalidProblem(what, where, "allow more of them, or keep fewer")
+    if group.least is not None and group.least > able:
+        what = f"at least {group.least} of {who} are wanted, and {able} of them can be taken"
+        raise InvalidProblem(what, where, "ask for fewer of them, or name more candidates")
+    if group.least is not None and group.most is not None and group.least > group.most:
+        what = f"at least {group.least} and at most {group.most} of {who} are wanted"
+        raise InvalidProblem(what, where, "correct one of the two")
+
+
+def _count(groups: Sequence[Group], members: Array, state: Array, sign: float) -> int | None:
+    """Return the greatest (-1) or least (1) number of free sites that meets the groups; None where no set does."""
+    low = np.array([-np.inf if g.least is None else g.least for g in groups], dtype=float)
+    high = np.array([np.inf if g.most is None else g.most for g in groups], dtype=float)
+    rules = [LinearConstraint(members.astype(float), low, high)] if len(groups) else []
+    free = (state == -1).astype(float)
+    sites = Bounds((state == 1).astype(float), (state != 0).astype(float))
+    solved = milp(sign * free, integrality=np.ones(len(state)), bounds=sites, constraints=rules)
+    return None if solved.x is None else round(float(free @ solved.x))
+
+
+def _binding(groups: Sequence[Group], members: Array, state: Array, most: int) -> list[int]:
+    """Return the groups without which more sites were possible: a single one if that is enough, else all that limit."""
+    limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
+    for i in limiting:
+        kept = [k for k in range(len(groups)) if k != i]
+        if (_count([groups[k] for k in kept], members[kept], state, -1.0) or 0) > most:
+            return [i]
+    return limiting
+
+
+def _listed(own: Array, names: Sequence[str]) -> str:
+    told = [names[i] for i in np.flatnonzero(own).tolist()]
+    return ", ".join(told[:_NAMED]) + (f" and {len(told) - _NAMED} more" if len(told) > _NAMED else "")
+
+
+def _told(groups: Sequence[Group]) -> str:
+    return ", ".join(str(i + 1) for i in range(len(groups)))
