@@ -294,9 +294,9 @@ class Fix:
     def undetermined(self, name: str = "position") -> Array:
         """Return which entries (..., q) of a named part the data leave open, whatever number stands there.
 
-        An entry is open where its standard deviation is more than 100 times the size of stations and target together, a
-        speed where it is more than that of light. Symmetry leaves such entries: the height over a plane of stations, for
-        instance, where the target is in that plane. Tables and texts call them "not determined".
+        An entry is open where its standard deviation is more than 100 times the size of stations and target together,
+        or a speed more than that of light. Symmetry leaves such entries, for instance the height of a target in the
+        plane of all stations. Tables and texts call them "not determined".
 
         Parameters
         ----------
