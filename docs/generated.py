@@ -111,6 +111,20 @@ def kinds() -> str:
     return "\n".join([*head, *lines])
 
 
+def columns() -> str:
+    """Return the roles of columns of foreign tables: their names, the units that fit, and what they hold."""
+    from optloc.files.columns import roles
+
+    lines = []
+    for name, role in roles().items():
+        names = " ".join(f"`{word}`" for word in role.names)
+        if role.with_unit:
+            names += f"{'; ' if names else ''}with a unit: " + " ".join(f"`{word}`" for word in role.with_unit)
+        units = " ".join(f"`{unit}`" for unit in role.units) if name != "sigma" else "those of the readings"
+        lines.append(f"| `{name}` | {names} | {units or '-'} | {role.text} |")
+    return "\n".join(["| role | names | units | what the column holds |", "|---|---|---|---|", *lines])
+
+
 def layers() -> str:
     """Return the layers of the house as a drawing: every folder on its floor, with what its docstring says."""
     source = ast.parse((DOCS.parent / "tests" / "test_layers.py").read_text(encoding="utf-8"))
@@ -349,6 +363,7 @@ GENERATED: dict[str, Callable[..., str]] = {
     "costs": costs,
     "formats": formats,
     "kinds": kinds,
+    "columns": columns,
     "words": words,
     "commands": commands,
     "layers": layers,

@@ -40,6 +40,32 @@ class Choice:
         return f"{self.kind}:{self.name}:{sorted(self.settings.items())!r}"
 
 
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How one solve of a back end ended.
+
+    Parameters
+    ----------
+    backend : str
+        Name of the back end.
+    status : str
+        Its own word.
+    message : str
+        Its own sentence; empty where it has none.
+    found : bool
+        Whether it returned a point that is an answer.
+    """
+
+    backend: str
+    status: str
+    message: str
+    found: bool
+
+    def __str__(self) -> str:
+        """Return back end and status, and the message where there is one."""
+        return f"{self.backend}: {self.message or self.status}"
+
+
 class SolverError(ArithmeticError):
     """A back end stopped with an error of its own on numbers that it was given."""
 
@@ -60,6 +86,7 @@ def hold_in_forks(lock: Any) -> None:
 # share it start in a copy of the caller's context.
 _CHOICE: ContextVar[Choice | None] = ContextVar("choice", default=None)
 _TALLY: ContextVar[list[tuple[str, int]] | None] = ContextVar("tally", default=None)
+_ENDINGS: ContextVar[list[Ending] | None] = ContextVar("endings", default=None)
 
 
 def choice_for(kind: Kind) -> Choice | None:
@@ -87,6 +114,37 @@ def counting() -> Iterator[list[tuple[str, int]]]:
         yield tally
     finally:
         _TALLY.reset(token)
+
+
+@contextmanager
+def recording() -> Iterator[list[Ending]]:
+    """Yield a list to which every solve inside adds how it ended; a list outside gets the same entries afterwards."""
+    endings: list[Ending] = []
+    outer = _ENDINGS.get()
+    token = _ENDINGS.set(endings)
+    try:
+        yield endings
+    finally:
+        _ENDINGS.reset(token)
+        if outer is not None:
+            outer.extend(endings)
+
+
+def failures() -> tuple[Ending, ...]:
+    """Return the endings without an answer that the innermost `recording` holds so far."""
+    return tuple(ending for ending in _ENDINGS.get() or () if not ending.found)
+
+
+def record(ending: Ending) -> None:
+    """Add the ending of a solve to the list of `recording`, where there is one."""
+    endings = _ENDINGS.get()  # one list for all threads of a caller: appending is atomic
+    if endings is not None:
+        endings.append(ending)
+
+
+def first_sentence(trouble: BaseException) -> str:
+    """Return the first line of an error, and its type where it has no text."""
+    return str(trouble).partition("\n")[0] or type(trouble).__name__
 
 
 def count(name: str, iterations: int) -> None:

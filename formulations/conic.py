@@ -24,6 +24,7 @@ Trends Optim. 1 (2014), section 6.3 (the projection).
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from formulations.algebra import Array, Index
-from formulations.backend import SolverError, choice_for, count, hold_in_forks
+from formulations.backend import Ending, SolverError, choice_for, count, first_sentence, hold_in_forks, record
 
 _Arguments = ParamSpec("_Arguments")
 _Built = TypeVar("_Built")
@@ -55,9 +56,9 @@ class Answer:
     Parameters
     ----------
     values : Mapping[str, Array]
-        Values of the variables by name; NaN where the solver gave none.
+        Values of the variables by name; NaN where the solver ended without an answer.
     primal : float
-        Objective at the point found.
+        Objective at the point found; NaN where there is none.
     bound : float
         Lower bound of the optimum, recomputed from the dual point; minus infinity where none is available.
     status : str
@@ -66,6 +67,8 @@ class Answer:
         True where the solver met its full tolerances.
     iterations : int
         Interior-point (or other) iterations.
+    message : str
+        The solver's own sentence, for instance why it refused; empty where it gave none.
     """
 
     values: Mapping[str, Array]
@@ -74,6 +77,7 @@ class Answer:
     status: str
     solved: bool
     iterations: int
+    message: str = ""
 
 
 class Relaxation:
@@ -150,6 +154,7 @@ class Relaxation:
         else:
             answer = self._directly(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
         count(backend, answer.iterations)
+        record(Ending(backend, answer.status, answer.message, bool(np.isfinite(answer.primal))))
         return answer
 
     def _directly(
@@ -166,42 +171,66 @@ class Relaxation:
         try:
             solution = solver.solve()
         except Exception as trouble:  # whatever stops a solver that was built
+            record(Ending("CLARABEL", "error", first_sentence(trouble), found=False))
             raise SolverError(f"Clarabel failed: {trouble}") from trouble
         x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
         if not (np.isfinite(x).all() and np.isfinite(z).all()):
             x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)
-        quadratic = float(x @ data.square(x))
         far = self.radius * (1.0 + float(np.sqrt(x @ x))) if reach is None else reach
-        return Answer(
-            data.recover(x),
-            0.5 * quadratic + float(data.q @ x) + data.d,
-            data.bound(x, z, far) if bound else -np.inf,
-            status,
-            status == "Solved",
-            int(solution.iterations),
-        )
+        # any dual point bounds the optimum, whatever the solver ended with
+        low = data.bound(x, z, far) if bound else -np.inf
+        # the last iterate of a solve that failed is no answer
+        at = x if status in _MET else np.full(len(x), np.nan)
+        quadratic = float(at @ data.square(at))
+        primal = 0.5 * quadratic + float(data.q @ at) + data.d
+        return Answer(data.recover(at), primal, low, status, status == "Solved", int(solution.iterations))
 
     def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> Answer:
         import cvxpy
 
         for name, value in values.items():
             self.parameters[name].value = value
+        _forget(self.problem)
+        status, message = cvxpy.settings.SOLVER_ERROR, ""
         try:
-            # cvxpy would start from the answer of the solve before: answers would depend on their order
-            self.problem.solve(solver=backend, **{"warm_start": False, **settings})
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # an inaccurate solution is told by its status
+                # cvxpy would start from the answer of the solve before: answers would depend on their order
+                self.problem.solve(solver=backend, **{"warm_start": False, **settings})
         except cvxpy.error.SolverError as trouble:
-            status = str(trouble)
+            message = first_sentence(trouble)
+        except Exception as trouble:  # noqa: BLE001  (a back end may raise anything; its program stays usable)
+            message = f"{type(trouble).__name__}: {first_sentence(trouble)}"
         else:
             status = str(self.problem.status)
-        found: dict[str, Array] = {}
-        for variable in self.problem.variables():
-            missing = variable.value is None
-            found[variable.name()] = np.full(variable.shape, np.nan) if missing else np.asarray(variable.value)
-        known = status in ("optimal", "optimal_inaccurate")
-        stats = self.problem.solver_stats if known else None
+        stats = None if message else self.problem.solver_stats
         iterations = int(stats.num_iters or 0) if stats is not None else 0
-        primal = float(self.problem.value) if known else np.nan
-        return Answer(found, primal, -np.inf, status, status == "optimal", iterations)
+        good = status == cvxpy.OPTIMAL or (status == cvxpy.OPTIMAL_INACCURATE and backend in _REDUCED)
+        found = {v.name(): v.value for v in self.problem.variables()} if good else {}
+        good = good and all(value is not None and np.isfinite(value).all() for value in found.values())
+        point = {
+            v.name(): np.array(found[v.name()], dtype=np.float64) if good else np.full(v.shape, np.nan)
+            for v in self.problem.variables()
+        }
+        primal = float(self.problem.value) if good else np.nan
+        return Answer(point, primal, -np.inf, status, good and status == cvxpy.OPTIMAL, iterations, message)
+
+
+# How Clarabel ends with an answer: its tolerances are met, or its reduced ones (5e-5 of the gap, 1e-4 of feasibility),
+# which it also tries where it stops at a limit or makes no progress.
+_MET = ("Solved", "AlmostSolved")
+# Back ends that call an answer inaccurate where reduced tolerances of theirs are met. Others, SCS for one, call the
+# last iterate so, wherever it is.
+_REDUCED = ("ECOS", "QOCO")
+
+
+def _forget(problem: Any) -> None:
+    """Remove the values of the solve before from a cvxpy problem: one that fails would leave them in place."""
+    for variable in problem.variables():
+        variable.save_value(None)
+    for constraint in problem.constraints:
+        for dual in constraint.dual_variables:
+            dual.save_value(None)
 
 
 def _solver(data: Data, settings: Mapping[str, Any]) -> Any:

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
-from formulations.backend import Choice, SolverError, count, hold_in_forks
+from formulations.backend import Choice, Ending, SolverError, count, first_sentence, hold_in_forks, record
 
 Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
@@ -48,7 +48,12 @@ _SILENCE: dict[str, dict[str, Any]] = {
         "convexify_strategy": "regularize",
     },
     "blocksqp": {"print_header": False, "print_iteration": False},
+    "fatrop": {"fatrop": {"print_level": 0}},
+    "uno": {"uno": {"logger": "SILENT"}},
 }
+# Violation of a constraint, in its own unit of order one, from which a point is no solution whatever a solver claims:
+# ten times the loosest tolerance, the 1e-4 of IPOPT.
+_BROKEN = 1e-3
 
 _COMPILERS = ("cc", "gcc", "clang")
 _PATIENCE = 600.0  # seconds; some 10 for 200 rows, and large programs are long source
@@ -61,7 +66,7 @@ class Local:
     Parameters
     ----------
     x : Array, shape (n,)
-        The point; the last iterate where `success` is False.
+        The point; where `success` is False the last iterate, which is no solution.
     cost : float
         ``|We|^2`` plus the prior term.
     bounds : Array, shape (n,)
@@ -70,9 +75,9 @@ class Local:
     equalities, inequalities : Array
         Multipliers of ``c = 0`` and ``d >= 0``; the latter are at most zero.
     status : str
-        IPOPT's own word.
+        The solver's own word, and what contradicts it.
     success : bool
-        True where IPOPT met its tolerances.
+        True where the solver met its tolerances, the point meets the constraints and the cost has a gradient there.
     iterations : int
         Interior-point iterations.
     """
@@ -152,6 +157,7 @@ class Program:
         program = {"x": x, "p": data, "f": cost, "g": ca.vertcat(c, d)}
         self._name = "ipopt" if choice is None else choice.name
         options = _options(choice, settings or {})
+        self._check = ca.Function("check", [x, data], [ca.gradient(cost, x), ca.vertcat(c, ca.fmin(d, 0.0))])
         solver = ca.nlpsol("nls", self._name, program, options)
         faster = _compile(self._name, solver, options) if compiled else None
         self.compiled = faster is not None
@@ -216,10 +222,19 @@ class Program:
         try:
             with self.lock:
                 found, stats = self._solver(**given), self._solver.stats()
+            status = str(stats["return_status"])
         except RuntimeError as trouble:  # CasADi has no other kind
+            record(Ending(self._name, "error", first_sentence(trouble), found=False))
             raise SolverError(f"{self._name} failed: {trouble}") from trouble
+        except KeyError as trouble:
+            record(Ending(self._name, "error", "it reports no status", found=False))
+            raise SolverError(f"{self._name} failed: it reports no status") from trouble
         iterations = int(stats.get("iter_count", 0))
         count(self._name, iterations)
+        against = self._contradiction(found["x"], data, status) if stats["success"] else ""
+        status = f"{status}, but {against}" if against else status
+        success = bool(stats["success"]) and not against
+        record(Ending(self._name, status, "", success))
         multipliers = _numbers(found["lam_g"])
         return Local(
             x=_numbers(found["x"]),
@@ -227,10 +242,22 @@ class Program:
             bounds=_numbers(found["lam_x"]),
             equalities=multipliers[: self._equal],
             inequalities=multipliers[self._equal :],
-            status=str(stats["return_status"]),
-            success=bool(stats["success"]),
+            status=status,
+            success=success,
             iterations=iterations,
         )
+
+    def _contradiction(self, x: Any, data: Array, status: str) -> str:
+        """Return what shows that a point is no solution although the solver claims success; empty where nothing does.
+
+        Some solvers call the end of their time, or a start without a gradient, a success.
+        """
+        if "limit" in status.lower():
+            return "it stopped at a limit"
+        slope, broken = (_numbers(value) for value in self._check(x, data))
+        if not np.isfinite(slope).all():
+            return "the cost has no gradient there"
+        return "" if np.abs(broken).max(initial=0.0) <= _BROKEN else "the constraints are not met"
 
 
 class _Locks:

@@ -35,7 +35,7 @@ from typing import Any, Literal
 import numpy as np
 
 from formulations.algebra import Array
-from formulations.backend import SolverError
+from formulations.backend import SolverError, first_sentence
 
 Criterion = Literal["A", "D", "E"]
 
@@ -155,7 +155,10 @@ def semidefinite(
             bounds.append(information - least * (pick @ pick.T) >> 0)
     each = cp.hstack(parts)
     problem = cp.Problem(cp.Minimize(cp.max(each) if worst else design.weight @ each), bounds)
-    problem.solve(solver=cp.CLARABEL)
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.error.SolverError as error:
+        raise SolverError(f"Clarabel failed: {first_sentence(error)}") from None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise SolverError(f"Clarabel ended with {problem.status}")
     return float(problem.value), np.asarray(w.value)

@@ -202,6 +202,8 @@ def sparse_fit(
         values[f"cone {k}"] = moved / np.abs(moved).max()  # a cone may be multiplied by a factor
     structure = (n, tuple(member.tolist()), tuple(len(c) - 1 for c in cones))
     answer = _relaxation(*structure, backend).solve(values, bound=bound)
+    if not np.isfinite(answer.primal):
+        return SparseFit(np.full(n, np.nan), np.zeros(m), np.nan, answer.bound * scale**2, answer)
     y = centre + back @ (scale * answer.values["y"])
     # in closed form at the y found: exact zeros, where the solver's own errors are only small
     errors = shrink(B @ y - g, member, price)

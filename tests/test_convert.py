@@ -180,6 +180,13 @@ def test_bad_geojson_names_the_feature(text, words, tmp_path):
         convert(path, tmp_path / "stations.csv")
 
 
+def turned_back(place, seconds):
+    """Return a place along the axes that the Earth had so many seconds ago."""
+    angle = 7.2921151467e-5 * seconds
+    x, y, z = place
+    return np.array([x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle), z])
+
+
 def pseudoranges(folder, unit="m"):
     receiver, clock = place(139.5, 35.3, 60.0), [3.2e5, -1.1e5]
     rng = np.random.default_rng(4)
@@ -188,7 +195,7 @@ def pseudoranges(folder, unit="m"):
         for i, (azimuth, elevation) in enumerate(zip(rng.uniform(0, 6.28, 7), rng.uniform(0.3, 1.4, 7), strict=True)):
             e, n, u = ECEF.enu_axes(receiver)
             line = np.cos(elevation) * (np.sin(azimuth) * e + np.cos(azimuth) * n) + np.sin(elevation) * u
-            satellite = receiver + 2.3e7 * line
+            satellite = turned_back(receiver + 2.3e7 * line, 2.3e7 / SPEED_OF_LIGHT)
             rows.append((100.0 + k, f"G{i:02d}", *satellite, 2.3e7 + clock[k]))
     table = pd.DataFrame(rows, columns=["t_gps_s", "sat", "sat_x_m", "sat_y_m", "sat_z_m", "pr_m"])
     path = folder / "gnss.csv"

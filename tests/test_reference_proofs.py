@@ -126,8 +126,8 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch):
     seen = []
     for threads in ("1", "3"):
         monkeypatch.setenv("OPTLOC_THREADS", threads)
-        fixes = [optloc.solve(ranged, method).x for method in ("sdp", "socp")]
-        fixes += [optloc.solve(angular, method).x for method in ("directions", "minimax")]
+        fixes = [optloc.solve(ranged, method, refine=False).x for method in ("sdp", "socp")]
+        fixes += [optloc.solve(angular, method, refine=False).x for method in ("directions", "minimax")]
         bounds = [reference_bound(ranged, optloc.solve(ranged), "moment").bound]
         bounds += [reference_bound(angular, optloc.solve(angular), "directions").bound]
         seen.append([*fixes, *bounds])

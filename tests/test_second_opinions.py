@@ -91,7 +91,7 @@ def test_the_relaxation_that_knows_the_height_is_the_answer_of_sdp_alone():
         SATELLITES, measured("tdoa", a=[0, 0], b=[1, 2], sigma=15.0), frame=ECEF, constraints=[height(exactly=up)]
     )
     drawn = simulate(template, x, seed=14)
-    alone, refined = solve(drawn, "sdp").position, solve(drawn, "sdp+lsr").position
+    alone, refined = solve(drawn, "sdp", refine=False).position, solve(drawn, "sdp+lsr").position
     assert np.median(np.linalg.norm(alone - refined, axis=1)) < 1.0
 
 

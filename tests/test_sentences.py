@@ -1,10 +1,13 @@
 """What the tool says: every sentence is short enough to be read once, whoever's names stand in it."""
 
 import ast
+import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from habits import HABITS, STORED, counts, risen
 from sources import parsed
 
 from optloc.base.types import Status
@@ -92,3 +95,37 @@ def test_every_error_names_a_place_and_a_step():
                 lacking.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert count > 500
     assert lacking == []
+
+
+# Habits of private language: their number in a folder can fall, never rise.
+
+
+@pytest.mark.slow
+def test_no_folder_gains_a_habit_of_private_language():
+    assert risen(counts(), json.loads(STORED.read_text(encoding="utf-8"))) == []
+
+
+def test_a_habit_more_is_found():
+    before = {"optloc/files": {"is none": 2, "beside": 1}}
+    assert risen({"optloc/files": {"is none": 2}}, before) == []
+    assert risen({"optloc/files": {"is none": 3}, "docs": {"beside": 1}}, before) == [
+        "optloc/files: is none: 3, was 2",
+        "docs: beside: 1, was 0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("habit", "text"),
+    [
+        ("a clause as the subject of a sentence", "What has a prior brings a row."),
+        ("return a clause", "Return where a refinement ends."),
+        ("software that speaks or feels", "The user is told at least every two seconds."),
+        ("that of, those of", "that of its value at the first epoch"),
+        ("is none", "an answer that is none"),
+    ],
+)
+def test_habits_are_recognised(habit, text):
+    assert re.search(HABITS[habit], text)
+    assert not any(
+        re.search(pattern, "Return the covariance of the position (N, d, d).") for pattern in HABITS.values()
+    )

@@ -492,9 +492,11 @@ def test_digits_that_are_lost_are_told(tmp_path):
     assert "rounded to 71.5 m" in understood(tmp_path / "t.parquet", Told(**told)).notes[0]
 
 
-def test_a_column_like_those_of_receivers_that_names_none_is_told(tmp_path):
-    found = plan(tmp_path, "t_s,A1_m,A2_m,A9_m,note\n1,3,4,5,x\n", what="range")
-    assert "'A9_m' may hold readings, but name no station of anchors.csv" in found.notes
+def test_a_column_like_those_of_receivers_that_names_none_is_refused(tmp_path):
+    text = "t_s,A1_m,A2_m,A9_m,note\n1,3,4,5,x\n"
+    with pytest.raises(InvalidProblem, match=r"column 'A9_m': there is no station 'A9'; did you mean 'A4'"):
+        plan(tmp_path, text, what="range")
+    assert len(plan(tmp_path, text, what="range", ignore=("A9_m",)).sections[0].columns["z"]) == 2
 
 
 def test_differences_share_the_errors_of_their_stations_as_in_one_call(tmp_path):

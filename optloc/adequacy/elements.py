@@ -365,6 +365,11 @@ def ends_of(problem: Problem, by: By) -> Ends:
     if by not in GROUPINGS:
         raise InvalidProblem(f"unknown grouping {by!r}", "by", nearest(str(by), GROUPINGS))
     parts = [_ends(problem, rows.kind, rows.a, rows.b, by) for rows in problem.rows]
+    # Errors of compass bearings are clockwise; those of a group that is read both ways are anticlockwise.
+    blocks = list(zip(problem.rows, parts, strict=True))
+    others = [name for rows, (name, _) in blocks if rows.kind == "azimuth" and rows.sense > 0.0]
+    both = list({text for name in others for text in name.ravel().tolist()})
+    parts = [(name, np.where(np.isin(name, both), sign, rows.sense * sign)) for rows, (name, sign) in blocks]
     return Ends(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from optloc.base.linalg import Tangent, tangent
 from optloc.base.types import Array, Band, Polygon
 from optloc.linear.constraints import Face, exact, levels, restore, tangent_at
-from optloc.linear.normal import Normal, degrees_of_freedom, marginal, step
+from optloc.linear.normal import Normal, marginal, step
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.problem.epochs import states_by_epoch
 from optloc.problem.problem import Problem
 

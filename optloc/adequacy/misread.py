@@ -13,7 +13,7 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Rows
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.linear.constraints import exact, violation_names
-from optloc.linear.normal import degrees_of_freedom
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem.epochs import by_epoch, separable

@@ -68,7 +68,7 @@ def _shown(text: str, most: int = _SHOWN) -> str:
 
 
 class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
-    """A fix was required but its status is not a clean one.
+    """A fix was required but its status is not a clean one, or it has too little redundancy.
 
     Parameters
     ----------
@@ -76,19 +76,26 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         The problem that was to be solved.
     fix : Fix
         The fix that was refused; its status, alternatives and certificate say why.
+    why : str, optional
+        Why a fix with a clean status was refused.
 
     Notes
     -----
-    ``str(error)`` is the sentence of ``fix.status``, with its advice; a batch gives each distinct one once.
+    ``str(error)`` is `why`, or else the sentence of ``fix.status``, with its advice; a batch gives each distinct one
+    once.
     """
 
-    def __init__(self, problem: Any, fix: Any) -> None:
-        super().__init__(problem, fix)
+    def __init__(self, problem: Any, fix: Any, why: str = "") -> None:
+        # Only positional arguments survive pickling on their way back from a worker process.
+        super().__init__(problem, fix, why)
         self.problem = problem
         self.fix = fix
+        self.why = why
 
     def __str__(self) -> str:
-        """Return the sentence of the status; of a batch, one sentence a distinct status."""
+        """Return why, or the sentence of the status; of a batch, one sentence a distinct status."""
+        if self.why:
+            return self.why
         status = getattr(self.fix, "status", None)
         if status is None:
             return "There is no fix."
@@ -130,6 +137,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
 def _alike(word: str, known: Iterable[str]) -> list[str]:
     """Return up to two names that a word was perhaps meant to be; none for a single letter, which may be anything."""
     names = list(known)
+    if word.strip() in names:  # it differs by case, or by blanks at its ends
+        return [word.strip()]
     begun = [name for name in names if len(word) > 2 and name.startswith(word)][:2]
     # Half of the letters alike is chance, but for names of one length, such as R5 and R6.
     same = [name for name in names if len(name) == len(word)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import Any, Literal
 
@@ -111,6 +111,25 @@ class Rows:
         """Return the number of rows."""
         return int(self.a.shape[0])
 
+    @property
+    def sense(self) -> float:
+        """Return the sign of errors of `z` in reports of biases, residuals and suspects: -1 of compass bearings."""
+        return 1.0
+
+    def clockwise(self) -> Rows:
+        """Return the same rows as compass bearings, whose errors are reported clockwise, as they were read."""
+        return CompassRows(*(getattr(self, one.name) for one in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class CompassRows(Rows):
+    """Azimuths that were read clockwise from north: `z` is anticlockwise from the first axis all the same."""
+
+    @property
+    def sense(self) -> float:
+        """Return -1."""
+        return -1.0
+
 
 @dataclass(frozen=True, slots=True)
 class Motion:
@@ -155,7 +174,8 @@ class Bias:
     row, member : int array (n,)
         Sparse design: which global rows are touched, and by which member.
     coefficient : float array (n,)
-        Sign or size of each touch, for instance +1 for station a and -1 for station b.
+        Sign or size of each touch, for instance +1 for station a and -1 for station b. Of compass bearings -1: their
+        bias is clockwise, like the readings.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         Added to the measurement; times the measured quantity; times seconds since the first target's reference time
         (by default the first epoch); or a turn of
@@ -278,6 +298,8 @@ class Status(IntEnum):
     MISFIT = 14
     UNPROVEN = 15
     CURVED = 16
+    UNREFINED = 17
+    UNCHECKED = 18
 
     def __str__(self) -> str:
         """Return the label: what `print` shows."""
@@ -319,9 +341,10 @@ _SENTENCES: dict[Status, str] = {
     Status.INFEASIBLE: "No position meets the constraints.",
     Status.UNBOUNDED: "Positions ever farther away explain the data about as well: they say a direction and a least "
     "range; add a station farther off, a bearing or a known height.",
-    Status.NUMERICAL: "A solver failed numerically; check the scale and the units of the input.",
+    Status.NUMERICAL: "A solver failed, and the reason names it; check the scale and the units of the input, or choose "
+    "another solver.",
     Status.REJECTED: "A measurement is not a finite number; remove the row or give it weight zero.",
-    Status.UNAVAILABLE: "The method does not apply to these kinds of rows; choose another or 'auto'.",
+    Status.UNAVAILABLE: "The method gives no start for these rows; the reason says why, and 'auto' takes all kinds.",
     Status.DISCONNECTED: "The station pairs fall into groups without a common station; add a pair that links them.",
     Status.CONTRADICTORY: "The measurements contradict each other, and leaving few of them out does not help, or they "
     "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
@@ -331,6 +354,8 @@ _SENTENCES: dict[Status, str] = {
     "'auto' tries to, the certificate says what is missing, and whoever can do without allows this status.",
     Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
     "optloc.likelihood_region.",
+    Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
+    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
 }
 
 PRECEDENCE = (
@@ -339,6 +364,7 @@ PRECEDENCE = (
     Status.TOO_FEW_ROWS,
     Status.DISCONNECTED,
     Status.UNAVAILABLE,
+    Status.UNREFINED,
     Status.INFEASIBLE,
     Status.NUMERICAL,
     Status.SINGULAR_GEOMETRY,
@@ -356,6 +382,9 @@ PRECEDENCE = (
 )
 """Which of all that applies to a fix is its status: the first of these."""
 
+NOTES = (Status.UNCHECKED,)
+"""Findings that are never a status: they stand beside one, `ok` included."""
+
 ANSWERED = (
     Status.OK,
     Status.CURVED,
@@ -369,7 +398,7 @@ ANSWERED = (
 
 
 def first_status(marks: Array) -> Array:
-    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing does."""
+    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing but notes does."""
     marks = np.asarray(marks)
     code = np.full(marks.shape, int(Status.OK), dtype=np.int8)
     anywhere = int(np.bitwise_or.reduce(marks, axis=None))  # few statuses occur in a batch

@@ -47,7 +47,7 @@ __all__ = [
 Quantity = Literal["length", "angle", "ratio", "level", "speed", "time", "frequency", "power", "plain"]
 """What a number measures; it decides which units make sense."""
 
-AzimuthConvention = Literal["east-counterclockwise", "north-clockwise"]
+AzimuthConvention = Literal["east-counterclockwise", "north-clockwise", "north-counterclockwise"]
 """Where azimuth zero is and which way it grows; the first is the one used in memory."""
 
 SPEED_OF_LIGHT: Final = 299_792_458.0
@@ -196,8 +196,9 @@ def conversion(
         Speed in m/s that turns propagation times into lengths and frequencies into speeds.
     carrier : float, optional
         Carrier frequency in Hz; needed when a speed is given in Hz.
-    convention : {"east-counterclockwise", "north-clockwise"}
-        For azimuths: a compass bearing A is ``pi / 2 - A`` in memory.
+    convention : {"east-counterclockwise", "north-clockwise", "north-counterclockwise"}
+        For azimuths: a compass bearing A is ``pi / 2 - A`` in memory, an angle A anticlockwise from north
+        ``pi / 2 + A``.
     where : str, optional
         Place to name when something is wrong.
 
@@ -231,9 +232,9 @@ def conversion(
             )
         # Negative: a receding emitter is heard at a lower frequency.
         return Conversion(-propagation_speed / carrier)
-    if quantity == "angle" and convention == "north-clockwise":
-        # A compass turns the other way and begins at north.
-        return Conversion(-factor, offset=math.pi / 2)
+    if quantity == "angle" and convention != "east-counterclockwise":
+        # North is a quarter turn from the x axis; a compass turns the other way.
+        return Conversion(-factor if convention == "north-clockwise" else factor, offset=math.pi / 2)
     return Conversion(factor)
 
 

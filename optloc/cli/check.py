@@ -16,7 +16,7 @@ from optloc.adequacy.noise_level import CommonLevel, LateSignals, common_level_a
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import together
 from optloc.base.types import Array, Bias, Stations
-from optloc.cli.file_fixes import CHUNK
+from optloc.cli.file_fixes import CHUNK, table_json
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.from_table import read_problem
 from optloc.cli.output import (
@@ -31,9 +31,9 @@ from optloc.cli.output import (
 )
 from optloc.files import Loaded
 from optloc.files.readings import Told
-from optloc.linear.constraints import exact
+from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
 from optloc.models import MODELS
-from optloc.problem.epochs import separable
+from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem
 from optloc.quality.health import Health, health_of
 from optloc.report.columns import Columns, records
@@ -70,7 +70,7 @@ def run_check(
         more = {} if checked is None else {"health": _health_json(checked)}
         more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
         more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
-        write_text(Path("-"), dumps(found | more | {"advice": advice_json(told)}))
+        write_text(Path("-"), dumps(found | table_json(loaded) | more | {"advice": advice_json(told)}))
     elif not quiet:
         sheet = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
@@ -131,7 +131,8 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     """Return what a file holds, as numbers and words."""
     problem = loaded.problem
     alone = separable(problem)
-    redundancy = _redundancy(problem, alone)
+    apart = _apart(problem, alone)
+    redundancy = degrees_of_freedom(apart)
     parts = _components(problem)
     flattest, widest = _spread(_together(problem, alone))
     # Of epochs that are fixed one by one, that at which stations are nearest to a line or plane.
@@ -151,7 +152,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "absent_rows": int((problem.weight == 0.0).sum()),
         "constraints": [constraint.name for constraint in problem.constraints],
         "biases": {bias.name: _bias(loaded, bias) for bias in problem.biases},
-        "unknowns": problem.layout.size // problem.epochs if alone else problem.layout.size,
+        "unknowns": int(present_unknowns(apart).max()),
         "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},
         "epochs_with_too_few_rows": int((redundancy < 0).sum()),
         "groups_of_connected_stations": {"most": int(parts.max(initial=0))},
@@ -197,21 +198,9 @@ def _bias(loaded: Loaded, bias: Bias) -> str:
     return f"{bias.form} of {names}, prior {prior} {unit}"
 
 
-def _redundancy(problem: Problem, alone: bool) -> Array:
-    """Return rows and priors less unknowns, of each epoch (k,) or of the run (1,)."""
-    present = np.bincount(problem.epoch, problem.weight > 0.0, problem.epochs)
-    layout = problem.layout
-    known = len(exact(problem)) + sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
-    known += sum(prior.mean.shape[-1] for prior in problem.priors)
-    # the steps of a walk are known to be small: a row for each
-    known += (problem.epochs - 1) * sum(bias.density.size for bias in problem.biases if bias.density is not None)
-    if problem.stations.estimated:
-        # What is surveyed counts as measured: each unknown offset comes with a prior of its own.
-        times = 1 if alone or problem.stations.span == "run" else problem.epochs
-        known += len(problem.stations.errors) * problem.stations.count * problem.dimension * times
-    if alone:
-        return np.asarray(present + known - layout.size // problem.epochs)
-    return np.array([present.sum() + known - layout.size])
+def _apart(problem: Problem, alone: bool) -> Problem:
+    """Return the epochs of a problem as a batch where they are fixed one by one, else the run as a batch of one."""
+    return (by_epoch(problem) if alone else problem).flat()
 
 
 def _components(problem: Problem) -> Array:

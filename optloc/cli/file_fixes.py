@@ -152,6 +152,11 @@ def _labels(loaded: Loaded, n: int, first: int | None, target: int, spread: bool
 # All of it for machines.
 
 
+def table_json(loaded: Loaded) -> dict[str, Any]:
+    """Return how a foreign table was read, as a part of a JSON value; nothing of a problem file."""
+    return {"table": dict(loaded.table)} if loaded.table else {}
+
+
 def fixes_json(found: FileFixes) -> dict[str, Any]:
     """Return all fixes of a file as one JSON value; lengths in metres, angles in degrees."""
     from optloc.uncertainty.radii import accuracy
@@ -170,6 +175,7 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     return {
         "file": found.loaded.source,
         "title": found.loaded.title,
+        **table_json(found.loaded),
         "frame": {"kind": frame.kind, "origin_deg": origin},
         "fixes": [row | detail for row, detail in zip(rows, per_fix, strict=True)] if single else rows,
         "runs": [] if single else per_fix,

@@ -165,7 +165,8 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     sheet = fix_sheet(fix, found.columns, found.loaded.title)
     rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
     table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
-    table.add_row("status", Text(rows[0][1], style=f"bold {_colour(Status(int(fix.code)))}"))
+    colour = _CARE if fix.unchecked and fix.status is Status.OK else _colour(Status(int(fix.code)))
+    table.add_row("status", Text(rows[0][1], style=f"bold {colour}"))
     for row in rows[1:]:
         table.add_row(*row)
     console.print(table)

@@ -59,11 +59,18 @@ _OPTIONS: dict[str, Any] = {
         list[str] | None,
         _option(
             "ROLE=NAME",
-            "Column of a role that its name does not tell: message, station, time, target, reference, sigma, or a "
-            "kind; epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Once for each; "
-            "message=set+msg joins two.",
+            "Column of a role that its name does not tell: message, station, time, target, reference, sigma, heading, "
+            "or a kind; epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Once for "
+            "each; message=set+msg joins two.",
             "--column",
         ),
+    ],
+    "ignore": Annotated[
+        list[str] | None,
+        _option("COLUMN", "Column that is left out although it may be a measurement. Once for each.", "--ignore"),
+    ],
+    "time_unit": Annotated[
+        _TEXT, _option("UNIT", "Of the column of times, where its name does not end in it.", "--time-unit")
     ],
     "unit": Annotated[_TEXT, _option("UNIT", "Of the values, where the column's name does not end in it.", "--unit")],
     "what": Annotated[
@@ -79,7 +86,19 @@ _OPTIONS: dict[str, Any] = {
     ],
     "average": Annotated[bool, _flag("Take the mean of several readings of the same.", "--average")],
     "azimuth": Annotated[
-        _TEXT, _option("CONVENTION", "Of bearings: north-clockwise or east-counterclockwise.", "--azimuth")
+        _TEXT,
+        _option(
+            "CONVENTION",
+            "Of bearings: north-clockwise, north-counterclockwise, east-counterclockwise, or bow-clockwise, to which "
+            "the column of headings is added.",
+            "--azimuth",
+        ),
+    ],
+    "declination": Annotated[
+        _TEXT,
+        _option(
+            "ANGLE|DATE", "Magnetic declination of bearings, east positive: '4 deg', or 2026-06-01.", "--declination"
+        ),
     ],
     "positive": Annotated[_TEXT, _option("a-farther|b-farther", "Where differences are positive.", "--positive")],
     "reference": Annotated[_TEXT, _option("STATION", "The other station of all differences.", "--reference")],
@@ -92,8 +111,14 @@ _OPTIONS: dict[str, Any] = {
         Path | None, _option("FILE", "RINEX navigation beside RINEX observations or Android's log.", "--navigation")
     ],
     "system": Annotated[_TEXT, _option("G|E|J", "Satellites that are taken; GPS by default.", "--system")],
+    "turned": Annotated[
+        bool, _flag("Satellites of a table are along ECEF at reception, not transmission.", "--turned")
+    ],
     "mask": Annotated[_TEXT, _option("ANGLE", "Lowest elevation of satellites; 10 deg by default.", "--mask")],
 }
+
+
+_FLAGS = ("average", "still", "turned")
 
 
 def takes_table(command: Callable[..., None]) -> Callable[..., None]:
@@ -103,13 +128,12 @@ def takes_table(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def taking(**values: Any) -> None:
         given = {name: values.pop(name) for name in _OPTIONS}
-        command(**values, given=given | {"columns": columns_of(given["columns"])})
+        named = {"columns": columns_of(given["columns"]), "ignore": tuple(given["ignore"] or ())}
+        command(**values, given=given | named)
 
     kept = [entry for entry in own.parameters.values() if entry.name != "given"]
     more = [
-        Parameter(
-            name, Parameter.KEYWORD_ONLY, default=False if name in ("average", "still") else None, annotation=kind
-        )
+        Parameter(name, Parameter.KEYWORD_ONLY, default=False if name in _FLAGS else None, annotation=kind)
         for name, kind in _OPTIONS.items()
     ]
     taking.__signature__ = own.replace(parameters=[*kept, *more])  # type: ignore[attr-defined]  # what typer reads
@@ -171,7 +195,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         plan.read()
         say_next(console, f"Nothing is written: --out names the problem file, and optloc fix {file} fixes it as it is.")
         if as_json:
-            write_text(Path("-"), dumps({"understood": _pairs(plan.about), "notes": list(plan.notes)}))
+            write_text(Path("-"), dumps(plan.as_read))
         return 0
     found = written(file, out, told, tell=lambda plan: _tell(plan, console))
     if as_json:
@@ -206,16 +230,12 @@ def _tell(plan: Plan, console: Console) -> None:
     say_all(console, plan.notes)
 
 
-def _pairs(about: Sequence[tuple[str, str]]) -> list[list[str]]:
-    return [list(pair) for pair in about]
-
-
 def _json(found: Converted) -> dict[str, Any]:
     about: dict[str, Any] = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
     if found.loaded is None:
         return about
     problem = found.loaded.problem
-    about["understood"] = _pairs(found.about)
+    about |= found.as_read
     return about | {"stations": problem.stations.count, "epochs": problem.epochs, "rows": problem.count}
 
 
@@ -230,7 +250,7 @@ def table_told(file: Path, given: Mapping[str, Any]) -> Told | None:
         return Told(**given)
     said = [name for name, value in given.items() if value]
     if said:
-        flag = {"what": "--as", "columns": "--column"}.get(said[0], f"--{said[0]}")
+        flag = {"what": "--as", "columns": "--column"}.get(said[0], f"--{said[0].replace('_', '-')}")
         what = f"it is for a table; {file.name} is a problem file"
         raise InvalidProblem(what, flag, "write it in the file, or name a table that ends in .csv, .json or .parquet")
     return None

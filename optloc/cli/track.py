@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -15,6 +16,7 @@ from rich.text import Text
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import is_stream
 from optloc.base.types import Array, Rows
+from optloc.cli.file_fixes import table_json
 from optloc.cli.from_table import read_problem
 from optloc.cli.options import coordinates
 from optloc.cli.output import (
@@ -182,10 +184,16 @@ def run_track(
         if columns:
             _write(loaded, ones, columns, (out, plot, html), growing)
             if as_json:
-                write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "scans": records(columns)}))
+                write_text(Path("-"), dumps(_json(loaded, columns)))
     if not quiet and not as_json:
         _show(loaded, columns, Screen())
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
+
+
+def _json(loaded: Loaded, columns: Columns) -> dict[str, Any]:
+    """Return a track as a JSON value."""
+    about = {"file": loaded.source, "title": loaded.title, **table_json(loaded)}
+    return about | {"scans": records(columns)}
 
 
 def dynamics_of(wanted: Wanted) -> Dynamics:
@@ -273,8 +281,9 @@ def _one_after_another(parts: list[Rows]) -> Rows:
     def of(name: str) -> Array:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    z, weight, correction = of("z"), of("weight"), of("correction")
-    return Rows(parts[0].kind, z, of("a"), of("b"), of("epoch"), of("target"), weight, correction)
+    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
+    columns: dict[str, Any] = {name: of(name) for name in names}
+    return replace(parts[0], **columns)
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:

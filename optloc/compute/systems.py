@@ -14,7 +14,7 @@ import numpy as np
 
 from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, inlined
 from optloc.compute.lanes import Room
 
 # Scaled systems in the memory of a block of lanes.
@@ -272,6 +272,17 @@ def positive(a: float, b: float, c: float, d: float, e: float, f: float) -> bool
         return False
     dd, ee, ff = d - b * b / a, e - b * c / a, f - c * c / a
     return dd > 0.0 and ff - ee * ee / dd > 0.0
+
+
+@inlined
+def positive_along(a: float, b: float, c: float, d: float, e: float, f: float, second: bool, third: bool) -> bool:
+    """Return whether a matrix is positive definite along the coordinates that there are, see `positive`.
+
+    Of a coordinate that there is not (`second`, `third` False) no entry counts: its pivot is as large as the others,
+    because beside 1, whatever its unit, large ones would leave it to rounding.
+    """
+    most = max(abs(a), abs(d) if second else 0.0, abs(f) if third else 0.0)
+    return positive(a, b, c, d if second else most, e, f if third else most)
 
 
 @compiled

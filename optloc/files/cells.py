@@ -9,10 +9,11 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
-from optloc.files.roles import Roles, unit_of
+from optloc.files.columns import unit_of
+from optloc.files.roles import Roles
 from optloc.files.table import Table
 
 # What cells hold that hold nothing, in the words of spreadsheets, databases and programs.
@@ -108,13 +109,33 @@ def _zone(name: str) -> ZoneInfo:
         raise InvalidProblem(f"there is no time zone {name[:40]!r}", "--zone", advice) from None
 
 
-def moments(roles: Roles, name: str, zone: str | None) -> Array | None:
-    """Return a column of times as seconds (m,), None where its numbers have no unit: then they are mere labels."""
+def moments(roles: Roles, name: str, zone: str | None, told_unit: str | None = None) -> Array | None:
+    """Return a column of times as seconds (m,), None where its numbers have no unit: then they are mere labels.
+
+    Parameters
+    ----------
+    roles : Roles
+        The table.
+    name : str
+        The column.
+    zone : str, optional
+        Time zone of dates that name none.
+    told_unit : str, optional
+        Unit of its numbers, where its name does not end in one.
+    """
     table = roles.table
     if is_dated(table, name):
         held, factor = instants(table, name, zone), 1.0
     else:
         unit = unit_of(name, UNITS["time"])
+        if told_unit is not None and told_unit not in UNITS["time"]:
+            raise InvalidProblem(
+                f"{told_unit!r} is no unit of time", "--time-unit", nearest(told_unit, [*UNITS["time"]])
+            )
+        if told_unit is not None and unit not in (None, told_unit):
+            what = f"the column {name!r} ends in {unit}, not in {told_unit}"
+            raise InvalidProblem(what, "--time-unit", "leave it out, or name another column with --column time=NAME")
+        unit = told_unit if unit is None else unit
         if unit is None:
             return None
         held, factor = numbers(table, name), UNITS["time"][unit]

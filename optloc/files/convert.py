@@ -6,7 +6,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -21,15 +21,34 @@ from optloc.base.inputs import at_most
 from optloc.base.outputs import claim, together, write_text
 from optloc.base.types import Array
 from optloc.base.units import UNITS
+from optloc.files.cells import moments
+from optloc.files.columns import PLACE, role_named, role_of, unit_of
+from optloc.files.declination import angle_of, date_of
 from optloc.files.foreign import read_table
+from optloc.files.headings import stations_turned
 from optloc.files.measurements import ESTIMATE
 from optloc.files.orbits import read_orbits
-from optloc.files.pseudoranges import is_gnss, received
+from optloc.files.pseudoranges import at_reception, is_gnss, received
 from optloc.files.reader import Loaded, read
-from optloc.files.readings import CARTESIAN, COMPASS, Named, Readings, Told, named_columns, sort_named, sorts_of
-from optloc.files.roles import GUESSES, PLACE, Places, Roles, places_of, scaled, stem, unit_of
+from optloc.files.reading_report import about, left_over, uses_of
+from optloc.files.readings import (
+    CARTESIAN,
+    CONVENTIONS,
+    Named,
+    Readings,
+    Told,
+    as_angles,
+    holds_names,
+    named_columns,
+    sigmas_by_kind,
+    sort_named,
+    sorts_of,
+    without,
+)
+from optloc.files.receiver_names import check_receivers
+from optloc.files.roles import Places, Roles, check_told, in_space, places_of, scaled
 from optloc.files.schema import ConstraintTable, Units
-from optloc.files.shapes import epochs_of, inline, long, wide
+from optloc.files.shapes import epochs_of, inline, long, sigma_column, sigma_of, wide
 from optloc.files.table import distinct
 from optloc.files.writer import write_csv
 from optloc.models import MODELS, kind_named
@@ -44,8 +63,6 @@ _ORBITS = (".tle", ".2le", ".3le", ".sp3", ".omm")
 _FEW = 3
 # Letters of the name of a file that is not kept.
 _LETTERS = 40
-# Names of columns that are repeated of a list.
-_NAMED = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +99,8 @@ class Plan:
         The same, behind them.
     height : str
         What the constraint on the height says, where there is one.
+    uses : mapping of str to str
+        Role of each column that is used.
     """
 
     source: Path
@@ -92,6 +111,13 @@ class Plan:
     lines: tuple[str, ...] = ()
     after: tuple[str, ...] = ()
     height: str = ""
+    uses: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def as_read(self) -> dict[str, Any]:
+        """Return how the table was read, as a JSON value."""
+        pairs = [list(pair) for pair in self.about]
+        return {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
 
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
         """Return the problem, with more constraints; nothing is left on the disk."""
@@ -100,7 +126,7 @@ class Plan:
             place = Path(folder) / f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml"
             # A height that is told takes the place of one that was assumed.
             (replace(self, height="") if "--height" in (more or {}) else self).write(place)
-            return replace(read(place, more=more), source=self.source.name)
+            return replace(read(place, more=more), source=self.source.name, table=self.as_read)
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file with its tables beside it, and return their paths."""
@@ -133,12 +159,12 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """What was written, the problem that it is (None of stations alone), what was assumed, and what it is."""
+    """What was written, the problem that it is (None of stations alone), what was assumed, and how it was read."""
 
     written: tuple[Path, ...]
     loaded: Loaded | None
     notes: tuple[str, ...] = ()
-    about: tuple[tuple[str, str], ...] = ()
+    as_read: Mapping[str, Any] = field(default_factory=dict)
 
 
 def convert(
@@ -190,15 +216,14 @@ def convert(
     claim(*plan.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
     # Read before it is there: what cannot be read is not written.
     loaded = plan.read()
-    return Converted(plan.write(out), loaded, plan.notes, plan.about)
+    return Converted(plan.write(out), loaded, plan.notes, plan.as_read)
 
 
 def _check_told(told: Told) -> None:
     """Refuse roles, frames and conventions that there are none of."""
     for role in told.columns:
-        if role not in GUESSES and role not in MODELS:
-            raise InvalidProblem(f"there is no role {role!r}", "--column", nearest(role, GUESSES))
-    choices = {"frame": ("cartesian", "ecef"), "azimuth": (COMPASS, CARTESIAN), "positive": ("a-farther", "b-farther")}
+        role_named(role)
+    choices = {"frame": ("cartesian", "ecef"), "azimuth": CONVENTIONS, "positive": ("a-farther", "b-farther")}
     for name, known in choices.items():
         given = getattr(told, name)
         if given not in (None, *known):
@@ -229,18 +254,33 @@ def understood(source: Path, told: Told) -> Plan:
         For what is wrong, and for what may mean two things: naming the option that says which.
     """
     _check_told(told)
-    if is_gnss(source):
-        return _gnss(source, told)
-    roles = Roles(read_table(source), told.columns)
-    satellites = roles.find("pseudorange") is not None and roles.find("satellite") is not None
-    if told.what == "pseudoranges" or (told.what is None and satellites):
+    plan = _gnss(source, told) if is_gnss(source) else _of_table(source, told)
+    azimuths = any(section.kind == "azimuth" for section in plan.sections)
+    if told.declination is not None and not azimuths:
+        raise InvalidProblem("the table has no bearings", "--declination", "leave it out")
+    if told.turned and _AT_RECEPTION != plan.lines:
+        raise InvalidProblem("the table has no satellites", "--turned", "leave it out")
+    return plan
+
+
+def _of_table(source: Path, told: Told) -> Plan:
+    """Return what a table is."""
+    table = without(read_table(source), told.ignore)
+    own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
+    roles = Roles.of(table, own)
+    satellites = all(roles.find(role) for role in ("toa", "satellite", "x"))
+    if (told.what == "pseudoranges" and roles.find("satellite")) or (told.what is None and satellites):
         return _pseudoranges(source, roles, told)
     told = told if told.what is None else replace(told, what=_sort(told.what))
+    named: list[Named] = []
     if told.stations is not None:
         place = places_of(told.stations, {k: name for k, name in told.columns.items() if k in PLACE}, told.frame)
-        columns = [one for one in named_columns(list(roles.table.columns), place.names) if _may_be(one, told)]
-        if len(columns) > 1 and "station" not in told.columns:
-            return _plan(roles, told, place, source, wide(roles, told, columns, place))
+        named = _of_receivers(roles, place)
+        chosen = [one for one in named if _may_be(one, told)]
+        if len(chosen) > 1 and not _is_long(roles, told, place):
+            roles = Roles.of(table, own, [one.column for one in chosen]).without_stations()
+            return _plan(roles, told, place, source, wide(roles, told, chosen, place), named)
+    roles = as_angles(roles, told)
     sorts, heard = sorts_of(roles, told), None
     if not sorts:
         raise _unknown(roles, told)
@@ -249,7 +289,38 @@ def understood(source: Path, told: Told) -> Plan:
             advice = "name a table or GeoJSON file with --stations"
             raise InvalidProblem("nothing is known of where the stations are", "--stations", advice)
         place, heard = inline(roles, told)
-    return _plan(roles, told, place, source, [long(roles, sort_named(name), told, place, heard) for name in sorts])
+    forms = [sort_named(name) for name in sorts]
+    return _plan(roles, told, place, source, [long(roles, form, told, place, heard, forms) for form in forms], named)
+
+
+def _of_receivers(roles: Roles, place: Places) -> list[Named]:
+    """Return the columns that are called after stations, without those that have another role.
+
+    Raises
+    ------
+    InvalidProblem
+        For a column that is called like a station and like a role, where its cells do not tell.
+    """
+    told = {part for role in roles.told for part in roles.by_role[role].split("+")}
+    found = [one for one in named_columns(list(roles.table.columns), place.names) if one.column not in told]
+    kept = []
+    for one in found:
+        role = role_of(one.column)
+        if role in ("station", "reference", "name", "id") and holds_names(roles.table, one.column, place.names):
+            continue
+        kept.append(one)
+    return kept
+
+
+def _is_long(roles: Roles, told: Told, place: Places) -> bool:
+    """Return whether a table has one reading a row: a column of stations, and one of readings."""
+    if "station" in roles.told:
+        return True
+    station = roles.find("station")
+    if station is None or not holds_names(roles.table, station, place.names):
+        return False
+    # Times beside columns of receivers are the times of their readings.
+    return bool({*sorts_of(roles, told)} - {"times"})
 
 
 def _unknown(roles: Roles, told: Told) -> InvalidProblem:
@@ -270,12 +341,22 @@ def _may_be(one: Named, told: Told) -> bool:
 # From readings to the tables of a problem file.
 
 
-def _plan(roles: Roles, told: Told, place: Places, source: Path, found: Sequence[Readings]) -> Plan:
-    """Return what readings become."""
+def _plan(
+    roles: Roles, told: Told, place: Places, source: Path, found: Sequence[Readings], named: Sequence[Named]
+) -> Plan:
+    """Return what readings become; `named` are the columns that are called after stations."""
+    place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
+    place, turn = stations_turned(place, found)
     epochs = epochs_of(roles, told, found)
-    sections = tuple(_section(one, epochs, sigma) for one, sigma in zip(found, _sigmas(told, found), strict=True))
-    notes = [*roles.table.notes, *([place.note] if place.note else [])]
-    notes += dict.fromkeys(note for one in found for note in one.notes)
+    sigmas = _sigmas(told, found)
+    uses = uses_of(roles, told, found, epochs, sigmas)
+    check_receivers(roles.table, uses, named, place.names)
+    rest = left_over(roles, uses, named)
+    parts = zip(found, sigmas, strict=True)
+    sections = tuple(_with_declination(_section(one, epochs, sigma), one, told) for one, sigma in parts)
+    notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
+    notes += [note for note in (turn, place.note) if note]
+    notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
     lines: tuple[str, ...] = ()
     if any(one.form.value == "sp" for one in found):
         speed = _sp_speed(told)
@@ -283,29 +364,11 @@ def _plan(roles: Roles, told: Told, place: Places, source: Path, found: Sequence
         notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range: straight rays, one speed")
     after: tuple[str, ...] = ()
     if told.window is not None and "epoch" not in epochs:
-        if "time" not in epochs:
-            advice = "name the column of times with --column time=NAME, and its unit at the end of its name"
-            raise InvalidProblem("a window needs a column of times", "--window", advice)
         after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
-    notes += _left_out(roles, told, found)
     height, note = _height(found, place)
     notes += [*_few(sections, told), *([note] if note else [])]
-    return Plan(
-        source, sections, place, tuple(_about(roles, told, place, found, epochs)), tuple(notes), lines, after, height
-    )
-
-
-def _left_out(roles: Roles, told: Told, found: Sequence[Readings]) -> list[str]:
-    """Return a remark on columns that are in the unit of those of receivers, but name none."""
-    used = {cell for one in found for cell in one.cells}
-    if told.stations is None or len(used) <= len(found):
-        return []
-    units = {unit_of(name, UNITS["length"]) for name in used} - {None}
-    like = [name for name in roles.table.columns if name not in used and unit_of(name, UNITS["length"]) in units]
-    like = [name for name in like if name not in {roles.find(role) for role in ("time", "message", "sigma")}]
-    return (
-        [f"{', '.join(map(repr, like))} may hold readings, but name no station of {told.stations.name}"] if like else []
-    )
+    read = [*about(roles, told, place, found, epochs, uses), *([("not used", ", ".join(rest))] if rest else [])]
+    return Plan(source, sections, place, tuple(read), tuple(notes), lines, after, height, uses)
 
 
 def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:
@@ -327,26 +390,30 @@ def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:
 
 def _sigmas(told: Told, found: Sequence[Readings]) -> list[str | None]:
     """Return the standard deviation of each sort as it is written, None where the table has its own."""
-    if told.sigma is None and all(one.sigma is not None for one in found):
-        return [None] * len(found)
     if told.sigma is None:
-        raise _no_sigma("20 ns")
+        for one in found:
+            if one.sigma is None:
+                raise _no_sigma("20 ns", one.form.kind if len(found) > 1 else "rows")
+        return [None] * len(found)
     if "=" not in told.sigma:
         if len({one.form.quantity for one in found}) > 1:
             advice = "write --sigma '" + ",".join(f"{one.form.kind}=1 {one.unit}" for one in found) + "'"
             raise InvalidProblem("the readings are of several kinds, and each needs its own", "--sigma", advice)
         return [told.sigma] * len(found)
-    parts = [part.partition("=") for part in told.sigma.split(",")]
-    given = {kind_named(word.strip(), "--sigma"): amount.strip() for word, _, amount in parts}
-    lacking = next((one.form.kind for one in found if one.form.kind not in given), None)
+    given = sigmas_by_kind(told.sigma)
+    other = next((kind for kind in given if kind not in {one.form.kind for one in found}), None)
+    if other is not None:
+        raise InvalidProblem(f"the table has no readings of {other}", "--sigma", f"leave {other} out")
+    lacking = next((one.form.kind for one in found if one.form.kind not in given and one.sigma is None), None)
     if lacking is not None:
         raise InvalidProblem(f"nothing is said of {lacking}", "--sigma", f"add {lacking}=AMOUNT behind a comma")
-    return [given[one.form.kind] for one in found]
+    return [given.get(one.form.kind) for one in found]
 
 
-def _no_sigma(example: str) -> InvalidProblem:
+def _no_sigma(example: str, rows: str = "rows") -> InvalidProblem:
     advice = f"say it with --sigma '{example}' (or metres); --sigma estimate finds it from many epochs"
-    return InvalidProblem("nothing is known of how accurate the rows are", "--sigma", advice)
+    what = "the rows are" if rows == "rows" else f"the readings of {rows} are"
+    return InvalidProblem(f"nothing is known of how accurate {what}", "--sigma", advice)
 
 
 def _sp_speed(told: Told) -> float:
@@ -375,6 +442,17 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
         lines += [f'arrival_sigma = "{_share(str(sigma), found.unit)}"    # of one station, sigma / sqrt(2)']
         sigma = None
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
+
+
+def _with_declination(section: Section, found: Readings, told: Told) -> Section:
+    """Return a section of bearings with the declination that is told."""
+    if told.declination is None or found.form.kind != "azimuth":
+        return section
+    if found.azimuth == CARTESIAN:
+        raise InvalidProblem("angles from the x axis have no declination", "--declination", "leave it out")
+    if date_of(told.declination, "--declination") is None:
+        angle_of(told.declination, None, "--declination")
+    return replace(section, lines=(*section.lines, f"declination = {json.dumps(told.declination.strip())}"))
 
 
 def _share(sigma: str, unit: str) -> str:
@@ -420,81 +498,69 @@ def _few(sections: Sequence[Section], told: Told) -> list[str]:
     return []
 
 
-def _about(
-    roles: Roles, told: Told, place: Places, found: Sequence[Readings], epochs: Mapping[str, Array]
-) -> list[tuple[str, str]]:
-    """Return what was understood, for a reader to check."""
-    out: list[tuple[str, str]] = []
-    used = {cell for one in found for cell in one.cells}
-    for one in found:
-        cells = list(dict.fromkeys(one.cells))
-        shown = ", ".join(cells[:_NAMED]) + (f" and {len(cells) - _NAMED} more columns" if len(cells) > _NAMED else "")
-        unit = f" in {one.unit}" if one.unit != "1" else ""
-        text = {COMPASS: "bearings of a compass", CARTESIAN: "angles from the x axis"}.get(
-            str(one.azimuth), one.form.text
-        )
-        out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {text}"))
-        if one.b is not None and one.form.kind != "range_sum":
-            out.append(
-                ("sign", f"positive where the {'first' if one.positive == 'a-farther' else 'second'} is farther")
-            )
-    wanted: tuple[str, ...] = ("station", "reference", "message", "time", "target", "sigma", "phase", "p", "s", "sp")
-    wanted += PLACE if told.stations is None else ()
-    wanted = tuple(role for role in wanted if role != "sigma" or any(one.sigma is not None for one in found))
-    named = {role: column for role in wanted if (column := roles.find(role))}
-    if "epoch" in epochs:
-        roles_ = ("message", "time") if told.window is None else ("time",)
-        by = next((f"column {named[role]}" for role in roles_ if role in named), "row")
-        out.append(("epochs", f"{len(set(epochs['epoch'].tolist()) - {''})} by {by}"))
-    elif "time" in epochs:
-        each = f"{told.window} each" if told.window else f"{len(np.unique(epochs['time']))}"
-        out.append(("epochs", f"{each} by column {named['time']}"))
-    if "target" in epochs:
-        out.append(("targets", f"{len(set(epochs['target'].tolist()))} by column {named['target']}"))
-    where = told.stations.name if told.stations is not None else "the table itself"
-    by = "latitude and longitude" if place.frame == "geodetic" else f"x and y, {place.frame}, in {place.unit}"
-    out.append(("stations", f"{len(set(place.names))} of {where}, by {by}"))
-    used |= {part for column in named.values() for part in column.split("+")}
-    rest = [name for name in roles.table.columns if name not in used]
-    return [*out, ("not used", ", ".join(rest))] if rest else out
-
-
 # A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
+
+
+# What a problem file says of satellites, and what is said of those that were turned.
+_AT_RECEPTION = ("# Satellites are where they were when they sent, along the axes of the Earth at reception.",)
+_TURNED = "satellites are turned with the Earth during the flight of the signal; --turned takes them as they are"
 
 
 def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
     """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
-    if told.sigma is None:
+    form = sort_named("arrivals")
+    own = sigma_column(roles, form, told, [form])
+    if told.sigma is None and own is None:
         raise _no_sigma("2 m")
-    epoch, satellite, z = roles.labels("epoch"), roles.labels("satellite"), roles.numbers("pseudorange")
-    unit = told.unit or unit_of(roles.column("pseudorange"), UNITS["length"]) or "m"
+    by = "message" if roles.find("message") is not None else "time"
+    epoch, satellite, z = roles.labels(by), roles.labels("satellite"), roles.numbers("toa")
+    unit = told.unit or unit_of(roles.column("toa"), UNITS["length"]) or "m"
     Units("length").conversion(unit, "--unit")
     length = unit_of(roles.column("x"), UNITS["length"]) or "m"
     place = np.stack([scaled(roles, axis, "length", length) for axis in "xyz"], axis=-1)
     _check_far(roles, place * UNITS["length"][length])
     _check_once(roles, epoch, satellite)
+    notes = roles.table.notes
+    if not told.turned:
+        metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
+        place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
+        notes += (_TURNED,)
     columns = {"epoch": epoch, "a": satellite, "z": z}
-    named = roles.column("epoch")
-    if stem(named) != "epoch" and "+" not in named:
-        columns["time"] = roles.numbers("epoch")
+    when = roles.find("time")
+    if when is not None:
+        seconds = moments(roles, when, told.zone, told.time_unit)
+        columns["time"] = roles.numbers("time") if seconds is None else seconds
+    uses = {roles.column(role): role for role in ("satellite", "toa", *"xyz")}
+    uses |= dict.fromkeys(roles.column(by).split("+"), by) | ({} if when is None else {when: "time"})
+    if own is not None:
+        columns["sigma"] = sigma_of(roles.table, own, form, unit, range(len(z)))
+        uses[own] = "sigma_toa"
+    rest = left_over(roles, uses, (), lengths=True)
     satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
     section = Section("toa", columns, unit, told.sigma, "the range and the receiver's clock")
-    about = (
-        ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('pseudorange')}, with a clock of each epoch"),
-        ("epochs", f"{len(set(epoch.tolist()))} by column {named}"),
-        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF"),
-    )
-    return Plan(source, (section,), Places(satellites, "ecef", length), about)
+    when_ = "reception" if told.turned else "transmission"
+    read = [
+        ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('toa')}, with a clock of each epoch"),
+        ("epochs", f"{len(set(epoch.tolist()))} by column {roles.column(by)}"),
+        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF at {when_}"),
+    ]
+    read += [("sigma", f"of pseudoranges, from column {own}")] if "sigma" in columns else []
+    read += [("not used", ", ".join(rest))] if rest else []
+    places = Places(satellites, "ecef", length)
+    return Plan(source, (section,), places, tuple(read), notes, _AT_RECEPTION, uses=uses)
 
 
 def _gnss(source: Path, told: Told) -> Plan:
     """Return what a receiver of navigation satellites has seen as arrivals, like a table of pseudoranges."""
+    if told.columns or told.ignore:
+        flag = "--column" if told.columns else "--ignore"
+        raise InvalidProblem(f"{source.name} has no columns with names", flag, "leave it out")
     found = received(source, told.navigation, told.sigma, system=told.system, mask=told.mask)
     columns = {"epoch": found.epoch, "time": found.time, "a": found.satellite, "z": np.round(found.z, 4)}
     columns["sigma"] = np.round(found.sigma, 3)
     places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
     section = Section("toa", columns, "m", None, "the range and the receiver's clock")
-    return Plan(source, (section,), Places(places, "ecef", "m"), found.about, found.notes)
+    return Plan(source, (section,), Places(places, "ecef", "m"), found.about, found.notes, _AT_RECEPTION)
 
 
 def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:
@@ -529,7 +595,9 @@ def _write_satellites(
     if out.suffix.lower() != ".csv":
         what = "satellites are stations that move: they become a CSV table"
         raise InvalidProblem(what, str(out), "let the name behind --out end in .csv")
-    orbits, roles = read_orbits(source), Roles(read_table(times), told)
+    own = {role: name for role, name in told.items() if stations is None or role not in PLACE}
+    orbits, roles = read_orbits(source), Roles.of(read_table(times), own)
+    check_told(roles, ("time", "satellite"))
     written, seconds = roles.table.raw(roles.column("time")), roles.table.times(roles.column("time"), 1.0)
     whose = roles.labels("satellite") if roles.find("satellite") is not None else None
     wanted = distinct(whose)[0] if whose is not None else list(orbits.courses)
@@ -553,7 +621,7 @@ def _resting(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray
     """Return where stations on the ground are in ECEF, by name."""
     if path is None:
         return {}
-    own = {role: name for role, name in told.items() if role in ("name", "x", "y", "z", "lat", "lon", "height")}
+    own = {role: name for role, name in told.items() if role in PLACE}
     place = places_of(path, own, "ecef")
     held, scale = place.columns, UNITS["length"][place.unit]
     if place.frame == "geodetic":

@@ -6,16 +6,20 @@ Everything becomes `optloc.problem.build.measured` and `assemble`; what these fu
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass, replace
+from datetime import date
+from typing import Any, NamedTuple, cast, get_args
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Stations
-from optloc.base.units import SPEED_OF_LIGHT, Conversion, Quantity, conversion
-from optloc.files.roles import WORDS, stem, unit_of, worded
+from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
+from optloc.files.columns import stem, unit_of
+from optloc.files.declination import angle_of, date_of, declinations
+from optloc.files.readings import CARTESIAN, COMPASS
+from optloc.files.roles import WORDS, worded
 from optloc.files.schema import FrameTable, StationsTable, Units
 from optloc.files.stations import survey
 from optloc.files.table import Table, of_frame
@@ -70,6 +74,13 @@ class _Receivers:
         return float(np.ptp(self.stations.position, axis=-2).max())
 
 
+class _North(NamedTuple):
+    """From where bearings are counted, and the declination of magnetic north, None for true north."""
+
+    azimuth: str
+    declination: Any
+
+
 class _Readings(NamedTuple):
     """Values (..., m) as they are given, what each belongs to, and the unit that their column names."""
 
@@ -92,6 +103,8 @@ def locate(
     unit: Any = None,
     reference: str | None = None,
     height: Any = None,
+    azimuth: str = COMPASS,
+    declination: Any = None,
     frame: str = "cartesian",
     speed: float | Medium = SPEED_OF_LIGHT,
     method: str = "auto",
@@ -100,8 +113,10 @@ def locate(
 
     Measurements are mappings of a station's name to a value, arrays (..., s) in the order of the stations, pandas
     series, or data frames with one column for each station (each row is a fix of its own) or with the columns station,
-    value and, where wanted, epoch. What was not heard is NaN. Several kinds may be given together. As many coordinates
-    come out as go in: without altitudes a target on Earth is taken to be at the level of the stations, 0 m.
+    value and, where wanted, epoch. Every name must be that of a station, those of all columns of a frame with one for
+    each station included; an unknown one is refused. What was not heard is NaN. Several kinds may be given together. As
+    many coordinates come out as go in: without altitudes a target on Earth is taken to be at the level of the stations,
+    0 m.
 
     Parameters
     ----------
@@ -117,9 +132,10 @@ def locate(
     ranges : measurements, optional
         Distances of a tag, metres.
     pseudoranges : measurements, optional
-        Distances that share an unknown clock error, metres.
+        Distances that share an unknown clock error, metres. Satellites are where they were when they sent, along the
+        axes of the Earth at reception: turn places of the time of sending by the rotation of the Earth in the flight.
     bearings : measurements, optional
-        Compass bearings, degrees from true north (the y axis), clockwise.
+        Compass bearings, degrees from true north (the y axis), clockwise; see `azimuth` and `declination`.
     elevations : measurements, optional
         Angles above the horizon, degrees.
     sigma : float, str, or mapping of argument to these
@@ -131,6 +147,12 @@ def locate(
         Station that time differences are taken to; the first by default.
     height : float, or (least, greatest), optional
         Known height of the target: metres above the WGS 84 ellipsoid, or along z where there is no Earth.
+    azimuth : "north-clockwise", "north-counterclockwise" or "east-counterclockwise"
+        Where bearings are counted from, and which way.
+    declination : float, str or date, optional
+        Of bearings from magnetic north, east positive: in the unit of the bearings, text such as "4 deg", or a date
+        such as "2026-06-01", at which the World Magnetic Model gives that of each station on Earth. It is added to
+        compass bearings.
     frame : "cartesian" or "ecef"
         What x, y, z of stations mean.
     speed : float, Layers or Atmosphere
@@ -162,10 +184,27 @@ def locate(
     given = {word: values for word, values in arguments.items() if values is not None}
     if not given:
         raise InvalidProblem("there are no measurements", "locate", f"give one of {', '.join(arguments)}")
-    for name, text in (("reference", reference), ("frame", frame), ("method", method), *_texts(unit)):
+    texts = (("reference", reference), ("frame", frame), ("method", method), ("azimuth", azimuth), *_texts(unit))
+    for name, text in texts:
         if text is not None and not isinstance(text, str):
             raise InvalidProblem(f"{type(text).__name__} is no name", name, "give text, such as 'ns' for a unit")
-    return solve(_pose(stations, latlon, given, sigma, unit, reference, height, frame, _speed(speed)), method=method)
+    north = _North(azimuth, declination)
+    _check_north(north, given)
+    problem = _pose(stations, latlon, given, sigma, unit, reference, height, frame, _speed(speed), north)
+    return solve(problem, method=method)
+
+
+def _check_north(north: _North, given: Mapping[str, Any]) -> None:
+    """Refuse conventions of azimuths that there are none of, and a declination without bearings from north."""
+    known = get_args(AzimuthConvention)
+    if north.azimuth not in known:
+        raise InvalidProblem(f"there is no convention {north.azimuth!r}", "azimuth", nearest(north.azimuth, known))
+    if north.declination is None:
+        return
+    if "bearings" not in given:
+        raise InvalidProblem("there are no bearings", "declination", "leave it out")
+    if north.azimuth == CARTESIAN:
+        raise InvalidProblem("angles from the x axis have no declination", "declination", "leave it out")
 
 
 def _speed(given: Any) -> float | Medium:
@@ -192,6 +231,7 @@ def _pose(
     height: Any,
     frame: str,
     through: float | Medium,
+    north: _North,
 ) -> Problem:
     """Return the problem of the arguments of `locate`."""
     medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
@@ -201,9 +241,11 @@ def _pose(
         found = _readings(word, values, places.names, reference)
         units = Units(cast("Quantity", MODELS[_WORDS[word].kind].quantity), speed)
         own = _per_word(unit, word, given, "unit") or found.unit or _WORDS[word].unit
-        step = conversion(own, units.quantity, propagation_speed=speed, where=f"unit of {word}")
+        convention = cast("AzimuthConvention", north.azimuth if word == "bearings" else CARTESIAN)
+        step = replace(units, convention=convention).conversion(own, f"unit of {word}")
         spread = _spread(_per_word(sigma, word, given, "sigma"), word, units, own)
-        rows.append(_rows(word, found, spread, step, places, speed))
+        made = _rows(word, found, spread, step, places, speed)
+        rows.append(_from_north(made, north, own, places) if word == "bearings" else made)
     at = _heights(height, places, given)
     return assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
 
@@ -332,8 +374,9 @@ def _readings(word: str, given: Any, names: Sequence[str], reference: str | None
     if reference is not None and reference not in names:
         raise InvalidProblem(f"there is no station {reference!r}", "reference", nearest(str(reference), names))
     first = names[0] if reference is None else reference
+    given = _with_names(given)
     if hasattr(given, "columns") and hasattr(given, "index"):
-        found = _of_table(word, given, names)
+        found = _of_table(word, given, names, first)
     elif hasattr(given, "index") and hasattr(given, "to_numpy"):
         found = _Readings(_numbers(word, given.to_numpy()), list(given.index))
     elif isinstance(given, Mapping):
@@ -360,6 +403,17 @@ def _readings(word: str, given: Any, names: Sequence[str], reference: str | None
     return _Readings(found.values[..., kept], [ends[i] for i in kept], found.unit)
 
 
+def _with_names(given: Any) -> Any:
+    """Return a structured array as a mapping, and tables of polars, pyarrow and xarray as pandas has them.
+
+    Each of them names what its values belong to: an array alone would take them in the order of the stations.
+    """
+    fields = getattr(getattr(given, "dtype", None), "names", None)
+    if fields:
+        return {name: given[name] for name in fields}
+    return given.to_pandas() if hasattr(given, "to_pandas") else given
+
+
 def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[int, int]:
     """Return the numbers of the stations that a key names; -1 where there is one station only."""
     pair = key if isinstance(key, tuple) else (key,)
@@ -377,13 +431,38 @@ def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[in
     return one, other[0] if other else -1
 
 
-def _of_table(word: str, frame: Any, names: Sequence[str]) -> _Readings:
+def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: str) -> list[Any]:
+    """Return the columns of a data frame whose names are those of stations, or of pairs of them."""
+    found = []
+    for column in columns:
+        try:
+            _ends(word, column, names, reference)
+        except InvalidProblem:
+            continue
+        found.append(column)
+    return found
+
+
+def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> _Readings:
+    """Return the values of a data frame with one column for each station or pair; every column must be one."""
+    columns = list(frame.columns)
+    for column in columns:
+        try:
+            _ends(word, column, names, reference)
+        except InvalidProblem as error:
+            advice = f"{error.advice}; drop a column that holds no {_WORDS[word].noun}"
+            raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
+    # By number: two columns may have one name.
+    values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
+    return _Readings(np.stack(values, axis=-1), columns)
+
+
+def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> _Readings:
     """Return the values of a data frame: one column for each station, or one row for each value."""
-    wide = [
-        name for name in frame.columns if str(name) in names or (isinstance(name, tuple) and set(name) <= set(names))
-    ]
-    if wide:
-        return _Readings(np.stack([_numbers(word, frame[name].to_numpy()) for name in wide], axis=-1), wide)
+    columns = list(frame.columns)
+    wide = _named(word, columns, names, reference)
+    if wide and len(wide) == len(columns):
+        return _wide(word, frame, names, reference)
     stems = {stem(str(name)): name for name in reversed(list(frame.columns))}
     kind = _WORDS[word].kind
     value_words = [*WORDS["z"].split(), *(stem(each) for each in (word, word.rstrip("s"), kind, *MODELS[kind].aliases))]
@@ -392,11 +471,16 @@ def _of_table(word: str, frame: Any, names: Sequence[str]) -> _Readings:
         role: next((stems[each] for each in words if each in stems), None)
         for role, words in (("a", WORDS["a"].split()), ("b", WORDS["b"].split()), ("z", value_words))
     }
+    tidy = None not in (chosen["a"], chosen["z"]) and {*wide} <= {*chosen.values()}
+    if wide and not tidy:
+        return _wide(word, frame, names, reference)
     for role, text in (("a", "station"), ("z", "value")):
         if chosen[role] is None:
-            columns = ", ".join(str(name) for name in frame.columns)
+            listed = ", ".join(str(name) for name in columns)
             advice = "call columns by the stations, or use the columns station and value"
-            raise InvalidProblem(f"no column is a {text}; there are {columns}", word, advice)
+            if {str(label) for label in frame.index} <= {*names}:
+                advice = "its rows are the stations: give the transposed frame, .T"
+            raise InvalidProblem(f"no column is a {text}; there are {listed}", word, advice)
     epochs = next((stems[each] for each in ("epoch", "message", "msg", "pulse") if each in stems), None)
     ends = [str(name) for name in frame[chosen["a"]]]
     if word == "tdoa" and chosen["b"] is not None:
@@ -456,8 +540,6 @@ def _rows(word: str, found: _Readings, sigma: float, unit: Conversion, places: _
     heard = np.isfinite(z)
     if np.isinf(z).any():
         raise InvalidProblem("a value is infinite", word, "use NaN where there is none")
-    if word == "bearings":
-        z = np.pi / 2 - z
     if word in ("toa", "tdoa"):
         _check_far(word, z, sigma, places)
     own = {"weight": heard.astype(float), "a": a, "b": None if word != "tdoa" else b}
@@ -465,6 +547,22 @@ def _rows(word: str, found: _Readings, sigma: float, unit: Conversion, places: _
     # close loops this claims the least: what follows from the others says nothing more.
     noise = {"arrival_sigma": sigma / np.sqrt(2.0)} if word == "tdoa" else {"sigma": sigma}
     return measured(kind, np.where(heard, z, 0.0), **own, **noise)
+
+
+def _from_north(made: Measured, north: _North, unit: str, places: _Receivers) -> Measured:
+    """Return rows of bearings with the declination of magnetic north, and the sense in which they are counted."""
+    rows, east = made.rows.clockwise() if north.azimuth == COMPASS else made.rows, north.declination
+    if east is None:
+        return replace(made, rows=rows)
+    if isinstance(east, bool) or not isinstance(east, str | date | float | int | np.number):
+        what = f"{type(east).__name__} is no declination"
+        raise InvalidProblem(what, "declination", 'give a number, "4 deg", or a date such as "2026-06-01"')
+    day = date_of(east, "declination")
+    if day is None:
+        amount = angle_of(str(east), unit, "declination")
+        return replace(made, rows=replace(rows, correction=rows.correction + amount))
+    each = declinations(places.stations.position[0], places.frame, day, "declination")
+    return replace(made, rows=replace(rows, correction=rows.correction + each[rows.a]))
 
 
 def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:

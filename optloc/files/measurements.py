@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import date
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
+from optloc.base.frames import Frame
+from optloc.base.types import Array, Stations
 from optloc.base.units import LARGEST, Conversion
-from optloc.files.schema import MeasurementsTable, Units, join, kind_model
+from optloc.files.declination import angle_of, date_of, declinations
+from optloc.files.schema import DeclinationTable, MeasurementsTable, Units, join, kind_model
 from optloc.files.table import Epochs, Table, distinct
 from optloc.models import Model
 from optloc.problem.signal import Signal
@@ -62,6 +65,10 @@ class Chunk:
         Whether the distance of the two stations is still to be added to z.
     table : Table
         Where the rows come from.
+    declined_on : date, optional
+        Day that the magnetic declination is the one of.
+    declination : array, optional
+        Declination of that day at the stations of the rows that are present, radians: part of the corrections.
     """
 
     kind: str
@@ -86,6 +93,8 @@ class Chunk:
     target: Array | None
     excess: bool
     table: Table
+    declined_on: date | None = None
+    declination: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,20 +167,24 @@ def _chunk(c: Context, kind: str) -> Chunk:
         a, b = b, a
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
+    east, day = _declination(c, units.name(name)) if kind == "azimuth" else (0.0, None)
     return Chunk(
-        kind, np.arange(table.count), z, a, b, weight, _correction(c, units, unit), unit, units, units.name(name),
-        np.broadcast_to(unit.slope(z), z.shape), np.zeros(c.table.count),
+        kind, np.arange(table.count), z, a, b, weight, _correction(c, units, unit) + east, unit, units,
+        units.name(name), np.broadcast_to(unit.slope(z), z.shape), np.zeros(c.table.count),
         sigma, arrival, covariance, signal_of(c),
         table.labels("epoch") if table.has("epoch") else None,
         table.times("time", seconds) if table.has("time") else None,
         table.labels("time") if table.has("time") else None,
         table.labels("target") if table.has("target") else None,
-        section.excess and _adds_up(model), table,
+        section.excess and _adds_up(model), table, day,
     )  # fmt: skip
 
 
 def _check_options(c: Context, kind: str, model: Model) -> None:
-    section = c.section
+    section, declined = c.section, c.section.declination is not None
+    if declined and kind == "azimuth" and section.azimuth == "east-counterclockwise":
+        advice = 'write azimuth = "north-clockwise" or "north-counterclockwise", or leave the declination out'
+        raise InvalidProblem("angles from the x axis have no declination", join(c.where, "key 'declination'"), advice)
     if section.kind is None:
         return  # settings of a mixed table apply to the kinds that know them
     if section.excess and not _adds_up(model):
@@ -180,8 +193,11 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
         )
     if section.positive == "b-farther" and not _compares(model):
         raise InvalidProblem(f"{kind} has no sign to turn", join(c.where, "key 'positive'"), "leave it out")
-    if section.azimuth == "north-clockwise" and kind != "azimuth":
-        raise InvalidProblem(f"{kind} is no azimuth", join(c.where, "key 'azimuth'"), "leave it out")
+    if kind != "azimuth":
+        north = section.azimuth not in {None, "east-counterclockwise"}
+        key = "azimuth" if north else "declination" if declined else None
+        if key is not None:
+            raise InvalidProblem(f"{kind} is no azimuth", join(c.where, f"key {key!r}"), "leave it out")
 
 
 def _adds_up(model: Model) -> bool:
@@ -259,18 +275,65 @@ def _check_pairs(c: Context, kind: str, a: Array, b: Array) -> None:
 
 
 def _correction(c: Context, units: Units, unit: Conversion) -> Array:
+    """Return what rows exceed the model by (m,), SI; a correction of azimuths turns them clockwise, however counted."""
     if c.table.has("correction"):
-        return c.table.numbers("correction") * _size(unit, c)
+        return c.table.numbers("correction") * _size(unit, units, c)
     if c.section.correction is None:
         return np.zeros(c.table.count)
     number, own = units.amount(c.section.correction, unit, join(c.where, "key 'correction'"))
-    return np.full(c.table.count, number * _size(own, c))
+    return np.full(c.table.count, number * _size(own, units, c))
 
 
-def _size(unit: Conversion, c: Context) -> float:
+def _size(unit: Conversion, units: Units, c: Context) -> float:
     if unit.logarithmic:
         raise InvalidProblem("a correction in dB is no sum", join(c.where, "key 'correction'"), "correct z itself")
-    return unit.factor
+    # A correction of 4 deg is added to a compass bearing: the reading is 4 deg anticlockwise of the true direction.
+    return -unit.factor if units.clockwise else unit.factor
+
+
+def _declination(c: Context, unit: str) -> tuple[float, date | None]:
+    """Return the declination of a section in radians, or zero and the day that it is the one of."""
+    given, place = c.section.declination, join(c.where, "key 'declination'")
+    if given is None:
+        return 0.0, None
+    day = date_of(given, place)
+    if day is not None or isinstance(given, DeclinationTable):
+        return 0.0, day
+    # Bearings from magnetic north are anticlockwise of true ones by what magnetic north is east of north.
+    return angle_of(given, unit, place), None
+
+
+def with_declination(chunk: Chunk, epoch: Array, stations: Stations, frame: Frame) -> Chunk:
+    """Return a chunk with the magnetic declination of its day at its stations among the corrections.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        Rows of one kind.
+    epoch : int array (m,)
+        Epoch of each.
+    stations : Stations
+        Where stations are at each epoch.
+    frame : Frame
+        Of the stations.
+    """
+    if chunk.declined_on is None:
+        return chunk
+    used = np.flatnonzero(chunk.weight > 0.0)
+    moment = epoch[used] if len(stations.position) > 1 else np.zeros_like(used)
+    east = np.zeros(len(epoch))
+    where = join(chunk.table.source, "key 'declination'")
+    east[used] = declinations(stations.position[moment, chunk.a[used]], frame, chunk.declined_on, where)
+    return replace(chunk, correction=chunk.correction + east, declination=east[used])
+
+
+def declination_told(chunks: Sequence[Chunk]) -> str:
+    """Return the declination that the date of a file stands for, in words; empty where no date gives one."""
+    found = [chunk.declination for chunk in chunks if chunk.declination is not None and len(chunk.declination)]
+    if not found:
+        return ""
+    low, high = (f"{end(np.degrees(np.concatenate(found))):+.2f}" for end in (np.min, np.max))
+    return f"; magnetic declination {low if low == high else f'{low} to {high}'} deg, east positive"
 
 
 def with_baseline(chunk: Chunk, baseline: Array) -> Chunk:

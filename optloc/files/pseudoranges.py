@@ -184,8 +184,12 @@ def _sent(
     return chosen, place[chosen], (seen.pseudorange + SPEED_OF_LIGHT * clock)[chosen], notes
 
 
-def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int) -> Array:
-    """Return where the receiver was at each epoch (count, 3), to some hundred metres, without a guess."""
+def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int, *, level: bool = False) -> Array:
+    """Return where the receiver was at each epoch (count, 3), to some hundred metres, without a guess.
+
+    On the ground (`level`) three satellites are enough.
+    """
+    from optloc.linear.constraints import height
     from optloc.solvers import solve
 
     slot = np.arange(len(epoch)) - np.searchsorted(epoch, epoch)  # epochs stand in order
@@ -193,19 +197,76 @@ def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int) 
     stations, ranges, weight = np.zeros((count, width, 3)), np.zeros((count, width)), np.zeros((count, width))
     stations[:] = place[0]
     stations[epoch, slot], ranges[epoch, slot], weight[epoch, slot] = place, z, 1.0
-    enough = np.flatnonzero(weight.sum(1) >= _ENOUGH)
+    least, held = (_ENOUGH - 1, height(0.0, 0.0)) if level else (_ENOUGH, ())
+    enough = np.flatnonzero(weight.sum(1) >= least)
     found = np.full((count, 3), np.nan)
     if len(enough):
         rows = measured("toa", ranges[enough], a=np.arange(width), sigma=10.0, weight=weight[enough])
-        fix = solve(assemble(station_array(stations[enough, None]), rows, frame=ECEF), "gtrs+lsr")
+        problem = assemble(station_array(stations[enough, None]), rows, frame=ECEF, constraints=held)
+        fix = solve(problem, "auto" if level else "gtrs+lsr")
         found[enough] = np.where(np.linalg.norm(fix.position, axis=-1)[:, None] < _BEYOND, fix.position, np.nan)
     good = np.flatnonzero(np.isfinite(found).all(-1))
     if not len(good):
-        what = f"no epoch has {_ENOUGH} satellites that fix a place"
+        what = f"no epoch has {least} satellites that fix a place"
         raise InvalidProblem(what, source.name, "see whether both files are of one day, or name another --system")
     # an epoch without one is near its neighbours
-    nearest = np.abs(np.arange(count)[:, None] - good).argmin(1) if len(good) < count else np.arange(count)
-    return found[good[nearest]] if len(good) < count else found
+    after = np.searchsorted(good, np.arange(count)).clip(max=len(good) - 1)
+    before = (after - 1).clip(min=0)
+    nearer = np.arange(count) - good[before] <= good[after] - np.arange(count)
+    return found[good[np.where(nearer & (good[before] <= np.arange(count)), before, after)]]
+
+
+# Passes that turn satellites of a table: the first is off by what the Earth turns in a flight, 150 m, the second by
+# what it turns while light covers these, 1 mm, and the third by less than rounding.
+_PASSES = 3
+
+
+def at_reception(source: Path, epoch: Array, place: Array, z: Array) -> Array:
+    """Return where satellites were when they sent (n, 3), along the axes that the Earth has at reception.
+
+    How long a signal flew is seen from the distance of its satellite: a pseudorange holds the clock of the receiver,
+    which may be a second off.
+
+    Parameters
+    ----------
+    source : Path
+        The table, to be named.
+    epoch : object array (n,)
+        Label of the epoch of each pseudorange.
+    place : array (n, 3)
+        Satellites along the axes of the Earth at transmission, metres.
+    z : array (n,)
+        Pseudoranges, metres.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no epoch has the satellites that fix a receiver.
+    """
+    labels, number = np.unique(epoch.astype(str), return_inverse=True)
+    order = np.argsort(number, kind="stable")
+    number, place, z = number[order], place[order], z[order]
+    now = place
+    for _ in range(_PASSES):
+        rough = _rough(source, number, now, z, len(labels))[number]
+        now = turned(place, np.linalg.norm(now - rough, axis=-1) / SPEED_OF_LIGHT)
+    out = np.empty_like(now)
+    out[order] = now
+    return out
+
+
+def _rough(source: Path, epoch: Array, place: Array, z: Array, count: int) -> Array:
+    """Return where the receiver of a table was at each epoch (count, 3), to some hundred metres."""
+    try:
+        return _first_pass(source, epoch, place, z, count)
+    except InvalidProblem:
+        # Three satellites fix a receiver on the ground: a kilometre of height turns them by some millimetres.
+        try:
+            return _first_pass(source, epoch, place, z, count, level=True)
+        except InvalidProblem as error:
+            advice = "say --turned if they are along the axes of the Earth at reception already"
+            what = f"{error.what}, and their satellites cannot be turned with the Earth"
+            raise InvalidProblem(what, source.name, advice) from None
 
 
 def _sky(rough: Array, place: Array) -> tuple[tuple[Array, Array, Array], Array, Array]:

@@ -14,17 +14,25 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, at_most
 from optloc.base.types import Array, Bias, Rows, Stations
-from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
+from optloc.files.measurements import (
+    ESTIMATE,
+    Chunk,
+    check_repeats,
+    chunks_of,
+    declination_told,
+    square,
+    with_baseline,
+    with_declination,
+)
+from optloc.files.propagation import medium_in, speed_of
 from optloc.files.roles import ASSUMED, azimuths_of, in_our_words
 from optloc.files.schema import (
     ConstraintTable,
     ProblemFile,
     Units,
     join,
-    medium_in,
     name_of,
     read_document,
-    speed_of,
     validate,
 )
 from optloc.files.stations import over_epochs, survey
@@ -76,6 +84,8 @@ class Loaded:
         Unit of the file that people read each bias in, and its SI size with sign; those read in SI are left out.
     azimuths : str
         From where azimuths are counted, and how the file would say otherwise; empty where there are none.
+    table : mapping
+        How a foreign table was read, as a JSON value; empty of a problem file.
     """
 
     problem: Problem
@@ -88,6 +98,7 @@ class Loaded:
     levels: NoiseLevels | None = None
     bias_units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     azimuths: str = ""
+    table: Mapping[str, Any] = field(default_factory=dict)
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the unit that people read an unknown in and its SI size: the file's, or what its slot says."""
@@ -228,6 +239,9 @@ def assemble(
     )
     # Excess paths become path sums only now, when it is known where their stations were.
     chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
+    chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
+    if azimuths:
+        azimuths += declination_told(chunks)
     rows, numbers = _rows(chunks, index, target)
     noise = _noise(file, chunks, numbers, index, target, source)
     written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
@@ -310,10 +324,13 @@ def _rows(
 ) -> tuple[tuple[Rows, ...], list[Array]]:
     """Return the rows of each kind, and the global number of each row of each chunk."""
     # A problem has one block of rows for each kind, in the order of appearance; numbers lead back to the chunks.
-    kinds = dict.fromkeys(chunk.kind for chunk in chunks)
+    # Compass bearings beside other azimuths have a block of their own, as their errors are clockwise.
+    order = list(dict.fromkeys(chunk.kind for chunk in chunks))
+    distinct = dict.fromkeys((chunk.kind, chunk.units.clockwise) for chunk in chunks)
+    kinds = sorted(distinct, key=lambda pair: order.index(pair[0]))
     rows, numbers, start = [], [np.zeros(0, dtype=np.int64)] * len(chunks), 0
-    for kind in kinds:
-        same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
+    for kind, clockwise in kinds:
+        same = [i for i, chunk in enumerate(chunks) if (chunk.kind, chunk.units.clockwise) == (kind, clockwise)]
         columns = {
             name: np.concatenate([getattr(chunks[i], name) for i in same])
             for name in ("z", "a", "b", "weight", "correction")
@@ -322,7 +339,8 @@ def _rows(
             "epoch": np.concatenate([index[i] for i in same]),
             "target": np.concatenate([target[i] for i in same]),
         }
-        rows.append(Rows(kind, **columns, **joined))
+        made = Rows(kind, **columns, **joined)
+        rows.append(made.clockwise() if clockwise else made)
         for i in same:
             numbers[i] = start + np.arange(len(chunks[i].z))
             start += len(chunks[i].z)

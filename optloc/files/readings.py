@@ -15,9 +15,10 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.cells import NOTHING
-from optloc.files.roles import Roles, bare, guesses, unit_of
+from optloc.files.columns import any_unit, bare, is_sigma, role_of, sigma_kind, stem, tokens, unit_of
+from optloc.files.roles import Roles
 from optloc.files.table import Table
-from optloc.models import MODELS
+from optloc.models import MODELS, kind_named
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,23 +51,31 @@ class Form:
 
 
 _OWN = {
-    "arrivals": Form("toa", "time", "arrival times"),
+    "arrivals": Form("toa", "toa", "arrival times"),
+    "times": Form("toa", "time", "arrival times"),
     "sp": Form("range", "sp", "times from P to S of an earthquake, as ranges"),
 }
 
 
 def sort_named(name: str) -> Form:
-    """Return a sort of reading by its name: "arrivals", "sp" or a kind with stations."""
+    """Return a sort of reading by its name: "arrivals", "times" (arrivals in the column of times), "sp" or a kind."""
     return _OWN[name] if name in _OWN else Form(name, name, MODELS[name].summary)
 
 
-# Sorts that a column's name alone tells, the likeliest first; the others are told.
-_SEEN = ("tdoa", "range", "range_sum", "azimuth", "elevation", "range_rate", "fdoa", "groa")
+# Kinds that the name of a column suggests, in the order of the sections of a problem file.
+_SEEN = ("tdoa", "range", "range_sum", "azimuth", "elevation", "range_rate", "fdoa", "groa", "rss_difference")
 # What programs write in place of a reading that there is none of.
 _MARKS = tuple(map(Decimal, (0, -1, *(sign * (10**n - 1) for n in (2, 3, 4, 5, 6, 9) for sign in (1, -1)))))
+# Names that are an angle or a height without a unit.
+_ANGLE_OR_HEIGHT = ("elevation", "elev")
+# Letters of names such as d, r and el, which programs use for much else.
+_LETTERS = 2
 # Radians of a turn: what is beyond is in degrees.
 _TURN = Decimal("6.2832")
 COMPASS, CARTESIAN = "north-clockwise", "east-counterclockwise"
+COUNTER, BOW = "north-counterclockwise", "bow-clockwise"
+CONVENTIONS = (COMPASS, CARTESIAN, COUNTER, BOW)
+"""Conventions of azimuths in tables: those of a problem file, and from the bow of a vehicle, whose heading is added."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +94,10 @@ class Told:
         columns suggest.
     columns : mapping of str to str
         Column of each role that is not found by its name; "set+msg" puts two columns together.
+    ignore : tuple of str
+        Columns that are left out, such as measurements that are not wanted.
+    time_unit : str, optional
+        Unit of the column of times, where its name does not end in it.
     unit : str, optional
         Unit of the values, where the column's name does not end in it.
     frame : "cartesian" or "ecef", optional
@@ -96,7 +109,9 @@ class Told:
     average : bool
         Whether several readings of the same become their mean; by default they are refused.
     azimuth : str, optional
-        Convention of azimuths, as in a problem file.
+        Convention of azimuths, as in a problem file, or "bow-clockwise"; with a column of headings that by default.
+    declination : str, optional
+        Magnetic declination of bearings, east positive: "4 deg", or a date such as "2026-06-01".
     positive : str, optional
         Sign of differences, as in a problem file.
     reference : str, optional
@@ -115,18 +130,23 @@ class Told:
         Letter of the system whose satellites are taken: "G", "E" or "J"; GPS.
     mask : str, optional
         Elevation below which satellites are left out, such as "15 deg"; 10 degrees.
+    turned : bool
+        Whether the satellites of a table are along the axes of the Earth at reception; by default at transmission.
     """
 
     stations: Path | None = None
     sigma: str | None = None
     what: str | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
+    ignore: tuple[str, ...] = ()
+    time_unit: str | None = None
     unit: str | None = None
     frame: str | None = None
     times: Path | None = None
     missing: str | None = None
     average: bool = False
     azimuth: str | None = None
+    declination: str | None = None
     positive: str | None = None
     reference: str | None = None
     vp: str | None = None
@@ -137,6 +157,7 @@ class Told:
     navigation: Path | None = None
     system: str | None = None
     mask: str | None = None
+    turned: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +182,12 @@ class Readings:
         Sign of differences.
     azimuth : str, optional
         Convention of azimuths.
+    heading : str, optional
+        Column of headings that are part of the values.
     sigma : array (m,), optional
         Standard deviations in the same unit.
+    errors : tuple of str
+        Columns that hold these.
     notes : tuple of str
         What was assumed, and what was left out.
     """
@@ -176,7 +201,9 @@ class Readings:
     b: Array | None = None
     positive: str = "a-farther"
     azimuth: str | None = None
+    heading: str | None = None
     sigma: Array | None = None
+    errors: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def take(self, pick: Sequence[int]) -> Readings:
@@ -197,31 +224,43 @@ class Readings:
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """A column that names stations: a sort of reading, where its name says one, and the stations."""
+    """A column that names stations.
+
+    Parameters
+    ----------
+    column : str
+        Its name.
+    form : str, optional
+        Sort of reading, None where the name does not say one.
+    ends : tuple of str
+        The stations.
+    minus : bool
+        Whether a minus is between the two stations.
+    sigma : bool
+        Whether it holds standard deviations.
+    """
 
     column: str
     form: str | None
     ends: tuple[str, ...]
     minus: bool
-
-
-def tokens(text: str) -> tuple[str, ...]:
-    """Return the words and numbers of a name, without case."""
-    return tuple(re.findall(r"[^\W\d_]+|\d+", text.lower()))
+    sigma: bool = False
 
 
 def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named]:
-    """Return the columns of a wide table: those whose names hold one station or two, and nothing that is unknown."""
+    """Return the columns of a wide table: those whose names hold one station or two, and no unknown word."""
     known = sorted({tokens(name): name for name in stations if tokens(name)}.items(), key=lambda item: -len(item[0]))
     exact = {name.strip(): name for name in stations}
     found = []
     for column in columns:
         text = bare(column)
         ends, rest = ([exact[text]], []) if text in exact else _stations_in(tokens(text), known)
-        form = _form_of("".join(word for word in rest if word not in _ENDS))
+        words = [word for word in rest if word not in _ENDS and not is_sigma(word)]
+        form = _form_of("".join(words), any_unit(column))
         if ends and len(ends) <= 2 and form is not None:
             between = re.search(r"[-\u2212\u2013]|minus", text) is not None
-            found.append(Named(column, form or None, tuple(ends), len(ends) == 2 and between))
+            deviation = any(map(is_sigma, rest))
+            found.append(Named(column, form or None, tuple(ends), len(ends) == 2 and between, deviation))
     return found
 
 
@@ -243,29 +282,127 @@ def _stations_in(words: tuple[str, ...], known: Sequence[tuple[tuple[str, ...], 
     return ends, rest
 
 
-def _form_of(word: str) -> str | None:
-    """Return the sort of reading that a word names, "" where there is none, and None for one that is unknown."""
+def _form_of(word: str, unit: str | None) -> str | None:
+    """Return the sort of reading that a word with a unit names, "" where there is none, and None for an unknown one."""
     if not word:
         return ""
-    return next((name for name in (*_OWN, *_SEEN) if word in guesses(sort_named(name).value)), None)
+    role = role_of(word if unit is None else f"{word}_{unit}")
+    if role == "height" and unit is None and word in _ANGLE_OR_HEIGHT:
+        return "elevation"  # a station has one height, and an angle in each row
+    if role in ("toa", "time"):
+        return "arrivals"
+    return role if role == "sp" or role in _SEEN else None
+
+
+def sigma_told(told: Told, kind: str) -> str | None:
+    """Return the standard deviation that the user states for a kind, None where --sigma does not name the kind."""
+    if told.sigma is None or "=" not in told.sigma:
+        return told.sigma
+    return sigmas_by_kind(told.sigma).get(kind)
+
+
+def sigmas_by_kind(text: str) -> dict[str, str]:
+    """Return the amounts of "range=6 m,azimuth=2 deg" by kind."""
+    parts = [part.partition("=") for part in text.split(",")]
+    return {kind_named(word.strip(), "--sigma"): amount.strip() for word, _, amount in parts}
+
+
+def holds_names(table: Table, column: str, stations: Sequence[str]) -> bool:
+    """Return whether the cells of a column are names of stations: then it holds no readings."""
+    cells = {str(cell).strip() for cell in table.raw(column).tolist() if cell is not None and str(cell).strip()}
+    return bool(cells) and cells <= {name.strip() for name in stations}
+
+
+def without(table: Table, ignored: Sequence[str]) -> Table:
+    """Return a table without the columns that the user ignores; raise InvalidProblem for one that it does not have."""
+    known = [*table.columns, *table.others]
+    lacking = next((name for name in ignored if name not in known), None)
+    if lacking is not None:
+        raise InvalidProblem(f"{table.source} has no column {lacking!r}", "--ignore", nearest(lacking, known))
+    columns = {name: column for name, column in table.columns.items() if name not in ignored}
+    others = {name: kind for name, kind in table.others.items() if name not in ignored}
+    return replace(table, columns=columns, others=others)
 
 
 def sorts_of(roles: Roles, told: Told) -> list[str]:
     """Return the sorts of readings of a table with one reading a row; none where its columns do not tell."""
     if told.what is not None:
-        return [told.what]
+        return ["times" if told.what == "arrivals" and roles.find("toa") is None else told.what]
     if all(roles.find(role) for role in ("station", "time", "phase")) or roles.find("sp"):
         return ["sp"]
     if roles.find("p") and roles.find("s") and roles.find("station"):
         return ["sp"]
-    fitting = [name for name in _SEEN if (column := roles.find(name)) and _fits(column, name)]
-    return fitting or (["arrivals"] if roles.find("station") and roles.find("time") else [])
+    fitting = [name for name in _SEEN if roles.find(name)]
+    fitting += ["arrivals"] if roles.find("toa") else []
+    if fitting or not (roles.find("station") and roles.find("time")):
+        return fitting
+    _check_times_alone(roles)
+    return ["times"]
 
 
-def _fits(column: str, name: str) -> bool:
-    """Return whether the unit in a column's name, if there is one, is one of a sort: an elevation may be a height."""
-    given = column.strip() != bare(column)
-    return not given or unit_of(column, UNITS[MODELS[name].quantity]) is not None  # type: ignore[index]
+def _check_times_alone(roles: Roles) -> None:
+    """Raise InvalidProblem where a column beside the times may hold the readings: then the times are no arrivals."""
+    taken = {part for name in roles.by_role.values() for part in name.split("+")}
+    for column in [*roles.table.columns, *roles.table.others]:
+        other = column not in taken and role_of(column) is None
+        if other and (any_unit(column) is not None or _kind_within(column, None) is not None):
+            what = f"the readings may be in {column!r}, or be the times in {roles.find('time')!r}"
+            advice = f"say --column range={quoted(column)} or another kind, or --as arrivals for the times"
+            raise InvalidProblem(what, roles.table.source, advice)
+
+
+def _kind_within(column: str, unit: str | None) -> str | None:
+    """Return the kind that words of a column's name and a unit suggest, such as "range" of "dist_raw_m"; else None."""
+    words = [word for word in tokens(bare(column)) if not word.isdigit()]
+    parts = ["_".join(words[i:j]) for i in range(len(words)) for j in range(len(words), i, -1)]
+    named = [part if unit is None else f"{part}_{unit}" for part in parts if len(part) >= _LETTERS]
+    return next((role for name in named if (role := role_of(name)) is not None and role in MODELS), None)
+
+
+def as_angles(roles: Roles, told: Told) -> Roles:
+    """Return roles in which a column `elevation` without a unit is an angle or a height, as the options say.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no option says which: an elevation may be the angle of a sight or the height of a station.
+    """
+    column = roles.by_role.get("height")
+    if column is None or "height" in roles.told or stem(column) not in _ANGLE_OR_HEIGHT or any_unit(column):
+        return roles
+    rest = {role: name for role, name in roles.by_role.items() if role != "height"}
+    if told.what == "elevation" or told.unit in UNITS["angle"]:
+        return replace(roles, by_role={"elevation": column, **rest})
+    name = quoted(column)
+    advice = f"say --column elevation={name} with --unit deg, --column height={name}, or --ignore {name}"
+    raise InvalidProblem(f"the column {column!r} may be an angle or a height", roles.table.source, advice)
+
+
+def quoted(name: str) -> str:
+    """Return a column's name as a shell takes it."""
+    return name if re.fullmatch(r"[\w.%+-]+", name) else repr(name)
+
+
+def unused_measurement(column: str, lengths: bool = False) -> str | None:
+    """Return what a column that is not used could measure, None where its name suggests no measurement.
+
+    Parameters
+    ----------
+    column : str
+        Its name.
+    lengths : bool
+        Whether only lengths and their rates can be measurements of the table.
+    """
+    kind = sigma_kind(column)
+    unit = any_unit(column)
+    role = role_of(column) or (None if unit is None else _kind_within(column, unit))
+    if kind is not None or role is None or (lengths and role in MODELS and MODELS[role].quantity == "angle"):
+        return None
+    # One or two letters without a unit are too little to suspect a measurement.
+    short = unit is None and len(stem(column)) <= _LETTERS
+    if role in MODELS and not short:
+        return MODELS[role].summary
+    return MODELS["height"].summary if role in ("height", "depth") and not short else None
 
 
 # Units, gaps, repeats.

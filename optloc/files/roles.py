@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
@@ -15,7 +14,9 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
-from optloc.files.foreign import read_table, records
+from optloc.files.columns import any_unit, check_unit, rank, role_named, role_of, stem, unit_of
+from optloc.files.foreign import read_table
+from optloc.files.records import records
 from optloc.files.schema import MeasurementsTable, ProblemFile, join
 from optloc.files.table import Table
 from optloc.models import BEARING, MODELS, kind_named
@@ -33,91 +34,77 @@ WORDS = {
 what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`).
 Columns that may be left out have their names alone: what a table has besides must not change what it says."""
 
-_A, _B = (
-    " ".join(f"{word}{end}" for word in ("anchor", "sensor", "node", "rx", "site") for end in ends)
-    for ends in ("a1", "b2")
-)
-# Role: names that suggest it, the likeliest first; spelled like `WORDS`. A kind is a role, too, with its aliases.
-GUESSES = {
-    "message": "message msg messageid msgid pulse frame epoch event eventid burst shot seq id",
-    "station": f"station receiver rx sensor anchor node site stationid receiverid sensorid beacon {WORDS['a']} {_A}",
-    "reference": f"{WORDS['b']} refstation {_B}",
-    "time": "toa arrival timeofarrival arrivaltime rxtime time timestamp utc datetime date t",
-    "epoch": "epoch time tgps gpstime tow t timestamp",
-    "target": "target tag mobile transmitter emitter icao hex mac device track",
-    "sigma": "sigma std stddev stdev sd uncertainty",
-    "phase": "phase phasehint phasetype",
-    "p": "p tp ptime ppick parrival",
-    "s": "s ts stime spick sarrival",
-    "sp": "sp sminusp spdifference stmp tstp",
-    "satellite": "satellite sat prn sv svid satid",
-    "pseudorange": "pseudorange pr prange rho c1c prm",
-    "name": f"{WORDS['name']} user",
-    "x": "x satx xecef ecefx xsat",
-    "y": "y saty yecef ecefy ysat",
-    "z": "z satz zecef ecefz zsat",
-    "lat": WORDS["lat_deg"],
-    "lon": WORDS["lon_deg"],
-    "height": f"{WORDS['height']} elev",
-    "depth": "depth",
-}
-# Short words for what a table measures, which would be too many ways to spell the kinds of a problem file.
-_SHORT = {
-    "range": "ranges dist r d",
-    "tdoa": "tdoas timedifference rdiff",
-    "azimuth": "az bearings brg lob lineofbearing",
-    "elevation": "el elev",
-}
-PLACE = ("name", "x", "y", "z", "lat", "lon", "height", "depth")
-"""Roles of columns that say where stations are."""
 GEOJSON = (".geojson", ".json")
 # Properties of a GeoJSON point that may be its name or its height, the likeliest first.
 _NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
 _HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
 _FLAT = "no heights are given: all stations are taken to be at height 0"
-# Units as people spell them in headers.
-_SPELLED = {
-    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
-    **dict.fromkeys(("feet", "foot"), "ft"),
-    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("msec", "millis", "milliseconds"), "ms"),
-    **dict.fromkeys(("µs", "μs", "usec", "micros", "microseconds"), "us"),
-    **dict.fromkeys(("nsec", "nanos", "nanoseconds"), "ns"),
-    **dict.fromkeys(("°", "degree", "degrees"), "deg"),
-    **dict.fromkeys(("radian", "radians"), "rad"),
-}
-# Longest first: of toa_ns the unit is ns, not s.
-_UNITS = sorted({*UNITS["length"], *UNITS["angle"], *UNITS["speed"], "dB", *_SPELLED}, key=len, reverse=True)
-_SUFFIX = re.compile(rf"\s*[_ \[(/]\s*({'|'.join(map(re.escape, _UNITS))})[\])]?$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """The columns of a table by role.
+    """The columns of a table by role: a column has one role at most.
 
     Parameters
     ----------
     table : Table
         The table.
-    told : mapping of str to str
-        What the user says: column by role; several columns with "+" between them.
+    by_role : mapping of str to str
+        Column of each role; several columns with "+" between them make one label.
+    told : frozenset of str
+        Roles that the user named.
     """
 
     table: Table
-    told: Mapping[str, str]
+    by_role: Mapping[str, str]
+    told: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, table: Table, told: Mapping[str, str], readings: Collection[str] = ()) -> Roles:
+        """Return the roles of a table: first as the user names them, then as the names of the columns suggest.
+
+        Parameters
+        ----------
+        table : Table
+            The table.
+        told : mapping of str to str
+            Column by role, or by another word for the role.
+        readings : collection of str
+            Columns that hold the readings of receivers, and so have no other role.
+
+        Raises
+        ------
+        InvalidProblem
+            For an unknown role or column, a unit that does not fit, and a column with two roles.
+        """
+        given = _given(table, told)
+        used = {part for name in given.values() for part in name.split("+")} | set(readings)
+        found: dict[str, str] = {}
+        for column in table.columns:
+            role = None if column in used else role_of(column)
+            if role is not None and (role not in found or rank(role, column) < rank(role, found[role])):
+                found[role] = column
+        return cls(table, found | given, frozenset(given))
 
     def find(self, role: str) -> str | None:
-        """Return the column of a role, None where no name suggests it; a told one that is none is InvalidProblem."""
-        columns = list(self.table.columns)
-        if role in self.told:
-            for part in self.told[role].split("+"):
-                if part not in columns:
-                    advice = nearest(part, columns)
-                    raise InvalidProblem(f"there is no column {part!r} for the {role}", self.table.source, advice)
-            return self.told[role]
-        # Reversed, so that of two columns with one stem the first one counts.
-        stems = {stem(name): name for name in reversed(columns)}
-        return next((stems[guess] for guess in guesses(role) if guess in stems), None)
+        """Return the column of a role, None where there is none."""
+        if role == "name" and stem(self.by_role.get("name", "")) != "name" and "name" not in self.told:
+            role = "station"  # a callsign names a station only where nothing else does
+        if role in self.by_role:
+            return self.by_role[role]
+        if role in ("station", "name"):
+            return next((self.by_role[other] for other in _NAMES_STATION if other in self.by_role), None)
+        # An `id` that does not name the station is the label of a message.
+        if role == "message" and any(other in self.by_role for other in _NAMES_STATION[:-1]):
+            return self.by_role.get("id")
+        return None
+
+    def without_stations(self) -> Roles:
+        """Return the roles of a table whose columns name the stations: an `id` is then the label of a message."""
+        kept = {role: name for role, name in self.by_role.items() if role not in (*_NAMES_STATION, "reference")}
+        if "id" in self.by_role:
+            kept = {"message": self.by_role["id"], **kept}
+        return replace(self, by_role=kept)
 
     def column(self, role: str) -> str:
         """Return the column of a role; raise InvalidProblem where there is none."""
@@ -140,31 +127,36 @@ class Roles:
         return self.table.numbers(self.column(role))
 
 
-def guesses(role: str) -> list[str]:
-    """Return the names that suggest a role: of a kind that and its other words."""
-    if role in GUESSES:
-        return GUESSES[role].split()
-    words = (role, *MODELS[role].aliases) if role in MODELS else (role,)
-    return [*map(stem, words), *_SHORT.get(role, "").split()]
+# Roles whose columns can name the station of a row, the likeliest first.
+_NAMES_STATION = ("station", "name", "id")
 
 
-def stem(column: str) -> str:
-    """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
-    return re.sub(r"[^a-z0-9]", "", bare(column).lower())
+def _given(table: Table, told: Mapping[str, str]) -> dict[str, str]:
+    """Return the columns that the user names, by role; raise InvalidProblem for one that cannot have its role."""
+    given: dict[str, str] = {}
+    owner: dict[str, str] = {}
+    for word, name in told.items():
+        role = role_named(word)
+        role = _epoch_role(name) if role == "epoch" else role
+        if role in given:
+            what = f"the role {role} is given to two columns, {given[role]!r} and {name!r}"
+            raise InvalidProblem(what, "--column", "name one; ONE+TWO makes one label of two columns")
+        for part in name.split("+"):
+            if part not in table.columns:
+                what = f"there is no column {part!r} for the {word}"
+                raise InvalidProblem(what, table.source, nearest(part, list(table.columns)))
+            if part in owner:
+                what = f"the column {part!r} is given two roles, {owner[part]} and {role}"
+                raise InvalidProblem(what, "--column", "a column has one role")
+            check_unit(role, part)
+            owner[part] = role
+        given[role] = name
+    return given
 
 
-def unit_of(column: str, known: Iterable[str]) -> str | None:
-    """Return the unit that a column's name ends in, None where it is none of those known."""
-    found = _SUFFIX.search(column.strip())
-    if found is None:
-        return None
-    spelled = found.group(1).lower()
-    return {unit.lower(): unit for unit in known}.get(_SPELLED.get(spelled, spelled).lower())
-
-
-def bare(column: str) -> str:
-    """Return a column's name without its unit."""
-    return _SUFFIX.sub("", column.strip())
+def _epoch_role(name: str) -> str:
+    """Return the role of a column that is named as the epoch: a time, or a label."""
+    return "time" if role_of(name) == "time" else "message"
 
 
 # Other words for kinds and columns of problem files, and what is left to the format.
@@ -210,10 +202,11 @@ def worded(table: Table, unit: str) -> Table:
     # Of a table with latitudes, x is what it has besides.
     if not any(key in found or table.has(key) for key in ("lat_deg", "lon_deg")):
         axes = {key: name for key in "xyz" if (name := _column(table, key))}
-        found |= {key: name for key, name in axes.items() if _said(name) in (None, *UNITS["length"])}
+        found |= {key: name for key, name in axes.items() if any_unit(name) in (None, *UNITS["length"])}
     found = {key: name for key, name in found.items() if not table.has(key) and key not in table.names}
-    # Latitudes in radians are none that could be read: the column stays unknown.
-    named = {key: name for key, name in found.items() if not key.endswith("_deg") or _said(name) in (None, "deg")}
+    # A column in a unit that does not fit stays unknown: latitudes in radians, or an angle that is called elevation.
+    fits = {"lat_deg": ("deg",), "lon_deg": ("deg",), "height": tuple(UNITS["length"])}
+    named = {key: name for key, name in found.items() if any_unit(name) in (None, *fits.get(key, (any_unit(name),)))}
     columns = dict(table.columns)
     for key in ("height", *"xyz"):
         name = named.get(key, "")
@@ -280,7 +273,7 @@ def _value(table: Table, kind: str, where: str) -> tuple[Table, str | None]:
         return table, None
     model = MODELS[kind]
     name = _column(table, " ".join([WORDS["z"], *(stem(word) for word in (kind, *model.aliases))]))
-    if name is None or (_said(name) is not None and unit_of(name, UNITS[model.quantity]) is None):  # type: ignore[index]
+    if name is None or (any_unit(name) is not None and unit_of(name, UNITS[model.quantity]) is None):  # type: ignore[index]
         return table, None
     return replace(table, names={**table.names, "z": name}), unit_of(name, UNITS[model.quantity])  # type: ignore[index]
 
@@ -292,17 +285,17 @@ def _column(table: Table, words: str) -> str | None:
     return next((stems[word] for word in words.split() if word in stems), None)
 
 
-def _said(name: str) -> str | None:
-    """Return the unit of any quantity that a column's name ends in."""
-    return unit_of(name, _UNITS)
-
-
 ASSUMED = " (no convention is named)"
 """What is said beside azimuths of format 1 that might be meant otherwise."""
-_OTHER = {"north-clockwise": "east-counterclockwise", "east-counterclockwise": "north-clockwise"}
+_OTHER = {
+    "north-clockwise": "east-counterclockwise",
+    "east-counterclockwise": "north-clockwise",
+    "north-counterclockwise": "north-clockwise",
+}
 _COUNTED = {
     "north-clockwise": "the compass, clockwise from north (+y)",
     "east-counterclockwise": "the axes, anticlockwise from east (+x)",
+    "north-counterclockwise": "north (+y), anticlockwise",
 }
 
 
@@ -349,8 +342,30 @@ def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> Places:
         data = json_of(read_text(path), path.name)
         if isinstance(data, list) or (isinstance(data, dict) and "features" in data):
             return _of_geojson(data, path.name)
-        return placed(Roles(records(data, path.name), told), frame)
-    return placed(Roles(read_table(path), told), frame)
+        roles = Roles.of(records(data, path.name), told)
+    else:
+        roles = Roles.of(read_table(path), told)
+    found = placed(roles, frame)
+    column = roles.find("heading")
+    if column is not None:
+        factor = UNITS["angle"][unit_of(column, UNITS["angle"]) or "deg"] / UNITS["angle"]["deg"]
+        headings = {"heading_deg": factor * roles.table.numbers(column, optional=True)}
+        found = replace(found, columns={**found.columns, **headings})
+    check_told(roles, ("name", "heading", *place_roles(roles)))
+    return found
+
+
+def place_roles(roles: Roles) -> tuple[str, ...]:
+    """Return the roles of the columns that `placed` reads for the positions of stations."""
+    across, ups = (("lat", "lon"), _UPS["height"]) if roles.find("lat") is not None else (("x", "y"), _UPS["z"])
+    return (*across, *[role for role in ups if roles.find(role) is not None][:1])
+
+
+def check_told(roles: Roles, used: Collection[str]) -> None:
+    """Raise InvalidProblem where the user names a role that a table of this form does not use."""
+    for role in sorted(roles.told - set(used)):
+        what = f"the role {role} of the column {roles.by_role[role]!r} is not used in {roles.table.source}"
+        raise InvalidProblem(what, "--column", "leave it out, or say with --as what the table holds")
 
 
 def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Places:
@@ -376,6 +391,14 @@ def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Place
     return Places({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
 
+def in_space(place: Places) -> Places:
+    """Return stations with a third coordinate: 0 where their table gives none."""
+    if place.frame == "geodetic" or "z" in place.columns:
+        return place
+    flat = {"z": np.zeros(len(place.names))}
+    return replace(place, columns={**place.columns, **flat}, note=_FLAT.replace("height 0", "z = 0"))
+
+
 def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:
     """Return the numbers of a role in a unit; a column whose name has none is in it."""
     own = unit_of(roles.column(role), UNITS[quantity]) or unit
@@ -383,9 +406,13 @@ def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: 
     return values if own == unit else values * UNITS[quantity][own] / UNITS[quantity][unit]
 
 
+# Roles that give the third coordinate, the likeliest first: of latitude and longitude, and of x and y.
+_UPS = {"height": ("height", "depth"), "z": ("z", "height", "depth")}
+
+
 def _upwards(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
     """Return heights, None where there are none, and their unit; depths are heights that grow downwards."""
-    found = next((one for one in (role, "depth") if roles.find(one) is not None), None)
+    found = next((one for one in _UPS[role] if roles.find(one) is not None), None)
     if found is None:
         return None, unit or "m"
     unit = unit or unit_of(roles.column(found), UNITS["length"]) or "m"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
@@ -19,11 +20,8 @@ from optloc.base.units import (
     Conversion,
     Quantity,
     conversion,
-    sound_in_air,
-    sound_in_water,
 )
 from optloc.models import MODELS, Model, kind_named
-from optloc.models.medium import Atmosphere, Layers, Medium
 
 # Words that a file may get wrong, and amounts such as "30 ns".
 
@@ -58,6 +56,11 @@ class Units:
     speed: float = SPEED_OF_LIGHT
     carrier: float | None = None
     convention: AzimuthConvention = "east-counterclockwise"
+
+    @property
+    def clockwise(self) -> bool:
+        """Return whether numbers grow clockwise, as those of a compass do."""
+        return self.convention == "north-clockwise"
 
     def name(self, unit: str | None) -> str:
         """Return a unit; None is the SI unit."""
@@ -190,6 +193,19 @@ class StationsTable(DataTable):
     at each epoch."""
 
 
+class DeclinationTable(_Table):
+    """The magnetic declination of the World Magnetic Model at each station."""
+
+    date: str
+    """Day in ISO 8601, such as "2026-06-01"."""
+
+    @field_validator("date", mode="before")
+    @classmethod
+    def _written(cls, value: Any) -> Any:
+        """Return a date of TOML as text."""
+        return value.isoformat() if isinstance(value, date) else value
+
+
 def _kind_words() -> list[str]:
     return [*sorted(MODELS), *sorted(alias for model in MODELS.values() for alias in model.aliases)]
 
@@ -208,6 +224,9 @@ class MeasurementsTable(DataTable):
     azimuth: AzimuthConvention | None = None
     """Where azimuth zero is and which way it grows. Default: a compass (north-clockwise) for the kind `bearing`, and in
     format 2 wherever there is an Earth; else east-counterclockwise."""
+    declination: Amount | DeclinationTable | None = None
+    """Magnetic declination, east positive, of bearings from magnetic north: a number in the unit of z or an amount such
+    as "4 deg"; or a date such as "2026-06-01", at which the World Magnetic Model gives that of each station."""
     positive: Literal["a-farther", "b-farther"] = "a-farther"
     """Sign of differences (and sense of ratios): a against b, or b against a."""
     excess: bool = False
@@ -228,7 +247,7 @@ class MeasurementsTable(DataTable):
     duration: Amount | None = None
     """Seconds that are integrated for one measurement."""
     correction: Amount | None = None
-    """Known amount by which every row exceeds the model."""
+    """Known amount by which every row exceeds the model; of azimuths the angle by which all turn clockwise."""
     weight: float | None = Field(default=None, ge=0.0, le=1.0)
     """Weight of all rows: 1 as measured, 0 absent."""
     time_unit: str = "s"
@@ -376,13 +395,6 @@ class MediumTable(_Table):
     """Of an atmosphere: metres over which it falls to 1 / e; 7350 by default."""
 
 
-# Keys of each kind of medium.
-_MEDIA = {
-    "layers": ("depths", "speeds", "between", "surface", "unit", "speed_unit"),
-    "atmosphere": ("refractivity", "scale_height"),
-}
-
-
 class WindowTable(_Table):
     """How rows are put together to epochs by their times."""
 
@@ -414,67 +426,6 @@ class ProblemFile(_Table):
     constraints: list[ConstraintTable] = Field(default_factory=list, max_length=_MANY)
     covariance: list[list[float]] | None = None
     """Covariance of the rows of one epoch across all kinds, in the order of the file, in their units."""
-
-
-def medium_in(file: ProblemFile, source: str) -> Medium | None:
-    """Return what the waves of a problem file come through, None where their speed is one number."""
-    return None if file.medium is None else _medium(file.medium, _stated_speed(file, source), source)
-
-
-def speed_of(file: ProblemFile, source: str) -> float:
-    """Return the speed by which times are lengths, metres per second: light where a problem file names none."""
-    medium, stated = medium_in(file, source), _stated_speed(file, source)
-    if medium is not None:
-        return medium.unit_speed
-    return SPEED_OF_LIGHT if stated is None else stated
-
-
-def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
-    """Return the medium that a table states; `reference` is the propagation speed beside it, if there is one."""
-    place = join(source, "[medium]")
-    own = _MEDIA[table.kind]
-    given = {key for key in table.model_fields_set - {"kind"} if getattr(table, key) is not None}
-    wrong, lacking = sorted(given - set(own)), [key for key in ("depths", "speeds") if key in own and key not in given]
-    if wrong:
-        raise InvalidProblem(f"the kind {table.kind!r} has no {wrong[0]!r}", place, f"its keys are {', '.join(own)}")
-    if lacking:
-        raise InvalidProblem(f"the kind {table.kind!r} needs {lacking[0]}", place, "give a list of numbers")
-    if table.kind == "atmosphere" and reference is not None:
-        what = "an atmosphere has its own speed, that of light over the refractive index"
-        raise InvalidProblem(what, place, "leave propagation_speed out")
-    length, speed = (
-        Units(quantity).conversion(unit, place).to_si  # type: ignore[arg-type]
-        for quantity, unit in (("length", table.unit), ("speed", table.speed_unit))
-    )
-    try:
-        if table.kind == "atmosphere":
-            return Atmosphere(**{key: getattr(table, key) for key in given})
-        surface = Units("length").plain(table.surface, table.unit, place)
-        depth, speeds = (
-            tuple(float(to_si(v)) for v in values or ())
-            for to_si, values in ((length, table.depths), (speed, table.speeds))
-        )
-        return Layers(depth, speeds, table.between, surface, reference)
-    except InvalidProblem as error:
-        raise InvalidProblem(error.what, place, error.advice) from None
-
-
-def _stated_speed(file: ProblemFile, source: str) -> float | None:
-    """Return the propagation speed that a file states, metres per second."""
-    given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
-    if isinstance(given, SoundTable):
-        water = given.medium != "air"
-        if not water and (given.salinity is not None or given.depth):
-            raise InvalidProblem("air has no salinity and no depth", place, "leave them out")
-        usual = 35.0 if given.medium == "sea water" else 0.0
-        salinity = usual if given.salinity is None else given.salinity
-        return sound_in_water(given.celsius, salinity, given.depth) if water else sound_in_air(given.celsius)
-    if given is None:
-        return None
-    speed = Units("speed").plain(given, "m/s", place)
-    if not speed > 0.0:
-        raise InvalidProblem(f"the speed {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
-    return speed
 
 
 def schema() -> dict[str, Any]:

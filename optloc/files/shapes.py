@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from decimal import Decimal
 from typing import Any
@@ -13,6 +13,8 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.files.cells import instants, is_dated, moments, numbers
+from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
+from optloc.files.headings import from_bow, heading_of
 from optloc.files.readings import (
     CARTESIAN,
     COMPASS,
@@ -21,12 +23,13 @@ from optloc.files.readings import (
     Readings,
     Told,
     in_unit,
+    sigma_told,
     sort_named,
     unit_for,
     without_gaps,
     without_repeats,
 )
-from optloc.files.roles import Places, Roles, placed, stem, unit_of
+from optloc.files.roles import Places, Roles, placed
 from optloc.files.schema import Units
 from optloc.files.table import Table
 from optloc.models import BEARING
@@ -42,20 +45,35 @@ def wide(roles: Roles, told: Told, columns: Sequence[Named], place: Places) -> l
     """Return the readings of a table that has a column for each receiver, one set for each sort."""
     sorts: dict[str, list[Named]] = {}
     for one in columns:
+        if one.sigma:
+            continue
         name = one.form or told.what or ("tdoa" if one.minus else None)
         if name is None:
             shown = ", ".join(repr(each.column) for each in columns[:_SHOWN])
             advice = "say it with --as arrivals, --as range, --as tdoa or another kind"
             raise InvalidProblem(f"columns such as {shown} do not tell what they hold", roles.table.source, advice)
         sorts.setdefault(name, []).append(one)
-    return [_wide_sort(roles, sort_named(name), told, chosen, place) for name, chosen in sorts.items()]
+    errors = [one for one in columns if one.sigma]
+    forms = {name: sort_named(name) for name in sorts}
+    return [_wide_sort(roles, forms[name], told, chosen, errors, place, forms) for name, chosen in sorts.items()]
 
 
-def _wide_sort(roles: Roles, form: Form, told: Told, columns: Sequence[Named], place: Places) -> Readings:
+def _wide_sort(
+    roles: Roles,
+    form: Form,
+    told: Told,
+    columns: Sequence[Named],
+    errors: Sequence[Named],
+    place: Places,
+    forms: Mapping[str, Form],
+) -> Readings:
+    """Return the readings of one sort; `errors` are the columns of standard deviations, `forms` all sorts by name."""
     table = roles.table
     values: list[Decimal] = []
     rows, cells, ends, notes = [], [], [], []
-    first, empty, dated = "", 0, False
+    deviations: list[Array] = []
+    errors_used: list[str] = []
+    first, empty = "", 0
     for one in columns:
         dated = form.quantity == "length" and is_dated(table, one.column)
         held = instants(table, one.column, told.zone) if dated else numbers(table, one.column)
@@ -68,13 +86,84 @@ def _wide_sort(roles: Roles, form: Form, told: Told, columns: Sequence[Named], p
         rows += pick
         cells += [one.column] * len(pick)
         ends += [_ends(one, form, told, table.source)] * len(pick)
+        own = next((each.column for each in errors if _is_error_of(each, one, form)), None)
+        own = None if sigma_told(told, form.kind) is not None else own
+        own = own or sigma_column(roles, form, told, list(forms.values()))
+        if own is not None:
+            deviations.append(sigma_of(table, own, form, first, pick))
+            errors_used.append(own)
     if not values:
         raise InvalidProblem("no cell holds a reading", table.source, "look at the columns of the receivers")
     pairs = form.stations > 1
     minus = all(one.minus or len(one.ends) == 1 for one in columns)
     found = Readings(form, first, values, np.array(rows), cells, np.array([a for a, _ in ends], dtype=object))
     found = replace(found, b=np.array([b for _, b in ends], dtype=object) if pairs else None, notes=tuple(notes))
+    if len(deviations) == len(columns):
+        found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
     return _settled(found, roles, told, place, empty, "a-farther" if minus else None)
+
+
+def _is_error_of(error: Named, one: Named, form: Form) -> bool:
+    """Return whether a column holds the standard deviations of another column of the same receivers."""
+    kinds = (None, one.form, form.kind)
+    return error.ends == one.ends and error.form in kinds and _allows(form, error.column)
+
+
+def _allows(form: Form, column: str) -> bool:
+    """Return whether a column's name ends in a unit of a sort, or in none."""
+    unit = any_unit(column)
+    return unit is None or unit in UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
+
+
+def sigma_column(roles: Roles, form: Form, told: Told, forms: Sequence[Form]) -> str | None:
+    """Return the column of standard deviations of a sort of readings, None where --sigma states them or none has them.
+
+    Parameters
+    ----------
+    roles : Roles
+        The table.
+    form : Form
+        The sort.
+    told : Told
+        What the user says of the table.
+    forms : sequence of Form
+        All sorts of the table.
+
+    Raises
+    ------
+    InvalidProblem
+        Where a column may belong to several sorts.
+    """
+    if sigma_told(told, form.kind) is not None:
+        return None
+    named = roles.by_role.get(f"sigma_{form.kind}")
+    named = named or next((name for name in roles.table.columns if sigma_kind(name) == form.kind), None)
+    if named is not None and _allows(form, named):
+        return named
+    column = roles.find("sigma")
+    if column is None or not _allows(form, column):
+        return None
+    others = [one for one in forms if _allows(one, column)]
+    if (any_unit(column) is None and len({one.quantity for one in others}) > 1) or len(others) > 1:
+        kinds = " or ".join(one.kind for one in others)
+        advice = f"say --column sigma_{others[0].kind}={column}, or give all of them with --sigma"
+        raise InvalidProblem(f"the column {column!r} may be the error of {kinds}", roles.table.source, advice)
+    return column
+
+
+def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Sequence[int]) -> Array:
+    """Return the standard deviations of some rows in the unit of their values."""
+    known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
+    own = unit_of(column, known) or unit
+    if {own, unit} & set(UNITS["time"]) and not {own, unit} <= set(UNITS["time"]) and form.quantity == "length":
+        advice = "give both in one unit, or say --sigma"
+        raise InvalidProblem(f"it is in {own}, its readings are in {unit}", table.where(column), advice)
+    held = numbers(table, column)
+    for row in pick:
+        if held[row] is None:
+            advice = "give a number, or leave the row out"
+            raise InvalidProblem("the reading has no standard deviation", table.where(column, row), advice)
+    return np.array([float(held[row]) for row in pick]) * known[own] / known[unit]  # type: ignore[arg-type]  # checked
 
 
 def _ends(one: Named, form: Form, told: Told, source: str) -> tuple[str, str | None]:
@@ -115,8 +204,24 @@ def inline(roles: Roles, told: Told) -> tuple[Places, Array]:
     return replace(every, columns=columns), np.array(heard, dtype=object)
 
 
-def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | None) -> Readings:
-    """Return the readings of a table that has one a row; `heard` are stations that are known without a column."""
+def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | None, forms: Sequence[Form]) -> Readings:
+    """Return the readings of one sort of a table that has one a row.
+
+    Parameters
+    ----------
+    roles : Roles
+        The table.
+    form : Form
+        The sort.
+    told : Told
+        What the user says of the table.
+    place : Places
+        The stations.
+    heard : object array (m,), optional
+        Stations of the rows, where the table has no column of them.
+    forms : sequence of Form
+        All sorts of the table.
+    """
     table = roles.table
     if form.value == "sp" and roles.find("sp") is None:
         return _picks(roles, told, place)
@@ -131,8 +236,8 @@ def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | Non
     positive, b = ("a-farther", None) if form.stations == 1 else _others(roles, told)
     found = Readings(form, unit, [value for value in held if value is not None], pick, [column] * len(pick), a[pick])
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
-    if roles.find("sigma") is not None and told.sigma is None:
-        found = replace(found, sigma=_own_sigma(roles, form, unit)[pick])
+    if (own := sigma_column(roles, form, told, forms)) is not None:
+        found = replace(found, sigma=sigma_of(table, own, form, unit, pick.tolist()), errors=(own,))
     return _settled(found, roles, told, place, table.count - len(pick), positive)
 
 
@@ -146,13 +251,6 @@ def _others(roles: Roles, told: Told) -> tuple[str | None, Array]:
         raise InvalidProblem("no column looks like the second station", roles.table.source, advice)
     against = stem(column) in ("reference", "ref", "refstation", "b")
     return ("a-farther" if against else None), roles.labels("reference")
-
-
-def _own_sigma(roles: Roles, form: Form, unit: str) -> Array:
-    """Return the standard deviations of a table in the unit of its values."""
-    known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
-    own = unit_of(roles.column("sigma"), known) or unit
-    return roles.numbers("sigma") * known[own] / known[unit]
 
 
 def _picks(roles: Roles, told: Told, place: Places) -> Readings:
@@ -220,6 +318,8 @@ def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: in
     found = _with_digits(found, table)
     keys = _keys(found, roles, told)
     found = without_gaps(found, [keys[row] for row in found.row.tolist()], told, table, empty)
+    if found.form.kind == "azimuth" and (heading := heading_of(found, roles, told)) is not None:
+        found = from_bow(found, roles, heading, told)
     if not told.still:
         found = without_repeats(found, [keys[row] for row in found.row.tolist()], told, table)
     signed = found.form.stations > 1 and found.form.kind != "range_sum"
@@ -256,6 +356,8 @@ def _with_digits(found: Readings, table: Table) -> Readings:
 def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readings:
     """Return azimuths with their convention: as told, as their name says, or, on Earth, that of a compass."""
     named = any(word in stem(found.cells[0]) for word in (BEARING, "brg", "compass", "heading"))
+    if found.heading is not None:
+        return found
     if told.azimuth is not None or named:
         return replace(found, azimuth=told.azimuth or COMPASS)
     if place.frame == "cartesian":
@@ -287,14 +389,19 @@ def epochs_of(roles: Roles, told: Told, found: Sequence[Readings]) -> dict[str, 
         taken.add(target)
     if told.still:
         return out
-    if told.window is not None and found[0].form.value == "time" and long:
-        return out | {"epoch": _clusters(found[0], told.window, table.count)}
     message, when = (None if (name := roles.find(role)) in taken else name for role in ("message", "time"))
+    if told.window is not None and found[0].form.kind == "toa" and when is None and long:
+        return out | {"epoch": _clusters(found[0], told.window, table.count)}
+    if told.window is not None and when is None:
+        raise _no_times()
     if message is not None and told.window is None:
         out["epoch"] = roles.labels("message")
-    time = None if when is None else moments(roles, when, told.zone)
+    time = None if when is None else moments(roles, when, told.zone, told.time_unit)
     if time is not None:
         out["time"] = time
+    elif when is not None and told.window is not None:
+        advice = "say it with --time-unit, such as --time-unit ns"
+        raise InvalidProblem(f"the unit of the times in column {when!r} is not known", table.source, advice)
     elif when is not None and message is None:
         out["epoch"] = roles.labels("time")
     if not long and not out.keys() & {"epoch", "time"}:
@@ -302,9 +409,17 @@ def epochs_of(roles: Roles, told: Told, found: Sequence[Readings]) -> dict[str, 
     return out
 
 
+def _no_times() -> InvalidProblem:
+    advice = "name the column of times with --column time=NAME, and its unit with --time-unit"
+    return InvalidProblem("a window needs a column of times", "--window", advice)
+
+
 def _clusters(found: Readings, window: str, count: int) -> Array:
     """Return the message (n,) of each row of arrivals: of the same are those less than a window apart."""
-    factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / Decimal(repr(UNITS["length"][found.unit]))
+    # Arrivals in metres are times that the speed of light has multiplied.
+    seconds = Decimal(repr(UNITS["length"][found.unit]))
+    seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))
+    factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / seconds
     out, label, last = np.full(count, "", dtype=object), 0, None
     for i in sorted(range(len(found.values)), key=lambda i: found.values[i]):
         label += last is None or found.values[i] - last > factor

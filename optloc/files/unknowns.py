@@ -197,7 +197,8 @@ def bias_of(
         targets=epochs.targets,
         where=where,
     )
-    # Which way an angle is counted does not matter to an error of it.
+    _check_sense(bias, rows, written, where)
+    # Priors and estimates are in the sense of the readings, which the coefficients of the bias hold.
     spelled = {
         (replace(units, convention="east-counterclockwise"), name)
         for numbers, units, name in written
@@ -207,6 +208,21 @@ def bias_of(
     bias = changing(bias, epochs.clock, where, **_change(table, [units for units, _ in spelled], where))
     mean, sigma = _prior(table, [units for units, _ in spelled], prior_shape(bias, dimension), where)
     return replace(bias, mean=mean, sigma=sigma), _unit_to_read(table.form, spelled, where)
+
+
+def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array, Units, str]], where: str) -> None:
+    """Refuse a bias of azimuths that are counted both ways, and a scale of those that are counted from north."""
+    ends = np.cumsum([block.count for block in rows])
+    touched = {int(i) for i in np.unique(np.searchsorted(ends, bias.row, side="right"))}
+    senses = {rows[i].sense for i in touched if rows[i].kind == "azimuth"}
+    if len(senses) > 1 and bias.form != "time":
+        what = "it touches azimuths that are counted clockwise and others that are counted anticlockwise"
+        advice = "count all of them one way, or name with members who is read which way"
+        raise InvalidProblem(what, where, advice)
+    north = any(units.convention != "east-counterclockwise" for n, units, _ in written if np.isin(bias.row, n).any())
+    if bias.form == "scale" and north:
+        what = "a scale of bearings would count from the x axis, not from north"
+        raise InvalidProblem(what, where, 'use the form "offset", or azimuth = "east-counterclockwise"')
 
 
 def _change(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, Any]:

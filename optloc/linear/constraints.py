@@ -308,6 +308,11 @@ def _kind(problem: Problem, level: Level) -> str:
     return constraint.kind if isinstance(constraint, Band) else "plane"
 
 
+def is_height(problem: Problem, level: Level) -> bool:
+    """Return whether a level is of a height above the Earth."""
+    return _kind(problem, level) == "height"
+
+
 def is_exact(constraint: Band | Polygon) -> bool:
     """Return whether a constraint is an equality."""
     return isinstance(constraint, Band) and bool(np.all(constraint.lower == constraint.upper))

@@ -13,11 +13,9 @@ from optloc.base.arrays import as_number, eye, gather, library, placed
 from optloc.base.linalg import Tangent
 from optloc.base.types import Array, Rows
 from optloc.linear import chain
-from optloc.linear.constraints import exact
 from optloc.linear.evaluate import differentiate
-from optloc.linear.walks import chain_at, free_of, walk_names, walks
+from optloc.linear.walks import chain_at, walks
 from optloc.models import MODELS
-from optloc.problem.epochs import windows
 from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, together, whiten
 from optloc.problem.problem import Problem
 
@@ -555,40 +553,3 @@ def _block_diagonal(blocks: Array) -> Array:
     apart = placed(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
     whole: Array = library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))
     return whole
-
-
-# Degrees of freedom: what the rows say more than the unknowns need.
-
-
-def degrees_of_freedom(problem: Problem) -> Array:
-    """Return rows present (the rank of their noise) less unknowns without a prior, (N,)."""
-    rank: Any = np.zeros(problem.batch_shape, dtype=int)
-    heard: Any = 0
-    for _, _, part in windows(problem, len(problem.weight) if problem.weight.ndim > 1 else 1):
-        for whitener in whiten(part.noise, part.weight):
-            # One matrix may stand for all groups; a whitener has as many rows that are not zero as its covariance has
-            # rank.
-            same = len(whitener.row) if whitener.matrix.shape[-3] == 1 else 1
-            rank = rank + same * (whitener.matrix != 0.0).any(-1).sum((-1, -2))
-        heard = heard + _heard(part)
-    # What has a prior brings a row of its own, and counts for nothing.
-    known = (
-        {prior.name for prior in problem.priors}
-        | {b.name for b in problem.biases if b.sigma is not None}
-        | {name for name, _, _ in problem.stations.errors}
-        | {*walk_names(problem)}
-    )
-    layout = problem.layout
-    unknowns: Any = sum(slot.size for slot in layout.shared if slot.name not in known)
-    unknowns = unknowns + heard * sum(slot.size for slot in layout.local if slot.name not in known)
-    # steps of walks are rows and unknowns alike: what is left is how they begin
-    unknowns = unknowns + free_of(problem)
-    return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
-
-
-def _heard(problem: Problem) -> Array:
-    """Return the number of epochs with a row that is present, (...)."""
-    # Local unknowns of an epoch without a row are no unknowns of these data.
-    order = np.argsort(problem.epoch, kind="stable")
-    _, first = np.unique(problem.epoch[order], return_index=True)
-    return np.asarray(np.maximum.reduceat(problem.weight[..., order] > 0.0, first, axis=-1).sum(-1))

@@ -40,6 +40,7 @@ def state_of(events: Events, unwritten: dict[str, Event]) -> Record:
         times = [[site.stations[i], str(value)] for i, value in event.times.items()]
         about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
         about |= {"when": None if event.when is None else str(event.when), "track": event.track}
+        about |= {"refused": event.refused} if event.refused else {}
         return {"event": event.name, "rows": rows, "times": times, **about}
 
     return {
@@ -103,7 +104,8 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     entries = [_parts(entry, 2, "times") for entry in _typed(each.get("times"), list, "times")]
     heard = [{"station": station, "time_ps": time} for station, time in entries]
     rows, sigmas, times = rows_and_arrivals(given, heard, site)
-    if not rows and not times:
+    refused = _typed(each.get("refused", ""), str, "refused")
+    if not rows and not times and not refused:
         raise InvalidProblem("an event has no rows", "rows")
     name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
@@ -114,6 +116,7 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     # checkpoints from before there were tracks have neither
     event.when = None if each.get("when") is None else picoseconds(each["when"], "time_ps")
     event.track = _typed(each.get("track", False), bool, "track")
+    event.refused = refused
     return event
 
 

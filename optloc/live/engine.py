@@ -128,7 +128,12 @@ class Engine:
 
     def settle(self, events: Iterable[Event]) -> None:
         """Answer events that have closed, and let their proofs be made; or hand them to their tracks."""
-        closed = list(events)
+        closed = []
+        for event in events:
+            if event.refused:
+                self._fail(event, event.refused)
+            else:
+                closed.append(event)
         followed = [event for event in closed if event.track]
         if followed:
             scans = [Scan(e, group.ready.fast.problem, z) for group in self._groups(followed) for e, z in _pairs(group)]

@@ -14,7 +14,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import has_controls
 from optloc.base.units import LARGEST
 from optloc.live.metrics import Metrics
-from optloc.live.site import Row, Site
+from optloc.live.site import Row, Site, UnknownName
 
 # One line.
 
@@ -93,7 +93,7 @@ def parse(line: bytes, site: Site) -> Message:
     Raises
     ------
     InvalidProblem
-        Where it says nothing of the kind; the sentence names the key.
+        Where it says nothing of the kind; the sentence names the key. `UnknownName` says whose event it is.
     """
     if len(line) > LINE:
         raise InvalidProblem(f"the line has {len(line)} bytes, {LINE} at most", None, "send fewer rows a line")
@@ -136,6 +136,21 @@ def _general(found: dict[str, Any], site: Site) -> Message:
     if len(ways) != 1 and ways != ["rows", "arrivals"]:
         what = f"the line has {' and '.join(ways)}" if ways else "the line has no rows"
         raise InvalidProblem(what, None, "give one of z, rows, arrivals, station, kind")
+    more = found.get("more", ways[0] in ("station", "kind"))
+    if type(more) is not bool:
+        raise InvalidProblem("it is neither true nor false", "more", "say true where more rows are to come")
+    try:
+        rows, sigmas, times = _named(found, ways, site)
+    except UnknownName as error:
+        error.event, error.whole = event, not more
+        raise
+    return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, ways))
+
+
+def _named(
+    found: dict[str, Any], ways: list[str], site: Site
+) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
+    """Return the values, the standard deviations and the arrivals of a line, by the names that it gives."""
     rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
     if "rows" in ways:
         for entry in _list(found["rows"], "rows"):
@@ -149,10 +164,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
         _arrival(found, site, times)
     elif "kind" in ways:
         _row(found, site, rows, sigmas)
-    more = found.get("more", ways[0] in ("station", "kind"))
-    if type(more) is not bool:
-        raise InvalidProblem("it is neither true nor false", "more", "say true where more rows are to come")
-    return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, ways))
+    return rows, sigmas, times
 
 
 def _event(found: Mapping[str, Any]) -> str:
@@ -239,9 +251,7 @@ def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> Non
         what = "the site has neither toa nor tdoa rows, so that it cannot take arrivals"
         raise InvalidProblem(what, "station", "send values: kind, a, b, z")
     if type(station) is not str or station not in site.number:
-        raise InvalidProblem(
-            f"there is no station {str(station)[:40]!r}", "station", nearest(str(station), site.number)
-        )
+        raise UnknownName(f"there is no station {str(station)[:40]!r}", "station", nearest(str(station), site.number))
     given = [key for key in _DIGITS if key in found]
     if len(given) != 1:
         raise InvalidProblem("an arrival needs one time", "station", "give time_ns, time_ps or time")
@@ -346,6 +356,8 @@ class Event:
         Whether it is answered by the state of its track, in the place of a fix.
     reply : Reply, optional
         Who waits for its answers.
+    refused : str
+        Why it is not solved: a line of it names a station or a kind that the site does not have.
     """
 
     name: str
@@ -361,6 +373,7 @@ class Event:
     reply: Reply | None = None
     when: int | None = None
     track: bool = False
+    refused: str = ""
 
 
 @dataclass(slots=True)
@@ -432,17 +445,45 @@ class Events:
             if message.whole:
                 self._close(event, "whole", now)
                 return
-            self.open[message.event] = event
-            if len(self.open) > self.most:
-                counts["early"] += 1
-                oldest = next(iter(self.open))
-                self._close(self.open.pop(oldest), "early", now)
+            self._open(event, now)
         else:
             self._join(event, message)
             self._wait_for(event, reply)
         if message.whole or self._is_whole(event):
             self.open.pop(event.name, None)
             self._close(event, "whole", now)
+
+    def refuse(self, error: UnknownName, now: float, when: float, *, track: bool = False) -> None:
+        """Refuse the event of a line that names an unknown station or kind, where other lines belong to it as well.
+
+        The event is answered by the sentence of the error when it closes: without the rows of this line it would be
+        another event. A line that is a whole event is refused by itself, and may be sent again.
+
+        Parameters
+        ----------
+        error : UnknownName
+            What is wrong with the line.
+        now, when, track
+            As of `take`.
+        """
+        if self.part[1] > 1 and share_of(error.event, self.part[1]) != self.part[0]:
+            return
+        event = self.open.get(error.event)
+        if event is None:
+            if error.whole or not error.event or error.event in self.closed:
+                return
+            event = Event(error.event, {}, {}, when, now, track=track)
+            self._open(event, now)
+        event.refused = event.refused or str(error)
+        if error.whole:
+            self._close(self.open.pop(event.name), "whole", now)
+
+    def _open(self, event: Event, now: float) -> None:
+        self.open[event.name] = event
+        if len(self.open) > self.most:
+            self.metrics.counts["early"] += 1
+            oldest = next(iter(self.open))
+            self._close(self.open.pop(oldest), "early", now)
 
     def due(self, when: float, now: float) -> None:
         """Close what has waited long enough; times as of `take`."""
@@ -540,7 +581,7 @@ class Events:
             again = Event(
                 event.name, {**message.rows, **event.rows}, {**message.times, **event.times}, now, now,
                 {**(message.sigmas or {}), **event.sigmas}, event.target or message.target,
-                "late", event.revision + 1, event.conflict or bool(other), None, event.when, event.track,
+                "late", event.revision + 1, event.conflict or bool(other), None, event.when, event.track, event.refused,
             )  # fmt: skip
             counts["revisions"] += 1
             self.closed[event.name] = again

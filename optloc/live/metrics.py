@@ -31,7 +31,7 @@ COUNTS = {
     "elsewhere": "rows of events that other processes answer",
     "dropped": "messages of a broker that were dropped because the input was full",
     "refused": "requests that were refused because the input was full",
-    "unsolvable": "events whose rows make no problem",
+    "unsolvable": "events whose rows make no problem, or name what the site does not have",
     "tracked": "events that were taken into a track",
     "unordered": "events that came after a later one of their track, and were refused",
     "forgotten": "tracks that were forgotten: silent for too long, too many, or failed",

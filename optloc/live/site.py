@@ -18,8 +18,9 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array
 from optloc.base.units import Conversion
+from optloc.files.propagation import speed_of
 from optloc.files.reader import Draft, assemble
-from optloc.files.schema import ProblemFile, join, name_of, read_document, speed_of
+from optloc.files.schema import ProblemFile, join, name_of, read_document
 from optloc.files.table import Table, table_of
 from optloc.files.unknowns import FREE, places_of
 from optloc.models import MODELS
@@ -32,6 +33,21 @@ FAST = "gtrs+lsr"
 _KEPT = 64
 # Settings that a row may bring along in a table of the site, beside its stations.
 _OWN = ("sigma", "weight", "correction")
+
+
+class UnknownName(InvalidProblem):
+    """A line names a station or a kind that the site does not have.
+
+    Attributes
+    ----------
+    event : str
+        The event of the line, "" where it is not known.
+    whole : bool
+        Whether the event consists of this line alone.
+    """
+
+    event: str = ""
+    whole: bool = True
 
 
 class Row(NamedTuple):
@@ -177,8 +193,10 @@ class Site:
 
         Raises
         ------
-        InvalidProblem
+        UnknownName
             For a kind that the site has not, or a station that it does not know.
+        InvalidProblem
+            Where there is a station too many or too few.
         """
         known = self.index.get((kind, a, b))
         if known is not None:
@@ -186,14 +204,14 @@ class Site:
         alike = [row for row in self.rows if row.kind == kind]
         if not alike:
             kinds = list(dict.fromkeys(row.kind for row in self.rows))
-            raise InvalidProblem(f"the site has no rows of the kind {kind[:40]!r}", "kind", nearest(kind, kinds))
+            raise UnknownName(f"the site has no rows of the kind {kind[:40]!r}", "kind", nearest(kind, kinds))
         count = MODELS[kind].stations
         for key, name, needed in (("a", a, count > 0), ("b", b, count > 1)):
             if bool(name) != needed:
                 what = "the station is missing" if needed else "there is a station too many"
                 raise InvalidProblem(what, key, f"{kind} rows name {count} of them")
             if needed and name not in self.number:
-                raise InvalidProblem(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
+                raise UnknownName(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
         if a == b and count > 1:
             raise InvalidProblem(f"{kind} names station {a!r} twice", "b", "name two stations")
         return Row(alike[0].section, -1, kind, a, b)

@@ -26,7 +26,8 @@ Adapter = Callable[[bytes], bytes]
 class ChirpStack:
     """Uplinks of ChirpStack (version 4, JSON) whose gateways have fine timestamps.
 
-    The event is the deduplication id, the target the device; gateways that the site does not know are left out.
+    The event is the deduplication id, the target the device. Gateways of other networks hear a device, too: those that
+    the site does not have are left out, and each is named once in a warning.
 
     Parameters
     ----------
@@ -36,13 +37,16 @@ class ChirpStack:
 
     def __init__(self, stations: Collection[str]) -> None:
         self._stations = frozenset(stations)
+        self._foreign: set[str] = set()
 
     def __call__(self, line: bytes) -> bytes:
         """Return an uplink as a whole event."""
         found = _object(line)
         if found is None or not isinstance(found.get("rxInfo"), list):
             return line
-        heard = [each for each in found["rxInfo"] if isinstance(each, dict) and each.get("gatewayId") in self._stations]
+        every = [each for each in found["rxInfo"] if isinstance(each, dict) and isinstance(each.get("gatewayId"), str)]
+        heard = [each for each in every if each["gatewayId"] in self._stations]
+        self._warn({each["gatewayId"] for each in every} - self._stations)
         arrivals = [
             {"station": each["gatewayId"], "time": str(each["fineTimeSinceGpsEpoch"]).removesuffix("s")}
             for each in heard
@@ -52,6 +56,12 @@ class ChirpStack:
         target = device.get("devEui") if isinstance(device, dict) else None
         event = {"event": found.get("deduplicationId"), "arrivals": arrivals} | ({"target": target} if target else {})
         return json.dumps(event).encode()
+
+    def _warn(self, foreign: set[str]) -> None:
+        """Name gateways that the site does not have, each once."""
+        for name in sorted(foreign - self._foreign) if len(self._foreign) < _MESSAGES else ():
+            self._foreign.add(name)
+            LOG.warning("gateway %r is no station of the site: its arrivals are left out", name[:40])
 
 
 # Nanoseconds within which receivers of one network hear the same transmission, and messages that are remembered: equal

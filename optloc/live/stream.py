@@ -24,7 +24,7 @@ from optloc.live.engine import BATCH, Engine
 from optloc.live.events import LINE, Events, parse
 from optloc.live.metrics import Metrics
 from optloc.live.queues import Inbox, Line, Outbox, Ticket
-from optloc.live.site import Site, read_site
+from optloc.live.site import Site, UnknownName, read_site
 from optloc.live.tracks import Following, Tracks
 
 LOG = logging.getLogger("optloc.live")
@@ -278,17 +278,20 @@ class Stream:
         refused = None
         if data:
             counts["lines"] += 1
+            track = self._settings.track if line.track is None else line.track
             try:
                 message = parse(data, self.site)
                 self._keep(data, line.stamp)
                 if message.command:
                     refused = self._obey(message.command)
                 else:
-                    track = self._settings.track if line.track is None else line.track
                     self._events.take(message, line.stamp, line.when, ticket, track=track)
             except Exception as error:  # a stream goes on, whatever one line brings to light
                 if not isinstance(error, InvalidProblem):
                     LOG.exception("line %d of %s failed", line.number, line.source)
+                if isinstance(error, UnknownName):
+                    self._keep(data, line.stamp)
+                    self._events.refuse(error, line.stamp, line.when, track=track)
                 counts["malformed"] += 1
                 refused = {"error": str(error), "line": line.number, "source": line.source}
                 if ticket is None:

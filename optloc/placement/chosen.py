@@ -13,6 +13,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.bounds.bound_map import bound_map, extent, plan_of
 from optloc.bounds.crlb import crlb
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.simulate import simulate
 from optloc.placement.best_set import Searched, Task, random_sets, search
 from optloc.placement.sites import LETTER, Plan, Posed, pose
@@ -313,12 +314,9 @@ def _before(posed: Posed, task: Task) -> tuple[Array, tuple[str, ...]]:
 
 
 def _redundancy(posed: Posed, chosen: Array) -> Array:
-    """Return rows in sight less unknowns without a prior of their own (P,)."""
-    rows = (posed.assembled(chosen).weight > 0.0).sum(-1)
-    given = {prior.name for prior in posed.plan.problem.priors}
-    slots = (*posed.problem.layout.shared, *posed.problem.layout.local)
-    known = {bias.name for bias in posed.problem.biases if bias.sigma is not None} | given
-    return np.asarray(rows - sum(slot.size for slot in slots if slot.name not in known))
+    """Return the degrees of freedom (P,) of a fix from chosen sites, with the priors of the plan alone."""
+    problem = replace(posed.assembled(chosen), priors=posed.plan.problem.priors)
+    return np.asarray(degrees_of_freedom(problem))
 
 
 def _swaps(task: Task, names: Sequence[str], chosen: Array) -> Iterator[Swap]:

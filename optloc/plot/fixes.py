@@ -16,12 +16,12 @@ from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS, RAY, Point
 from optloc.models.layers import Layers
 from optloc.plot import style
-from optloc.plot.outlines import rings
 from optloc.plot.style import (
     BLACK,
     BLUE,
     GREEN,
     GREY,
+    HEIGHT,
     ORANGE,
     PLAN,
     PURPLE,
@@ -100,7 +100,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     panels = figure.subplots(1, count, squeeze=False)[0]
     sizes = [_overview(panels[0], scene, PLAN)]
     if spatial:
-        _overview(panels[1], scene, (0, 2))
+        _overview(panels[1], scene, HEIGHT)
     if near:
         sizes.append(_close(panels[-1], scene))
     if len(every) == 1 and every[0].code.size == 1 and np.isfinite(scene.fixes).all():
@@ -200,14 +200,14 @@ def _shift(scene: Scene, centre: Array) -> Scene:
 
 
 def _reach(scene: Scene, known: Array, centre: Array) -> float:
-    outlined = np.array([bool(pieces) for pieces in scene.outlines] or [False] * len(known))
+    outlined = np.array([bool(regions) for regions in scene.outlines] or [False] * len(known))
     semi_axes, _ = error_ellipse(scene.covariances[known & ~outlined][:, :2, :2])
     largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)
-    for fix, pieces in zip(scene.fixes, scene.outlines, strict=False):
-        for line in rings([piece[:, :2] for piece in pieces]):
+    for fix, regions in zip(scene.fixes, scene.outlines, strict=False):
+        for line in regions[PLAN].lines if regions else []:
             # The part around the fix, whole; other parts are other positions, which the overview shows.
-            if (line.min(0) <= fix[:2]).all() and (fix[:2] <= line.max(0)).all():
-                largest = max(float(largest), float(np.abs(line - centre).max()) / _SPREAD)
+            if (line.min(0) <= 0.0).all() and (line.max(0) >= 0.0).all():
+                largest = max(float(largest), float(np.abs(fix[:2] + line - centre).max()) / _SPREAD)
     away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
     reach = _SEMI_AXES * float(largest) + _SPREAD * float(np.quantile(away, 0.95))
     return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)

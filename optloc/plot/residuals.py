@@ -41,6 +41,8 @@ Sets = dict[str, tuple[Array, float]]
 def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
     """Return a picture of the residuals z - h(x) by station or pair of stations, one panel for each kind.
 
+    Residuals of compass bearings are clockwise.
+
     A bar reaches over twice the standard deviation of a row, the other way of its zero too. Of many residuals the box
     holds the middle half. A fix follows its measurements, so that residuals are smaller than errors: `optloc.health`
     compares each station with what the others say.
@@ -76,7 +78,7 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
     sigma = np.broadcast_to(np.sqrt(variances(weighed(part, vectors).noise, part.count)), residual.shape)
     weight = np.broadcast_to(part.weight, residual.shape)
     sets = [
-        _sets(part, rows, residual[:, cols], sigma[:, cols], weight[:, cols])
+        _sets(part, rows, rows.sense * residual[:, cols], sigma[:, cols], weight[:, cols])
         for rows, start in zip(part.rows, part.starts, strict=True)
         for cols in [slice(start, start + rows.count)]
     ]

@@ -16,11 +16,12 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.outputs import visible, written
 from optloc.base.types import Array, Band, Polygon, Status
 from optloc.linear.courses import course_at, elapsed
-from optloc.plot.outlines import Pieces, pieces_of, rings
+from optloc.plot.outlines import outlines_of
 from optloc.problem.chart import CARTESIAN
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.uncertainty.outline import Outline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,6 +36,7 @@ View = tuple[int, int]
 """Which two of the scene's axes a panel shows."""
 
 PLAN: View = (0, 1)
+HEIGHT: View = (0, 2)
 # Places of a note around its point, points of 1/72 inch, the usual one first; and where text ends on either side of it.
 _PLACES = ((5, 5), (-5, 5), (5, -5), (-5, -5), (0, 8), (0, -8), (9, 0), (-9, 0), (14, 14), (-14, 14), (14, -14))
 _ASIDE: dict[int, Literal["left", "center", "right"]] = {-1: "right", 0: "center", 1: "left"}
@@ -255,8 +257,8 @@ class Scene:
         The same as the alternatives have it.
     known : tuple of array (k, d)
         Places of known targets.
-    outlines : tuple of n tuples of array (v, d)
-        Convex parts of the region of each fix that no ellipse covers; empty for the others.
+    outlines : tuple of n dicts of View to Outline
+        The region of each fix that no ellipse covers, in the views of a picture; empty for the others.
     local : bool array (n,), optional
         Where an ellipse does not cover, and what does is not known.
     """
@@ -274,11 +276,11 @@ class Scene:
     paths: tuple[Array, ...] = ()
     other_paths: tuple[Array, ...] = ()
     known: tuple[Array, ...] = ()
-    outlines: tuple[Pieces, ...] = ()
+    outlines: tuple[dict[View, Outline], ...] = ()
     local: Array | None = None
 
     def moved(self, change: Callable[[Array], Array]) -> Scene:
-        """Return the scene with all positions changed; regions and covariances stay."""
+        """Return the scene with all positions changed; regions, outlines about the fixes and covariances stay."""
         return replace(
             self,
             stations=change(self.stations),
@@ -288,16 +290,7 @@ class Scene:
             paths=tuple(change(part) for part in self.paths),
             other_paths=tuple(change(part) for part in self.other_paths),
             known=tuple(change(part) for part in self.known),
-            outlines=tuple(_changed(pieces, change) for pieces in self.outlines),
         )
-
-
-def _changed(pieces: Pieces, change: Callable[[Array], Array]) -> Pieces:
-    """Return convex parts with all corners changed at once: there may be thousands."""
-    if not pieces:
-        return ()
-    ends = np.cumsum([len(piece) for piece in pieces])[:-1]
-    return tuple(np.split(change(np.concatenate(pieces)), ends))
 
 
 def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) -> Scene:
@@ -316,7 +309,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
     regions = () if problem.frame.kind == "ecef" else _regions(problem, reach)
     paths, other = _paths(problem, fixes)
     known = tuple(m.known.reshape(-1, *m.known.shape[-2:])[:, 0] for m in problem.motions if m.known is not None)
-    outlines = outlines_of(problem, fixes, len(position)) if outlined else ()
+    outlines = _outlines(problem, fixes, len(position)) if outlined else ()
     scene = Scene(
         *(stations, problem.stations.names, position, covariance, clean, others, gaps, axes[:d], regions),
         tracks=_tracks(problem),
@@ -324,24 +317,51 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
         other_paths=other,
         known=tuple(thinned(place) for place in known),
         outlines=outlines,
-        local=is_local(fixes, outlines, len(position)),
+        local=is_local(fixes, [bool(each) for each in outlines], len(position)),
     )
     return _local(problem, scene) if problem.frame.kind == "ecef" else scene
 
 
-def outlines_of(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[Pieces, ...]:
-    """Return the regions of fixes of one position each, in their order; none where there are others, or too many."""
+def _outlines(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[dict[View, Outline], ...]:
+    """Return the regions of fixes in the plan and, in space, in the view of the height."""
+    views = (PLAN, HEIGHT) if problem.dimension == 3 else (PLAN,)
+    local = local_frame(problem)
+    axes = np.eye(problem.dimension) if local is None else local.rotation_to_ecef().T
+    found = regions_of(problem, fixes, count, [axes[list(view)] for view in views])
+    return tuple(dict(zip(views, each, strict=False)) for each in found)
+
+
+def regions_of(
+    problem: Problem, fixes: Sequence[Fix], count: int, planes: Sequence[Array]
+) -> tuple[list[Outline], ...]:
+    """Return the regions of fixes of one position each in planes; none where there are others, or too many.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the fixes.
+    fixes : sequence of Fix
+        Single fixes or batches.
+    count : int
+        How many positions they are.
+    planes : sequence of array (2, d) or (n, 2, d)
+        Axes of each plane, of all fixes or of each.
+    """
     if count > _ELLIPSES or count != sum(fix.code.size for fix in fixes):
         return ()
-    return tuple(pieces for fix in fixes for pieces in pieces_of(problem, fix))
+    found: list[list[Outline]] = []
+    for fix in fixes:
+        part = slice(len(found), len(found) + fix.code.size)
+        found += outlines_of(problem, fix, [plane if plane.ndim == 2 else plane[part] for plane in planes])
+    return tuple(found)
 
 
-def is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces], count: int) -> Array | None:
+def is_local(fixes: Sequence[Fix], outlined: Sequence[bool], count: int) -> Array | None:
     """Return where an ellipse does not cover and there is no outline (n,); None unless fixes are one position each."""
     if count != sum(fix.code.size for fix in fixes):
         return None
     kinds = [np.zeros(fix.code.size) if fix.chart is None else np.ravel(fix.chart.kind) for fix in fixes]
-    bare = np.array([not pieces for pieces in outlines] or [True] * count, dtype=bool)
+    bare = np.array([not each for each in outlined] or [True] * count, dtype=bool)
     return np.asarray((np.concatenate([*kinds, np.zeros(0)]) != CARTESIAN) & bare)
 
 
@@ -508,13 +528,16 @@ def ellipses(panel: Axes, scene: Scene, view: View, size: float, **style: Any) -
         return
     look: dict[str, Any] = {"color": BLUE, "linewidth": 1.5, "zorder": 2} | style
     seen: set[str] = set()
-    outlines = scene.outlines or ((),) * len(scene.fixes)
+    outlines = scene.outlines or ({},) * len(scene.fixes)
     local = np.zeros(len(scene.fixes), dtype=bool) if scene.local is None else scene.local
-    for i, (centre, covariance, pieces) in enumerate(zip(scene.fixes, scene.covariances, outlines, strict=True)):
-        around = [np.append(line, [[np.nan, np.nan]], axis=0) for line in rings([piece[:, view] for piece in pieces])]
-        label = "95 % region" if pieces else "local ellipse: it does not cover" if local[i] else "95 % ellipse"
+    for i, (centre, covariance, regions) in enumerate(zip(scene.fixes, scene.covariances, outlines, strict=True)):
+        region, place = regions.get(view), centre[list(view)]
+        around = [] if region is None else [np.append(place + line, [[np.nan] * 2], axis=0) for line in region.lines]
+        label = "local ellipse: it does not cover" if local[i] else "95 % ellipse"
+        if region is not None:
+            label = "95 % region, cut off" if region.cut else "95 % region"
         dashes = {"linestyle": ":"} if local[i] else {}
-        line = np.concatenate(around) if around else centre[list(view)] + ring(covariance[np.ix_(view, view)])
+        line = np.concatenate(around) if around else place + ring(covariance[np.ix_(view, view)])
         if around or np.isfinite(line).all():
             panel.plot(*(line.T / size), **(look | dashes | {"label": None if label in seen else label}))
             seen.add(label)

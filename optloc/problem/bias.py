@@ -130,6 +130,9 @@ def family(
 ) -> Bias:
     """Return a bias without prior over the rows of a problem; arguments as `with_bias`.
 
+    A bias of azimuths that were all read clockwise is clockwise: its coefficients are negative. A time along a course
+    has no such sense.
+
     Parameters
     ----------
     rows : sequence of Rows
@@ -170,7 +173,20 @@ def family(
     idle = sorted(set(range(len(names))) - set(member.tolist()))
     if idle:
         raise InvalidProblem(f"{names[idle[0]]} touches no row", f"{where}, members", "leave it out")
+    if form != "time":
+        coefficient = coefficient * _sense(rows, row)
     return Bias(name, names, row, member, coefficient, form, np.zeros(1))
+
+
+def _sense(rows: Sequence[Rows], touched: Array) -> float:
+    """Return the sense of a bias that touches rows of given global numbers: -1 where all their azimuths are clockwise.
+
+    Elevations beside them have no sense of their own.
+    """
+    ends = np.cumsum([block.count for block in rows])
+    blocks = [rows[i] for i in np.unique(np.searchsorted(ends, touched, side="right"))]
+    senses = {block.sense for block in blocks if block.kind == "azimuth"}
+    return senses.pop() if len(senses) == 1 else 1.0
 
 
 def _select_rows(rows: Sequence[Rows], form: Form, kind: str | None, where: str) -> list[tuple[Rows, int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,16 @@ def by_epoch(problem: Problem) -> Problem:
             return out
 
         rows.append(
-            Rows(old.kind, spread(old.z), a, b, np.zeros_like(a), target, spread(old.weight), spread(old.correction))
+            replace(
+                old,
+                z=spread(old.z),
+                a=a,
+                b=b,
+                epoch=np.zeros_like(a),
+                target=target,
+                weight=spread(old.weight),
+                correction=spread(old.correction),
+            )
         )
     noise = _noise(problem, where, int(starts[-1]))
     return replace(states_by_epoch(problem), rows=tuple(rows), noise=noise)
@@ -393,7 +403,7 @@ def _inside(epoch: Array, first: int, last: int) -> slice | Array:
 
 
 def _rows(block: Rows, kept: slice | Array) -> Rows:
-    return Rows(block.kind, *(getattr(block, name)[..., kept] for name in _ROW_ARRAYS))
+    return replace(block, **{name: getattr(block, name)[..., kept] for name in _ROW_ARRAYS})
 
 
 def _touches(problem: Problem, bias: Bias, number: _Numbers, inside: Callable[[Array], slice | Array]) -> Bias:
@@ -481,7 +491,8 @@ def _append(one: Rows, two: Rows) -> Rows:
         shape = batch if a.ndim > 1 or b.ndim > 1 else ()
         return np.concatenate([np.broadcast_to(v, (*shape, v.shape[-1])) for v in (a, b)], axis=-1)
 
-    return Rows(one.kind, *(both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS))
+    arrays: dict[str, Any] = {name: both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS}
+    return replace(one if one.count else two, **arrays)
 
 
 def _stations(problem: Problem, more: Problem) -> Stations:

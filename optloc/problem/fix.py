@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.types import ANSWERED, PRECEDENCE, Array, Status
+from optloc.base.types import ANSWERED, NOTES, PRECEDENCE, Array, Status
 from optloc.problem.chart import Chart, Extent
 from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
@@ -80,7 +80,8 @@ class Suspect:
         Global numbers of the rows it takes part in; empty for a prior.
     error : array (q,)
         Estimated error, measured less true: of the station's arrival time times c (positive: late) where the rows
-        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians or ratios.
+        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians (clockwise of
+        compass bearings) or ratios.
     sigma : array (q,)
         Standard deviations of `error`; infinite where nothing else tells how large it is.
     p_with : float
@@ -183,7 +184,7 @@ class Fix:
     cost : array (...)
         Weighted sum of squared residuals, chi-square distributed if the model is right.
     dof : int array (...)
-        Degrees of freedom: rows present less unknowns without a prior.
+        Degrees of freedom, or redundancy: rows present less unknowns without a prior. See `unchecked`.
     weights : array (..., m)
         Row weights that were used.
     stages : tuple of Stage
@@ -292,11 +293,11 @@ class Fix:
         return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
 
     def undetermined(self, name: str = "position") -> Array:
-        """Return which entries (..., q) of a named part the data leave open, whatever number stands there.
+        """Return a mark for each entry (..., q) of a named part that the data do not determine.
 
-        An entry is open where its standard deviation is more than 100 times the size of stations and target together,
-        or a speed more than that of light. Symmetry leaves such entries, for instance the height of a target in the
-        plane of all stations. Tables and texts call them "not determined".
+        The standard deviation of such an entry is more than 100 times the size of stations and target together, that of
+        a speed more than the speed of light. Symmetry causes such entries, such as the height of a target in the plane
+        of the stations. Tables and texts call them "not determined".
 
         Parameters
         ----------
@@ -429,20 +430,31 @@ class Fix:
         return np.asarray((self._all_marks & sum({one.mark for one in statuses})) != 0)
 
     @property
+    def unchecked(self) -> Any:
+        """Return whether a single fix has no redundancy, a bool, or the bool array (...) of a batch.
+
+        Every set of measurements fits such a fix, a wrong one as well. Fixes without an answer are none of these.
+        """
+        out = np.asarray(self.answered & (self.dof <= 0))
+        return bool(out) if self.shape == () else out
+
+    @property
     def _all_marks(self) -> Array:
         # a fix of a solver from outside may have a status alone
-        return np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
+        marks = np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
+        return np.asarray(marks | np.where(self.unchecked, Status.UNCHECKED.mark, 0))
 
     @property
     def findings(self) -> Any:
         """Return all that stands against a single fix, a tuple of `Status`, or an object array (...) of a batch.
 
-        The most serious comes first: it is the status. An `ok` fix has none.
+        The most serious comes first: it is the status. Notes come last: an `ok` fix has nothing but these, `unchecked`
+        where it has no redundancy.
         """
         marks, out = self._all_marks, np.empty(self.shape, dtype=object)
         for i in np.ndindex(self.shape):
             found = int(marks[i])
-            out[i] = tuple(one for one in PRECEDENCE if one is not Status.OK and found & one.mark)
+            out[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and found & one.mark)
         return out[()]
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
@@ -489,19 +501,33 @@ class Fix:
             raise InvalidProblem("a fix that is not of one position has no chart", "fix", "see its covariance")
         return self.chart
 
-    def require(self, allow: Iterable[Status | str] = ()) -> Fix:
+    def require(self, allow: Iterable[Status | str] = (), *, redundancy: int = 0) -> Fix:
         """Return the fix if every status in it is `ok` or allowed; raise NoSolution with the first that is not.
 
         Parameters
         ----------
         allow : iterable of Status or str
             What passes beside `ok`, for instance ``("curved", "unproven")``.
+        redundancy : int
+            Least degrees of freedom of a fix that passes. With 1 a wrong measurement is noticed, with 0, the default,
+            fixes that nothing checks pass as well (`unchecked`).
+
+        Raises
+        ------
+        NoSolution
+            With the first fix of another status, else with the first of less redundancy.
+        InvalidProblem
+            For an unknown status or a redundancy that is no whole number.
         """
+        wanted = _whole(redundancy)
         passing = [Status.OK, *(one if isinstance(one, Status) else status_named(one) for one in allow)]
         bad = np.flatnonzero(~np.isin(np.ravel(self.code), passing))
         if len(bad):
             flat = self.flat()
             raise NoSolution(None, flat[int(bad[0])])
+        weak = np.flatnonzero(np.ravel(self.dof) < wanted)
+        if len(weak):
+            raise NoSolution(None, self.flat()[int(weak[0])], _too_weak(self, weak, wanted))
         return self
 
     def flat(self) -> Fix:
@@ -519,6 +545,25 @@ class Fix:
     def __len__(self) -> int:
         """Return the length of the first batch axis."""
         return int(self.x.shape[0])
+
+
+def _whole(redundancy: Any) -> int:
+    """Return a redundancy that is asked for; raise InvalidProblem where it is no whole number."""
+    if isinstance(redundancy, bool) or not isinstance(redundancy, int | np.integer) or redundancy < 0:
+        raise InvalidProblem(f"{redundancy!r} is no redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")
+    return int(redundancy)
+
+
+def _too_weak(fix: Fix, weak: Array, wanted: int) -> str:
+    """Return why fixes of a batch, by their numbers, have too little redundancy, in a sentence."""
+    found = int(np.ravel(fix.dof)[weak[0]])
+    which = "The fix" if fix.shape == () else f"Fix {int(weak[0])} of {fix.code.size}"
+    more = f" ({len(weak)} fixes have less than {wanted})" if len(weak) > 1 else ""
+    means = "a wrong measurement would not be noticed" if found <= 0 else "a wrong measurement could not be named"
+    return (
+        f"{which} has a redundancy of {found}, and {wanted} is required{more}: {means}; "
+        "add a row, a station or what is known, such as a height."
+    )
 
 
 # Words, tables and maps are made on a higher floor: `optloc` says by whom, once.

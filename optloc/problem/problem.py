@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.arrays import library, placed
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Array, Band, Bias, CompassRows, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
 from optloc.models.medium import Atmosphere, Medium
@@ -298,6 +298,7 @@ def _join(parts: list[Array]) -> Array:
 _NUMBERS: dict[type, dict[str, int]] = {
     Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3, "velocity_covariance": 3},
     Rows: {"z": 1, "weight": 1, "correction": 1},
+    CompassRows: {"z": 1, "weight": 1, "correction": 1},
     Block: {"covariance": 3},
     Motion: {"known": 3, "rise": 2},
     Prior: {"mean": 1, "covariance": 2},

@@ -12,7 +12,7 @@ from optloc.base.types import Array
 from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, worth_loading
 from optloc.proof.box import bound_nodes, cost_at, rounding
 from optloc.proof.everywhere import prove_everywhere
-from optloc.proof.near import BUDGET, OPEN, prove
+from optloc.proof.near import OPEN, prove
 from optloc.proof.pose import Posed
 from optloc.proof.search_space import Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 
@@ -129,11 +129,14 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
 def _prove_few(pose: Posed, asked: Asked) -> Answered:
     """Return the outcome of a few proofs, begun in plain Python; who needs more begins anew in machine code."""
     n = len(asked.x)
-    out = _prove_plainly(pose, asked, FIRST_BOXES // max(n, 1))
-    short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
+    few = max(_AT_LEAST, FIRST_BOXES // max(n, 1))
+    out = _prove_plainly(pose, asked, few)
+    # With more boxes a larger gap may be proven than with few, and minima may be met: only who has some left is done.
+    short = np.flatnonzero((out.boxes >= few) & (asked.budget > few))
     if len(short) and enabled():
         pose, asked = pose.take(short), asked.take(short)
-        more = _prove(pose, asked) if usable(_loop, n) else _prove_plainly(pose, asked, PLAIN_BOXES // len(short))
+        plenty = max(_AT_LEAST, PLAIN_BOXES // len(short))
+        more = _prove(pose, asked) if usable(_loop, n) else _prove_plainly(pose, asked, plenty)
         for array, found in zip(out, more, strict=True):
             array[short] = found
     return out
@@ -141,7 +144,7 @@ def _prove_few(pose: Posed, asked: Asked) -> Answered:
 
 def _prove_plainly(pose: Posed, asked: Asked, boxes: int) -> Answered:
     with plain():
-        return _prove(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, boxes))))
+        return _prove(pose, asked._replace(budget=np.minimum(asked.budget, boxes)))
 
 
 def lacks_code(count: int) -> bool:

@@ -133,6 +133,12 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
 
 
 @inlined
+def reaches(low: float, level: float) -> bool:
+    """Return whether a cost is at least a level where the residual is at least `low` long: no cost is negative."""
+    return level <= 0.0 or (low > 0.0 and low * low >= level)
+
+
+@inlined
 def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
     """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
     size = floor

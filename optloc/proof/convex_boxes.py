@@ -11,7 +11,7 @@ from optloc.compute.jit import compiled, inlined, put
 from optloc.compute.systems import principal
 from optloc.proof.atlas import Atlas, home_of, infinity, set_centre
 from optloc.proof.box import J0, cost_at, linearise_rows, rounding
-from optloc.proof.curvature import G0, G1, G2, convex, sum_up
+from optloc.proof.curvature import G0, G1, G2, NOISE0, convex, sum_up
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, size_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE
 from optloc.proof.search_space import HIDDEN_REACH, Box, Chart, Cost, Known, is_convex, widen
@@ -219,10 +219,11 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: flo
     _tables(cost, box, atlas, i, np.zeros(3))
     if not cost_at(cost.K, cost.w, box.nodes) >= value:
         return False
-    sums = box.sums
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
-    margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
-    hull = np.zeros(3)
+    margin, hull = 0.0, np.zeros(3)
+    for k in range(3):
+        slope = abs(box.sums[G0 + k]) + box.sums[NOISE0 + k]
+        margin += slope * slope / eps
     set_hull(atlas, i, hull, limit)
     if not _grow(cost, box, atlas, i, hull, margin):
         return False

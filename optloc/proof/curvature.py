@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
-from optloc.compute.systems import inverse, positive, principal
+from optloc.compute.systems import inverse, positive, positive_along, principal
 from optloc.proof.box import clip, digits, is_empty
 from optloc.proof.nodes.dispatch import curve_others, shape_of
 from optloc.proof.nodes.node import (
@@ -195,10 +195,9 @@ def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sum
             d1 += most * (abs(curves[j, H11]) + n1 + n4)
             d2 += most * (abs(curves[j, H22]) + n2 + n4)
             away += (abs(curves[j, FORCE]) + most) * curves[j, CHI]
-    # In the plane nothing depends on the third coordinate: any positive entry leaves the test to the others.
-    h3 = 1.0 if half[1] == 0.0 and sums[H11] == 0.0 else h3 - d1 - away
-    h0, h5 = h0 - d0 - away, 1.0 if half[2] == 0.0 and sums[H22] == 0.0 else h5 - d2 - away
-    return positive(h0, h1, h2, h3, h4, h5)
+    # In the plane nothing depends on the third coordinate.
+    second, third = half[1] != 0.0 or sums[H11] != 0.0, half[2] != 0.0 or sums[H22] != 0.0
+    return positive_along(h0 - d0 - away, h1, h2, h3 - d1 - away, h4, h5 - d2 - away, second, third)
 
 
 @compiled

@@ -31,6 +31,7 @@ from optloc.proof.box import (
     cost_at,
     cube,
     cut_out,
+    digits,
     is_empty,
     least_left,
     least_residual,
@@ -39,6 +40,7 @@ from optloc.proof.box import (
     push,
     push_around,
     push_halves,
+    reaches,
     reaches_infinity,
     rounding,
     share_left,
@@ -48,9 +50,20 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
 from optloc.proof.curvature import has_no_infimum, most_curved_side, spread_of, sum_up
-from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
+from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
-from optloc.proof.search_space import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
+from optloc.proof.search_space import (
+    COARSEST,
+    HIDDEN_REACH,
+    Box,
+    Chart,
+    Cost,
+    Known,
+    chart_at,
+    descend,
+    empty_box,
+    equal_within,
+)
 from optloc.proof.squares import Squares, bend_of, clip_to_squares, squares_of
 
 # Branch and bound over all positions, for costs that nothing encloses.
@@ -150,6 +163,10 @@ def search_everywhere(
     stack, aside, d = np.empty((_CAPACITY, DEPTH)), np.empty((_CAPACITY, DEPTH)), atlas.dimension
     size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
     floor, first, now, value = accuracy_floor_far(cost, atlas), zero(), levels.shape[0] - 1, levels[-1]
+    while now >= first and levels[now] <= 0.0:  # which no cost is below
+        now -= 1
+    if now < first:
+        return CLEAR, 0, value, first, met
     while True:
         if size == 0:  # nothing below this level is left
             if now <= first:
@@ -166,7 +183,7 @@ def search_everywhere(
         if not (taken and _squeeze(cost, atlas, squares, level, box, piece)):
             continue
         low = _bound(cost, atlas, box, floor)
-        if low > 0.0 and low * low >= level:
+        if reaches(low, level):
             continue
         here, noise = cost_at(cost.K, cost.w, box.nodes), rounding(cost.K, cost.weight, floor, box.nodes)
         if here < value:
@@ -174,7 +191,7 @@ def search_everywhere(
             return CHEAPER, boxes, 0.0, shown, met
         touching = _touches(box, d - 1, infinity(atlas, piece))
         # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
-        sound = (whole or (low > 0.0 and low * low >= value)) and here < _NEAR * (level + 1.0)
+        sound = (whole or reaches(low, value)) and here < _NEAR * (level + 1.0)
         side = _side_of_rest(cost, atlas, box, touching, sqrt(max(level, 0.0)), noise, sound)
         if side < 0:
             continue
@@ -523,12 +540,17 @@ def prove_atlas(
     """Prove the same as `prove_everywhere` with the atlas alone, where `optloc.proof.box.reaches_infinity` holds."""
     chart, _ = chart_at(cost, x, box)
     least, corners, nowhere = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), np.full(x.shape[0], nan)
+    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
     if not region_of(cost, chart, box, sqrt(least + gaps[0]), nowhere, nowhere, corners[0], corners[1]):
         corners[:] = nan
     others = beside.points
     middle, radius = cube(cost.kinds, cost.data, x)
     squares = squares_of(cost, box, middle, radius)
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if gaps[0] > 0.0 else 0))
+    most, noise = max(COARSEST, eps), max(noise, digits(cost.K) * accuracy_floor_far(cost, atlas))
+    eps = equal_within(eps, least, noise)
+    if not eps <= most:
+        return COARSE, 0, -inf, gaps[0], 0
     known, place = zero(), np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):
         put(x if p == 0 else others[p - 1], place)

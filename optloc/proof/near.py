@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, isnan, nan, sqrt
+from math import inf, isnan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from optloc.proof.box import (
     push,
     push_around,
     push_halves,
+    reaches,
     rounding,
     shrink,
     uncut,
@@ -40,14 +41,17 @@ from optloc.proof.nodes.node import (
     SLOPE2,
 )
 from optloc.proof.search_space import (
+    COARSEST,
     Box,
     Chart,
     Cost,
     Known,
+    blur_at,
     chart_on,
     curve_along,
     curve_box,
     descend,
+    equal_within,
     lay_down,
     place,
     shapes_of,
@@ -154,7 +158,7 @@ def branch(
         linearise_rows(K, w, nodes, rows)
         low = least_residual(K, weight, floor, half, nodes, rows)
         # A length, where the level is a cost: below 1 the length is the larger, so it is squared.
-        if low > 0.0 and low * low >= aim.level:
+        if reaches(low, aim.level):
             continue
         here, noise = cost_at(K, w, nodes), rounding(K, weight, floor, nodes)
         if here < aim.better:
@@ -162,7 +166,7 @@ def branch(
         # What cannot hold a residual shorter than rho, and below what no minimum, is cut off from all sides.
         uncut(half, cut)
         shrink(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
-        sound = aim.whole or (low > 0.0 and low * low >= aim.value)
+        sound = aim.whole or reaches(low, aim.value)
         if _is_done(at, half, minima, sides, aim, (unique or aim.whole) and sound):
             continue
         if unique or aim.whole:
@@ -288,6 +292,8 @@ _OUTWARDS = 1e-9
 
 # Verdicts of a proof.
 UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
+COARSE = 9
+"""A verdict beside these: the rounding of residuals exceeds the stated noise by so much that no two costs differ."""
 
 
 @compiled
@@ -320,7 +326,8 @@ def prove(
     kappa : float
         Gap to prove; 0 proves the value alone.
     eps : float
-        How far below the cost of the fix still counts as equal, 1e-6 (1 + f) or so: covers rounding.
+        How far below the cost of the fix still counts as equal, 1e-6 (1 + f) or so; where the rounding of residuals
+        makes more of it, that counts (`optloc.proof.search_space.equal_within`).
     budget : int
         How many boxes may be looked at.
     reach : float
@@ -340,20 +347,21 @@ def prove(
         UNIQUE: the value is proven, and no other minimum (beside `others`) has a gap below kappa. VALUE: kappa is 0 and
         the value is proven. BETTER: `found` costs less. OTHER: `found` is close to another minimum whose gap is below
         kappa. BUDGET: boxes are left. OPEN: there is no enclosure. STATIONARY: the fix is no strict minimum, or not
-        polished enough. SINGULAR: the rows do not determine a position near the fix.
+        polished enough. SINGULAR: the rows do not determine a position near the fix. COARSE: the noise is finer than
+        rounding.
     boxes : int
         How many boxes were looked at.
     bound : float
-        A certified lower bound of f over the region or over all positions; -inf where there is none.
+        A certified lower bound of f over the region or over all positions; -inf where there is none. Of a proven value
+        it is below the cost of the fix by what counts as equal.
     """
     # Standard deviations of the fix as units: boxes are then about as wide as the cost needs in every direction.
     chart, good = chart_on(cost, x, box, known.planes, known.surface)
     if not good:
         return SINGULAR, 0, -inf
     least, sums, bent = cost_at(cost.K, cost.w, box.nodes), box.sums, chart.surface.shape[0] > 0
-    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
-    margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
-    corners, alone = np.empty((2, 3)), True
+    slope, noise = (sums[G0], sums[G1], sums[G2]), blur_at(cost, chart, box) if not bent else 0.0
+    corners, alone, most, there = np.empty((2, 3)), True, max(COARSEST, eps), least
     low, high = corners[0], corners[1]
     if not region_of(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
@@ -362,7 +370,16 @@ def prove(
         if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
             return OPEN, 0, -inf
         reach_of_piece(chart.surface, chart.origin, chart.sense, low, high)
-        margin = _margin(cost, chart, box, least, eps)
+        there, noise = _laid(cost, chart, box)
+        slope = (box.sums[G0], box.sums[G1], 0.0)
+    eps = equal_within(eps, least, noise)
+    # A fix is off its surface by a rounding: half of eps is for what that costs.
+    if not abs(there - least) <= 0.5 * eps:
+        return STATIONARY, 0, -inf
+    if not eps <= most:
+        return COARSE, 0, -inf
+    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
+    margin = steepness(slope, noise) / (0.5 * eps if bent else eps)
     minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
     if count == 0:
         return STATIONARY, 0, -inf
@@ -399,19 +416,22 @@ def _extent(low: Array, high: Array, sides: Array) -> float:
     return most
 
 
-@compiled
-def _margin(cost: Cost, chart: Chart, box: Box, least: float, eps: float) -> float:
-    """Return how convex the box of a fix must be for no place of a surface in it to cost less by eps.
+@inlined
+def steepness(slope: tuple[float, float, float], noise: float) -> float:
+    """Return the greatest squared length of a slope along standard deviations whose residual is off by `noise`."""
+    a, b, c = abs(slope[0]) + noise, abs(slope[1]) + noise, abs(slope[2]) + noise
+    return a * a + b * b + c * c
 
-    The fix is off its surface by a rounding. Half of eps is for what that costs, NaN where it is more; half for the
-    slope, which is another on the surface.
-    """
-    sums = box.sums
+
+@compiled
+def _laid(cost: Cost, chart: Chart, box: Box) -> tuple[float, float]:
+    """Return the cost of a fix on its surface, infinite off it, and the rounding of its residual; fill the sums."""
     box.at[:], box.half[:] = 0.0, 0.0
-    if not abs(value_at(cost, chart, box) - least) <= 0.5 * eps:
-        return nan
-    curve_box(cost, chart, box)
-    return float((sums[G0] * sums[G0] + sums[G1] * sums[G1]) / (0.5 * eps))
+    there, noise = value_at(cost, chart, box), 0.0
+    if there < inf:
+        noise = blur_at(cost, chart, box)
+        curve_box(cost, chart, box)
+    return there, noise
 
 
 @compiled

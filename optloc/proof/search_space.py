@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, put, put_rows, zero
-from optloc.compute.systems import inverse, invert, positive, roughly_principal
+from optloc.compute.systems import inverse, invert, positive_along, roughly_principal
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, rounding
 from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
 from optloc.proof.nodes.dispatch import size_of
@@ -469,6 +469,38 @@ def value_at(cost: Cost, chart: Chart, box: Box) -> float:
 
 
 @inlined
+def blur_at(cost: Cost, chart: Chart, box: Box) -> float:
+    """Return a bound of the rounding errors of a residual (its length) at the centre of a box whose nodes are bounded.
+
+    On a surface the height, which is worked out from the Earth's centre, is rounded as well.
+    """
+    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+    if chart.surface.shape[0] > 0:
+        total = 0.0
+        for i in range(cost.K.shape[0]):
+            along = 0.0
+            for j in range(cost.K.shape[1]):
+                along += cost.K[i, j] * box.lean[j]
+            total += along * along
+        noise += sqrt(total) * box.graph[SLIP]
+    return noise
+
+
+# How far below the cost f of a fix another cost counts as equal, in roundings e of a residual: 8 e sqrt(f) + 24 e^2.
+# Each of two costs is off by 2 e sqrt(f) + e^2, and half of what counts as equal is left for them; a slope of the cost
+# is off by e along each of three axes, which 24 e^2 makes an eighth of the curvature, a quarter where half is left.
+_COSTS, _SLOPES = 8.0, 24.0
+COARSEST = 1.0
+"""By how much costs may be off for a proof to be worth its name: a ninth of the gap at which two minima differ."""
+
+
+@compiled
+def equal_within(eps: float, least: float, noise: float) -> float:
+    """Return how far below the cost `least` of a fix another counts as equal: eps, or more where rounding is coarse."""
+    return float(max(eps, noise * (_COSTS * sqrt(max(least, 0.0)) + _SLOPES * noise)))
+
+
+@inlined
 def shapes_of(cost: Cost, chart: Chart) -> Array:
     """Return the codes of the nodes for tests of convexity: along a surface a range is not convex."""
     return cost.kinds if chart.surface.shape[0] == 0 else np.full_like(cost.kinds, ANY)
@@ -515,12 +547,12 @@ def turned(cost: Cost, chart: Chart, side: int) -> Chart:
 
 # Steps of a descent: damped Newton needs five to ten from a box near a minimum; beyond forty it creeps along a valley.
 _STEPS = 40
-# A step of so many standard deviations ends it: the next one, of Newton's, would be a millionth.
+# A step that gains so many standard deviations, squared, ends it: the next one, of Newton's, would be a millionth.
 _CLOSE = 1e-3
 # Damping at first, its factors after a step that was good and one that was not, and from where on it grows again. Steps
 # that are damped by more than the last are no Newton steps, and do not end a descent.
 _DAMPING, _LESS, _MORE, _LEAST, _FREE = 1e-6, 0.1, 10.0, 1e-4, 1e-3
-# Rounding of two costs of the same point, relative and absolute: a step may raise the cost by it.
+# Rounding of sums of squares, relative and absolute; a step may raise the cost by it and by what residuals are rounded.
 _SAME_COST = 1e-14
 
 
@@ -529,11 +561,15 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
     """Move the centre of a box to a minimum of the cost; return the cost there, or infinity where none is reached.
 
     The half-widths become zero, and the tables are those of the point. Newton's Hessian where it is positive definite,
-    that of Gauss and Newton elsewhere, damped after Levenberg and Marquardt.
+    that of Gauss and Newton elsewhere, damped after Levenberg and Marquardt. Lengths of steps are counted in standard
+    deviations, whatever the unit of the search coordinates is: away from the fix they are another.
     """
     box.half[:] = 0.0
     start = box.at.copy()
     cost_now, damping = value_at(cost, chart, box), _DAMPING
+    if not cost_now < inf:
+        return inf
+    noise = blur_at(cost, chart, box)
     curve_box(cost, chart, box)
     for _ in range(_STEPS):
         length = _step(cost, box, damping)
@@ -543,19 +579,14 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
         for k in range(3):
             box.at[k] -= box.solve[0, k]
         after = value_at(cost, chart, box)
-        if after <= cost_now * (1.0 + _SAME_COST) + _SAME_COST:
+        if after <= cost_now + _SAME_COST * (1.0 + cost_now) + noise * (2.0 * sqrt(cost_now) + noise):
             cost_now = after
+            noise = blur_at(cost, chart, box)
             curve_box(cost, chart, box)
-            if length < _CLOSE * _CLOSE and damping <= _FREE:
+            if length < _CLOSE * _CLOSE + noise * noise and damping <= _FREE:
                 sums = box.sums
-                good = positive(
-                    sums[H00],
-                    sums[H01],
-                    sums[H02],
-                    sums[H11] if sums[H11] != 0.0 else 1.0,
-                    sums[H12],
-                    sums[H22] if sums[H22] != 0.0 else 1.0,
-                )
+                h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
+                good = positive_along(h0, h1, h2, h3, h4, h5, h3 != 0.0, h5 != 0.0)
                 return cost_now if good else float("inf")
             damping *= _LESS
         else:
@@ -566,11 +597,14 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
 
 @compiled
 def _step(cost: Cost, box: Box, damping: float) -> float:
-    """Write the damped step into the first row of box.solve; return its squared length, NaN where there is none."""
+    """Write the damped step into the first row of box.solve; return its squared length in standard deviations.
+
+    NaN where there is none.
+    """
     sums, solve = box.sums, box.solve
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
-    h3, h5 = h3 if h3 != 0.0 else 1.0, h5 if h5 != 0.0 else 1.0
-    if not positive(h0, h1, h2, h3, h4, h5):
+    second, third = h3 != 0.0, h5 != 0.0
+    if not positive_along(h0, h1, h2, h3, h4, h5, second, third):
         # Less the curvature of the nodes, Gauss and Newton's information is left, which always falls.
         for j in range(box.curves.shape[0]):
             force = box.curves[j, FORCE]
@@ -581,6 +615,7 @@ def _step(cost: Cost, box: Box, damping: float) -> float:
             h4 -= force * box.curves[j, H12]
             h5 -= force * box.curves[j, H22]
     more = 1.0 + damping
+    h3, h5 = h3 if second else 1.0, h5 if third else 1.0
     if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
         return float("nan")
     g0, g1, g2 = sums[G0], sums[G1], sums[G2]
@@ -588,4 +623,4 @@ def _step(cost: Cost, box: Box, damping: float) -> float:
     s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
     s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
     solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
-    return float(s0 * s0 + s1 * s1 + s2 * s2)
+    return float(abs(s0 * g0 + s1 * g1 + s2 * g2))

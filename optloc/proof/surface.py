@@ -44,9 +44,9 @@ SURFACE_WIDTH, SIDES = 13 + HEIGHT_WIDTH, 6
 # Numbers of a graph over a box: how far it sags below its tangent plane at most, and how far off it the centre may be;
 # greatest slopes; the Hessian at the centre; its greatest size over the box, and its greatest change.
 SAG, SLIP, _STEEP0, _STEEP1, _BEND00, _BEND01, _BEND11, _BENT, _TURNED, GRAPH_WIDTH = range(10)
-# Newton's steps down to a surface, which double the digits of what is left, and their end: well above the rounding of
-# coordinates, far below what is measured.
-_STEPS, _CLOSE = 20, 1e-7
+# Newton's steps down to a surface, which double the digits of what is left. They end at the accuracy of a height; up to
+# so many times as far off the surface a place will do, because bounds count how far it is.
+_STEPS, _LOOSE = 20, 10.0
 # Cosine between the normal and the chart's axis below which a surface is no graph: a piece ends at 0.57. And the share
 # of the Earth's least radius that a box may leave of the radius of curvature: heights are exact so deep.
 _STEEP, _LEFT = 0.2, 0.7
@@ -96,17 +96,18 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
         Working memory.
     """
     data, up, off, rise = surface[DATA:MIDDLE], triple(surface, UP), 0.0, 0.0
+    exact = EXACT * max(1.0, surface[LEVEL] / LEAST_RADIUS)
     _, normal, _, _, _ = normal_at(data, centre)
     for _ in range(_STEPS):
         height, normal, _, _, _ = normal_at(data, centre)
         rise, off = inner(normal, up), height - surface[LEVEL]
         if not rise > _STEEP:
             return False
-        if abs(off) <= _CLOSE:
+        if abs(off) <= exact:
             break
         for m in range(3):
             centre[m] -= off / rise * up[m]
-    if not abs(off) <= _CLOSE:
+    if not abs(off) <= _LOOSE * exact:
         return False
     reach = size = 0.0
     for k in range(2):
@@ -132,7 +133,7 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
         return False
     _write_graph(data, centre, half, sense, gram, graph, second, (sag, rise, least, bend, size))
     # Twice: the mean of slopes over a box counts half of what grows with the box, and this does not.
-    graph[SLIP] = 2.0 * (abs(off) + 4.0 * EXACT * max(1.0, surface[LEVEL] / LEAST_RADIUS)) / least
+    graph[SLIP] = 2.0 * (abs(off) + 4.0 * exact) / least
     half[2] = graph[SAG] + graph[SLIP]
     return True
 

@@ -46,7 +46,8 @@ class Health:
     """What many fixes say of G stations (pairs, kinds), in SI units and radians; NaN where they say nothing.
 
     Residuals are left-out ones: the measurement less what the rest of its fix, without this station, predicts, with the
-    offsets of the others taken out. A station's error is not absorbed by the fix that it is compared with.
+    offsets of the others taken out. A station's error is not absorbed by the fix that it is compared with. Of compass
+    bearings biases and residuals are clockwise.
 
     Parameters
     ----------

@@ -19,6 +19,9 @@ from optloc.problem.fix import Active, Explanation, Fix
 Columns = dict[str, Array]
 """A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
 
+UNCHECKED = "no redundancy: a wrong measurement would not be noticed"
+"""The sentence beside the status of a fix that nothing checks."""
+
 _RATES = {"velocity": "v", "acceleration": "a"}
 _STATES = ("position", *_RATES)
 
@@ -175,6 +178,7 @@ def _of_target(
     columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}
     for name, numbers in {"cost": fix.cost, "dof": fix.dof, "p_value": np.asarray(fix.p_value)}.items():
         columns[name] = np.repeat(numbers, count)
+    columns["unchecked"] = np.repeat(np.atleast_1d(fix.unchecked), count)
     columns["alternatives"] = np.repeat(np.isfinite(fix.alternatives.gap).sum(-1), count)
     columns |= {"undetermined": np.array(lost, dtype=object)} if any(lost) else {}
     return columns | _repeat(count, **words)
@@ -300,6 +304,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
     return {
         "sentence": Status(int(fix.code)).sentence,
         "findings": [one.label for one in fix.findings],
+        "unchecked": bool(fix.unchecked),
         "gap_to_infinity": None if fix.infinity is None else fix.infinity,
         "chart": _chart_json(fix),
         "alternatives": [

@@ -16,12 +16,13 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import visible
-from optloc.base.types import Array, Status
+from optloc.base.types import NOTES, Array, Status
 from optloc.bounds.observability import Observability
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Active, Fix, Suspect
 from optloc.problem.problem import Problem
 from optloc.report.columns import (
+    UNCHECKED,
     Columns,
     active_of,
     alternative_position,
@@ -91,9 +92,9 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Shee
     """
     columns = fix_columns(fix) if columns is None else columns
     verdict, reason = Status(int(fix.code)), str(fix.reason[()] or "")
-    told = [("status", verdict.label), ("", verdict.sentence)]
+    told = [("status", f"{verdict.label}; {UNCHECKED}" if fix.unchecked else verdict.label), ("", verdict.sentence)]
     told += [("reason", reason)] if reason else []
-    others = [one.label for one in fix.findings if one is not verdict]
+    others = [one.label for one in fix.findings if one is not verdict and one not in NOTES]
     told += [("besides", ", ".join(others))] if others else []
     # A run may have a state of each epoch: those that fit on a screen.
     rows = len(columns["x"])
@@ -294,7 +295,9 @@ def count_sheet(columns: Columns, title: str) -> Sheet:
         shares = ((sigma, 0.5), (sigma, 0.95), (columns["p_value"], 0.5))
         rows.append((label, str(count), *(_quantile(values[inside], share) for values, share in shares)))
     head = ("status", "fixes", "median sigma, m", "95 % of sigmas, m", "median p")
-    return Sheet(f"{title}{len(columns['status'])} fixes", head, rows)
+    alone = int(np.asarray(columns["unchecked"], dtype=bool).sum())
+    more = f", {alone if alone < len(columns['status']) else 'all'} with {UNCHECKED}" if alone else ""
+    return Sheet(f"{title}{len(columns['status'])} fixes{more}", head, rows)
 
 
 def _quantile(values: Array, share: float) -> str:

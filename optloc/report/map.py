@@ -14,11 +14,12 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status
 from optloc.models import MODELS
 from optloc.plot.fixes import lines_of_position
-from optloc.plot.outlines import Pieces
-from optloc.plot.outlines import rings as around
-from optloc.plot.style import figure_class, is_local, outlines_of, states_of, thinned
+from optloc.plot.outlines import level_planes
+from optloc.plot.style import figure_class, is_local, regions_of, states_of, thinned
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.report.columns import UNCHECKED
+from optloc.uncertainty.outline import Outline
 
 # Coastlines for maps without a network.
 #
@@ -274,7 +275,7 @@ def spots(
     covariance: Array,
     clean: Array,
     text: Sequence[str],
-    outlines: Sequence[Pieces] = (),
+    outlines: Sequence[Sequence[Outline]] = (),
 ) -> Spots:
     """Return positions in a problem's frame as marks on the Earth.
 
@@ -288,21 +289,21 @@ def spots(
         Where the status is ok.
     text : sequence of n str
         What is told of each.
-    outlines : sequence of n tuples of array (v, d), optional
-        Convex parts of the regions that no ellipse covers; empty for the others.
+    outlines : sequence of n sequences of Outline, optional
+        The plan of each region that no ellipse covers, along east and north; empty for the others.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, _RING)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     rings: list[Array] = []
     more: list[Array] = []
-    for centre, spread, pieces in zip(position, covariance, outlines or [()] * len(position), strict=True):
+    for centre, spread, regions in zip(position, covariance, outlines or [()] * len(position), strict=True):
         if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
             rings.append(np.zeros((0, 2)))
             continue
         # The ellipse of east and north, whatever the height is worth.
         axes = problem.frame.enu_axes(centre)[:2]
-        if pieces:
-            lines = [degrees(problem, centre + line @ axes) for line in around([(p - centre) @ axes.T for p in pieces])]
+        if regions:
+            lines = [degrees(problem, centre + line @ axes) for region in regions for line in region.lines]
             lines.sort(key=len, reverse=True)
             rings.append(lines[0])
             more += lines[1:]
@@ -326,14 +327,20 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
     """Return the marks of fixes; labels name them where there are as many."""
     parts = [part for fix in fixes for part in states_of(fix)]
     position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
-    status = [Status(int(code)).label for fix in fixes for code in np.ravel(fix.code)]
+    status = [
+        f"{Status(int(code)).label} ({UNCHECKED})" if alone else Status(int(code)).label
+        for fix in fixes
+        for code, alone in zip(np.ravel(fix.code), np.ravel(fix.unchecked), strict=True)
+    ]
     named = list(labels) if len(labels) == len(position) > 1 else [""] * len(position)
     told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
     sentences = [sentence(*each) for each in zip(named, told, degrees(problem, position), sigma, strict=True)]
-    outlines = outlines_of(problem, fixes, len(position))
+    outlines = regions_of(problem, fixes, len(position), [level_planes(problem, position)])
+    for i, regions in enumerate(outlines):
+        sentences[i] += ", 95 % region cut off: it goes on" if any(region.cut for region in regions) else ""
     found = spots(problem, position, covariance, clean, sentences, outlines)
-    return replace(found, local=is_local(fixes, outlines, len(position)))
+    return replace(found, local=is_local(fixes, [bool(each) for each in outlines], len(position)))
 
 
 def sentence(name: str, status: str, place: Array, sigma: float) -> str:

@@ -23,6 +23,7 @@ from optloc.plot.bound_map import COLOURS, isolines, levels
 from optloc.plot.style import BLACK, BLUE, ORANGE
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.report.columns import UNCHECKED
 from optloc.report.figures import Drawing, Mark
 from optloc.report.map import (
     Canvas,
@@ -185,7 +186,10 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     several = [fixes] if isinstance(fixes, Fix) else list(fixes)
     found, others = fixed_spots(problem, several, labels), other_spots(problem, several)
     single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
-    return _page(problem, found, others, title, "fix", single)
+    alone = sum(int(np.sum(fix.unchecked)) for fix in several)
+    count = sum(fix.code.size for fix in several)
+    which = "" if count == 1 else f"{alone if alone < count else 'all'} of {count} fixes: "
+    return _page(problem, found, others, title, "fix", single, f"{which}{UNCHECKED}." if alone else "")
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
@@ -240,7 +244,10 @@ def _on_earth(geodetic: bool) -> None:
         raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
 
 
-def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, single: Fix | None) -> str:
+def _page(
+    problem: Problem, found: Spots, others: Spots, title: str, what: str, single: Fix | None, first: str = ""
+) -> str:
+    """Return the page of a map, with a first line of text where something is to be told."""
     stations, tracks = station_spots(problem), ground_tracks(problem)
     limits = _limits([stations.place, found.place, others.place, *(line for _, line in tracks)])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
@@ -263,7 +270,7 @@ def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, 
         text = text.replace("holds 95 %.", "holds 95 % (dotted: an ellipse that does not).")
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
-    return write_page(title, [Part("map", "Map", maps=[canvas], note=note)])
+    return write_page(title, [Part("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])
 
 
 def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:

@@ -196,7 +196,7 @@ def propose(scene: Scene, seed: int = 0) -> Tuples:
     if not len(picks):
         return no_sets(scene)
     problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
-    fix = solve(problem, "roots")
+    fix = solve(problem, "roots", refine=False)
     # All roots of the closed form: d rows may meet in several places.
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     which, slot = np.nonzero(np.isfinite(x).all(-1))

@@ -21,7 +21,7 @@ from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
 __all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Method", "given", "solve", "vectors"]
 
 
-def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
+def solve(problem: Problem, method: str = "auto", *, start: Any = None, refine: bool = True) -> Fix:
     """Return the fix of every problem of a batch, without a first guess.
 
     Parameters
@@ -29,10 +29,14 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     problem : Problem
         Batch axes (...). Where its epochs share no unknown they are solved as one more batch axis, (..., k).
     method : str
-        "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``.
+        "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``. One that only starts,
+        such as "sdp" or "minimax", is followed by "lsr+certify".
     start : array (..., size), optional
         Starting vector: all that a method has which begins with a refinement, such as "lsr", and one more candidate
         of every other.
+    refine : bool
+        False: a method that only starts returns its estimate as it is, with the status `unrefined`: for those who
+        compare starts.
 
     Returns
     -------
@@ -47,10 +51,10 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     """
     run = Method.parse(method)
     fix = at_once(problem, run) if start is None else None
-    return solve_in_stages(problem, run, start) if fix is None else fix
+    return solve_in_stages(problem, run, start, refine=refine) if fix is None else fix
 
 
-def solve_in_stages(problem: Problem, run: Method, start: Any = None) -> Fix:
+def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:
     """Return what `solve` returns, by the stages of a method: a batch is what they are made for."""
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
@@ -61,6 +65,8 @@ def solve_in_stages(problem: Problem, run: Method, start: Any = None) -> Fix:
 
     def work(some: Problem, part: slice) -> Fix:
         pool = run(some, None if vector is None else begin(some, vector[part]))
+        if refine and pool.curvature is None:
+            pool = _FINISH(some, pool)
         with where("the verdict"):
             return hide_open_epochs(verdict(some, pool))
 
@@ -69,6 +75,10 @@ def solve_in_stages(problem: Problem, run: Method, start: Any = None) -> Fix:
     with np.errstate(all="ignore"):  # what overflows is judged: a status says so, once
         fix = in_parts(flat, work, most, failed)
     return fix.reshape(shape) if shape != (len(fix),) else fix
+
+
+# What refines and judges the starts of a method that has nothing behind them.
+_FINISH = Method(("lsr", "certify"))
 
 
 def _broadcast_start(problem: Problem, start: Any) -> Array:

@@ -52,6 +52,9 @@ class Formulation:
         Maps a flat batch of problems and their fixes to lower bounds of the maximum-likelihood cost.
     words : tuple of str
         Other words of a method behind which it stands.
+    needs : callable
+        Maps problems that it gave no start to what it needs and they lack, as a sentence without its subject, such as
+        "starts from azimuths"; to "" where they lack nothing that is known.
     """
 
     summary: str
@@ -63,6 +66,7 @@ class Formulation:
     starts: Mapping[str, Callable[[Problem], Array]] = field(default_factory=dict)
     bound: Callable[[Problem, Fix], Reference] | None = None
     words: tuple[str, ...] = ()
+    needs: Callable[[Problem], str] = lambda problem: ""
 
 
 def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
@@ -75,6 +79,36 @@ def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], A
         return nowhere if seen is None else locate(seen)
 
     return start
+
+
+def _needs_sight(problem: Problem) -> str:
+    """Return what is needed where no azimuth is measured."""
+    kinds = dict.fromkeys(rows.kind for rows in problem.rows)
+    return "" if "azimuth" in kinds else f"starts from azimuths, and these rows are {' and '.join(kinds)}"
+
+
+def _needs_bearings(problem: Problem) -> str:
+    """Return what is needed where fewer than two stations measure whole bearings."""
+    wanted = ("azimuth", "elevation")[: problem.dimension - 1]
+    seen = [
+        {
+            (int(a), int(epoch))
+            for rows in problem.rows
+            if rows.kind == kind
+            for a, epoch in zip(rows.a, rows.epoch, strict=True)
+        }
+        for kind in wanted
+    ]
+    if len(set.intersection(*seen)) > 1:
+        return ""
+    kinds = dict.fromkeys(rows.kind for rows in problem.rows)
+    return f"starts from {' and '.join(wanted)} of two stations or more, and these rows are {' and '.join(kinds)}"
+
+
+def _needs_directions(problem: Problem) -> str:
+    """Return what is needed where directions are not those of space."""
+    plane = problem.dimension == 2
+    return "relaxes directions in space, and these rows are in a plane" if plane else _needs_bearings(problem)
 
 
 # both are refined on block averages; only where they begin differs
@@ -143,6 +177,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "30 us",
         "Dogancay 2006, 2015",
         starts={"wiv": _from_bearings(instrumental)},
+        needs=_needs_sight,
     ),
     "bearing_course": Formulation(
         "the same for a target on a polynomial course, over all epochs at once; one station that turns may do",
@@ -161,6 +196,7 @@ _PROGRAMS: dict[str, Formulation] = {
         starts={"directions": _from_bearings(by_directions)},
         bound=partial(reference_bound, method="directions"),
         words=("bound",),
+        needs=_needs_directions,
     ),
     "moment_sdp": Formulation(
         "order-2 moments of position and range errors in a box: a lower bound of the likelihood's cost",
@@ -178,6 +214,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "10 ms",
         "Kahl, Hartley 2008",
         starts={"minimax": _from_bearings(least_worst)},
+        needs=_needs_bearings,
     ),
     "bistatic": Formulation(
         "closed-form range of one receiver and one illuminator; polynomial course of several epochs",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,22 +11,26 @@ from optloc.base.types import Array, Status
 from optloc.linear.constraints import TOLERANCE, Face, exact, faces, violation
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
+from optloc.problem.fix import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
 from optloc.solvers.refine import refine
 
 # Height above which a station is a satellite, Earth radii: above all aircraft, below all orbits.
 _SATELLITE = 1.0 + 100e3 / WGS84_A
 # How deep a line may dip: 5 km to a satellite, for refraction and for targets below the ellipsoid or badly measured; 50
-# km to others, a chord of 1 600 km along the ground: only what is clearly on the other side of the Earth is excluded.
+# km from the ground to a target in space: only what is clearly on the other side of the Earth is excluded.
 _GRAZE, _GROUND = 1.0 - 5e3 / WGS84_A, 1.0 - 50e3 / WGS84_A
 
 
 def is_hidden(problem: Problem, x: Array) -> Array:
     """Return which vectors x (N, size) place a target behind the Earth as seen from a station that hears it.
 
-    The straight line may pass 5 km below the ellipsoid to a station above 100 km, and 50 km to others.
+    One end of the line is in space, above 100 km: no wave passes through the Earth and leaves it. The straight line may
+    pass 5 km below the ellipsoid to a satellite, and 50 km from the ground to a target in space. Between two points on
+    the ground the Earth hides nothing: waves of earthquakes pass through it, and radio waves go around it.
 
     Parameters
     ----------
@@ -36,8 +40,15 @@ def is_hidden(problem: Problem, x: Array) -> Array:
         Parameter vectors.
     """
     out = np.zeros(len(x), dtype=bool)
+    for _, blocked in _blocked(problem, x):
+        out |= blocked
+    return out
+
+
+def _blocked(problem: Problem, x: Array) -> Iterator[tuple[int, Array]]:
+    """Yield each station that measures a target, and where the Earth is between them (N,); arguments of `is_hidden`."""
     if not problem.frame.geodetic or problem.dimension != 3:
-        return out
+        return
     position = np.broadcast_to(problem.stations.position, (len(x), *problem.stations.position.shape[-3:]))
     # stretched along the axis the ellipsoid is the unit sphere, and lines stay lines
     stretch = np.array([1.0, 1.0, 1.0 / (1.0 - WGS84_F)]) / WGS84_A
@@ -47,9 +58,8 @@ def is_hidden(problem: Problem, x: Array) -> Array:
             continue
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
         point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3]) * stretch
-        for nodes in _heard(problem, target):
-            out |= _is_blocked(point, stations[:, nodes[0], nodes[1]], nodes[2])
-    return out
+        for epoch, station, heard in _heard(problem, target):
+            yield station, _is_blocked(point, stations[:, epoch, station], heard)
 
 
 def _heard(problem: Problem, target: int) -> list[tuple[int, int, Array]]:
@@ -68,13 +78,15 @@ def _heard(problem: Problem, target: int) -> list[tuple[int, int, Array]]:
 
 def _is_blocked(point: Array, station: Array, heard: Array) -> Array:
     """Return whether the line from point to station dips too deep; unit sphere coordinates."""
-    limit = np.where((station**2).sum(-1) > _SATELLITE**2, _GRAZE, _GROUND)
+    satellite = (station**2).sum(-1) > _SATELLITE**2
+    limit = np.where(satellite, _GRAZE, _GROUND)
     line = station - point
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        outside = satellite | ((point**2).sum(-1) > _SATELLITE**2)
         # the point of the segment next to the centre; at its ends nothing lies in between
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[:, None] * line) ** 2).sum(-1)
-    return np.asarray(heard & (share > 0.0) & (nearest < limit**2))
+    return np.asarray(heard & outside & (share > 0.0) & (nearest < limit**2))
 
 
 def lowest_sight(problem: Problem, x: Array) -> Array:
@@ -119,7 +131,7 @@ def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) ->
 def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares) -> Pool:
     """Return the feasible candidates of a flat batch, with those on faces added where the cheapest breaks a constraint.
 
-    A target that the Earth hides from a satellite which hears it is not feasible either.
+    A target that the Earth hides from a station which hears it is not feasible either.
 
     Every set of inequalities that can hold with equality together is a face. The cost is minimised on each from the
     cheapest candidates, and what is feasible competes: the cheapest meets the conditions of Karush, Kuhn and Tucker.
@@ -141,10 +153,15 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     broken = _breaks(problem, pool)
     if not broken.any():
         return pool
+    return _keep_misfits(problem, pool, broken, _bound(problem, pool, broken, descend))
+
+
+def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Pool:
+    """Return the pool of `bound_pool` where some candidates (N, q) are broken."""
     sides = faces(problem)
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     needy = np.flatnonzero(broken[np.arange(len(first)), first])
-    refused = np.where(broken & (pool.code == Status.OK), pool.cost, np.inf)
+    refused = np.where(broken & (pool.code == Status.OK) & _fits(pool, pool.cost), pool.cost, np.inf)
     kept = replace(_without(pool, broken), hidden=_name_hidden(problem, pool.x, refused))
     # where the cheapest is feasible it is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
@@ -159,6 +176,7 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     beyond = np.full((size, width), np.inf)
     for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (beyond, 4)):
         array[needy] = np.concatenate([found[place] for found in on_faces], axis=1)
+    beyond = np.where(_fits(pool, beyond), beyond, np.inf)
     return replace(
         kept,
         hidden=_first_told(kept.hidden, _name_hidden(problem, x, beyond)),
@@ -169,13 +187,37 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     )
 
 
+def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> Pool:
+    """Return a pool with minima that fit badly behind the Earth, where no minimum in sight was found.
+
+    A wrong row may move the best minimum of a good network there: then the misfit is the reason, not the horizon.
+    """
+    unseen = ~((pool.code == Status.OK) & np.isfinite(pool.cost)).any(1)
+    back = broken & unseen[:, None] & (before.code == Status.OK) & ~_fits(before, before.cost)
+    item, slot = np.nonzero(back & np.isfinite(before.x).all(-1))
+    if not len(item):
+        return pool
+    inside = violation(problem.take(item), before.x[item, slot]) <= TOLERANCE
+    item, slot = item[inside], slot[inside]
+    cost, code = pool.cost.copy(), pool.code.copy()
+    cost[item, slot], code[item, slot] = before.cost[item, slot], before.code[item, slot]
+    return replace(pool, cost=cost, code=code)
+
+
+def _fits(pool: Pool, cost: Array) -> Array:
+    """Return which costs (N, q) noise explains; all of a pool with a loss, whose costs have no such test."""
+    if pool.loss:
+        return np.ones(cost.shape, dtype=bool)
+    return ~(tail_probability(cost, pool.dof[:, None]) < REFUTED)
+
+
 def without_broken(problem: Problem, pool: Pool) -> Pool:
     """Return candidates of which those that break a constraint, or are hidden, have infinite cost."""
     return _without(pool, _breaks(problem, pool))
 
 
 def _breaks(problem: Problem, pool: Pool) -> Array:
-    """Return which candidates break a constraint, or stand where the Earth hides them from a satellite."""
+    """Return which candidates break a constraint, or stand where the Earth hides them from a station."""
     broken = np.zeros(pool.cost.shape, dtype=bool)
     item, slot = np.nonzero(np.isfinite(pool.x).all(-1))
     if len(item) and (problem.constraints or problem.frame.geodetic):
@@ -218,8 +260,8 @@ def _on_face(
 
 # What the Earth hides is told, not dropped.
 
-# Minima that a sentence places; the others are counted.
-_PLACED = 2
+# Minima that a sentence places, and stations that it names for each; the others are counted.
+_PLACED, _NAMED = 2, 3
 # Two refinements of one minimum differ by less, relative to coordinates from the Earth's centre.
 _SAME = 1e-6
 
@@ -244,7 +286,7 @@ def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
     behind = is_hidden(part, points) & (violation(part, points) <= TOLERANCE)
     for i in np.unique(item[behind]):
         own = np.flatnonzero(behind & (item == i))
-        out[i] = _describe(problem, points[own], cost[i, slot[own]])
+        out[i] = _describe(problem, points[own], cost[i, slot[own]], int(i))
     return out
 
 
@@ -253,8 +295,8 @@ def _first_told(one: Array | None, other: Array | None) -> Array | None:
     return one if one is None or other is None else np.where(one != "", one, other)
 
 
-def _describe(problem: Problem, x: Array, cost: Array) -> str:
-    """Return how many minima (q, size) lie behind the Earth, what they cost, and where the best ones are."""
+def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
+    """Return a sentence on the minima (q, size) of problem `item` behind the Earth: costs, places, stations."""
     names = {motion: state_names(motion, len(problem.motions), 0)[0] for motion in range(len(problem.motions))}
     slots = [slot for slot in problem.layout.shared if slot.name in names.values()]
     kept: list[int] = []
@@ -262,18 +304,26 @@ def _describe(problem: Problem, x: Array, cost: Array) -> str:
         if not any(np.abs(x[i] - x[j]).max() <= _SAME * np.abs(x[j]).max() for j in kept):
             kept.append(int(i))
     lines = (
-        f"{len(kept)} minima, the best of cost {cost[kept[0]]:.3g}, lie"
+        f"{len(kept)} minima, the best of cost {cost[kept[0]]:.3g}, have stations below their horizon"
         if len(kept) > 1
-        else (f"the only minimum found, of cost {cost[kept[0]]:.3g}, lies")
+        else f"the only minimum found, of cost {cost[kept[0]]:.3g}, has stations below its horizon"
     )
-    text = f"{lines} behind the Earth as a satellite sees it"
-    if len(slots) != 1:
-        return text
     places = []
     for j in kept[:_PLACED]:
-        lat, lon, height = problem.frame.to_geodetic(x[j, slots[0].start : slots[0].start + 3])
-        places.append(f"{np.degrees(lat):.3f}, {np.degrees(lon):.3f} deg at {height:.4g} m")
-    return f"{text}: {'; '.join(places)}" + ("; ..." if len(kept) > _PLACED else "")
+        below = _below(problem, x[j], item)
+        if len(slots) == 1:
+            lat, lon, height = problem.frame.to_geodetic(x[j, slots[0].start : slots[0].start + 3])
+            below = f"{np.degrees(lat):.3f}, {np.degrees(lon):.3f} deg at {height:.4g} m ({below})"
+        places.append(below)
+    return f"{lines}: {'; '.join(places)}" + ("; ..." if len(kept) > _PLACED else "")
+
+
+def _below(problem: Problem, x: Array, item: int) -> str:
+    """Return the names of the stations that the Earth hides from a target at a vector (size,) of one problem."""
+    found = sorted({station for station, blocked in _blocked(problem.take(np.array([item])), x[None]) if blocked[0]})
+    names = [problem.stations.names[station] for station in found]
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{', '.join(names[:_NAMED])}{more}"
 
 
 def least_finished(pool: Pool) -> Array:

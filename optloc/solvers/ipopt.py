@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from formulations.backend import Choice, choice_for
+from formulations.backend import Choice, SolverError, choice_for
 from formulations.nls import Program
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
@@ -74,7 +74,7 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
         code[item, slot] = _stationary(part, points, code[item, slot], face[item, slot])
     cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
-    found = without_broken(problem, Pool(x, cost, code, face, weights, pool.dof, pool.stages))
+    found = without_broken(problem, Pool(x, cost, code, face, weights, pool.dof, pool.stages, missing=pool.missing))
     settled = settle(problem, found, Stage("nlp", f"{len(item)} programs", perf_counter() - began))
     return replace(settled, refined=False)  # least squares has the last word where it follows
 
@@ -136,7 +136,11 @@ class _ScaledProblem:
         self.prior = _prior(problem, unit, centre)
 
     def from_start(self, start: Array) -> tuple[Array, float, int]:
-        found = self.program.solve((start - self.centre) / self.unit, self.z, self.weight, self.data, prior=self.prior)
+        begin = (start - self.centre) / self.unit
+        try:
+            found = self.program.solve(begin, self.z, self.weight, self.data, prior=self.prior)
+        except SolverError:  # of this candidate alone; `recording` has its text
+            return start, np.inf, int(Status.NUMERICAL)
         code = (
             Status.OK if found.success else Status.MAX_ITERATIONS if "Iteration" in found.status else Status.NUMERICAL
         )

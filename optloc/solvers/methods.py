@@ -8,7 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
-from formulations.backend import Choice, Kind, counting, using
+from formulations.backend import Choice, Ending, Kind, counting, recording, using
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.records import take
 from optloc.base.registry import Table
@@ -191,6 +191,9 @@ METHODS = {
     "robust": "roots+lsr+widen+lsr+search+suspects+certify",
 }
 
+# Endings of back ends that a sentence names; more are not read.
+_SHOWN = 3
+
 # More candidates change nothing about these, so that nobody has to prove them.
 _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS)
 
@@ -267,10 +270,23 @@ def _named(name: str, solver: Solver) -> Solver:
     """Return a stage whose numerical failures say where they happened."""
 
     def stage(problem: Problem, pool: Pool | None) -> Pool:
-        with where(name):
-            return solver(problem, pool)
+        with where(name), recording() as endings:
+            found = solver(problem, pool)
+        failed = [ending for ending in endings if not ending.found]
+        return _note_failures(found, name, failed, len(endings)) if failed else found
 
     return stage
+
+
+def _note_failures(pool: Pool, name: str, failed: list[Ending], solves: int) -> Pool:
+    """Return the pool of a stage that says how often its back ends ended without an answer, and what they report."""
+    told = "; ".join(str(ending) for ending in list(dict.fromkeys(failed))[:_SHOWN])
+    count = f"{len(failed)} of {solves} solve{'' if solves == 1 else 's'} without an answer"
+    pool = pool.without(np.flatnonzero(pool.empty), f"{name}: {count} ({told})", Status.NUMERICAL)
+    if not pool.stages:
+        return pool
+    last = pool.stages[-1]
+    return replace(pool, stages=(*pool.stages[:-1], replace(last, detail=f"{last.detail}; {count} ({told})")))
 
 
 def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
@@ -304,7 +320,7 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
 def _beside(problem: Problem, start: Pool, x: Array) -> Pool:
     """Return a pool of starts with more of them (N, q, size) beside it."""
     both = pack(np.concatenate([start.x, x], axis=1))
-    return replace(offer(problem, both, None, "", perf_counter()), stages=start.stages)
+    return replace(offer(problem, both, None, "", perf_counter()), stages=start.stages, missing=start.missing)
 
 
 def is_unproven(fix: Fix) -> Array:

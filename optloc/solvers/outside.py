@@ -13,7 +13,7 @@ from optloc.base.types import Array, Status
 from optloc.problem.claims import Claims, choose, untried
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.pool import Curvature, Pool, begin
+from optloc.solvers.pool import Curvature, NoStart, Pool, begin
 from optloc.solvers.stages import Solver
 from optloc.solvers.verdict.findings import NO_ANSWER, NO_PROOF
 from optloc.solvers.verdict.judge import fill, judge, verdict
@@ -70,9 +70,11 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     shape = x.shape[:2]
     # nobody has refined them: a verdict would call them minima
-    if np.isnan(fix.cost).all() and (fix.code == Status.UNAVAILABLE).all():
+    if np.isnan(fix.cost).all() and (fix.code == Status.UNREFINED).any():
         code = np.full(shape, int(Status.UNAVAILABLE), dtype=np.int8)
-        return Pool(x, np.full(shape, np.nan), code, np.zeros(shape, dtype=int), fix.weights, fix.dof, fix.stages)
+        missing = NoStart(np.where(fix.code == Status.UNREFINED, "", fix.reason), fix.code)
+        faces, costs = np.zeros(shape, dtype=int), np.full(shape, np.nan)
+        return Pool(x, costs, code, faces, fix.weights, fix.dof, fix.stages, missing=missing)
     cost = np.concatenate([fix.cost[:, None], fix.cost[:, None] + fix.alternatives.gap], axis=1)
     # empty slots have infinite gaps
     listed = np.where(np.isfinite(fix.alternatives.gap), int(Status.OK), int(Status.UNAVAILABLE))

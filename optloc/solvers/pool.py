@@ -15,7 +15,7 @@ from optloc.base.errors import NUMERICAL
 from optloc.base.records import Axes, join, overwrite
 from optloc.base.threads import flow
 from optloc.base.types import Array, Status
-from optloc.linear.normal import degrees_of_freedom
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models.layers import Layers
 from optloc.problem.claims import Claims
 from optloc.problem.fix import Fix, Stage
@@ -79,6 +79,22 @@ class TriedBefore:
 
 
 @dataclass(frozen=True, slots=True)
+class NoStart:
+    """Why N problems have no candidate, where a stage knows it.
+
+    Parameters
+    ----------
+    reason : object array (N,)
+        A sentence; "" where nothing is known.
+    code : int array (N,)
+        `Status`: unavailable where the method does not start such rows, numerical where its back end failed.
+    """
+
+    reason: Annotated[Array, Axes(0, empty="")]
+    code: Annotated[Array, Axes(0, empty=int(Status.UNAVAILABLE))]
+
+
+@dataclass(frozen=True, slots=True)
 class Pool:
     """Candidates of a flat batch of N problems, q slots each, with the evidence that stages have gathered.
 
@@ -124,6 +140,8 @@ class Pool:
         What a branch before has tried to prove: it stands where nothing new was found.
     hidden : object array (N,), optional
         What lies behind the Earth, in words; "" where nothing does.
+    missing : NoStart, optional
+        Why there is no candidate, where there is none; it counts only there.
     asked : bool
         Whether contradictions were looked into.
     refuted : str
@@ -151,6 +169,7 @@ class Pool:
     proven: Claims | None = None
     tried_before: TriedBefore | None = None
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
+    missing: NoStart | None = None
     asked: bool = False
     refuted: str = ""
     conclusion: Annotated[Array, Axes(0, empty=None)] | None = None
@@ -169,6 +188,21 @@ class Pool:
     def unfinished(self) -> bool:
         """Return whether the refinement of a best candidate ended before it had converged."""
         return bool(np.isin(self.code[:, 0], (Status.MAX_ITERATIONS, Status.STALLED)).any())
+
+    @property
+    def empty(self) -> Array:
+        """Return which problems have no candidate, (N,): neither a start nor a point with a cost."""
+        found = np.isfinite(self.x).all(-1) & (np.isnan(self.cost) | np.isfinite(self.cost))
+        return np.asarray(~found.any(1))
+
+    def without(self, items: Array, reason: str, status: Status) -> Pool:
+        """Return the pool with a reason why some of its problems have no candidate; reasons known before stay."""
+        blank = np.full(len(self), "", dtype=object)
+        known = self.missing or NoStart(blank, np.full(len(self), int(Status.UNAVAILABLE), dtype=np.int8))
+        told, code = known.reason.copy(), known.code.copy()
+        new = items[told[items] == ""]
+        told[new], code[new] = reason, int(status)
+        return replace(self, missing=NoStart(told, code))
 
     def merge(self, items: Array, other: Pool, stage: Stage | None = None) -> Pool:
         """Return the pool with those of other problems in the place of some, and one more stage."""
@@ -202,6 +236,7 @@ def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: flo
         np.broadcast_to(problem.weight, (len(x), problem.count)),
         degrees_of_freedom(problem) if before is None else before.dof,
         (*(before.stages if before else ()), stage),
+        missing=None if before is None else before.missing,
     )
 
 

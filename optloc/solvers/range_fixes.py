@@ -19,7 +19,8 @@ from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.jit import enabled, ready, usable
 from optloc.compute.sums import equations_at
-from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
+from optloc.linear.normal import depends_on_place, weighed
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.problem.fix import Stage
 from optloc.problem.layout import Layout

@@ -13,8 +13,9 @@ from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.pack import coarseness, pack
 from optloc.compute.sums import equations_at, serves
-from optloc.linear.constraints import Face, restore, tangent_at
+from optloc.linear.constraints import Face, is_height, restore, tangent_at
 from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
+from optloc.models.primitives import WGS84_A
 from optloc.problem.epochs import whole, windows
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
@@ -222,6 +223,10 @@ class _Part:
         return _Part(self.problem.take(items), self.weights.take(items), self.blur[items])
 
 
+# Roundings that lie between a measurement and its residual.
+_ROUNDINGS = 4.0
+
+
 def _blur(problem: Problem, count: int) -> Array:
     """Return the rounding error (N,) of the whitened residuals: arrival times that count from long ago are coarse."""
     squares: Any = 0.0
@@ -229,9 +234,22 @@ def _blur(problem: Problem, count: int) -> Array:
         sigma = np.sqrt(variances(part.noise, part.count))
         ratio = (np.abs(part.observed) + coarseness(part)) / sigma
         squares = squares + (np.where(part.weight > 0.0, ratio, 0.0) ** 2).sum(-1)
-    # Four roundings lie between a measurement and its residual.
-    coarse = 4.0 * np.finfo(float).eps * np.sqrt(squares)
+    coarse = _ROUNDINGS * np.finfo(float).eps * np.sqrt(squares)
     return np.broadcast_to(np.where(np.isfinite(coarse), coarse, 0.0), (count,))
+
+
+def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | float:
+    """Return what a known height adds to the rounding error (N,) of the whitened residuals.
+
+    A place is put back onto it from the Earth's centre, so that its coordinates are off by the rounding of that
+    distance; the information of the rows says what that makes of their residuals.
+    """
+    if not any(is_height(problem, level) for level in face):
+        return 0.0
+    slots = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
+    own = [column for slot in slots for column in range(slot.start, slot.start + slot.size)]
+    information = np.diagonal(equations.shared, axis1=-2, axis2=-1)[..., own].sum(-1)
+    return np.asarray(_ROUNDINGS * np.finfo(float).eps * WGS84_A * np.sqrt(np.maximum(information, 0.0)))
 
 
 def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration: int) -> None:
@@ -249,7 +267,7 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
         after.cost,
         decrement(now, move, rules.n),
         solvable,
-        part.blur,
+        part.blur + (_blur_of_face(part.problem, rules.face, now) if rules.face else 0.0),
         damping,
         state.growth[active],
         rules.tolerance,

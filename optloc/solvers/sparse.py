@@ -14,12 +14,13 @@ from optloc.base import linalg
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
+from optloc.linear.redundancy import present_unknowns
 from optloc.models import MODELS
 from optloc.problem.arrivals import as_arrivals
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, begin, offer, pack
-from optloc.solvers.stages import fix_by, gtrs, lsr
+from optloc.solvers.stages import explain_absence, fix_by, gtrs, lsr
 from optloc.solvers.starts.position import hold_still, one_position, spread_of, vectors
 from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.starts.squared_range import Coordinates, lift_rows
@@ -236,9 +237,13 @@ def sparse(problem: Problem, pool: Pool | None) -> Pool:
     With fewer than about ten stations this is a start and nothing more: the sum of the errors' sizes then often hides
     the wrong rows. Search their subsets instead.
     """
+    return explain_absence(problem, _starts(problem, pool), "sparse")
+
+
+def _starts(problem: Problem, pool: Pool | None) -> Pool:
     began = perf_counter()
     if not one_position(problem):
-        x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: sparse(one, None)))
+        x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: _starts(one, None)))
         return offer(problem, x, pool, "sparse", began)
     alone = hold_still(problem)
     arrived = as_arrivals(alone)
@@ -272,44 +277,52 @@ def sparse_errors(problem: Problem) -> SparseErrors:
     problem : Problem
         N problems.
     """
-    x = vectors(problem, _lift(problem)[:, None])[:, 0]
-    x, raw = _linearise(problem, x)
+    position, failed = _lift(problem)
+    x = vectors(problem, position[:, None])[:, 0]
+    x, raw, unsolved = _linearise(problem, x)
     start = problem.layout.take(x, "position")
     fixed, wrong = _test_support(problem, x, raw)
-    return SparseErrors(np.stack([start, fixed], axis=1), raw, wrong)
+    # without the answer of a programme nothing of it is left: not the fix of the rows that were not tested, either
+    failed |= unsolved
+    found = np.where(failed[:, None, None], np.nan, np.stack([start, fixed], axis=1))
+    return SparseErrors(found, raw & ~failed[:, None], wrong & ~failed[:, None])
 
 
-def _lift(problem: Problem) -> Array:
-    """Return positions (N, d) of the squared rows in two weightings.
+def _lift(problem: Problem) -> tuple[Array, Array]:
+    """Return positions (N, d) of the squared rows in two weightings, and where the solver failed (N,).
 
     Where these leave a direction open (pairs without a common station have one more unknown each), it is the closed
     form of all rows.
     """
-    lifts, point = row_wise(problem), None
+    lifts, point, failed = row_wise(problem), None, np.zeros(problem.batch_shape[0], dtype=bool)
     for _ in range(2):
-        y, _ = _fit(lifts.rows, lifts.right, lifts.error(point), lifts)
-        point = y[:, : problem.dimension]
+        y, _, unsolved = _fit(lifts.rows, lifts.right, lifts.error(point), lifts)
+        point, failed = y[:, : problem.dimension], failed | unsolved
     assert point is not None
     position = point * lifts.scale[:, None] + lifts.origin
-    lost = np.flatnonzero(np.isnan(position).any(1))
+    lost = np.flatnonzero(np.isnan(position).any(1) & ~failed)
     if len(lost):
         rest = problem.take(lost)
         position[lost] = rest.layout.take(gtrs(rest, None).x[:, 0], "position")
-    return position
+    return position, failed
 
 
-def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return vectors (N, size) after one step with sparse errors, and the support (N, m)."""
+def _linearise(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
+    """Return vectors (N, size) after one step with sparse errors, the support (N, m), and where the solver failed."""
     residual, jacobian = _derivatives(problem, x)
-    move, errors = _fit(jacobian, residual, _sigma(problem))
-    return x + move, errors != 0.0
+    move, errors, failed = _fit(jacobian, residual, _sigma(problem))
+    return x + move, errors != 0.0, failed
 
 
-def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) -> tuple[Array, Array]:
-    """Return the unknowns (N, n) and errors in sigmas (N, m) of linear rows; unknowns that no row has are zero."""
+def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) -> tuple[Array, Array, Array]:
+    """Return the unknowns (N, n) and errors in sigmas (N, m) of linear rows, and where the solver failed (N,).
+
+    Unknowns that no row has are zero.
+    """
     from formulations.sparse_errors import sparse_fit
 
     y, errors = np.full((len(rows), rows.shape[-1]), np.nan), np.zeros(right.shape)
+    failed = np.zeros(len(rows), dtype=bool)
     white, side = rows / sigma[..., None], right / sigma
 
     def fit(i: int) -> None:
@@ -320,11 +333,14 @@ def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) 
         kept = np.append(used, True)
         cones = [] if lifts is None else [cone[:, kept] for column, cone in lifts.cones(i) if used[column]]
         found = sparse_fit(white[i][:, used], side[i], cones=cones)
+        failed[i] = found.answer is not None and np.isnan(found.answer.primal)
+        if failed[i]:
+            return
         y[i], errors[i] = 0.0, found.errors
         y[i, used] = found.y
 
     mapped(fit, range(len(rows)), least=WORTH)
-    return y, errors
+    return y, errors, failed
 
 
 def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
@@ -356,8 +372,7 @@ def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Arra
 def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
     """Return the largest of the rows in error (N, m), so many that one row more than unknowns is left."""
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
-    unknown = problem.layout.n_shared + problem.layout.n_local * problem.epochs
-    most = np.maximum(present.sum(1, keepdims=True) - unknown - 1, 0)
+    most = np.maximum(present.sum(1, keepdims=True) - present_unknowns(problem)[:, None] - 1, 0)
     # argsort of argsort is the rank: 0 for the largest
     rank = np.argsort(np.argsort(-np.where(wrong, size, -np.inf), axis=1, kind="stable"), axis=1)
     return np.asarray(wrong & (rank < most))

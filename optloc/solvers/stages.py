@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from formulations.backend import count
+from formulations.backend import count, failures
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
@@ -21,7 +21,7 @@ from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
 from optloc.solvers.formulations import FORMULATIONS
-from optloc.solvers.inequalities import bound_pool, least_finished
+from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
@@ -40,7 +40,7 @@ from optloc.solvers.starts.position import (
 from optloc.solvers.starts.registration import step_beside
 from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.verdict.judge import judge, standing
-from optloc.solvers.verdict.minima import settle
+from optloc.solvers.verdict.minima import is_measured, settle
 
 Solver = Callable[[Problem, Pool | None], Pool]
 
@@ -73,8 +73,38 @@ def start_with(word: str) -> Solver:
             x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: start(one, None)))
         return offer(whole, x, pool, word, began)
 
-    return start
+    return lambda problem, pool: explain_absence(problem, start(problem, pool), word)
 
+
+def explain_absence(problem: Problem, pool: Pool, word: str) -> Pool:
+    """Return a pool of starts that says why a word of a method found none for rows that have some of other words.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    pool : Pool
+        Their starts.
+    word : str
+        What made them: a key of the starts of a formulation, or the name of a stage.
+    """
+    items = np.zeros(0, dtype=int) if word in _COMPLETE else np.flatnonzero(pool.empty)
+    if not len(items):
+        return pool
+    if failures():  # not the rows are the reason
+        return pool
+    part = problem.take(items)
+    # of what starts nowhere else, and determines nothing, the verdict knows more
+    items = items[~roots(part, None).empty | is_measured(part)]
+    forms = FORMULATIONS.values()
+    own = [form for form in forms if word in form.starts] or [form for form in forms if word in form.words]
+    needs = [form.needs(problem) for form in own]
+    told = needs[0] if needs and all(needs) else "finds no start from these rows"
+    return pool.without(items, f"{word} {told}: use 'auto'", Status.UNAVAILABLE)
+
+
+# Words whose starts serve all rows that any closed form serves.
+_COMPLETE = ("gtrs", "roots")
 
 gtrs, roots = start_with("gtrs"), start_with("roots")
 
@@ -239,6 +269,9 @@ def _answer(
     # where all that is known is hidden by the Earth, another minimum may be in sight
     hidden = np.zeros(len(fix.code), dtype=bool) if pool.hidden is None else pool.hidden != ""
     lost = ~fix.answered & (hidden | ~np.isin(fix.code, _SETTLED))
+    refuted = fix.answered & (fix.code == Status.MISFIT) & problem.frame.geodetic
+    behind: Array = np.flatnonzero(refuted)
+    lost[behind] = is_hidden(problem.take(behind), fix.x[behind]) if len(behind) else False
     # unlinked groups have fewer equations than the count says: without redundancy any place would fit
     lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
     items = np.flatnonzero(lost)
@@ -342,7 +375,7 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         count("lsr", int(done.iterations.sum()))
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
     # on the face without inequalities, number 0; `bound_pool` adds those on others
-    refined = Pool(x, cost, code, np.zeros(shape, dtype=int), weights, pool.dof, pool.stages)
+    refined = Pool(x, cost, code, np.zeros(shape, dtype=int), weights, pool.dof, pool.stages, missing=pool.missing)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
     return settle(problem, refined, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))

@@ -20,7 +20,7 @@ from optloc.base.outputs import written
 from optloc.study.baselines import BASELINES
 from optloc.study.methods import version_of
 from optloc.study.plan import Plan, planned
-from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
+from optloc.study.trial import COLUMNS, EXPLAINED, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -410,7 +410,8 @@ class Progress:
     methods : dict of (str, str) to int
         How many rows of which method have which status.
     failures : dict of (str, str) to str
-        Why a trial of a method has a status that only those without a fix have.
+        Why a trial of a method has no fix, by statuses whose reason says it: of the study, of a back end that failed,
+        of a method that does not start such rows.
     """
 
     manifest: Manifest
@@ -441,7 +442,7 @@ def progress(folder: Path) -> Progress:
         for row in table.group_by(["method", "status"], use_threads=False).aggregate([([], "count_all")]).to_pylist():
             method, status = str(row["method"]), str(row["status"])
             methods[method, status] += int(row["count_all"])
-            if status in FAILED and (method, status) not in failures:
+            if status in EXPLAINED and (method, status) not in failures:
                 own = pc.and_(pc.equal(table["method"], method), pc.equal(table["status"], status))
                 failures[method, status] = str(table["reason"].filter(own)[0])
     counts: Counter[str] = Counter()

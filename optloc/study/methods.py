@@ -8,11 +8,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from time import perf_counter, process_time
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +18,29 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Certificate, Status
 from optloc.files.schema import Units, join
 from optloc.problem.fix import Fix
+from optloc.study.backends import backend_kind, backends, kind_of, version_of
 from optloc.study.baselines import BASELINES, heard, only_networks, start_of
 from optloc.study.document import MethodTable
 from optloc.study.draws import Drawn
 from optloc.study.minimizers import baseline_of, code_of, load_minimizer
 from optloc.study.networks import CALIBRATE, Found, Networks, calibrated
+
+# Back ends stand in a module of their own; studies know them from here.
+__all__ = [
+    "SETTINGS",
+    "Method",
+    "Nonsense",
+    "Run",
+    "Setting",
+    "added",
+    "backend_kind",
+    "backends",
+    "check_settings",
+    "methods_of",
+    "require_program",
+    "run",
+    "version_of",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +255,7 @@ def run(method: Method, drawn: Drawn | Networks) -> Run:
 
     choice = None
     if method.solver:
-        choice = Choice(backend_kind(method.solver, "solver"), method.solver, method.settings)
+        choice = Choice(kind_of(method.solver), method.solver, method.settings)
     # What a method does about rounding and division is its own affair, and ends with it.
     asked = np.zeros(len(drawn.seed))
     with using(choice), counting() as tally, heard(lambda trial, _: _add(asked, trial)), np.errstate():
@@ -275,7 +291,8 @@ def _solved(method: Method, drawn: Drawn | Networks) -> Any:
     from optloc.solvers import solve
 
     assert method.method is not None
-    fix = solve(drawn.problem, method.method)
+    # Of a method that only starts the estimate itself is measured.
+    fix = solve(drawn.problem, method.method, refine=False)
     # A batch of one has no axis of its own.
     return fix if fix.shape else fix.flat()
 
@@ -421,88 +438,3 @@ def check_settings(solver: str, settings: dict[str, Any], where: str) -> None:
             raise InvalidProblem(f"{name!r} is no setting of {solver} that a file may make", where, advice)
         if not known[name].takes(value):
             raise InvalidProblem(f"{name} is {value!r}", where, f"it takes {known[name]}")
-
-
-# Back ends that are installed here: conic solvers of cvxpy, nonlinear ones of CasADi, least squares.
-
-
-@dataclass(frozen=True, slots=True)
-class Backend:
-    """A solver that is installed.
-
-    Parameters
-    ----------
-    kind : "conic", "nonlinear" or "least squares"
-        What it solves.
-    version : str
-        Its version; that of the library that ships it where it has none of its own.
-    summary : str
-        One line for listings.
-    """
-
-    kind: Literal["conic", "nonlinear", "least squares"]
-    version: str
-    summary: str
-
-
-# Where cvxpy's name of a solver is not that of its package.
-_PACKAGES = {"COPT": "coptpy", "CUCLARABEL": "juliacall", "GUROBI": "gurobipy", "MOSEK": "Mosek", "SDPA": "sdpa-python"}
-_NONLINEAR = {
-    "ipopt": "interior point with line search (Waechter, Biegler 2006)",
-    "sqpmethod": "sequential quadratic programming with CasADi's qrqp",
-    "feasiblesqpmethod": "feasible sequential quadratic programming",
-    "blocksqp": "block-structured sequential quadratic programming (Janka et al. 2016)",
-    "fatrop": "structured interior point",
-    "alpaqa": "augmented Lagrangian with PANOC",
-    "sleqp": "sequential linear and equality-constrained quadratic programming",
-    "uno": "unified nonlinear optimisation",
-    "knitro": "Artelys Knitro (licence)",
-    "snopt": "SNOPT (licence)",
-    "worhp": "WORHP (licence)",
-    "madnlp": "interior point in Julia",
-}
-
-
-def version_of(package: str) -> str:
-    """Return the version of an installed distribution, "?" where it has none."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "?"
-
-
-@cache
-def backends() -> dict[str, Backend]:
-    """Return every back end that works here, by the name that a study file uses."""
-    import casadi
-    import cvxpy
-    from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
-
-    found: dict[str, Backend] = {}
-    # Studies compare solvers of cones: those that have neither kind cannot take any program of this package.
-    for name in sorted(set(cvxpy.installed_solvers()) & set(SOLVER_MAP_CONIC)):
-        cones = {cone.__name__ for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
-        powers = [word for word, cone in (("cones of order 2", "SOC"), ("semidefinite cones", "PSD")) if cone in cones]
-        if powers:
-            found[name] = Backend("conic", version_of(_PACKAGES.get(name, name.lower())), " and ".join(powers))
-    # CasADi can only be asked plugin by plugin: it has no list.
-    for name, summary in _NONLINEAR.items():
-        if casadi.has_nlpsol(name):
-            found[name] = Backend("nonlinear", f"CasADi {version_of('casadi')}", summary)
-    about = "scipy.optimize.least_squares; a baseline of studies"
-    found["scipy"] = Backend("least squares", version_of("scipy"), about)
-    return found
-
-
-def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
-    """Return what a back end solves; raise InvalidProblem where it is unknown, not installed or no setting."""
-    found = {key: entry.kind for key, entry in backends().items() if entry.kind in ("conic", "nonlinear")}
-    if name not in found:
-        import cvxpy
-
-        known = {*_NONLINEAR, *cvxpy.settings.SOLVERS} - set(found)
-        if name in known:
-            advice = f"install it; here are {', '.join(found)}"
-            raise InvalidProblem(f"the solver {name!r} is not installed, or cannot solve these cones", where, advice)
-        raise InvalidProblem(f"unknown solver {name!r}", where, nearest(name, list(found)))
-    return "conic" if found[name] == "conic" else "nonlinear"

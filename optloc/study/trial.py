@@ -185,6 +185,9 @@ GAP = Column("gap", "float", "1", "Cost less the lowest cost that any method of 
 FAILED = DIED, LATE, INVALID = "died", "timeout", "invalid"
 """Statuses of a trial that has no fix: an error or the end of its process, its time limit, an answer that is none."""
 
+EXPLAINED = (*FAILED, Status.NUMERICAL.label, Status.UNAVAILABLE.label)
+"""Statuses of trials without a position whose reasons a summary names: back ends and methods are their cause."""
+
 VALUES: tuple[str, ...] = tuple(column.name for column in COLUMNS if column.value)
 """Columns that are equal bit for bit on one machine, whatever the executor."""
 

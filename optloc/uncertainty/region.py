@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -14,7 +13,7 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
 from optloc.compute.jit import enabled
 from optloc.compute.sums import equations_at
-from optloc.linear.constraints import exact, levels, restore
+from optloc.linear.constraints import exact
 from optloc.linear.normal import covariance
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import Fix
@@ -256,86 +255,6 @@ def _far_cells(cost: Cost, x: Array, level: float, most: int, lists: Array) -> t
     return Cells(base[:d], cells[:count], inside), bool((far[:count] <= level).any()), ""
 
 
-# Along what holds the position exactly: the cells of a grid that are reached from the fix.
-
-# Steps of the grid from the fix to where a Gaussian meets the level, and cells at most: more than a picture shows.
-# Where there are more the steps are doubled, so often that a region of a million standard deviations has an end.
-_FINE, _CELLS, _DOUBLINGS = 8.0, 4000, 20
-
-
-def cells_along(problem: Problem, fix: Fix, level: float, reach: float) -> Array:
-    """Return cells of the region of a fix that equalities hold, along the surface or line that they leave, (n, 2^k, d).
-
-    All positions there that are reached from the fix, or from an alternative, without costing more than a quantile of
-    chi-square with k degrees of freedom more than the fix; k is the dimension of what is left.
-
-    Parameters
-    ----------
-    problem : Problem
-        The problem of the fix: one static position, held by equalities.
-    fix : Fix
-        A single fix.
-    level : float
-        Probability that the region contains the target.
-    reach : float
-        How far from the fix the cells go, metres: where the region has no end, they have one.
-    """
-    flat, x = problem.flat().with_rows(weight=fix.weights[None]), fix.x[None]
-    face, d = exact(flat), problem.dimension
-    slot, _ = problem.layout.find("position")
-    own = slice(slot.start, slot.start + d)
-    gradients = levels(flat, face, x)[1][0][:, own]
-    left = np.linalg.svd(gradients)[2][len(gradients) :].T  # what is orthogonal to all of them
-    values, vectors = np.linalg.eigh(left.T @ fix.covariance() @ left)
-    axes = left @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    q, passes = quantile(level, axes.shape[1]), _passes(flat)
-    threshold = float(profile(flat, x[None], x, passes)[0][0, 0]) + q
-
-    def place(steps: Array) -> Array:
-        points = np.repeat(x, len(steps), axis=0)
-        points[:, own] += steps @ axes.T
-        return restore(flat, face, points)
-
-    def inside(steps: Array) -> Array:
-        points = place(steps)
-        cost = profile(flat, points[:, None], x, passes)[0][:, 0]
-        near = np.sqrt(((points[:, own] - x[0, own]) ** 2).sum(-1)) <= reach
-        return np.asarray(near & (cost <= threshold))
-
-    others = fix.alternatives.x[:, own][fix.alternatives.gap <= q]
-    starts = np.concatenate([np.zeros((1, axes.shape[1])), (others - x[0, own]) @ np.linalg.pinv(axes).T])
-    step = np.sqrt(q) / _FINE
-    for _ in range(_DOUBLINGS):
-        found = _flooded(inside, starts, step)
-        if found is not None:
-            break
-        step *= 2.0
-    else:
-        return np.zeros((0, 2 ** axes.shape[1], d))
-    corners = np.array(list(product((-0.5, 0.5), repeat=axes.shape[1])))
-    every = ((found[:, None] + corners) * step).reshape(-1, axes.shape[1])
-    return place(every)[:, own].reshape(len(found), len(corners), d)
-
-
-def _flooded(inside: Callable[[Array], Array], starts: Array, step: float) -> Array | None:
-    """Return the nodes (n, k) of a grid, in steps, that are reached within a region; None where there are too many."""
-    k = starts.shape[1]
-    ways = np.array([way for way in product((-1, 0, 1), repeat=k) if any(way)])
-    # those around a start are held too: the region may be thinner than a step
-    seen = {tuple(node) for node in np.round(starts / step).astype(int).tolist()}
-    held, front = set(seen), seen
-    while front:
-        fresh = {tuple(node) for at in front for node in (np.array(at) + ways).tolist()} - seen
-        seen |= fresh
-        nodes = np.array(sorted(fresh)).reshape(-1, k)
-        good = inside(nodes * step) if len(nodes) else np.zeros(0, dtype=bool)
-        front = {tuple(node) for node in nodes[good].tolist()}
-        held |= front
-        if len(held) > _CELLS:
-            return None
-    return np.array(sorted(held)).reshape(-1, k)
-
-
 # The inside: where rays from the fix leave the region.
 
 # Rays in the plane, of which every eighth lies on an axis or a diagonal: enough to draw the outline of an ellipse.
@@ -461,7 +380,7 @@ class Surface:
             metres, inverse = departure(flat, x, cov[None], (), centre[None])[0]
             kind = CARTESIAN if metres <= BENT else INVERSE_RANGE if inverse <= BENT else CURVED
         chart = Chart(np.asarray(kind, dtype=np.int8), x[0, part], cov[part, part], centre)
-        return cls(flat, x, chart, float(profile(flat, x[None], x, _passes(flat))[0][0, 0]))
+        return cls(flat, x, chart, float(profile(flat, x[None], x, passes(flat))[0][0, 0]))
 
     @property
     def kind(self) -> int:
@@ -499,7 +418,7 @@ class Surface:
         cost, information, vector = np.empty(len(x)), np.empty((len(x), d, d)), np.empty((len(x), d))
         for first in range(0, len(x), _PART):
             part = slice(first, first + _PART)
-            found = profile(self.problem, x[part, None], self.x, _passes(self.problem))
+            found = profile(self.problem, x[part, None], self.x, passes(self.problem))
             cost[part], information[part], vector[part] = (each[:, 0] for each in found)
         shape = points.shape[:-1]
         cost = np.where(good & np.isfinite(cost), cost, np.inf)
@@ -510,7 +429,7 @@ class Surface:
         return self.look(points)[0]
 
 
-def _passes(problem: Problem) -> int:
+def passes(problem: Problem) -> int:
     """Return how often the other unknowns move to their best: far from the fix they are far off, and rounding shows."""
     return 1 if problem.layout.size == problem.dimension else 2
 

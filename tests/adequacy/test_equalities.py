@@ -10,7 +10,7 @@ from optloc.adequacy.score import descend, explain_misfit
 from optloc.base.frames import Frame
 from optloc.cli import app
 from optloc.linear.constraints import box, height, violation
-from optloc.linear.normal import degrees_of_freedom
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.problem.epochs import by_epoch
 
 FREE = (optloc.Motion(0, span="epoch"),)

@@ -316,10 +316,10 @@ def test_price_and_prior_are_both_needed():
     assert free.slack + np.sum(free.target**2) > 1.5 * np.sum(one.truth**2)
     assert free.answer.primal < 0.1
     assert good.answer.primal > 10.0
-    one.sigma[:] = 2e4
+    one.sigma[:] = 1.5e4
     drawn = one.start(prices=(3.0,))[0]
     assert np.linalg.norm(drawn.target - one.truth) > 150e3
-    assert np.linalg.norm(drawn.target - one.station.mean((0, 1))) < 50e3
+    assert np.linalg.norm(drawn.target - one.station.mean((0, 1))) < 60e3
 
 
 def test_what_cannot_be_started():

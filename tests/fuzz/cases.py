@@ -10,13 +10,23 @@ from functools import partial
 import pyarrow as pa
 from fuzz import mutations as m
 from fuzz.originals import conversions, grafts, problems, studies
+from fuzz.surfaces import renamed, stream_case, study_case, table_case
 from pyarrow import parquet
 
-# Of twenty cases fourteen are problems. Methods of a study run in a process of their own, which takes its time.
-FAMILIES = ("problem",) * 14 + ("convert",) * 4 + ("study",) * 2
+# Of forty cases. Methods of a study run in a process of their own, which takes its time.
+FAMILIES = ("problem",) * 15 + ("table",) * 11 + ("stream",) * 6 + ("convert",) * 4 + ("folder",) * 3 + ("study",)
+# Those that have their own originals and commands.
+SURFACES = {"table": table_case, "stream": stream_case, "folder": study_case}
 # Levels of a document and of a table, the likelier ones often.
 DOCUMENT = ("bytes", "tokens", "tokens", "structure", "structure", *("graft",) * 3, *("rows",) * 6)
 TABLE = ("bytes", "tokens", "columns", "columns", "columns", "columns")
+PLAIN, TREE = ("bytes", "tokens", "tokens"), ("bytes", "tokens", "tokens", *("structure",) * 4, "rows")
+LINES = ("jsonl", "ndjson")
+LEVELS = (
+    dict.fromkeys(("csv", "tsv"), TABLE)
+    | dict.fromkeys(("json", "geojson", "state", *LINES), TREE)
+    | {"toml": DOCUMENT}
+)
 
 COMMANDS = (
     *[(("fix", "--json"), ())] * 8,
@@ -61,7 +71,10 @@ def case_of(seed, number):
     """Return a case."""
     rng = random.Random(f"{seed} {number}")
     family = rng.choice(FAMILIES)
-    if family == "convert":
+    if family in SURFACES:
+        original, held, arguments, asked = SURFACES[family](rng)
+        first = next(iter(held))
+    elif family == "convert":
         original = rng.choice(sorted(conversions()))
         held, more, asked = conversions()[original]
         first = next(iter(held))
@@ -74,9 +87,13 @@ def case_of(seed, number):
         arguments, asked = _command(rng, family, first)
     held, done = dict(held), []
     for _ in range(rng.choice([1, 1, 1, 2, 2, 3])):
-        name = rng.choice([first, *held])
+        name = rng.choice([first if first in held else next(iter(held)), *held])
         level, held[name] = mutated(rng, name, held[name], family)
         done.append(f"{level} of {name}")
+        # A part file is called by what is in it: half of the time it is called so again.
+        if family == "folder" and name.startswith("out/parts/") and rng.random() < 0.5:
+            data = held.pop(name)
+            held[renamed(name, data)] = data
     return Case(number, family, original, tuple(done), held, arguments, asked)
 
 
@@ -94,7 +111,7 @@ def mutated(rng, name, data, family):
     if suffix == "parquet":
         level = rng.choice(["bytes", "columns", "columns"])
         return (level, _packed(rng, data)) if level == "columns" else _bytes(rng, data)
-    level = rng.choice(TABLE if suffix == "csv" else DOCUMENT)
+    level = rng.choice(LEVELS.get(suffix, PLAIN))
     text = data.decode(errors="replace")
     if level == "bytes":
         return _bytes(rng, data)
@@ -102,24 +119,33 @@ def mutated(rng, name, data, family):
         chosen = rng.choice(m.TOKENS)
         return chosen.__name__, chosen(rng, text).encode("utf-8", "surrogatepass")
     if level == "columns":
-        rows = [line.split(",") for line in text.splitlines() if line] or [[""]]
+        separator = max(",;\t", key=text.partition("\n")[0].count)
+        rows = [line.split(separator) for line in text.splitlines() if line] or [[""]]
         chosen = rng.choice(m.COLUMNS)
         return chosen.__name__, m.csv_text(rng, chosen(rng, rows)).encode(rng.choice(m.ENCODINGS), "replace")
-    # What an earlier mutation has broken has no structure any more.
+    return _tree(rng, suffix, text, level, family) or _bytes(rng, data)
+
+
+def _tree(rng, suffix, text, level, family):
+    """Return what was done to the data of a document, and the document; None of one that earlier mutations broke."""
+    lines = text.splitlines() if suffix in LINES else [text]
+    at = rng.randrange(len(lines)) if lines else 0
     try:
-        tree = json.loads(text) if suffix == "geojson" else tomllib.loads(text)
-    except (ValueError, RecursionError):
-        return _bytes(rng, data)
-    if not isinstance(tree, dict):
-        return _bytes(rng, data)
-    if level == "graft" and suffix == "toml":
-        chosen = partial(m.graft, other=rng.choice(grafts(family)))
-        done = "graft"
+        tree = tomllib.loads(text) if suffix == "toml" else json.loads(lines[at])
+    except (ValueError, RecursionError, IndexError):
+        return None
+    if not isinstance(tree, dict | list):
+        return None
+    if level == "graft":
+        chosen, done = partial(m.graft, other=rng.choice(grafts("problem" if family == "stream" else family))), "graft"
     else:
         chosen = rng.choice(m.ROWS if level == "rows" else m.STRUCTURE)
         done = chosen.__name__
-    tree = chosen(rng, tree)
-    return done, (json.dumps(tree) if suffix == "geojson" else m.toml_text(tree)).encode("utf-8", "surrogatepass")
+    # Mutations of rows look for lists of this name.
+    rows = level == "rows" and isinstance(tree, list)
+    tree = chosen(rng, {"rows": tree})["rows"] if rows else chosen(rng, tree)
+    lines[at] = m.toml_text(tree) if suffix == "toml" else json.dumps(tree)
+    return done, "\n".join(lines).encode("utf-8", "surrogatepass")
 
 
 def _bytes(rng, data):

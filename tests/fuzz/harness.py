@@ -32,6 +32,7 @@ MANY = 50
 def warm(*, every: bool):
     """Load what the commands load, with their machine code, by running each, or one, on something known to be good."""
     from fuzz.originals import conversions, problems
+    from fuzz.surfaces import SITE, foreign, recording, study_folder
     from typer.testing import CliRunner
 
     from optloc.cli import app
@@ -50,6 +51,15 @@ def warm(*, every: bool):
         for command in commands if every else [["fix", "demo", "--json"]]:
             code = runner.invoke(app, command).exit_code
             assert code in (0, 1), (command, code)
+        if every:
+            for held, options in foreign().values():
+                for name, data in held.items():
+                    Path(name).write_bytes(data)
+                runner.invoke(app, ["fix", next(iter(held)), *options, "--json"])
+            Path("live.toml").write_text(SITE)
+            Path("rec.ndjson").write_text(recording())
+            runner.invoke(app, ["live", "live.toml", "--replay", "rec.ndjson"])
+            study_folder()
 
 
 def run(case, folder, *, again=False):
@@ -68,6 +78,7 @@ def run(case, folder, *, again=False):
     here = place / "here"
     here.mkdir()
     for name, data in case.files.items():
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
         (here / name).write_bytes(data)
     before = _listing(place)
     out, err, verdict = (folder / name for name in ("out", "err", "verdict"))
@@ -82,11 +93,10 @@ def run(case, folder, *, again=False):
         return run(case, folder, again=True)
     faults = outcome(code, err.read_text(errors="replace")) + _limits(usage, late)
     after = _listing(place)
-    faults += [f"input {name} changed" for name in before if before[name] != after.get(name)]
-    new = sorted(set(after) - set(before))
     asked = [f"here/{pattern}" for pattern in case.asked]
-    strays = [name for name in new if not any(fnmatch(name, pattern) for pattern in asked)]
-    faults += [f"stray file {name}" for name in strays]
+    others = {name for name in {*before, *after} if not any(fnmatch(name, pattern) for pattern in asked)}
+    faults += [f"input {name} changed" for name in before if name in others and before[name] != after.get(name)]
+    faults += [f"stray file {name}" for name in sorted(others - set(before))]
     said = verdict.read_text() if verdict.exists() else ""
     if said.startswith("mismatch"):
         faults.append(said)
@@ -212,6 +222,7 @@ def main():
     if not more:
         case = case_of(int(seed), int(first))
         for name, data in case.files.items():
+            Path(name).parent.mkdir(parents=True, exist_ok=True)
             Path(name).write_bytes(data)
         sys.stdout.write(f"optloc {' '.join(case.arguments)}\n")
         return

@@ -34,6 +34,7 @@ WORDS = (
     "position", "position[0]", "emission", "all", "target", "known", "free", "free_velocity", "static",
     "constant_velocity", "drift",
     "scale", "rotation", "pair", "kind", "ecef", "enu", "geodetic", "cartesian", "north-clockwise", "b-farther", "run",
+    "north-counterclockwise", "2026-06-01", "4 deg",
     "tdoa", "toa", "range", "range_sum", "groa", "azimuth", "elevation", "height", "range_rate", "fdoa",
     "rss_difference", "auto",
     "estimate ", "1 ns", "10 m", "-3 m", "0 m", "1e308 km", "1e-320 ps", "nan m", "5 parsec", "3 dB", "2 deg", "1 Hz",

@@ -176,6 +176,8 @@ def scale(kind, unit, section, speed):
         factor = ANGLE[unit or "rad"]
         if kind == "azimuth" and section.get("azimuth") == "north-clockwise":
             return lambda v: math.pi / 2 - factor * v, lambda z: -factor
+        if kind == "azimuth" and section.get("azimuth") == "north-counterclockwise":
+            return lambda v: math.pi / 2 + factor * v, lambda z: factor
     elif kind == "groa":
         if unit == "dB":
             return lambda v: 10 ** (v / 20), lambda z: z * math.log(10) / 20
@@ -214,12 +216,16 @@ def measured(section, rows, speed, several):
             for n, key in enumerate("ab")
         )
         sigma, arrival = spread(section, cell, kind, unit, speed, z, slope)
+        # A correction turns an azimuth clockwise, however it is counted: it is added to a compass bearing.
+        turn = -1.0 if kind == "azimuth" and section.get("azimuth") == "north-clockwise" else 1.0
         correction = 0.0
+        if section.get("declination") is not None:
+            raise Uncovered("declination")
         if "correction" in cell:
-            correction = number(cell, "correction") * slope(1.0)
+            correction = number(cell, "correction") * turn * slope(1.0)
         elif section.get("correction") is not None:
             value, (_, own) = amount(section["correction"], kind, unit, section, speed)
-            correction = value * own(1.0)
+            correction = value * turn * own(1.0)
         if section.get("positive") == "b-farther" and kind in ("tdoa", "groa", "fdoa", "rss_difference"):
             a, b = b, a
         if arrival is not None:

@@ -134,7 +134,7 @@ def judged(problem: Problem, x: Array, *, starts: bool = False) -> Counts:
         np.min(fix.alternatives.gap, axis=1, initial=np.inf),
         _nearest(pool, x[:, :n]),
         np.stack(_nees(fix, x), axis=1),
-        np.linalg.norm(_nearest(_pool(optloc.solve(problem, "roots"), n), x[:, :n])[:, :3], axis=1)
+        np.linalg.norm(_nearest(_pool(optloc.solve(problem, "roots", refine=False), n), x[:, :n])[:, :3], axis=1)
         if starts
         else np.full(len(x), np.nan),
         np.full(len(x), seconds / len(x)),

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from optloc.base.types import Array, Motion, Prior, Status
-from optloc.linear.normal import covariance, degrees_of_freedom, linearise
+from optloc.linear.normal import covariance, linearise
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.plugins.stonesoup.models import problem_of, rows_by_kind, values_of
 from optloc.problem.fix import Fix, tail_probability
 from optloc.problem.problem import Problem

@@ -55,8 +55,8 @@ def over_ground(ground: Ground) -> bool:
     return bool(ground.data.shape[0] > 0)
 
 
-# Newton's steps onto a surface, and their end; see `optloc.proof.surface`.
-_STEPS, _CLOSE = 20, 1e-7
+# Newton's steps onto a surface, and their end: the accuracy of a height.
+_STEPS, _CLOSE = 20, EXACT
 # As of `optloc.models.course`.
 _STILL, _E2 = 1e-14, WGS84_F * (2.0 - WGS84_F)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, put, usable, zero
+from optloc.compute.jit import compiled, enabled, inlined, put, usable, zero
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, home_of, set_centre, with_minima
 from optloc.proof.batch import Answered, Asked, plainly, without_rivals
 from optloc.proof.box import (
@@ -18,16 +18,17 @@ from optloc.proof.box import (
     cube,
     push_around,
 )
-from optloc.proof.convex_boxes import draw_in, is_elsewhere, set_axes, set_hull
-from optloc.proof.curvature import G0, G1, G2, entry
+from optloc.proof.convex_boxes import accuracy_floor_far, draw_in, is_elsewhere, set_axes, set_hull
+from optloc.proof.curvature import G0, LENGTH0, entry
 from optloc.proof.everywhere import CHEAPER, CLEAR, INFINITE, SPENT, UNBOUNDED, push_pieces
-from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, Aim, region_of
+from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, Aim, region_of
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
 from optloc.proof.runs.ground import Ground, axes_at, corners_on, over_ground, state_off, state_on
 from optloc.proof.runs.posed import Courses, Run, Runs
 from optloc.proof.runs.rows import (
     blur_of,
+    digits_of,
     is_balanced,
     is_convex_by,
     residual_at,
@@ -36,6 +37,7 @@ from optloc.proof.runs.search import (
     CAPACITY,
     Space,
     Tables,
+    blur_beside,
     cost_at_coordinates,
     floor_of,
     search_run,
@@ -46,11 +48,13 @@ from optloc.proof.runs.state_bounds import axes_of, hessian_of_state
 from optloc.proof.runs.state_search import prove_course
 from optloc.proof.runs.states import STATE, Course, cost_of_state
 from optloc.proof.search_space import (
+    COARSEST,
     HIDDEN_REACH,
     Chart,
     Known,
     accuracy_floor,
     chart_on,
+    equal_within,
     turned,
     widen,
 )
@@ -84,6 +88,16 @@ def _convex_sides(
     return False
 
 
+@inlined
+def _margin(tables: Tables, noise: float, eps: float) -> float:
+    """Return how convex a box must be for its cost to fall by no more than eps below that of its centre."""
+    total = 0.0
+    for k in range(3):
+        slope = abs(tables.box.sums[G0 + k]) + tables.box.sums[LENGTH0 + k] * noise
+        total += slope * slope
+    return total / eps
+
+
 @compiled
 def _set_far(run: Run, space: Space, tables: Tables, i: int, x: Array, value: float, eps: float, limit: float) -> bool:
     """Write a minimum and its surroundings into an atlas; see `optloc.proof.everywhere.set_minimum`."""
@@ -102,7 +116,7 @@ def _set_far(run: Run, space: Space, tables: Tables, i: int, x: Array, value: fl
             minima.axes[i, m, k] /= sqrt(own)
             minima.back[i, k, m] *= sqrt(own)
     cost_at_coordinates(run, space, tables, piece, hull)
-    margin = (box.sums[G0] ** 2 + box.sums[G1] ** 2 + box.sums[G2] ** 2) / eps
+    margin = _margin(tables, blur_beside(run, space, tables, floor_of(space, run.cost)), eps)
     set_hull(atlas, i, hull, limit)
     if not _convex_sides(run, space, tables, np.zeros(3), piece, hull, margin, minima.sides[i]):
         return False
@@ -127,7 +141,7 @@ def _set_near(
         at[2] = 0.0
     if not cost_at_coordinates(run, space, tables, 0, at) >= value:
         return False
-    margin = (box.sums[G0] ** 2 + box.sums[G1] ** 2 + box.sums[G2] ** 2) / eps
+    margin = _margin(tables, blur_beside(run, space, tables, floor_of(space, run.cost)), eps)
     if is_elsewhere(chart, box, x):
         return False
     if hidden:
@@ -206,16 +220,31 @@ def prove_run(
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
     least = cost_of_place(run, x, tables)
+    middle, radius = cube(run.cost.kinds, run.cost.data, x)
+    bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
+    far = not bound_to and _reaches_infinity(run)
+    most, eps = max(COARSEST, eps), equal_within(eps, least, _blur(run, chart, x, far, tables))
+    if not eps <= most:
+        return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
     aim = Aim(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
     task = Task(x, beside, aim, eps, budget, found)
-    bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
-    middle, radius = cube(run.cost.kinds, run.cost.data, x)
-    if not bound_to and _reaches_infinity(run):
+    if far:
         return _prove_far(run, task, atlas_of(middle, radius, D, 1 + beside.points.shape[0]), chart, tables)
     if not good:
         return SINGULAR, 0, -inf
     return _prove_near(run, task, atlas_of(middle, radius, D, 0), chart, tables, lower, upper)
+
+
+@compiled
+def _blur(run: Run, chart: Chart, x: Array, far: bool, tables: Tables) -> float:
+    """Return a bound of the rounding errors of a residual (its length) at a fix, and in the atlas of all positions."""
+    middle, radius = cube(run.cost.kinds, run.cost.data, x)
+    atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
+    space = Space(False, atlas, chart, none, none)
+    cost_at_coordinates(run, space, tables, 0, np.zeros(3))
+    noise = blur_beside(run, space, tables, floor_of(space, run.cost))
+    return float(max(noise, digits_of(run.rows) * accuracy_floor_far(run.cost, atlas)) if far else noise)
 
 
 @compiled

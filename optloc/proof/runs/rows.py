@@ -16,7 +16,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.compute.systems import positive
+from optloc.compute.systems import positive_along
 from optloc.proof.curvature import (
     BLUR0,
     C00,
@@ -379,6 +379,6 @@ def is_convex_by(half: Array, sums: Array, ball: float, margin: float) -> bool:
     d1 = sums[C01] + sums[C11] + sums[C12] + ball + margin
     d2 = sums[C02] + sums[C12] + sums[C22] + ball + margin
     # In the plane, and along a surface, nothing depends on the third coordinate.
-    second = 1.0 if half[1] == 0.0 and sums[H11] == 0.0 else sums[H11] - d1
-    third = 1.0 if half[2] == 0.0 and sums[H22] == 0.0 else sums[H22] - d2
-    return bool(positive(sums[H00] - d0, sums[H01], sums[H02], second, sums[H12], third))
+    second, third = half[1] != 0.0 or sums[H11] != 0.0, half[2] != 0.0 or sums[H22] != 0.0
+    h0, h3, h5 = sums[H00] - d0, sums[H11] - d1, sums[H22] - d2
+    return bool(positive_along(h0, sums[H01], sums[H02], h3, sums[H12], h5, second, third))

@@ -6,14 +6,14 @@ only where those of few say nothing.
 
 from __future__ import annotations
 
-from math import inf, nan
+from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, put
-from optloc.compute.systems import inverse, positive
+from optloc.compute.systems import inverse, positive_along
 from optloc.proof.atlas import Atlas, position, set_centre, widen_around
 from optloc.proof.box import (
     PIECE,
@@ -23,6 +23,7 @@ from optloc.proof.box import (
     linearise_rows,
     pop,
     push_halves,
+    reaches,
     steepest_side,
     uncut,
 )
@@ -37,6 +38,8 @@ from optloc.proof.runs.rows import (
     Sheet,
     blur_of,
     least_length,
+    multiply,
+    project,
     residual_at,
     sheet_of,
     sum_up_rows,
@@ -207,7 +210,7 @@ def search_run(
             continue
         linearise_rows(look.K, look.w, small.nodes, small.rows)
         low = least_residual(look.K, look.weight, floors[0], small.half, small.nodes, small.rows)
-        if low > 0.0 and low * low >= aim.level:
+        if reaches(low, aim.level):
             continue
         side = steepest_side(small.half, small.rows, d)
         if cost_at(look.K, look.w, small.nodes) < _WORTH * (aim.level + 1.0):
@@ -268,9 +271,9 @@ def _is_done(
     run: Run, space: Space, tables: Tables, aim: Aim, here: float, low: float, touching: bool, floor: float
 ) -> bool:
     """Return whether a box that has a cost at its centre and a bound need not be split."""
-    if low > 0.0 and low * low >= aim.level:
+    if reaches(low, aim.level):
         return True
-    if not (aim.whole or (low > 0.0 and low * low >= aim.value)) or not here < _NEAR * (aim.level + 1.0):
+    if not (aim.whole or reaches(low, aim.value)) or not here < _NEAR * (aim.level + 1.0):
         return False
     box, d = tables.box, space.atlas.dimension if space.far else 3
     _, ball = sum_at(run, space, tables, floor)
@@ -300,7 +303,7 @@ def _bound(run: Run, space: Space, tables: Tables, floor: float, level: float) -
         return here, -1.0
     noise, slip = blur_of(rows, floor, box.nodes), box.graph[SLIP]
     low = least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, False) - noise
-    if low > 0.0 and low * low >= level:
+    if reaches(low, level):
         return here, low
     set_curves(space, run.cost, box)
     return here, max(low, least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, True) - noise)
@@ -324,7 +327,8 @@ def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array
         face = home < 2 * d
         for k in range(d):
             u[k] = space.atlas.place[1 + k]
-    now, damping = cost_at_coordinates(run, space, tables, home, u), 1e-3
+    now, damping, floor = cost_at_coordinates(run, space, tables, home, u), 1e-3, floor_of(space, run.cost)
+    noise = blur_beside(run, space, tables, floor)
     for _ in range(_STEPS):
         length = _step(box, damping)
         if not length >= 0.0:
@@ -336,9 +340,9 @@ def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array
             inside = inside and (not space.far or abs(u[k]) <= _ASIDE)
         inside = inside and not (face and not u[d - 1] > 0.0)
         after = cost_at_coordinates(run, space, tables, home, u) if inside else inf
-        if after <= now:
-            now, damping = after, 0.1 * damping
-            if length < _CLOSE * _CLOSE:
+        if after <= now + noise * (2.0 * sqrt(now) + noise):
+            now, damping, noise = after, 0.1 * damping, blur_beside(run, space, tables, floor)
+            if length < _CLOSE * _CLOSE + noise * noise:
                 place_of(space, box, found)
                 known = is_listed(space.atlas, found) if space.far else is_known(u, box.half, space.minima, space.sides)
                 return now < level and not known
@@ -360,12 +364,27 @@ def cost_at_coordinates(run: Run, space: Space, tables: Tables, home: int, u: Ar
 
 
 @compiled
+def blur_beside(run: Run, space: Space, tables: Tables, floor: float) -> float:
+    """Return a bound of the rounding errors of a residual (its length) at a place whose nodes are bounded.
+
+    On a surface that of the height as well, see `optloc.proof.search_space.blur_at`.
+    """
+    box, values, total = tables.box, tables.sheet.length, 0.0
+    multiply(run.rows, box.lean, values)  # zero but on a surface
+    project(run.rows, values)
+    for value in values:
+        total += value * value
+    return float(blur_of(run.rows, floor, box.nodes) + sqrt(total) * box.graph[SLIP])
+
+
+@compiled
 def _step(box: Box, damping: float) -> float:
     """Write a damped Newton step into box.solve[0]; return its squared length, NaN where there is none."""
     sums, solve, more = box.sums, box.solve, 1.0 + damping
-    h3, h5 = sums[H11] if sums[H11] != 0.0 else 1.0, sums[H22] if sums[H22] != 0.0 else 1.0
-    if not positive(sums[H00], sums[H01], sums[H02], h3, sums[H12], h5):
+    h3, h5 = sums[H11], sums[H22]
+    if not positive_along(sums[H00], sums[H01], sums[H02], h3, sums[H12], h5, h3 != 0.0, h5 != 0.0):
         return nan
+    h3, h5 = h3 if h3 != 0.0 else 1.0, h5 if h5 != 0.0 else 1.0
     if not inverse(sums[H00] * more, sums[H01], sums[H02], h3 * more, sums[H12], h5 * more, solve):
         return nan
     g0, g1, g2 = sums[G0], sums[G1], sums[G2]

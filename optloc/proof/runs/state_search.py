@@ -10,8 +10,9 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, zero
 from optloc.compute.systems import invert
+from optloc.proof.box import reaches
 from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, SPENT
-from optloc.proof.near import BETTER, BUDGET, OTHER, STATIONARY, UNIQUE, VALUE, Aim
+from optloc.proof.near import BETTER, BUDGET, COARSE, OTHER, STATIONARY, UNIQUE, VALUE, Aim
 from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.runs.state_bounds import has_no_minimum, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import (
@@ -26,6 +27,7 @@ from optloc.proof.runs.states import (
     set_box,
     table_of,
 )
+from optloc.proof.search_space import COARSEST, equal_within
 
 # The search.
 
@@ -97,13 +99,13 @@ def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: in
         if where < 0 or _is_known(search, small.at, small.half):
             continue
         here, low = _look(search.few, axes, small, search.floors[1], aim.level)
-        if low > 0.0 and low * low >= aim.level:
+        if reaches(low, aim.level):
             continue
         if here < _WORTH * (aim.level + 1.0):
             boxes += 1
             put(table, small.at, small.half)
             here, low = _look(search.whole, axes, table, search.floors[0], aim.level)
-            if low > 0.0 and low * low >= aim.level:
+            if reaches(low, aim.level):
                 continue
             inside = _is_inside(axes, table.at, found)
             if inside and here < aim.better:
@@ -131,7 +133,7 @@ def _look(course: Course, axes: Axes, table: Table, floor: float, level: float) 
     if here < level:  # no bound will do
         return here, -1.0
     low = least_length(course, table, here, False) - noise
-    if low > 0.0 and low * low >= level:
+    if reaches(low, level):
         return here, low
     set_bends(course, axes, table)
     return here, max(low, least_length(course, table, here, True) - noise)
@@ -228,6 +230,7 @@ def _descends(search: Search, level: float, found: Array) -> bool:
     table = search.table
     before, damping = table.at.copy(), 1e-3
     now = _linearise(search, table)
+    noise = blur_of(search.whole.rows, search.floors[0], table.nodes)
     for _ in range(_STEPS):
         length = _step(table, damping)
         if not length >= 0.0:
@@ -236,9 +239,9 @@ def _descends(search: Search, level: float, found: Array) -> bool:
             before[m] = table.at[m]
             table.at[m] -= table.move[m]
         after = _linearise(search, table)
-        if after <= now:
+        if after <= now + noise * (2.0 * sqrt(now) + noise):
             now, damping = after, 0.1 * damping
-            if length < _CLOSE * _CLOSE:
+            if length < _CLOSE * _CLOSE + noise * noise:
                 table.half[:] = 0.0
                 return (
                     now < level
@@ -365,6 +368,9 @@ def prove_course(
     floors = floor_of(whole, x), floor_of(few, x)
     search = Search(whole, few, axes, table, small, floors, room[0], room[1])
     least = _linearise(search, table)
+    most, eps = max(COARSEST, eps), equal_within(eps, least, blur_of(whole.rows, floors[0], table.nodes))
+    if not eps <= most:
+        return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
     aim = Aim(level, least - eps, least - 0.5 * eps, False, 0, 0)
     known, place = zero(), x.copy()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,10 @@ from optloc.base.types import Array, Status
 from optloc.problem.chart import CARTESIAN, NAMES
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report.columns import Columns, records
+from optloc.report.columns import UNCHECKED, Columns, records
+
+if TYPE_CHECKING:
+    from optloc.uncertainty.outline import Outline
 
 # What has a covariance that covers: a fix that is ok, and a track that is followed or has just begun.
 _SURE = {Status.OK.label, "started"}
@@ -38,10 +41,11 @@ class Other(NamedTuple):
 
 
 class Area(NamedTuple):
-    """What holds 95 %: "ellipse95" or "region95", and its plan as a geometry of GeoJSON."""
+    """What holds 95 %: "ellipse95" or "region95", its plan as a geometry of GeoJSON, and whether that is cut off."""
 
     role: str
     geometry: dict[str, Any]
+    cut: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +220,9 @@ class Results:
 
     def areas(self) -> list[Area | None]:
         """Return what holds 95 % of each row; None where nothing does, or nothing is known of it."""
-        outlines = {} if self.problem is None or not self.fixes else self._outlines(self.problem)
+        outlines: dict[int, Outline] = {}
+        if self.problem is not None and self.fixes:
+            outlines = self._outlines(self.problem)
         return [self._area(row, outlines.get(i)) for i, row in enumerate(self._rows)]
 
     def _mark(self, row: dict[str, Any], others: tuple[Other, ...]) -> Mark:
@@ -236,7 +242,7 @@ class Results:
             target=str(row.get("target", "target")),
             time=float(number.get("time", np.nan)),
             others=others,
-            reason=row["reason"] or "",
+            reason="; ".join(part for part in (row["reason"], UNCHECKED if row.get("unchecked") else "") if part),
         )
 
     def _name(self, row: dict[str, Any]) -> str:
@@ -269,37 +275,41 @@ class Results:
         shown = np.flatnonzero(np.isfinite(gap))
         return tuple(Other(position[j], place[j], float(gap[j]), float(doubt[j])) for j in shown)
 
-    def _area(self, row: dict[str, Any], pieces: tuple[Array, ...] | None) -> Area | None:
+    def _area(self, row: dict[str, Any], region: Outline | None) -> Area | None:
         if row.get("lat_deg") is None or row["status"] not in _SHAPED:
             return None
         centre = np.array([row[axis] for axis in self.axes])
-        if pieces:
-            return Area("region95", _region(self.frame, centre, pieces))
+        if region is not None:
+            return Area("region95", _region(self.frame, centre, region), region.cut)
         if row["status"] not in _SURE or row["cov_ee"] is None or row.get("chart") not in (None, "", NAMES[CARTESIAN]):
             return None
         level = np.array([[row["cov_ee"], row["cov_en"]], [row["cov_en"], row["cov_nn"]]])
         return Area("ellipse95", _ellipse(self.frame, centre, level))
 
-    def _outlines(self, problem: Problem) -> dict[int, tuple[Array, ...]]:
-        """Return the convex parts of the regions of rows whose ellipses do not cover; empty where not known."""
-        from optloc.plot.outlines import pieces_of
+    def _outlines(self, problem: Problem) -> dict[int, Outline]:
+        """Return the plans of the regions of rows whose ellipses do not cover; of those that are known."""
+        from optloc.plot.outlines import level_planes, outlines_of
 
+        if not self.frame.geodetic:
+            return {}
         charts = [fix.chart for fix in self.fixes]
         kinds = [np.ravel(chart.kind) for chart in charts if chart is not None]
         # Fixes of one position each: a row is a fix.
         if len(kinds) != len(charts) or sum(map(len, kinds)) != len(self._rows):
             return {}
-        pieces = [part for fix in self.fixes for part in pieces_of(problem, fix)]
-        return {int(i): pieces[i] for i in np.flatnonzero(np.concatenate(kinds) != CARTESIAN)}
+        found: list[list[Outline]] = []
+        for fix in self.fixes:
+            planes = level_planes(problem, fix.position.reshape(-1, problem.dimension))
+            found += outlines_of(problem, fix, [planes])
+        return {i: each[0] for i, each in enumerate(found) if each}
 
 
-def _region(frame: Frame, centre: Array, pieces: tuple[Array, ...]) -> dict[str, Any]:
-    """Return the plan of a region of convex parts as a geometry."""
-    from optloc.plot.outlines import earth_line, polygon_geometry, polygons
+def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:
+    """Return the plan of a region along east and north as a geometry."""
+    from optloc.plot.outlines import earth_line, polygon_geometry
 
     axes = frame.enu_axes(centre)[:2]
-    plan = polygons([(piece - centre) @ axes.T for piece in pieces])
-    return polygon_geometry([[earth_line(frame, centre + line @ axes) for line in each] for each in plan])
+    return polygon_geometry([[earth_line(frame, centre + line @ axes) for line in each] for each in region.polygons])
 
 
 def _ellipse(frame: Frame, centre: Array, level: Array) -> dict[str, Any]:
@@ -331,7 +341,7 @@ def geojson(results: Results) -> dict[str, Any]:
         if mark.known:
             features.append(feature(point_geometry(mark.place), {"role": "fix", **told}))
         if area is not None:
-            features.append(feature(area.geometry, {"role": area.role, **about}))
+            features.append(feature(area.geometry, {"role": area.role, **({"cut": True} if area.cut else {}), **about}))
         for other in mark.others:
             doubt = {"gap": other.gap, "probability": other.probability}
             features.append(feature(point_geometry(other.place), {"role": "alternative", **about, **doubt}))

@@ -93,7 +93,7 @@ def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
     label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
     _point(_placemark(document, label, mark.words, style, mark), mark.place, flat)
     if area is not None:
-        word = area.role.replace("95", ", 95 %")
+        word = area.role.replace("95", ", 95 %, cut off" if area.cut else ", 95 %")
         _polygons(_placemark(document, f"{mark.name}: {word}", mark.words, style), area)
     for number, other in enumerate(mark.others, 1):
         place = _placemark(document, _named(mark, number), _doubt(mark, other), "alternative")

@@ -243,7 +243,8 @@ def _is_dear(on: Problem, costs: Costs, seeds: Array, level: Array, effort: int)
         part, own = on.take(items), costs.take(items)
         answer = prove(own, _question(part, own, x[items], cost[items] - level[items], effort))
         boxes[items] += answer.boxes
-        dear[items] = answer.verdict == VALUE
+        # where rounding is coarse a bound may be lower than what was asked for
+        dear[items] = (answer.verdict == VALUE) & (answer.bound > level[items] - equal_cost(level[items]))
         near, met, steep = x[items], *(np.flatnonzero(answer.verdict == code) for code in (BETTER, STATIONARY))
         if len(met):
             near[met] = vectors(part.take(met), answer.found[met][:, None])[:, 0]

@@ -19,7 +19,7 @@ from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked
 from optloc.proof.everywhere import UNBOUNDED
-from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
+from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, UNIQUE, VALUE
 from optloc.proof.scope import unsupported
 from optloc.proof.search_space import HIDDEN_REACH
 from optloc.solvers.certify.posed import (
@@ -51,6 +51,11 @@ METHOD = "branch and bound"
 # Reasons for which nothing is proven.
 UNFINISHED = "the proof was not finished within its budget of boxes"
 LACKS_CODE = "; machine code, which takes minutes to make once, would go on: run `optloc compile`"
+FINE = (
+    "the stated noise is finer than the rounding of ranges and coordinates, so that no proof can tell positions apart; "
+    "state a larger noise, or an origin nearby"
+)
+AROUND = "the region reaches around the Earth, and the proof is for one side of it"
 UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
 BARRED = "a position that costs less is not admitted: {}"
 LOST = "a position that costs less was met, and no minimum next to it was kept"
@@ -292,7 +297,11 @@ def _round(work: Work, items: Array) -> None:
     found = np.isin(answer.verdict, (BETTER, OTHER))
     if found.any():
         _add(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
-    _give_up(work, items[~(done | short | remote | found)], UNSETTLED)
+    fine, unclosed = answer.verdict == COARSE, answer.verdict == OPEN
+    _give_up(work, items[fine], FINE)
+    # Boxes ran out over all of the surface of a height before a region of it was tried.
+    _give_up(work, items[unclosed], AROUND if work.limited else _unfinished(work.pose, len(items)))
+    _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
 
 def _asked(work: Work, items: Array) -> Asked:
@@ -432,7 +441,7 @@ def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
     broken, hidden = violation(part, x) > TOLERANCE, is_hidden(part, x)
     names = violation_names(work.problem)
     for item, breaks, behind in zip(items[barred], broken, hidden, strict=True):
-        why = f"a constraint forbids it ({names})" if breaks else "the Earth hides it from a satellite"
+        why = f"a constraint forbids it ({names})" if breaks else "the Earth hides it from a station"
         _give_up(work, np.array([item]), BARRED.format(why) if breaks or behind else LOST)
 
 

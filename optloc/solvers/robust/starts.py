@@ -10,7 +10,8 @@ import numpy as np
 from optloc.base.types import Array, Status
 from optloc.linear.constraints import exact
 from optloc.linear.courses import elapsed
-from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
+from optloc.linear.normal import depends_on_place, weighed
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import independent, variances
 from optloc.problem.problem import Problem

@@ -204,7 +204,7 @@ def least_worst(seen: Bearings) -> Array:
     ahead = rays(seen.angle[..., 0], seen.angle[..., 1] if d == 3 else None, seen.axes).ahead
 
     for i in range(len(out)):  # each is a row of programs of a tenth of a millisecond: too short for threads
-        use = (seen.weight[i, :, : d - 1] > 0.0).all(-1)
+        use = (seen.weight[i, :, : d - 1] > 0.0).all(-1) & np.isfinite(seen.angle[i]).all(-1)
         if use.sum() > 1:
             # a cone is as wide in all directions: the larger of the two deviations is its half angle
             sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)

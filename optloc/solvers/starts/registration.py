@@ -14,7 +14,8 @@ from optloc.base.types import Array, Bias, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.courses import elapsed
 from optloc.linear.evaluate import plans
-from optloc.linear.normal import covariance, degrees_of_freedom, prior_parts
+from optloc.linear.normal import covariance, prior_parts
+from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.walks import places, state_of, walks
 from optloc.problem.clocks import greville, rate_name
 from optloc.problem.epochs import by_epoch, untied

@@ -9,7 +9,7 @@ from math import factorial
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array, Band, Motion, Polygon, Rows, Stations
+from optloc.base.types import Array, Band, Motion, Polygon, Stations
 from optloc.linear.constraints import is_exact, needs_velocity
 from optloc.linear.courses import elapsed
 from optloc.models import MODELS
@@ -80,7 +80,16 @@ def _take_rows(problem: Problem, target: int) -> Problem:
     """Return the problem with the rows of one target, which becomes the first."""
     own = [np.flatnonzero(rows.target == target) for rows in problem.rows]
     rows = [
-        Rows(r.kind, r.z[..., i], r.a[i], r.b[i], r.epoch[i], 0 * i, r.weight[..., i], r.correction[..., i])
+        replace(
+            r,
+            z=r.z[..., i],
+            a=r.a[i],
+            b=r.b[i],
+            epoch=r.epoch[i],
+            target=0 * i,
+            weight=r.weight[..., i],
+            correction=r.correction[..., i],
+        )
         for r, i in zip(problem.rows, own, strict=True)
         if len(i)
     ]

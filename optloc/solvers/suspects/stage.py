@@ -373,6 +373,8 @@ def _explanation(case: Case, rest: Rest, finding: Finding) -> Explanation:
     fix = rest.fix
     p_without = float(fix.p_value)
     told = _errors(case, rest)
+    # Errors of compass bearings are reported in the sense of the readings.
+    senses = np.concatenate([np.full(rows.count, rows.sense) for rows in case.work.rows])
     suspects = []
     for i in rest.left:
         group, error = case.groups[i], told.get(i)
@@ -380,6 +382,8 @@ def _explanation(case: Case, rest: Rest, finding: Finding) -> Explanation:
         p_with = _p_with(fix, error) if known is None else known
         none = np.full(1, np.nan)
         value, sigma = (none, none) if error is None else (error.value, error.sigma)
+        if group.rows and len(value) == len(group.rows):
+            value = senses[list(group.rows)] * value
         suspects.append(Suspect(group.name, group.kind, case.rows(group), value, sigma, p_with, p_without))
     return Explanation(tuple(suspects), case.vector(fix), float(fix.cost), int(fix.dof), p_without, rest.score)
 

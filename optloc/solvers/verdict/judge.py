@@ -32,7 +32,7 @@ from optloc.solvers.verdict.findings import (
     mark,
     reach_of,
 )
-from optloc.solvers.verdict.minima import station_direction, weak_direction
+from optloc.solvers.verdict.minima import is_measured, station_direction, unmeasured_direction, weak_direction
 
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
 
@@ -77,8 +77,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     assert curvature is not None
     code, reason = np.array(pool.code[:, 0]), fill(len(pool), "")
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
-    # a row that is absent may hold anything
-    broken = ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), code.shape)
+    broken = _is_broken(problem, len(pool))
     few = (pool.dof < 0) & ~broken
     missing = ~np.isfinite(cost) & ~broken & ~few
     answered = ~(broken | few | missing)
@@ -86,12 +85,17 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
     with np.errstate(invalid="ignore"):
-        lost = (code != Status.OK) | weak | is_improbable(cost, pool.dof, DOUBT)
-    far = answered & _runs_away(problem, curvature, distance, lost)
+        improbable = is_improbable(cost, pool.dof, DOUBT)
+    far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | improbable)
+    # No minimum in sight fits, and one that fits is hidden: that says more than where a refinement in sight broke off.
+    barred = answered & _has_hidden(pool) & ((code != Status.OK) | ((weak | far) & improbable))
+    far &= ~barred
     # far away every direction is weak: how far says more
-    weak &= ~far
+    weak &= ~(far | barred)
     code[broken], code[few], code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
-    code[weak] = Status.SINGULAR_GEOMETRY
+    code[weak], code[barred] = Status.SINGULAR_GEOMETRY, Status.INFEASIBLE
+    for i in np.flatnonzero(barred):
+        reason[i] = _hidden_or(pool, int(i), "")
     for i in np.flatnonzero(few):
         reason[i] = _lacking(-int(pool.dof[i]))
     for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
@@ -112,7 +116,13 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, DOUBT), reason)
     if pool.asked:
         _weigh_redundancy(pool, finished, reason)
-    return Ruling(marks, reason, proven, broken | few | missing | weak | far)
+    return Ruling(marks, reason, proven, broken | few | missing | barred | weak | far)
+
+
+def _is_broken(problem: Problem, count: int) -> Array:
+    """Return which of so many problems have a measurement that is no number, (N,)."""
+    # a row that is absent may hold anything
+    return ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), (count,))
 
 
 def fill(count: int, value: object) -> Array:
@@ -157,18 +167,23 @@ def _open(problem: Problem, information: Array) -> str:
 
 def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, reason: Array) -> None:
     """Write the status of problems without any candidate: what keeps every closed form from a start."""
+    if pool.missing is not None:
+        told = items[pool.missing.reason[items] != ""]
+        code[told], reason[told] = pool.missing.code[told], pool.missing.reason[told]
+        items = np.setdiff1d(items, told)
     if not len(items):
         return
     barred = items[code[items] == Status.INFEASIBLE]
     for i in barred:
-        hidden = "" if pool.hidden is None else pool.hidden[i]
         bounds = violation_names(problem)
         missed = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides all that was found"
-        reason[i] = hidden or missed
+        reason[i] = _hidden_or(pool, int(i), missed)
     items = np.setdiff1d(items, barred)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves
     found = ranges(problem.take(items)) if single and len(items) else None
+    straight = bool(len(items)) and not isinstance(problem.medium, Layers)
+    measured = is_measured(problem.take(items)) if straight else np.zeros(len(items), dtype=bool)
     for place, i in enumerate(items):
         groups = () if found is None else found.groups[int(found.pattern[place])]
         if len(groups) > 1:
@@ -180,13 +195,16 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
         elif isinstance(problem.medium, Layers):
             code[i] = Status.INFEASIBLE
             reason[i] = "no place was found within the layers that direct rays lead from to all stations of the rows"
-        elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows):
+        elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows) or measured[place]:
             code[i] = Status.UNAVAILABLE
-            reason[i] = "no closed form starts from " + " and ".join(rows.kind for rows in problem.rows)
+            tried = any(stage.name == "search" for stage in pool.stages)
+            kinds = " and ".join(dict.fromkeys(rows.kind for rows in problem.rows))
+            reason[i] = f"no closed form starts from these rows of {kinds}"
+            reason[i] += ", and a search found nothing" if tried else ": use 'auto', which searches"
         else:
             code[i] = Status.SINGULAR_GEOMETRY
             one = problem.take(np.array([i]))
-            reason[i] = _short(one) or station_direction(one)
+            reason[i] = _short(one) or unmeasured_direction(one) or station_direction(one)
 
 
 def _short(problem: Problem) -> str:
@@ -199,6 +217,16 @@ def _short(problem: Problem) -> str:
         if motion.known is None and motion.span == "run" and rows < needed:
             lacking.append(f"target {i} has {rows} measurement{'' if rows == 1 else 's'} for {needed} unknowns")
     return "; ".join(lacking[:_SHOWN]) if len(problem.motions) > 1 else ""
+
+
+def _has_hidden(pool: Pool) -> Array:
+    """Return where a minimum lies behind the Earth, (N,)."""
+    return np.zeros(len(pool), dtype=bool) if pool.hidden is None else np.asarray(pool.hidden != "", dtype=bool)
+
+
+def _hidden_or(pool: Pool, item: int, otherwise: str) -> str:
+    """Return the sentence on what lies behind the Earth of one problem; another one where there is none."""
+    return otherwise if pool.hidden is None else pool.hidden[item] or otherwise
 
 
 def _name_hidden(hidden: Array, items: Array, reason: Array) -> None:
@@ -297,7 +325,7 @@ def judge(problem: Problem, pool: Pool) -> Fix:
     problem : Problem
         N problems.
     pool : Pool
-        Their candidates; starts that nobody has refined get the status `unavailable`.
+        Their candidates; starts that nobody has refined get the status `unrefined`.
     """
     if pool.curvature is None:
         return _show_starts(problem, pool)
@@ -387,16 +415,23 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
 
 
 def _show_starts(problem: Problem, pool: Pool) -> Fix:
-    """Return starts as fixes whose status says that they are not refined."""
+    """Return starts as fixes whose status says that they are not refined, or why there is none."""
     count, n = len(pool), problem.layout.n_shared
     name = pool.stages[-1].name if pool.stages else "start"
+    code, reason = np.full(count, int(Status.UNREFINED), dtype=np.int8), fill(count, "not refined")
+    empty, broken = pool.empty, _is_broken(problem, count)
+    few = (pool.dof < 0) & empty & ~broken
+    code[broken & empty], code[few], reason[broken & empty] = Status.REJECTED, Status.TOO_FEW_ROWS, ""
+    for i in np.flatnonzero(few):
+        reason[i] = _lacking(-int(pool.dof[i]))
+    _explain_missing(problem, pool, np.flatnonzero(empty & ~broken & ~few), code, reason)
     return Fix(
         pool.x[:, 0],
         np.full((count, n, n), np.nan),
         problem.layout,
         problem.frame,
-        np.full(count, int(Status.UNAVAILABLE), dtype=np.int8),
-        fill(count, "not refined"),
+        code,
+        reason,
         alike(claim(Certificate("unknown", "a start, not refined", name)), count),
         Alternatives(pool.x[:, 1:], np.full((count, pool.x.shape[1] - 1), np.nan)),
         np.full(count, np.nan),

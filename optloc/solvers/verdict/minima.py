@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -17,9 +18,9 @@ from optloc.problem.fix import Active, Stage
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import lowest_sight
-from optloc.solvers.policy import AMBIGUOUS_GAP, FAR, FLAT, LISTED_GAP, SAME_PLACE, equal_cost
+from optloc.solvers.policy import AMBIGUOUS_GAP, FAR, FLAT, LISTED_GAP, SAME_PLACE, WEAK, equal_cost
 from optloc.solvers.pool import Curvature, Pool
-from optloc.solvers.starts.position import distance_of
+from optloc.solvers.starts.position import distance_of, one_position, spread_of, vectors
 
 # Information that is none: no square of a Jacobian is as small, and its root still has an inverse.
 _DEAD = 1e-300
@@ -28,6 +29,9 @@ _TELLING = 0.05
 # Spread of stations, relative to their coordinates, that rounding may have left of a point; and across a line or plane,
 # relative to that along it: a micrometre a metre fixes nothing that noise would not hide.
 _POINT, _FLAT = 1e-9, 1e-6
+# Where rows are asked what they measure: around the stations, off their planes of symmetry; and the share of these
+# places at which they must determine a position, for some place may lie where they do not.
+_AWAY, _MOST = 1.3, 0.5
 
 
 def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
@@ -104,6 +108,41 @@ def weak_direction(problem: Problem, information: Array) -> str:
     direction = direction / np.abs(direction).max()
     terms = [f"{value:+.2g} {labels[i]}" for i, value in enumerate(direction) if abs(value) > _TELLING]
     return "undetermined along " + " ".join(terms)
+
+
+def _corners(problem: Problem) -> Array:
+    """Return vectors (N, q, size) of problems of one position at the corners of a box around the stations."""
+    centre, spread = spread_of(problem)
+    corners = _AWAY * np.array(list(product((-1.0, 1.0), repeat=problem.dimension)))
+    places = centre[:, None] + spread[:, None, None] * corners
+    return vectors(problem, np.broadcast_to(places, (problem.batch_shape[0], *corners.shape)))
+
+
+def is_measured(problem: Problem) -> Array:
+    """Return whether rows and equalities determine the position at most places, (N,); False where it is not one."""
+    size = problem.batch_shape[0]
+    if not one_position(problem):
+        return np.zeros(size, dtype=bool)
+    x = _corners(problem)
+    item, flat = np.repeat(np.arange(size), x.shape[1]), x.reshape(-1, x.shape[-1])
+    part = problem.take(item)
+    with np.errstate(all="ignore"):
+        found = measure_curvature(part, equations_at(part, flat), flat, np.zeros(len(flat), dtype=int))
+    assert found.regular is not None
+    assert found.weakest is not None
+    good = found.regular & (found.weakest >= WEAK)
+    return np.asarray(good.reshape(x.shape[:2]).mean(1) > _MOST)
+
+
+def unmeasured_direction(problem: Problem) -> str:
+    """Return a sentence that names what no row of one problem of one position measures, wherever it is; or ""."""
+    if not one_position(problem):
+        return ""
+    x = _corners(problem)[0]
+    with np.errstate(all="ignore"):
+        information, _, _ = marginal(equations_at(problem.take(np.zeros(len(x), dtype=int)), x))
+    dead = (np.diagonal(information, axis1=-2, axis2=-1) <= _DEAD).all(0)
+    return "nothing measures " + ", ".join(np.array(problem.layout.labels())[: len(dead)][dead]) if dead.any() else ""
 
 
 def station_direction(problem: Problem) -> str:

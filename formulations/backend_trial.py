@@ -1,0 +1,132 @@
+"""The trial of back ends in a process apart: ``python -m formulations.backend_trial SECONDS KIND:NAME...``.
+
+Each solves programs of two unknowns whose solution is known, and others that have none. It prints one line for each. A
+solver that does not end in time ends the process: nothing else stops machine code.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from threading import Timer
+from typing import Any
+
+import numpy as np
+
+from formulations.algebra import Array
+from formulations.backend import Choice, SolverError, using
+
+PASSED, FAILED = "backend-passed", "backend-failed"
+"""How the lines begin that say what came of it: solvers print lines of their own."""
+
+# Three ranges to a place, one of which has to be left by the constraints.
+_STATION = np.array([[0.0, 0.0], [1.0, 0.1], [0.2, 0.9]])
+_PLACE = np.array([0.6, 0.7])
+_RANGES = np.sqrt(((_PLACE - _STATION) ** 2).sum(1))
+# How near an answer has to be: first-order solvers stop at 1e-4.
+_NEAR = 1e-2
+
+
+def _conic(name: str) -> str:
+    """Return what is wrong with a conic solver; empty where nothing is."""
+    from formulations.minimax_cone import common
+    from formulations.squared_range import paraboloid
+    from formulations.squared_range_conic import hull, shor
+
+    rows = np.column_stack([_STATION, -0.5 * np.ones(3)])
+    right = 0.5 * ((_STATION**2).sum(1) - _RANGES**2)
+    with using(Choice("conic", name)):
+        found = [each(rows, right, paraboloid(2)) for each in (hull, shor)]
+        solved = [one for one in found if np.isfinite(one.y).all()]
+        if not solved:
+            return f"it solves no program of cones ({found[0].answer.message or found[0].answer.status})"
+        if any(np.abs(one.y[:2] - _PLACE).max() > _NEAR for one in solved):
+            return "its answer is wrong"
+        # two stations that look away from each other: no point is in front of both
+        apart = common(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 0.0], [1.0, 0.0]]), np.full(2, 0.1))
+        if apart.meet:
+            return "it finds a common point of cones that have none"
+    return ""
+
+
+def _nonlinear(name: str) -> str:
+    """Return what is wrong with a nonlinear solver; empty where nothing is."""
+    free, held = _solve(name), _solve(name, inequalities=lambda x, p: [0.5 - x[0]])
+    if isinstance(free, str) or isinstance(held, str):
+        return str(free if isinstance(free, str) else held)
+    if not (free.success and held.success):
+        return f"it ends without an answer ({held.status if free.success else free.status})"
+    if np.abs(free.x - _PLACE).max() > _NEAR or held.x[0] > 0.5 + _NEAR:
+        return "its answer is wrong"
+    hopeless: list[dict[str, Any]] = [
+        {"equalities": lambda x, p: [x[0] ** 2 + 1.0]},
+        {"inequalities": lambda x, p: [x[0] - 1.0, -x[0]]},
+        {"start": _STATION[0]},  # without a gradient
+        {"ranges": np.array([np.nan, 1.0, 1.0])},
+    ]
+    for each in hopeless:
+        found = _solve(name, **each)
+        if not isinstance(found, str) and found.success:
+            return "it calls a point a solution where there is none"
+    return ""
+
+
+def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **constraints: Callable[..., Any]) -> Any:
+    """Return the answer of a solver, or the sentence of its failure."""
+    import casadi as ca
+
+    from formulations.nls import Program
+
+    def residual(x: Any, p: Any, z: Any) -> list[Any]:
+        return [z[i] - ca.sqrt((x[0] - s[0]) ** 2 + (x[1] - s[1]) ** 2) for i, s in enumerate(_STATION.tolist())]
+
+    try:
+        program = Program(2, 3, residual=residual, choice=Choice("nonlinear", name), **constraints)  # type: ignore[arg-type]
+        return program.solve(np.array([0.4, 0.4]) if start is None else start, ranges)
+    except SolverError as trouble:
+        return str(trouble).partition("\n")[0]
+
+
+def _tried(kind: str, name: str) -> str:
+    """Return what is wrong with a solver of a kind, "conic" or "nonlinear"; empty where nothing is."""
+    try:
+        return _conic(name) if kind == "conic" else _nonlinear(name)
+    except Exception as trouble:  # noqa: BLE001  (whatever a solver raises is what is wrong with it)
+        return f"{type(trouble).__name__}: {trouble}".partition("\n")[0]
+
+
+def main(seconds: float, choices: list[str]) -> None:
+    """Try back ends one after the other, and print what is wrong with each.
+
+    Parameters
+    ----------
+    seconds : float
+        Time that each has for all programs.
+    choices : list of str
+        Kind and name of each, joined by a colon.
+    """
+    lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
+
+    def say(word: str, name: str, fault: str) -> None:
+        # solvers print to the same place, perhaps half a line
+        lines.write(f"\n{word} {name} {fault}\n")
+        lines.flush()
+
+    def stop(name: str) -> None:
+        say(FAILED, name, f"it does not end within {seconds:g} s on a program of two unknowns")
+        os._exit(0)
+
+    for kind, _, name in (choice.partition(":") for choice in choices):
+        import_module("cvxpy" if kind == "conic" else "casadi")  # outside the time of the solver
+        timer = Timer(seconds, stop, (name,))
+        timer.daemon = True
+        timer.start()
+        fault = _tried(kind, name)
+        timer.cancel()
+        say(FAILED if fault else PASSED, name, fault)
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]), sys.argv[2:])

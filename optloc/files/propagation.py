@@ -1,0 +1,75 @@
+"""The propagation speed and the medium that a problem file states."""
+
+from __future__ import annotations
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.units import SPEED_OF_LIGHT, sound_in_air, sound_in_water
+from optloc.files.schema import MediumTable, ProblemFile, SoundTable, Units, join
+from optloc.models.medium import Atmosphere, Layers, Medium
+
+# Keys of each kind of medium.
+_MEDIA = {
+    "layers": ("depths", "speeds", "between", "surface", "unit", "speed_unit"),
+    "atmosphere": ("refractivity", "scale_height"),
+}
+
+
+def medium_in(file: ProblemFile, source: str) -> Medium | None:
+    """Return what the waves of a problem file come through, None where their speed is one number."""
+    return None if file.medium is None else _medium(file.medium, _stated_speed(file, source), source)
+
+
+def speed_of(file: ProblemFile, source: str) -> float:
+    """Return the speed by which times are lengths, metres per second: light where a problem file names none."""
+    medium, stated = medium_in(file, source), _stated_speed(file, source)
+    if medium is not None:
+        return medium.unit_speed
+    return SPEED_OF_LIGHT if stated is None else stated
+
+
+def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
+    """Return the medium that a table states; `reference` is the propagation speed beside it, if there is one."""
+    place = join(source, "[medium]")
+    own = _MEDIA[table.kind]
+    given = {key for key in table.model_fields_set - {"kind"} if getattr(table, key) is not None}
+    wrong, lacking = sorted(given - set(own)), [key for key in ("depths", "speeds") if key in own and key not in given]
+    if wrong:
+        raise InvalidProblem(f"the kind {table.kind!r} has no {wrong[0]!r}", place, f"its keys are {', '.join(own)}")
+    if lacking:
+        raise InvalidProblem(f"the kind {table.kind!r} needs {lacking[0]}", place, "give a list of numbers")
+    if table.kind == "atmosphere" and reference is not None:
+        what = "an atmosphere has its own speed, that of light over the refractive index"
+        raise InvalidProblem(what, place, "leave propagation_speed out")
+    length, speed = (
+        Units(quantity).conversion(unit, place).to_si  # type: ignore[arg-type]
+        for quantity, unit in (("length", table.unit), ("speed", table.speed_unit))
+    )
+    try:
+        if table.kind == "atmosphere":
+            return Atmosphere(**{key: getattr(table, key) for key in given})
+        surface = Units("length").plain(table.surface, table.unit, place)
+        depth, speeds = (
+            tuple(float(to_si(v)) for v in values or ())
+            for to_si, values in ((length, table.depths), (speed, table.speeds))
+        )
+        return Layers(depth, speeds, table.between, surface, reference)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, place, error.advice) from None
+
+
+def _stated_speed(file: ProblemFile, source: str) -> float | None:
+    """Return the propagation speed that a file states, metres per second."""
+    given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
+    if isinstance(given, SoundTable):
+        water = given.medium != "air"
+        if not water and (given.salinity is not None or given.depth):
+            raise InvalidProblem("air has no salinity and no depth", place, "leave them out")
+        usual = 35.0 if given.medium == "sea water" else 0.0
+        salinity = usual if given.salinity is None else given.salinity
+        return sound_in_water(given.celsius, salinity, given.depth) if water else sound_in_air(given.celsius)
+    if given is None:
+        return None
+    speed = Units("speed").plain(given, "m/s", place)
+    if not speed > 0.0:
+        raise InvalidProblem(f"the speed {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
+    return speed

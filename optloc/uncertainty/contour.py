@@ -1,0 +1,280 @@
+"""Where a function of two coordinates is negative: its contour as closed lines, found by a grid and made exact.
+
+The grid lies inside cells that are known to hold the set, and is refined until the set has enough nodes. Every point of
+a line is then moved along its edge of the grid to where the function changes its sign, so that the grid decides which
+parts there are and how many corners a line has, but not where it runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base.types import Array
+
+Value = Callable[[Array], Array]
+"""Maps points (n, 2) to values (n,): negative inside, zero on the contour, perhaps infinite."""
+
+Polygon = list[Array]
+"""Closed lines (r, 2): the outer one counter-clockwise, then those around holes, clockwise."""
+
+# Nodes across the longer side of the grid on which cells that touch are told from cells that are apart.
+_COARSE = 200
+# Nodes of a first grid, and inside a part before it is traced: a disc of 600 has an outline of 90 corners, and 0.1 % of
+# its area is lost between them. And nodes that are evaluated at a time at most: 0.2 s in the plane.
+_FIRST, _INSIDE, _MOST = 4000, 600, 40_000
+# So many times more nodes inside show that parts are parts, and not a ridge that is thinner than a step.
+_APART_AT = 10
+# Grids at most: each has half the step of the one before.
+_PASSES = 8
+# Values below which a node is near the set, the widest first: beside a ridge of half width w the value is 3 at 2 w.
+_LIMITS = (3.0, 1.0, 0.2)
+# Least width of a grid, of its length: a line of cells has none.
+_THIN = 1e-9
+# Steps of the search for the change of sign along an edge: it begins with an interpolation, and the function is smooth.
+_STEPS = 7
+# Value to which larger ones are cut off for interpolations, in units of the value that ends the set.
+_CUT = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Nodes ``origin + (step * (i, j)) @ axes`` of a rotated grid (nx, ny), with a step (2,) along each of its axes."""
+
+    origin: Array
+    axes: Array
+    step: Array
+
+    def points(self, nodes: Array) -> Array:
+        """Return the points (n, 2) of nodes (n, 2), whole numbers or not."""
+        return np.asarray(self.origin + (self.step * nodes) @ self.axes)
+
+
+def trace(value: Value, cells: Array) -> list[Polygon]:
+    """Return the polygons in which a function is negative, inside cells that hold all of them.
+
+    Parameters
+    ----------
+    value : callable
+        Maps points (n, 2) to values (n,).
+    cells : array (m, v, 2)
+        Corners of convex cells.
+
+    Returns
+    -------
+    list of list of array (r, 2)
+        Each a closed line, then its holes; the parts that are larger come first.
+    """
+    found = [polygon for part in _parts(cells) for polygon in _trace_part(value, part)]
+    return sorted(found, key=lambda polygon: -area(polygon[0]))
+
+
+def area(line: Array) -> float:
+    """Return the area that a closed line (r, 2) encloses: negative where it runs clockwise."""
+    (x, y) = (line - line[0]).T
+    return 0.5 * float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())
+
+
+def holds(line: Array, point: Array) -> bool:
+    """Return whether a closed line (r, 2) is around a point (2,), by the crossings of a ray."""
+    (x0, y0), (x1, y1) = line[:-1, :2].T, line[1:, :2].T
+    crosses = (y0 > point[1]) != (y1 > point[1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = x0 + (point[1] - y0) / (y1 - y0) * (x1 - x0)
+    return bool((crosses & (x > point[0])).sum() % 2)
+
+
+def trace_nodes(value: Value, nodes: Array, step: float) -> list[Polygon]:
+    """Return the polygons in which a function is negative around nodes (n, 2) of a grid through the origin."""
+    low = nodes.min(0) - 2
+    mask = np.zeros(np.ptp(nodes, axis=0) + 5, dtype=bool)
+    mask[tuple((nodes - low).T)] = True
+    grid = _Grid(low * step, np.eye(2), np.full(2, step))
+    values = _evaluate(value, grid, mask)
+    return _polygons(value, grid, values)
+
+
+# Parts of the cells that do not touch, each with a grid of its own.
+
+
+def _parts(cells: Array) -> list[Array]:
+    """Return the cells (m, v, 2) in groups that do not touch each other."""
+    from scipy.ndimage import label
+
+    low, high = cells.min((0, 1)), cells.max((0, 1))
+    step = float((high - low).max()) / (_COARSE - 1)
+    if len(cells) == 1 or step <= 0.0:
+        return [cells]
+    first, last = np.floor((cells.min(1) - low) / step).astype(int), np.ceil((cells.max(1) - low) / step).astype(int)
+    groups, count = label(_painted(first, last, (_COARSE + 1, _COARSE + 1)), np.ones((3, 3)))
+    if count <= 1:
+        return [cells]
+    own = groups[tuple(first.T)]
+    # a group of its own size may come apart on its finer grid
+    return [part for i in range(1, count + 1) for part in _parts(cells[own == i])]
+
+
+def _painted(first: Array, last: Array, shape: tuple[int, int]) -> Array:
+    """Return which nodes of a grid lie in rectangles from a first to a last node, both (m, 2)."""
+    count = np.zeros((shape[0] + 1, shape[1] + 1), dtype=int)
+    (west, south), (east, north) = first.T, last.T + 1
+    for x, y, sign in ((west, south, 1), (east, south, -1), (west, north, -1), (east, north, 1)):
+        np.add.at(count, (x, y), sign)
+    return np.asarray(count.cumsum(0).cumsum(1)[:-1, :-1] > 0)
+
+
+def _trace_part(value: Value, cells: Array) -> list[Polygon]:
+    """Return the polygons of one group of cells."""
+    flat = cells.reshape(-1, 2)
+    middle = flat.mean(0)
+    axes = np.linalg.eigh(np.cov((flat - middle).T))[1].T[::-1].copy()
+    axes[1] *= np.sign(np.linalg.det(axes))  # no mirror image: lines keep their sense
+    grid, mask = _first_grid((cells - middle) @ axes.T, axes, middle)
+    found: list[Polygon] = []
+    for _ in range(_PASSES):
+        values = _evaluate(value, grid, mask)
+        found, inside = _polygons(value, grid, values), int((values < 0.0).sum())
+        # a part that is thinner than the grid comes apart on it
+        if inside >= _INSIDE and (len(found) <= 1 or inside >= _APART_AT * _INSIDE):
+            break
+        finer = _promising(values, mask)
+        if finer is None:
+            break
+        grid, mask = _Grid(grid.origin, axes, 0.5 * grid.step), finer
+    return found
+
+
+def _first_grid(cells: Array, axes: Array, middle: Array) -> tuple[_Grid, Array]:
+    """Return a grid over cells (m, v, 2) along its axes, and which of its nodes are in cells or beside them."""
+    low, high = cells.min((0, 1)), cells.max((0, 1))
+    size = np.maximum(high - low, _THIN * float((high - low).max()))
+    step = size / np.sqrt(_FIRST)  # a set that is long and thin along the axes takes no more nodes than a round one
+    for _ in range(2):  # cells fill a part of the rectangle: so much finer the grid may be
+        shape = np.ceil(size / step).astype(int) + 5
+        first = np.floor((cells.min(1) - low) / step).astype(int) + 1
+        last = np.ceil((cells.max(1) - low) / step).astype(int) + 3
+        mask = _painted(first, last, (int(shape[0]), int(shape[1])))
+        own, step = step, step * np.sqrt(mask.sum() / _FIRST)
+    return _Grid(middle + (low - 2.0 * own) @ axes, axes, own), mask
+
+
+def _promising(values: Array, mask: Array) -> Array | None:
+    """Return the nodes of a grid of half the step near which the set may be, or None where they are too many."""
+    from scipy.ndimage import binary_dilation
+
+    around = np.ones((3, 3), dtype=bool)
+    for limit in _LIMITS:
+        near = values < limit
+        if near.any():
+            kept = binary_dilation(near, around) & mask
+            finer = np.zeros((2 * mask.shape[0] - 1, 2 * mask.shape[1] - 1), dtype=bool)
+            finer[::2, ::2] = kept
+            finer = binary_dilation(finer, around)
+            if finer.sum() <= _MOST:
+                return np.asarray(finer)
+    return None
+
+
+def _evaluate(value: Value, grid: _Grid, mask: Array) -> Array:
+    """Return the values (nx, ny) at nodes of a mask, cut off, and outside of it as if far outside the set."""
+    out = np.full(mask.shape, _CUT)
+    nodes = np.argwhere(mask)
+    if len(nodes):
+        found = value(grid.points(nodes.astype(float)))
+        out[tuple(nodes.T)] = np.where(np.isnan(found), _CUT, np.clip(found, -_CUT, _CUT))
+    out[[0, -1]] = out[:, [0, -1]] = _CUT  # lines close
+    return out
+
+
+# Marching squares: the corners of a square that are inside decide which of its edges a line joins, the inside on its
+# left. Corners have the bits 1, 2, 4, 8 from the lower left one, counter-clockwise; edges are those below (B), right
+# (R), above (T) and left (L). Squares with two opposite corners are told by their middle.
+_JOINS: dict[int, tuple[str, ...]] = {
+    1: ("BL",),
+    2: ("RB",),
+    3: ("RL",),
+    4: ("TR",),
+    6: ("TB",),
+    7: ("TL",),
+    8: ("LT",),
+    9: ("BT",),
+    11: ("RT",),
+    12: ("LR",),
+    13: ("BR",),
+    14: ("LB",),
+}
+_APART: dict[int, tuple[str, ...]] = {5: ("BL", "TR"), 10: ("RB", "LT")}
+_TOGETHER: dict[int, tuple[str, ...]] = {5: ("BR", "TL"), 10: ("LB", "RT")}
+# An edge is its lower or left node, and whether it goes along the second axis.
+_EDGES = {"B": (0, 0, 0), "T": (0, 1, 0), "L": (0, 0, 1), "R": (1, 0, 1)}
+
+Edge = tuple[int, int, int]
+
+
+def _polygons(value: Value, grid: _Grid, values: Array) -> list[Polygon]:
+    """Return the polygons of values on a grid, their corners where the function changes its sign."""
+    loops = _loops(values)
+    if not loops:
+        return []
+    ends = np.cumsum([len(loop) for loop in loops])[:-1]
+    points = np.split(_crossings(value, grid, values, np.array([edge for loop in loops for edge in loop])), ends)
+    lines = [np.concatenate([line, line[:1]]) for line in points]
+    sizes = [area(line) for line in lines]
+    outer = [[line] for line, size in zip(lines, sizes, strict=True) if size > 0.0]
+    for line, size in zip(lines, sizes, strict=True):
+        if size < 0.0:
+            around = [polygon for polygon in outer if holds(polygon[0], line[0])]
+            if around:
+                min(around, key=lambda polygon: area(polygon[0])).append(line)
+    return outer
+
+
+def _loops(values: Array) -> list[list[Edge]]:
+    """Return the closed sequences of edges that the contour of zero crosses."""
+    inside = values < 0.0
+    code = inside[:-1, :-1] + 2 * inside[1:, :-1] + 4 * inside[1:, 1:] + 8 * inside[:-1, 1:]
+    following: dict[Edge, Edge] = {}
+    for i, j in np.argwhere((code > 0) & (code < 15)).tolist():
+        own = int(code[i, j])
+        joins = _JOINS.get(own)
+        if joins is None:
+            joins = (_TOGETHER if values[i : i + 2, j : j + 2].mean() < 0.0 else _APART)[own]
+        for join in joins:
+            (a, b, c), (d, e, f) = _EDGES[join[0]], _EDGES[join[1]]
+            following[i + a, j + b, c] = (i + d, j + e, f)
+    loops = []
+    while following:
+        first, here = following.popitem()
+        loop = [first]
+        while here != first:
+            loop.append(here)
+            here = following.pop(here)
+        loops.append(loop)
+    return loops
+
+
+def _crossings(value: Value, grid: _Grid, values: Array, edges: Array) -> Array:
+    """Return the points (n, 2) at which a function changes its sign along edges (n, 3) of a grid."""
+    begin, along = edges[:, :2].astype(float), np.eye(2)[edges[:, 2]]
+    one, two = values[tuple(edges[:, :2].T)], values[tuple((edges[:, :2] + np.eye(2, dtype=int)[edges[:, 2]]).T)]
+    # from the end inside to the end outside
+    start = np.where((one < 0.0)[:, None], begin, begin + along)
+    way = np.where((one < 0.0)[:, None], along, -along)
+    low, high = np.zeros(len(edges)), np.ones(len(edges))
+    at_low, at_high = np.minimum(one, two), np.maximum(one, two)
+    side = np.zeros(len(edges))
+    for _ in range(_STEPS):
+        share = at_low / (at_low - at_high)
+        middle = low + np.clip(share, 0.02, 0.98) * (high - low)
+        found = value(grid.points(start + middle[:, None] * way))
+        found = np.where(np.isnan(found), _CUT, np.clip(found, -_CUT, _CUT))
+        within = found < 0.0
+        low, high = np.where(within, middle, low), np.where(within, high, middle)
+        # where one end stays twice its value counts half (Illinois): both ends come near
+        at_high = np.where(within, np.where(side > 0.0, 0.5 * at_high, at_high), found)
+        at_low = np.where(within, found, np.where(side < 0.0, 0.5 * at_low, at_low))
+        side = np.where(within, 1.0, -1.0)
+    share = np.clip(at_low / (at_low - at_high), 0.0, 1.0)
+    return grid.points(start + (low + share * (high - low))[:, None] * way)
