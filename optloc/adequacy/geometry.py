@@ -9,8 +9,8 @@ import numpy as np
 
 from optloc.adequacy.score import descend, one_place
 from optloc.base.linalg import centre_and_spread
-from optloc.base.types import Array
-from optloc.linear.constraints import violation
+from optloc.base.types import Array, Band
+from optloc.linear.constraints import is_exact, violation
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
@@ -141,6 +141,8 @@ def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
     if shape is None or shape.extent[-1] == 0.0:
         return
     d, flat = problem.dimension, np.array([_is_flat(problem, shape, i) for i in range(problem.dimension)])
+    if flat[0] and not (d == 3 and flat[1]) and _is_decided(problem, shape):
+        return
     if d == 3 and flat[1]:
         axis = _spell(shape.axes[:, -1])
         seen = f"the stations stand on one line along {axis}: a turn about it changes no measurement"
@@ -154,6 +156,26 @@ def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
         name = "plane" if d == 3 else "line"
         seen = f"the mirror image of the fix in the best {name} of the stations ({_off(shape)}) fits about as well"
         yield Advice("mirror", seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
+
+
+# Share of a normal along which an equality changes, from which a mirror image breaks it.
+_ACROSS = 0.1
+
+
+def _is_decided(problem: Problem, shape: _Shape) -> bool:
+    """Return whether an equality holds the target off the plane of the stations: its mirror image breaks that."""
+    normal = shape.axes[:, 0]
+    for band in problem.constraints:
+        if not isinstance(band, Band) or not is_exact(band):
+            continue
+        if band.kind == "plane":
+            c = band.coefficients.reshape(-1, band.coefficients.shape[-1])[0]
+            off = np.abs(band.lower - c @ shape.centre[: len(c)]).min()
+            if abs(float(c @ normal[: len(c)])) > _ACROSS * float(np.linalg.norm(c)) and off > 0.0:
+                return True
+        if band.kind == "height" and abs(float(problem.frame.enu_axes(shape.centre)[2] @ normal)) > _ACROSS:
+            return True
+    return False
 
 
 def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:

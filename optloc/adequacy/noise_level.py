@@ -26,6 +26,9 @@ ACCUSED = 0.01
 _FACTORS = np.exp(np.arange(-60, 100) * 0.05)
 # Share of late rows from which they are no exception: what all have in common may be an offset.
 _MINORITY = 0.5
+# Share of late rows from which no row on time is left that others are late against: few fixes of hardly any redundancy
+# are explained by that as well as by noise of another size.
+_NEARLY_ALL = 0.95
 # Change of sigma that is worth a word: 20 % of it move no fix by a tenth of its sigma.
 _WORTH = 1.2
 # Eigenvalue of the tests of a group, as a share of the largest, below which it is rounding.
@@ -318,6 +321,8 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
         if offset > 0.0 and left < found.left:
             found = replace(found, share=0.0, delay=0.0, alike=kind, offset=offset, offset_error=error)
             return replace(found, late=late, carried=carried)
+        if found.share > _NEARLY_ALL:  # late against what
+            return replace(found, share=0.0, delay=0.0, late=late, carried=carried)
     late[kept], carried[kept] = found.late, found.carried
     return replace(found, late=late, carried=carried)
 

@@ -81,7 +81,7 @@ def _count(groups: Sequence[Group], members: Array, state: Array, sign: float) -
     rules = [LinearConstraint(members.astype(float), low, high)] if len(groups) else []
     free = (state == -1).astype(float)
     sites = Bounds((state == 1).astype(float), (state != 0).astype(float))
-    solved = milp(sign * free, integrality=np.ones(len(state)), bounds=sites, constraints=rules)
+    solved = milp(sign * free, integrality=np.ones(len(state), dtype=np.int64), bounds=sites, constraints=rules)
     return None if solved.x is None else round(float(free @ solved.x))
 
 
