@@ -111,7 +111,7 @@ class Made:
 
 @dataclass
 class Scene:
-    """Stations and targets: `place` by station in SI, `shown` as they are written, readings of each epoch and target."""
+    """Stations and targets: `place` of each station in SI, `shown` as a table writes it, `truth` of each target."""
 
     rng: random.Random
     what: str
@@ -185,7 +185,7 @@ def scene_of(rng, what):
     earth = rng.random() < 0.4 if what not in ("anchors", "range_rate") else False
     flat_only = kinds == ("azimuth",)
     dimension = 3 if earth or what == "sight" else 2 if flat_only else rng.choice([2, 3])
-    inline = "azimuth" in kinds and rng.random() < 0.6 or (kinds == ("range",) and rng.random() < 0.15)
+    inline = ("azimuth" in kinds and rng.random() < 0.6) or (kinds == ("range",) and rng.random() < 0.15)
     scene = Scene(rng, what, kinds, earth, dimension, inline, rng.random() < 0.4)
     count = rng.randint(5, 6) if dimension == 2 or flat_only else rng.randint(6, 8)
     scene.names = list(rng.choice(STRANGE if scene.odd and rng.random() < 0.5 else NAMES))[:count]
@@ -302,7 +302,7 @@ def ideal(scene, kind, a, b, truth):
 
 
 def instant(scene, start, far):
-    """Return the arrival of a signal in seconds, to a thousandth of a picosecond, in the seconds of today or of a run."""
+    """Return the arrival of a signal in seconds since 1970 or since the start of a run, to a femtosecond."""
     return (
         (Decimal(1_790_000_000) if scene.size > 300.0 else Decimal(12))
         + start
@@ -655,7 +655,7 @@ def number(cell):
         float(cell)
     except ValueError:
         return cell
-    return Literal(cell) if cell.strip() == cell and not cell.lstrip("-").startswith("0") or "." in cell else cell
+    return Literal(cell) if (cell.strip() == cell and not cell.lstrip("-").startswith("0")) or "." in cell else cell
 
 
 def raw_json(value):

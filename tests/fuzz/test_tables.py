@@ -44,7 +44,7 @@ def written(table, folder):
 
 
 def values(rows):
-    """Return the values of each kind in order; azimuths as cosines. Arrivals count from an instant that tables choose."""
+    """Return the values of each kind in order, azimuths as cosines; arrivals have no common origin and are left out."""
     found = {kind: [] for kind in {row.kind for row in rows}}
     for row in rows:
         found[row.kind] += [] if row.kind == "toa" else [math.cos(row.z) if row.kind == "azimuth" else row.z]
@@ -143,7 +143,8 @@ NAMED = {
         ["--stations", "anchors.csv", "--sigma", "10 cm"],
     ),
     "a time beside levels": (
-        "time_s,station,reference,rss_difference_dB\n" + "".join(f"7.5,{n},A,{0.5 * i}\n" for i, n in enumerate("BCD", 1)),
+        "time_s,station,reference,rss_difference_dB\n"
+        + "".join(f"7.5,{n},A,{0.5 * i}\n" for i, n in enumerate("BCD", 1)),
         ["--stations", "anchors.csv", "--sigma", "1 dB"],
     ),
     "stations called like the columns": (
