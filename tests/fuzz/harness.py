@@ -208,6 +208,7 @@ def run_part(seed, first, count):
             case = case_of(seed, number)
             found, about = run(case, Path(folder))
             counts[f"exit {about['code']}"] += 1
+            counts[f"{case.family}, exit {about['code']}"] += 1
             counts[about["verdict"] or "no verdict"] += 1
             faults += [f"case {case.name}: {fault}" for fault in found]
             for fault in found:  # at once: a run of many thousand cases is watched

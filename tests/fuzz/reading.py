@@ -39,14 +39,15 @@ ROLES = {
 }  # fmt: skip
 ALL_UNITS = {unit.lower(): unit for unit in {*LENGTHS, *ANGLE, *SPEED, *LEVEL}}
 ENDING = re.compile(
-    rf"(.*?)\s*[_ \[(/]\s*({'|'.join(sorted(map(re.escape, ALL_UNITS), key=len, reverse=True))})[\])]?", re.IGNORECASE
+    rf"(.*?)\s*[_ \[(/]\s*({'|'.join(sorted(map(re.escape, ALL_UNITS), key=len, reverse=True))})[\])]?",
+    re.IGNORECASE,
 )
 
 
 def frame_of(path):
     """Return a table of text, whatever its format: nested lists are rows, nested objects have longer names."""
     if path.suffix == ".parquet":
-        return pd.read_parquet(path).map(lambda cell: None if cell is None or cell != cell else str(cell))
+        return pd.read_parquet(path).map(lambda cell: None if pd.isna(cell) else str(cell))
     if path.suffix in (".csv", ".tsv"):
         found = pd.read_csv(path, sep=None, engine="python", dtype=str, keep_default_na=False)
         return found.map(lambda cell: cell or None)
@@ -149,7 +150,8 @@ def melted(frame, stations, given, told):
             hits = {asked or "tdoa": pairs[word]} if word in pairs and (asked or "-" in name) else {}
             for kind, (_, words) in KINDS.items() if not hits else ():
                 cut = [rest for w in words.split() for rest in (word.removeprefix(w), word.removesuffix(w))]
-                hits |= {kind: pairs[rest] for rest in cut if rest in pairs and rest != word and asked in (None, kind)}
+                named = [pairs[rest] for rest in cut if rest in pairs and rest != word and asked in (None, kind)]
+                hits |= {kind: named[-1]} if named else {}
             for kind, ends in hits.items():
                 own = unit or given.get("--unit")
                 if own in KINDS[kind][0]:

@@ -18,13 +18,22 @@ HERE = Path(__file__).parent
 SITE_FILES = ("p.toml", "p-*.csv")
 # Of a table and its options: the command before them, what stands behind them, what may be written.
 OF_TABLES = (
-    *[("fix", ("--json",), ())] * 4, ("fix", (), ()), ("fix", ("--out", "f.csv"), ("f.csv",)), ("fix", ("-m", "robust", "--json"), ()),
-    ("fix", ("--height", "3 m", "--json"), ()), ("fix", ("--noise-from-data", "station", "--json"), ()),
-    *[("convert", ("--out", "p.toml"), SITE_FILES)] * 3, ("convert", ("--json",), ()),
-    ("check", (), ()), ("check", ("--json",), ()), ("check", ("--out", "h.parquet"), ("h.parquet",)),
-    ("track", ("--json",), ()), ("track", (), ()), ("track", ("--out", "t.csv"), ("t.csv",)),
+    *[("fix", ("--json",), ())] * 4,
+    ("fix", (), ()),
+    ("fix", ("--out", "f.csv"), ("f.csv",)),
+    ("fix", ("-m", "robust", "--json"), ()),
+    ("fix", ("--height", "3 m", "--json"), ()),
+    ("fix", ("--noise-from-data", "station", "--json"), ()),
+    *[("convert", ("--out", "p.toml"), SITE_FILES)] * 3,
+    ("convert", ("--json",), ()),
+    ("check", (), ()),
+    ("check", ("--json",), ()),
+    ("check", ("--out", "h.parquet"), ("h.parquet",)),
+    ("track", ("--json",), ()),
+    ("track", (), ()),
+    ("track", ("--out", "t.csv"), ("t.csv",)),
     ("track", ("--model", "csm", "--filter", "ekf", "--json"), ()),
-)  # fmt: skip
+)
 
 # Tables of other programs, and sparse ones: the files, the first of them the table, and what must be told.
 
@@ -35,7 +44,8 @@ HEARD = dict(
 )
 NET = "station,latitude,longitude,elevation_m\nAQU,42.354,13.405,710\nFIAM,42.268,13.117,1070\nTERO,42.623,13.604,673\n"
 NET += "CAMP,42.536,13.409,1283\nFAGN,42.266,13.584,761\nINTR,42.011,13.904,924\n"
-PICKS = "station,P,S\nAQU,2026-04-06T01:32:41.73Z,2026-04-06T01:32:42.99Z\nFIAM,2026-04-06T01:32:44.31Z,2026-04-06T01:32:47.48Z\n"
+PICKS = "station,P,S\nAQU,2026-04-06T01:32:41.73Z,2026-04-06T01:32:42.99Z\n"
+PICKS += "FIAM,2026-04-06T01:32:44.31Z,2026-04-06T01:32:47.48Z\n"
 PICKS += "TERO,2026-04-06T01:32:46.31Z,2026-04-06T01:32:50.94Z\nCAMP,2026-04-06T01:32:44.03Z,2026-04-06T01:32:46.99Z\n"
 PHASES = "event,station,phase,time\n" + "".join(
     f"{event},{row.split(',')[0]},{phase},{row.split(',')[1 + (phase == 'S')]}\n"
@@ -248,15 +258,24 @@ def checkpoint():
 
 
 # Recording, what stands behind it, what may be written.
+_STATE, _UPLINKS = ("site.state",), ("--adapter", "chirpstack")
 OF_STREAMS = (
-    *[("rec.ndjson", (), ())] * 3, ("rec.ndjson", ("--phases", "one"), ()), ("rec.ndjson", ("--phases", "fix", "--late", "revise"), ()),
-    ("rec.ndjson", ("--track",), ()), ("rec.ndjson", ("--format", "geojson"), ()), ("rec.ndjson", ("--format", "nmea"), ()),
-    ("rec.ndjson", ("--format", "cot"), ()), ("rec.ndjson", ("--format", "aircraft"), ()), ("rec.ndjson", ("--partition", "1/2"), ()),
-    ("rec.ndjson", ("--record", "out.ndjson"), ("out.ndjson",)), *[("up.ndjson", ("--adapter", "chirpstack"), ())] * 3,
-    ("up.ndjson", ("--adapter", "chirpstack", "--track"), ()), *[("modes.ndjson", ("--adapter", "mode-s"), ())] * 3,
-    *[("rec.ndjson", ("--state", "site.state"), ("site.state",))] * 5,
-    ("up.ndjson", ("--adapter", "chirpstack", "--state", "site.state"), ("site.state",)),
-)  # fmt: skip
+    *[("rec.ndjson", (), ())] * 3,
+    ("rec.ndjson", ("--phases", "one"), ()),
+    ("rec.ndjson", ("--phases", "fix", "--late", "revise"), ()),
+    ("rec.ndjson", ("--track",), ()),
+    ("rec.ndjson", ("--format", "geojson"), ()),
+    ("rec.ndjson", ("--format", "nmea"), ()),
+    ("rec.ndjson", ("--format", "cot"), ()),
+    ("rec.ndjson", ("--format", "aircraft"), ()),
+    ("rec.ndjson", ("--partition", "1/2"), ()),
+    ("rec.ndjson", ("--record", "out.ndjson"), ("out.ndjson",)),
+    *[("up.ndjson", _UPLINKS, ())] * 3,
+    ("up.ndjson", (*_UPLINKS, "--track"), ()),
+    *[("modes.ndjson", ("--adapter", "mode-s"), ())] * 3,
+    *[("rec.ndjson", ("--state", "site.state"), _STATE)] * 5,
+    ("up.ndjson", (*_UPLINKS, "--state", "site.state"), _STATE),
+)
 
 
 def stream_case(rng):
@@ -287,11 +306,18 @@ chunk = 3
 method = "auto"
 chunk = 3
 """
+_RESUME = ("study", "run", "small.toml", "--out", "out", "-j", "1")
 OF_STUDIES = (
-    *[("study", "status", "out")] * 2, ("study", "status", "out", "--json"), *[("study", "report", "out")] * 2, ("study", "pairs", "out"),
-    ("study", "profiles", "out", "--json"), ("study", "compare", "out", "out"), ("study", "histories", "out", "--trials", "2"),
-    *[("study", "run", "small.toml", "--out", "out", "-j", "1", "-q")] * 2, ("study", "run", "small.toml", "--out", "out", "-j", "1", "--trials", "9"),
-)  # fmt: skip
+    *[("study", "status", "out")] * 2,
+    ("study", "status", "out", "--json"),
+    *[("study", "report", "out")] * 2,
+    ("study", "pairs", "out"),
+    ("study", "profiles", "out", "--json"),
+    ("study", "compare", "out", "out"),
+    ("study", "histories", "out", "--trials", "2"),
+    *[(*_RESUME, "-q")] * 2,
+    (*_RESUME, "--trials", "9"),
+)
 
 
 @cache

@@ -111,7 +111,7 @@ class Made:
 
 @dataclass
 class Scene:
-    """Stations and targets: `place` by station in SI, `shown` as they are written, readings of each epoch and target."""
+    """Stations and targets: `place` of each station in SI, `shown` as a table writes it, `truth` of each target."""
 
     rng: random.Random
     what: str
@@ -302,7 +302,7 @@ def ideal(scene, kind, a, b, truth):
 
 
 def instant(scene, start, far):
-    """Return the arrival of a signal in seconds, to a thousandth of a picosecond, in the seconds of today or of a run."""
+    """Return the arrival of a signal in seconds since 1970 or since the start of a run, to a femtosecond."""
     return (
         (Decimal(1_790_000_000) if scene.size > 300.0 else Decimal(12))
         + start

@@ -1,7 +1,8 @@
 """Whatever is in a file, a command ends with an answer or one sentence, in time, and what reads is read rightly.
 
-Cases are mutations of everything that optloc ships (`fuzz.mutations`, `fuzz.originals`), each run in a fork of one warm
-process (`fuzz.harness`) and, where its file reads, held against a plain re-reading of it (`fuzz.plain`, `fuzz.oracle`).
+Cases are mutations (`fuzz.mutations`) of everything that optloc ships (`fuzz.originals`), of foreign tables, recordings
+and checkpoints of streams, and folders of studies (`fuzz.surfaces`). Each runs in a fork of one warm process
+(`fuzz.harness`). A problem file that reads is compared with a plain re-reading of it (`fuzz.plain`, `fuzz.oracle`).
 """
 
 import json
@@ -24,9 +25,11 @@ import optloc
 from optloc.cli import app
 
 HERE = Path(__file__).parent
-FEW, ALONE = 4, 1
-# Of a seed, of which there are ten in full: 20 000 cases in parts that take a minute or two.
+FEW, ALONE = 5, 1
+# Of a seed, of which there are ten in full: 20 000 cases in parts of about ten minutes of one processor.
 PARTS, PART = 4, 500
+# Least share of the cases of a part that are problems which read as their plain re-reading does; 0.11 were measured.
+READ = 0.05
 
 
 def run(seed, first, count):
@@ -43,14 +46,15 @@ def test_mutated_files_end_in_an_answer_or_one_sentence(seed):
     assert not found["faults"], "\n".join(found["faults"])
     counts = found["counts"]
     assert sum(number for what, number in counts.items() if what.startswith("exit ")) == FEW
-    # Some are still read, and most of those are judged.
-    assert counts.get("same", 0) + counts.get("same fix", 0) > counts.get("not judged", 0)
+    # Most of the problems that are read are judged.
+    assert counts.get("same", 0) + counts.get("same fix", 0) >= counts.get("not judged", 0)
 
 
 @pytest.mark.parametrize("number", range(ALONE))
 def test_the_real_command_line_does_what_its_fork_does(number, seed, tmp_path):
     case = case_of(seed, 1000 + number)
     for name, data in case.files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(data)
     given = {**os.environ, "PYTHONPATH": str(Path(optloc.__file__).parents[1])}
     command = [sys.executable, "-m", "optloc.cli", *case.arguments]
@@ -119,3 +123,4 @@ def test_mutated_files_in_full(part, seed, pytestconfig):
     found = run(seed, part * PART, PART) if known is None else known
     store(found)
     assert not found["faults"], "\n".join(found["faults"])
+    assert found["counts"].get("same", 0) + found["counts"].get("same fix", 0) >= READ * PART

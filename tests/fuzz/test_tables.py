@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from fuzz import reading, tried
+from fuzz.surfaces import foreign
 from fuzz.tables import Row, made
 from fuzz.test_fuzz import parts
 
@@ -44,7 +45,7 @@ def written(table, folder):
 
 
 def values(rows):
-    """Return the values of each kind in order; azimuths as cosines. Arrivals count from an instant that tables choose."""
+    """Return the values of each kind in order, azimuths as cosines; arrivals have no common origin and are left out."""
     found = {kind: [] for kind in {row.kind for row in rows}}
     for row in rows:
         found[row.kind] += [] if row.kind == "toa" else [math.cos(row.z) if row.kind == "azimuth" else row.z]
@@ -143,7 +144,8 @@ NAMED = {
         ["--stations", "anchors.csv", "--sigma", "10 cm"],
     ),
     "a time beside levels": (
-        "time_s,station,reference,rss_difference_dB\n" + "".join(f"7.5,{n},A,{0.5 * i}\n" for i, n in enumerate("BCD", 1)),
+        "time_s,station,reference,rss_difference_dB\n"
+        + "".join(f"7.5,{n},A,{0.5 * i}\n" for i, n in enumerate("BCD", 1)),
         ["--stations", "anchors.csv", "--sigma", "1 dB"],
     ),
     "stations called like the columns": (
@@ -175,6 +177,18 @@ def test_words_of_two_meanings_are_read_by_unit_or_refused(name, tmp_path, monke
         assert err.count("\n") == 1
     else:
         assert not tried.differences(own, read(tmp_path / "p.toml"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["fix", "check", "track"])
+def test_sparse_tables_and_tables_of_other_programs_end_in_an_answer(verb, tmp_path, monkeypatch):
+    """No table of them is damaged, so none ends in a traceback or a warning, whichever epochs lack readings."""
+    monkeypatch.chdir(tmp_path)
+    for name, (held, options) in foreign().items():
+        for file, data in held.items():
+            Path(file).write_bytes(data)
+        _, _, _, fault = tried.ran(verb, next(iter(held)), *options, "--json")
+        assert not fault, f"{verb} {name}: {fault}"
 
 
 @pytest.mark.full

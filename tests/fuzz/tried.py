@@ -1,7 +1,7 @@
-"""What optloc makes of a drawn table: the rows it reads and the fixes it finds, against a reading of its own and the truth.
+"""The verdict on a drawn table: the rows that optloc reads against those of pandas, and its fixes against the truth.
 
-By hand: ``python -m fuzz.tried SEED FIRST COUNT`` (with ``tests`` on the path) prints a line for each wrong table and one
-of counts; ``python -m fuzz.tried SEED NUMBER`` writes a table to the folder it is run in, and prints its command.
+By hand: ``python -m fuzz.tried SEED FIRST COUNT`` (with ``tests`` on the path) prints a line for each wrong table and
+the counts; ``python -m fuzz.tried SEED NUMBER`` writes a table to the current folder and prints its command.
 """
 
 import json
@@ -12,6 +12,7 @@ import traceback
 import warnings
 from collections import Counter
 from contextlib import chdir
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ FLIGHT = 3.0
 # Standard deviations by which a fix of exact data may be off, and metres that rounding takes of coordinates on Earth.
 SIGMAS, ROUNDING = 5.0, 1e-5
 PAIRED = ("tdoa", "rss_difference")
+# Seconds by which the mean time of the rows of a window is beside the first of them.
+WINDOW = 0.1
 
 
 def tried(table, folder):
@@ -86,35 +89,40 @@ def differences(own, loaded):
     for (kind, a, b, epoch, z, weight, _, variance), t in zip(rows, target, strict=True):
         label = loaded.targets[epoch if loaded.own_epochs else t] if loaded.targets else ""
         label = "" if label == "target" else label
-        a, b = (first_alike(problem, epoch, end) for end in (a, b))
+        ends = [first_alike(problem, epoch, end) for end in (a, b)]
         if weight > 0.0:
-            theirs[kind, epoch, label, *turned_round(kind, a, b)] = (
-                -z if is_turned(kind, a, b) else z,
+            theirs[kind, epoch, label, *turned_round(kind, *ends)] = (
+                -z if is_turned(kind, *ends) else z,
                 math.sqrt(variance),
             )
     if mine.keys() != theirs.keys():
         lacking, more = sorted(mine.keys() - theirs.keys()), sorted(theirs.keys() - mine.keys())
         return f"rows {lacking[:2]} are not read, {more[:2]} are, of stations {names}"
-    least = {}
-    for key in mine:
-        least[key[1:3]] = min((mine[k][0] for k in mine if k[1:3] == key[1:3] and k[0] == "toa"), default=0)
-    base = {e: min((theirs[k][0] for k in theirs if k[1:3] == e and k[0] == "toa"), default=0.0) for e in least}
+    size = {key: 0.0 if isinstance(z, Fraction) else abs(z) for key, (z, _) in mine.items()}
+    mine, theirs = from_first(mine), from_first(theirs)
     for key, (z, sigma) in mine.items():
         other, spread = theirs[key]
-        if key[0] == "toa":
-            z, other = (
-                float(z - least[key[1:3]]) * (C if isinstance(z, reading.Fraction) else 1.0),
-                other - base[key[1:3]],
-            )
-        off = abs(z - other)
-        off = abs(math.remainder(z - other, math.tau)) if key[0] == "azimuth" else off
-        # Differences of floats keep what these have.
-        size = max(abs(z), 1.0, abs(float(mine[key][0])) if not isinstance(mine[key][0], reading.Fraction) else 0.0)
-        if off > VALUE * size:
+        off = abs(math.remainder(z - other, math.tau)) if key[0] == "azimuth" else abs(z - other)
+        # A difference of floats is as exact as its terms.
+        if off > VALUE * max(size[key], abs(z), 1.0):
             return f"{key}: {z!r} is read as {other!r}"
         if abs(sigma - spread) > SPREAD * sigma:
             return f"sigma of {key}: {sigma!r} is read as {spread!r}"
     return ""
+
+
+def from_first(rows):
+    """Return rows whose arrivals are metres behind the first arrival of their epoch and target."""
+    least = {}
+    for (kind, *group, _, _), (z, _) in rows.items():
+        if kind == "toa":
+            least[tuple(group)] = min(z, least.get(tuple(group), z))
+
+    def metres(key, z):
+        behind = z - least[key[1:3]]
+        return float(behind) * (C if isinstance(z, Fraction) else 1.0)
+
+    return {key: (metres(key, z) if key[0] == "toa" else z, sigma) for key, (z, sigma) in rows.items()}
 
 
 def keyed(rows, problem):
@@ -199,17 +207,22 @@ def of_fixes(table, told):
 
 
 def truth_of(table, fix):
-    """Return where the target of a fix is."""
+    """Return the place of the target of a fix, None where the table has no such epoch or target."""
+    label = plainly(fix["epoch"])
     for (epoch, target), spot in table.truth.items():
         if target not in (None, fix["target"]):
             continue
-        if epoch is None or epoch == plainly(fix["epoch"]) or (isinstance(epoch, float) and near(epoch, fix["time"])):
+        if epoch is None or epoch == label or (isinstance(epoch, float) and near(epoch, fix["time"], label)):
             return spot
     return None
 
 
-def near(one, two):
-    return two is not None and abs(one - two) < 0.1
+def near(epoch, time, label=""):
+    """Return whether an epoch in seconds is the one of a time, or of a label where an epoch has no time."""
+    try:
+        return abs(epoch - float(label if time is None else time)) < WINDOW
+    except ValueError:
+        return False
 
 
 def run_part(seed, first, count):
