@@ -38,6 +38,7 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known, known_minima, set_minimum
 from optloc.proof.curvature import clip_to_stationary
+from optloc.proof.descents import descend
 from optloc.proof.everywhere import is_left, leaves, push_pieces
 from optloc.proof.near import cut_side, lay_or_halve, region_of
 from optloc.proof.nodes.dispatch import bound_pieces
@@ -50,7 +51,6 @@ from optloc.proof.search_space import (
     chart_on,
     cost_of,
     curve_box,
-    descend,
     empty_box,
     turned,
     widen,

@@ -50,6 +50,7 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
 from optloc.proof.curvature import has_no_infimum, most_curved_side, spread_of, sum_up
+from optloc.proof.descents import descend
 from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.search_space import (
@@ -60,7 +61,6 @@ from optloc.proof.search_space import (
     Cost,
     Known,
     chart_at,
-    descend,
     empty_box,
     equal_within,
 )

@@ -30,6 +30,7 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import is_known, known_minima
 from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
+from optloc.proof.descents import descend
 from optloc.proof.enclosure import around_node, enclose
 from optloc.proof.nodes.node import (
     HEIGHT,
@@ -50,7 +51,6 @@ from optloc.proof.search_space import (
     chart_on,
     curve_along,
     curve_box,
-    descend,
     equal_within,
     lay_down,
     place,

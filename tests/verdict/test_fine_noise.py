@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from often import few
 from verdict.exact import COUNT, draw
 
 from optloc import ECEF, Frame, Motion, Status, assemble, certify, constraints, measured, solve
@@ -35,14 +36,14 @@ def above(place: Array, count: int, radius: float, rng: np.random.Generator, lea
 
 
 @needs_code
-@pytest.mark.parametrize("seed", range(6))
-def test_three_satellites_and_an_exact_height(seed):
+@pytest.mark.parametrize("number", few(range(6), 4))
+def test_three_satellites_and_an_exact_height(number):
     """The truth is the only minimum that is visible, or another one costs as little: never is there no proof."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(number)
     lat, lon, level = np.arcsin(rng.uniform(-1.0, 1.0)), rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 9e3)
     x = np.asarray(ECEF.from_geodetic(lat, lon, level))
-    place = above(x, 3, (26.56e6, 7.2e6, 42.16e6)[seed % 3], rng)
-    kind = ("tdoa", "toa")[seed // 3]
+    place = above(x, 3, (26.56e6, 7.2e6, 42.16e6)[number % 3], rng)
+    kind = ("tdoa", "toa")[number // 3]
     told = []
     for sigma in (100.0, 1.0, 0.1):
         rows = (
@@ -185,7 +186,7 @@ def turned_unproven(number: int, steps) -> tuple[str, list[str]]:
 @needs_code
 def test_a_finer_sigma_leaves_fixes_proven():
     """Some scenes of all families in the plain run; five hundred in full, fifty for each seed."""
-    found = [turned_unproven(number, (1e-6, 1e-9)) for number in range(100, 116)]
+    found = [turned_unproven(number, (1e-6, 1e-9)) for number in range(99, 115)]
     assert [name for name, _ in found if name] == []
     assert sum("ok" in labels for _, labels in found) > 10
 
