@@ -521,7 +521,9 @@ def besides(sheet, scene):
     for name in rng.sample(sorted(BESIDES), rng.choice([0, 0, 1, 2])):
         add(sheet, name, lambda name=name: BESIDES[name](rng))
     if scene.odd:
-        for name in rng.sample(sorted(MISLEADING), rng.choice([0, 0, 1, 1, 2])):
+        # Beside the place of a station, an altitude is the one of the station.
+        known = sorted({*MISLEADING} - ({"altitude_ft"} if scene.inline else set()))
+        for name in rng.sample(known, rng.choice([0, 0, 1, 1, 2])):
             add(sheet, name, lambda name=name: MISLEADING[name](rng))
             sheet.about.append(f"with {name}")
     for_all = list(dict.fromkeys(name for row in sheet.records for name in row))
