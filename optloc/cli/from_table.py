@@ -17,10 +17,10 @@ from optloc.cli.options import Budget, Force, Json, Quiet, Verbose
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from optloc.files.convert import Converted, Plan
     from optloc.files.reader import Loaded
     from optloc.files.readings import Told
     from optloc.files.schema import ConstraintTable
+    from optloc.files.table_problem import Converted, TableProblem
 
 _TABLES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".parquet", ".pq", ".rnx", ".obs")
 # RINEX observations of a year, such as site1230.21o.
@@ -219,7 +219,7 @@ def say_next(console: Console, line: str) -> None:
     say(console, line)
 
 
-def _tell(plan: Plan, console: Console) -> None:
+def _tell(plan: TableProblem, console: Console) -> None:
     """Print what a table is understood to be, and what was assumed."""
     from optloc.cli.output import say, say_all
 

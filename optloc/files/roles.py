@@ -220,7 +220,9 @@ def _rows_in_our_words(
     section: MeasurementsTable, table: Table, where: str, compass: bool
 ) -> tuple[MeasurementsTable, Table]:
     """Return measurements by our names, with the convention of azimuths; `compass` is that of the format."""
-    words = [section.kind] if section.kind else sorted(set(table.labels("kind"))) if table.has("kind") else []
+    words = [] if section.kind is None else [section.kind]
+    if section.kind is None and table.has("kind"):
+        words = sorted(set(table.labels("kind")))
     places = {word: _place_of(word, section, table, where) for word in words}
     kinds = {word: kind_named(word, places[word]) for word in words}
     bearing = {word for word, kind in kinds.items() if kind == "azimuth" and word.strip().lower() == BEARING}

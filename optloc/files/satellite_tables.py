@@ -1,0 +1,162 @@
+"""Tables of satellites: pseudoranges with positions at transmission, files of receivers, orbits at given times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.frames import ECEF
+from optloc.base.inputs import at_most
+from optloc.base.types import Array
+from optloc.base.units import UNITS
+from optloc.files.cells import moments
+from optloc.files.columns import PLACE, unit_of
+from optloc.files.foreign import read_table
+from optloc.files.orbits import read_orbits
+from optloc.files.pseudoranges import at_reception, received
+from optloc.files.reading_report import left_over
+from optloc.files.readings import Told, sort_named
+from optloc.files.roles import Places, Roles, check_told, places_of, scaled
+from optloc.files.schema import Units
+from optloc.files.shapes import sigma_column, sigma_of
+from optloc.files.table import distinct
+from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
+from optloc.files.writer import write_csv
+
+# Nothing is nearer to the centre of the Earth than its poles but what has another unit, metres.
+_SURFACE = 6.4e6
+# What a problem file says of satellites, and what is said of those that were turned.
+AT_RECEPTION = ("# Satellites are where they were when they sent, along the axes of the Earth at reception.",)
+_TURNED = "satellites are turned with the Earth during the flight of the signal; --turned takes them as they are"
+
+
+def pseudoranges(source: Path, roles: Roles, told: Told) -> TableProblem:
+    """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
+    form = sort_named("arrivals")
+    own = sigma_column(roles, form, told, [form])
+    if told.sigma is None and own is None:
+        raise no_sigma("2 m")
+    by = "message" if roles.find("message") is not None else "time"
+    epoch, satellite, z = roles.labels(by), roles.labels("satellite"), roles.numbers("toa")
+    unit = told.unit or unit_of(roles.column("toa"), UNITS["length"]) or "m"
+    Units("length").conversion(unit, "--unit")
+    length = unit_of(roles.column("x"), UNITS["length"]) or "m"
+    place = np.stack([scaled(roles, axis, "length", length) for axis in "xyz"], axis=-1)
+    _check_far(roles, place * UNITS["length"][length])
+    _check_once(roles, epoch, satellite)
+    notes = roles.table.notes
+    if not told.turned:
+        metres, ranges = place * UNITS["length"][length], Units("length").conversion(unit, "--unit").to_si(z)
+        place = at_reception(source, epoch, metres, ranges) / UNITS["length"][length]
+        notes += (_TURNED,)
+    columns = {"epoch": epoch, "a": satellite, "z": z}
+    when = roles.find("time")
+    if when is not None:
+        seconds = moments(roles, when, told.zone, told.time_unit)
+        columns["time"] = roles.numbers("time") if seconds is None else seconds
+    uses = {roles.column(role): role for role in ("satellite", "toa", *"xyz")}
+    uses |= dict.fromkeys(roles.column(by).split("+"), by) | ({} if when is None else {when: "time"})
+    if own is not None:
+        columns["sigma"] = sigma_of(roles.table, own, form, unit, range(len(z)))
+        uses[own] = "sigma_toa"
+    rest = left_over(roles, uses, (), lengths=True)
+    satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
+    section = Section("toa", columns, unit, told.sigma, "the range and the receiver's clock")
+    when_ = "reception" if told.turned else "transmission"
+    read = [
+        ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('toa')}, with a clock of each epoch"),
+        ("epochs", f"{len(set(epoch.tolist()))} by column {roles.column(by)}"),
+        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF at {when_}"),
+    ]
+    read += [("sigma", f"of pseudoranges, from column {own}")] if "sigma" in columns else []
+    read += [("not used", ", ".join(rest))] if rest else []
+    places = Places(satellites, "ecef", length)
+    return TableProblem(source, (section,), places, tuple(read), notes, AT_RECEPTION, uses=uses)
+
+
+def gnss(source: Path, told: Told) -> TableProblem:
+    """Return what a receiver of navigation satellites has seen as arrivals, like a table of pseudoranges."""
+    if told.columns or told.ignore:
+        flag = "--column" if told.columns else "--ignore"
+        raise InvalidProblem(f"{source.name} has no columns with names", flag, "leave it out")
+    found = received(source, told.navigation, told.sigma, system=told.system, mask=told.mask)
+    columns = {"epoch": found.epoch, "time": found.time, "a": found.satellite, "z": np.round(found.z, 4)}
+    columns["sigma"] = np.round(found.sigma, 3)
+    places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
+    section = Section("toa", columns, "m", None, "the range and the receiver's clock")
+    return TableProblem(source, (section,), Places(places, "ecef", "m"), found.about, found.notes, AT_RECEPTION)
+
+
+def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:
+    """Refuse a satellite that an epoch has twice."""
+    seen: dict[tuple[str, str], int] = {}
+    for row, key in enumerate(zip(epoch.tolist(), satellite.tolist(), strict=True)):
+        if key in seen:
+            what = f"satellite {key[1]!r} occurs again at epoch {key[0]!r}, first in row {seen[key] + 1}"
+            raise InvalidProblem(what, roles.table.at(row), "leave one of them out")
+        seen[key] = row
+
+
+def _check_far(roles: Roles, place: np.ndarray) -> None:
+    """Raise InvalidProblem where a satellite is within the Earth: its unit or its columns are other ones."""
+    near = np.flatnonzero(np.linalg.norm(place, axis=-1) < _SURFACE)
+    if len(near):
+        where = roles.table.where(roles.column("x"), int(near[0]))
+        away = np.linalg.norm(place[near[0]]) / 1e3
+        what = f"the satellite is {away:.4g} km from the centre of the Earth"
+        raise InvalidProblem(what, where, "name the columns with --column x=NAME and so on; a unit is seen from x_km")
+
+
+# Orbits at the times of measurements.
+
+
+def write_satellites(
+    source: Path, out: Path, told: Mapping[str, str], times: Path | None, stations: Path | None
+) -> Converted:
+    """Write where satellites are at the times of measurements, and with which velocity, as a table of stations."""
+    if times is None:
+        advice = "name the table of the measurements with --times: its times, and its satellites if it has them"
+        raise InvalidProblem("nothing is known of when the satellites are wanted", "--times", advice)
+    if out.suffix.lower() != ".csv":
+        what = "satellites are stations that move: they become a CSV table"
+        raise InvalidProblem(what, str(out), "let the name behind --out end in .csv")
+    own = {role: name for role, name in told.items() if stations is None or role not in PLACE}
+    orbits, roles = read_orbits(source), Roles.of(read_table(times), own)
+    check_told(roles, ("time", "satellite"))
+    written, seconds = roles.table.raw(roles.column("time")), roles.table.times(roles.column("time"), 1.0)
+    whose = roles.labels("satellite") if roles.find("satellite") is not None else None
+    wanted = distinct(whose)[0] if whose is not None else list(orbits.courses)
+    at_most("cells", 7 * len(wanted) * len(seconds), roles.table.source)
+    parts: list[tuple[Array, ...]] = []
+    for name in wanted:
+        rows = np.arange(len(seconds)) if whose is None else np.flatnonzero(whose == name)
+        rows = rows[np.unique(seconds[rows], return_index=True)[1]]
+        parts.append((np.full(len(rows), name, dtype=object), rows, *orbits.at(name, seconds[rows])))
+    rows = np.unique(seconds, return_index=True)[1]
+    for name, place in _resting(stations, told).items():
+        still = np.zeros((len(rows), 3))
+        parts.append((np.full(len(rows), name, dtype=object), rows, place + still, still))
+    names, rows, position, velocity = (np.concatenate(part) for part in zip(*parts, strict=True))
+    columns = {"name": names, "time": written[rows]} | dict(zip("xyz", position.T, strict=True))
+    write_csv(out, columns | dict(zip(("vx", "vy", "vz"), velocity.T, strict=True)))
+    return Converted((out,), None, ('positions are along ECEF: write kind = "ecef" in [frame]',))
+
+
+def _resting(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return where stations on the ground are in ECEF, by name."""
+    if path is None:
+        return {}
+    own = {role: name for role, name in told.items() if role in PLACE}
+    place = places_of(path, own, "ecef")
+    held, scale = place.columns, UNITS["length"][place.unit]
+    if place.frame == "geodetic":
+        lat, lon = np.radians(held["lat_deg"]), np.radians(held["lon_deg"])
+        found = ECEF.from_geodetic(lat, lon, scale * held["height"], where=path.name, first_row=1)
+    elif "z" in held:
+        found = scale * np.stack([held[axis] for axis in "xyz"], axis=-1)
+    else:
+        raise InvalidProblem("stations beside satellites have x, y and z", path.name, "or latitude and longitude")
+    return dict(zip(place.names, found, strict=True))

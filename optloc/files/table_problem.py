@@ -1,0 +1,131 @@
+"""A foreign table as a problem: what optloc understood, and the problem file with CSV tables that says the same."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.outputs import together, write_text
+from optloc.files.reader import Loaded, read
+from optloc.files.roles import Places
+from optloc.files.schema import ConstraintTable
+from optloc.files.writer import write_csv
+
+# Letters of the name of a file that is not kept.
+_LETTERS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One table of measurements: its kind, columns (m,), unit, noise, what it is, and further lines of the file."""
+
+    kind: str
+    columns: Mapping[str, Any]
+    unit: str
+    sigma: str | None
+    text: str
+    lines: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TableProblem:
+    """What a table is understood to be, before anything is written.
+
+    Parameters
+    ----------
+    source : Path
+        The table.
+    sections : tuple of Section
+        The measurements.
+    places : Places
+        The stations.
+    about : tuple of (str, str)
+        What was understood: a word, and what it is.
+    notes : tuple of str
+        What was assumed or left out.
+    lines : tuple of str
+        Further lines of the problem file, before its tables.
+    after : tuple of str
+        The same, behind them.
+    height : str
+        What the constraint on the height says, where there is one.
+    uses : mapping of str to str
+        Role of each column that is used.
+    """
+
+    source: Path
+    sections: tuple[Section, ...]
+    places: Places
+    about: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
+    height: str = ""
+    uses: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def as_read(self) -> dict[str, Any]:
+        """Return how the table was read, as a JSON value."""
+        pairs = [list(pair) for pair in self.about]
+        return {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
+
+    def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
+        """Return the problem, with more constraints; nothing is left on the disk."""
+        with TemporaryDirectory() as folder:
+            # As the table is called, as far as every system writes such a name.
+            place = Path(folder) / f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml"
+            # A height that is told takes the place of one that was assumed.
+            (replace(self, height="") if "--height" in (more or {}) else self).write(place)
+            return replace(read(place, more=more), source=self.source.name, table=self.as_read)
+
+    def write(self, out: Path) -> tuple[Path, ...]:
+        """Write a problem file with its tables beside it, and return their paths."""
+        tables = self.tables(out)
+        with together():
+            for path, columns in zip(tables, (self.places.columns, *(s.columns for s in self.sections)), strict=True):
+                write_csv(path, columns)
+            write_text(out, self._text([path.name for path in tables]))
+        return (out, *tables)
+
+    def tables(self, out: Path) -> tuple[Path, ...]:
+        """Return the names of the tables beside a problem file: stations, then the rows of each kind."""
+        many = len(self.sections) > 1
+        names = ("stations", *(section.kind if many else "rows" for section in self.sections))
+        return tuple(out.with_name(f"{out.stem}-{name}.csv") for name in names)
+
+    def _text(self, names: Sequence[str]) -> str:
+        # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
+        quoted = partial(json.dumps, ensure_ascii=False)
+        lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 2"]
+        lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", f'kind = "{self.places.frame}"']
+        lines += ["", "[stations]", f"file = {quoted(names[0])}", f'unit = "{self.places.unit}"']
+        for section, name in zip(self.sections, names[1:], strict=True):
+            lines += ["", "[[measurements]]", f'kind = "{section.kind}"                         # {section.text}']
+            lines += [f"file = {quoted(name)}", f'unit = "{section.unit}"', *section.lines]
+            lines += [f"sigma = {quoted(section.sigma)}"] if section.sigma is not None else []
+        lines += [*self.after, *(["", "[[constraints]]", 'kind = "height"', self.height] if self.height else [])]
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Converted:
+    """What was written, the problem that it is (None of stations alone), what was assumed, and how it was read."""
+
+    written: tuple[Path, ...]
+    loaded: Loaded | None
+    notes: tuple[str, ...] = ()
+    as_read: Mapping[str, Any] = field(default_factory=dict)
+
+
+def no_sigma(example: str, rows: str = "rows") -> InvalidProblem:
+    """Return the error of a table without standard deviations; `example` is one for --sigma."""
+    advice = f"say it with --sigma '{example}' (or metres); --sigma estimate finds it from many epochs"
+    what = "the rows are" if rows == "rows" else f"the readings of {rows} are"
+    return InvalidProblem(f"nothing is known of how accurate {what}", "--sigma", advice)
