@@ -106,10 +106,10 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     rows, sigmas, times = rows_and_arrivals(given, heard, site)
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
-        raise InvalidProblem("an event has no rows", "rows")
+        raise InvalidProblem("an event has no rows", "rows", "remove it")
     name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
-        raise InvalidProblem(f"the event {name!r} is there twice", "event")
+        raise InvalidProblem(f"the event {name!r} is there twice", "event", "remove it")
     event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))
     event.revision = _count(each.get("revision"), "revision")
     event.conflict = _typed(each.get("conflict"), bool, "conflict")
@@ -123,14 +123,14 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
 def _typed(found: Any, kind: type[T], where: str) -> T:
     """Return a value of a type; raise InvalidProblem for another one. True is no number."""
     if type(found) is not kind:
-        raise InvalidProblem(f"{str(found)[:_SHOWN]!r} is no {_NAMES[kind]}", where)
+        raise InvalidProblem(f"{str(found)[:_SHOWN]!r} is no {_NAMES[kind]}", where, "remove it")
     return found
 
 
 def _parts(found: Any, count: int, where: str) -> list[Any]:
     entry = _typed(found, list, where)
     if len(entry) != count:
-        raise InvalidProblem(f"an entry has {len(entry)} values, {count} are needed", where)
+        raise InvalidProblem(f"an entry has {len(entry)} values, {count} are needed", where, "remove it")
     return entry
 
 
@@ -138,7 +138,7 @@ def _count(found: Any, where: str) -> int:
     """Return a number of things that were counted."""
     number = _typed(found, int, where)
     if not 0 <= number <= _MOST:
-        raise InvalidProblem(f"{str(number)[:_SHOWN]} is no count", where)
+        raise InvalidProblem(f"{str(number)[:_SHOWN]} is no count", where, "remove it")
     return number
 
 
@@ -147,5 +147,5 @@ def _counts(found: Any) -> dict[str, int]:
     counts = _typed(found, dict, "counts")
     unknown = counts.keys() - COUNTS.keys()
     if unknown:
-        raise InvalidProblem(f"nothing is counted as {min(unknown)[:_SHOWN]!r}", "counts")
+        raise InvalidProblem(f"nothing is counted as {min(unknown)[:_SHOWN]!r}", "counts", "remove it")
     return {name: _count(number, "counts") for name, number in counts.items()}

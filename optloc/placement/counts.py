@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
@@ -11,11 +11,25 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 
-if TYPE_CHECKING:
-    from optloc.placement.sites import Group
-
 # Members of a group, and groups, that are named; the others are counted.
 _NAMED, _GROUPS = 8, 3
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A rule about some of the sites.
+
+    Parameters
+    ----------
+    members : tuple of str
+        Names of sites.
+    most, least : int, optional
+        How many of them may, or must, be taken, those that are kept included.
+    """
+
+    members: tuple[str, ...]
+    most: int | None = None
+    least: int | None = None
 
 
 def check_groups(

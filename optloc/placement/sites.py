@@ -13,7 +13,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Prior
 from optloc.linear.normal import Normal, linearise, with_priors
 from optloc.models import MODELS
-from optloc.placement.counts import check_groups
+from optloc.placement.counts import Group, check_groups
 from optloc.problem.arrivals import as_arrivals
 from optloc.problem.layout import emission_name
 from optloc.problem.noise import variances
@@ -21,6 +21,8 @@ from optloc.problem.problem import Problem
 
 Name = Literal["rms", "volume", "axis"]
 """Criteria: mean-square error, volume and longest axis of the error ellipsoid."""
+
+__all__ = ["LETTER", "Group", "Name", "Plan", "Posed", "pose"]
 
 LETTER: dict[str, Criterion] = {"rms": "A", "volume": "D", "axis": "E"}
 """The criteria's names in the literature."""
@@ -33,23 +35,6 @@ _EXACT = 1e-5
 _EMISSION = 10.0
 # The least area that a prior is made of, metres: a single place has no extent.
 _EXTENT = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """A rule about some of the sites.
-
-    Parameters
-    ----------
-    members : tuple of str
-        Names of sites.
-    most, least : int, optional
-        How many of them may, or must, be taken, those that are kept included.
-    """
-
-    members: tuple[str, ...]
-    most: int | None = None
-    least: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
