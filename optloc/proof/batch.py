@@ -14,7 +14,7 @@ from optloc.proof.box import bound_nodes, cost_at, rounding
 from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.near import OPEN, prove
 from optloc.proof.pose import Posed
-from optloc.proof.search_space import Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
+from optloc.proof.search_space import LINES, Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 
 # Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
 # what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
@@ -306,5 +306,5 @@ def _evaluate(pose: Posed, x: Array, out: Array) -> None:
                 origin[k] = x[i, p, k]
             bound_nodes(pose.kinds, data, origin, axes, axes, box.half, box.line, box.nodes)
             out[0, i, p] = cost_at(K, w, box.nodes)
-            floor = accuracy_floor(pose.kinds, data, weight, w, origin)
+            floor = accuracy_floor(pose.kinds, data, weight, w, origin, LINES)
             out[1, i, p] = rounding(K, weight, floor, box.nodes)

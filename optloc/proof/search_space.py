@@ -44,6 +44,10 @@ _DETERMINED = 1e-13
 # Roundings of a coordinate on its way from search coordinates to metres: three products, three sums, and the sizes of
 # what they are rounded beside.
 _PLACED = 8.0 * 2.0**-52
+# A residual counts 34 roundings or more for each size (`optloc.proof.box.digits`), of coordinates a share. Lines from a
+# position to stations are as exact as their own lengths, for a difference of two doubles is rounded once: what is left
+# are the 8 roundings of a position as it is placed. Where more steps lead to a position all of them count.
+LINES, PLACES = 0.25, 1.0
 # References of a group that needs none, and of one whose rows are too few.
 NONE, LOOSE = -1, -2
 
@@ -369,12 +373,12 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         sums[G0 + k] = along if k < count else 0.0
         for m in range(3):
             gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
-    floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin)
+    floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin, LINES)
     return Chart(origin, sense, back, gram, slip, floor, own), good
 
 
 @compiled
-def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: Array) -> float:
+def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: Array, share: float) -> float:
     """Return the sizes of what residuals are differences of, beside the nodes: measurements and coordinates.
 
     Parameters
@@ -383,6 +387,9 @@ def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: A
         As of `Cost`.
     origin : array (3,)
         A position, metres.
+    share : float
+        By what share coordinates count in ranges: LINES from a position that is a double, PLACES from one that is
+        worked out in many steps.
     """
     total = 0.0
     for i in range(w.shape[0]):
@@ -391,7 +398,7 @@ def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: A
     reach = abs(origin[0]) + abs(origin[1]) + abs(origin[2])
     for j in range(kinds.shape[0]):
         if kinds[j] == RANGE:  # as its node says: ranges are asked often enough to be spared the call
-            size = reach + (abs(data[j, 0]) + abs(data[j, 1]) + abs(data[j, 2]))
+            size = share * (reach + (abs(data[j, 0]) + abs(data[j, 1]) + abs(data[j, 2])))
         else:
             size = size_of(kinds[j], data[j], reach)
         total += weight[j] * size
@@ -539,5 +546,5 @@ def turned(cost: Cost, chart: Chart, side: int) -> Chart:
         sense[m, 2] = back[2, m] = own[UP + m]
         origin[m] = own[MIDDLE + m] + radius * own[UP + m]
     slip[2] = 0.0
-    floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin)
+    floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin, LINES)
     return Chart(origin, sense, back, numbers[2], slip, floor, own)

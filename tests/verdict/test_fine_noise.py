@@ -105,6 +105,24 @@ def test_a_height_that_is_held_is_refined_however_fine_the_noise():
         assert np.linalg.norm(fix.position - x) < 1e-6
 
 
+@needs_code
+@pytest.mark.parametrize(("kind", "count", "reach"), [("toa", 5, 3.7e3), ("toa", 6, 3.2e3), ("tdoa", 6, 3.2e3)])
+def test_a_small_network_in_coordinates_from_the_centre_of_the_earth(kind, count, reach):
+    """Coordinates are a thousand times as large as ranges: lines to stations keep their digits, and so do costs."""
+    rng = np.random.default_rng([count, len(kind)])
+    frame, level = Frame.enu(lat_deg=rng.uniform(-80.0, 80.0), lon_deg=rng.uniform(-180.0, 180.0)), 9e3
+    flat = np.column_stack([rng.uniform(-reach, reach, (count, 2)), rng.uniform(0.0, 500.0, count)])
+    place = flat @ frame.rotation_to_ecef().T + frame.origin_ecef()
+    lat, lon, _ = frame.to_geodetic(np.array([*rng.uniform(-1.5 * reach, 1.5 * reach, 2), level]))
+    x = np.asarray(ECEF.from_geodetic(lat, lon, level))
+    ends = {"a": np.arange(1, count), "b": 0} if kind == "tdoa" else {"a": np.arange(count)}
+    for share in (1e-6, 1e-9):
+        rows = measured(kind, sigma=share * reach, **ends)
+        fix = solve(exactly(assemble(place, rows, frame=ECEF, constraints=constraints.height(exactly=level)), x))
+        assert fix.status is Status.OK, (share, str(fix.reason))
+        assert np.linalg.norm(fix.position - x) < 1e-6
+
+
 @pytest.mark.parametrize("kind", ["range", "tdoa"])
 def test_what_rounding_hides_is_not_claimed(kind):
     """Beyond double precision there is no proof, the reason is true, and a bound is below the cost by the rounding."""

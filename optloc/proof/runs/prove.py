@@ -50,6 +50,7 @@ from optloc.proof.runs.states import STATE, Course, cost_of_state
 from optloc.proof.search_space import (
     COARSEST,
     HIDDEN_REACH,
+    LINES,
     Chart,
     Known,
     accuracy_floor,
@@ -378,7 +379,7 @@ def costs_of_runs(posed: Runs, x: Array) -> tuple[Array, Array]:
         tables = tables_of(run)
         for p, place in enumerate(plainly(x[i])):
             out[0, i, p] = cost_of_place(run, place, tables)
-            floor = accuracy_floor(run.cost.kinds, run.cost.data, run.cost.weight, run.cost.w, tables.box.centre)
+            floor = accuracy_floor(run.cost.kinds, run.cost.data, run.cost.weight, run.cost.w, tables.box.centre, LINES)
             out[1, i, p] = blur_of(run.rows, floor, tables.box.nodes)
     return out[0], out[1]
 

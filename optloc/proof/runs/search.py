@@ -45,6 +45,7 @@ from optloc.proof.runs.rows import (
     sum_up_rows,
 )
 from optloc.proof.search_space import (
+    LINES,
     Box,
     Chart,
     Cost,
@@ -103,7 +104,7 @@ def floor_of(space: Space, cost: Cost) -> float:
     """Return the sizes of what residuals are differences of, beside the nodes."""
     if space.far:
         return accuracy_floor_far(cost, space.atlas)
-    return accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, space.chart.origin)
+    return accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, space.chart.origin, LINES)
 
 
 @compiled

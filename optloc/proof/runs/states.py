@@ -40,7 +40,7 @@ from optloc.proof.runs.rows import (
     residual_at,
     sheet_of,
 )
-from optloc.proof.search_space import accuracy_floor
+from optloc.proof.search_space import PLACES, accuracy_floor
 
 # What is searched.
 
@@ -436,4 +436,4 @@ def floor_of(course: Course, state: Array) -> float:
         most[i] = abs(state[i]) + last * abs(state[d + i])
     if over_ground(course.ground):
         most[:] = WGS84_A + abs(course.ground.level)  # places are found from the Earth's centre
-    return accuracy_floor(course.kinds, course.data, course.rows.weight, course.rows.w, most)
+    return accuracy_floor(course.kinds, course.data, course.rows.weight, course.rows.w, most, PLACES)
