@@ -46,8 +46,8 @@ _DETERMINED = 1e-13
 _PLACED = 8.0 * 2.0**-52
 # A residual counts 34 roundings or more for each size (`optloc.proof.box.digits`), of coordinates a share. Lines from a
 # position to stations are as exact as their own lengths, for a difference of two doubles is rounded once: what is left
-# are the 8 roundings of a position as it is placed. Where more steps lead to a position all of them count.
-LINES, PLACES = 0.25, 1.0
+# are the 8 roundings of a position as it is placed.
+LINES = 0.25
 # References of a group that needs none, and of one whose rows are too few.
 NONE, LOOSE = -1, -2
 
@@ -388,8 +388,8 @@ def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: A
     origin : array (3,)
         A position, metres.
     share : float
-        By what share coordinates count in ranges: LINES from a position that is a double, PLACES from one that is
-        worked out in many steps.
+        By what share coordinates count in ranges: LINES from a position that is a double, more from one that is worked
+        out in many steps.
     """
     total = 0.0
     for i in range(w.shape[0]):

@@ -203,8 +203,11 @@ def turned_unproven(number: int, steps) -> tuple[str, list[str]]:
 
 @needs_code
 def test_a_finer_sigma_leaves_fixes_proven():
-    """Some scenes of all families in the plain run; five hundred in full, fifty for each seed."""
-    found = [turned_unproven(number, (1e-6, 1e-9)) for number in range(99, 115)]
+    """Some scenes of all families in the plain run; five hundred in full, fifty for each seed.
+
+    The last two are small beside their coordinates: a network, and a course over ground with many rows.
+    """
+    found = [turned_unproven(number, (1e-6, 1e-9)) for number in (*range(99, 115), 167, 206)]
     assert [name for name, _ in found if name] == []
     assert sum("ok" in labels for _, labels in found) > 10
 

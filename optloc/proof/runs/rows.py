@@ -48,6 +48,8 @@ from optloc.proof.nodes.node import (
 
 # Unit in the last place of a double at 1.
 _ULP = 2.0**-52
+# Roundings within a node, and in its slopes.
+_WITHIN = 32
 
 
 class Rows(NamedTuple):
@@ -171,7 +173,13 @@ def blur_of(rows: Rows, floor: float, nodes: Array) -> float:
 @compiled
 def digits_of(rows: Rows) -> float:
     """Return the relative rounding error of sums over nodes and rows: one a term, and 32 within a node."""
-    return float((32 + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
+    return float((_WITHIN + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
+
+
+@compiled
+def share_within(rows: Rows) -> float:
+    """Return the share of these digits that what is rounded within a node alone has, as coordinates are."""
+    return float(_WITHIN / (_WITHIN + rows.w.shape[0] + rows.weight.shape[0]))
 
 
 @compiled

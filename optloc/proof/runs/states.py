@@ -38,9 +38,10 @@ from optloc.proof.runs.rows import (
     blur_of,
     norm_of,
     residual_at,
+    share_within,
     sheet_of,
 )
-from optloc.proof.search_space import PLACES, accuracy_floor
+from optloc.proof.search_space import accuracy_floor
 
 # What is searched.
 
@@ -436,4 +437,6 @@ def floor_of(course: Course, state: Array) -> float:
         most[i] = abs(state[i]) + last * abs(state[d + i])
     if over_ground(course.ground):
         most[:] = WGS84_A + abs(course.ground.level)  # places are found from the Earth's centre
-    return accuracy_floor(course.kinds, course.data, course.rows.weight, course.rows.w, most, PLACES)
+    # Sums over nodes and rows round what becomes of coordinates, not these.
+    share = share_within(course.rows)
+    return accuracy_floor(course.kinds, course.data, course.rows.weight, course.rows.w, most, share)
