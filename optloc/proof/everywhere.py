@@ -222,7 +222,7 @@ def _bound_of_row(
     stack: Array,
     row: int,
 ) -> float:
-    """Return a lower bound of the residual in a box of the stack, infinite where the cost exceeds a level throughout."""
+    """Return a lower bound of the residual in a box of the stack, infinite where all costs exceed a level."""
     piece = int(stack[row, PIECE])
     if not _take(stack, row, atlas, chart, corners, box, piece):
         return inf
