@@ -167,9 +167,10 @@ class Relaxation:
         reach: float | None,
     ) -> Answer:
         data.feed(values)
-        solver = _solver(data, settings)
         try:
-            solution = solver.solve()
+            solution = _solver(data, settings).solve()
+            if str(solution.status) == "NumericalError":
+                solution = _solver(data, {**_REGULAR, **settings}).solve()
         except Exception as trouble:  # whatever stops a solver that was built
             record(Ending("CLARABEL", "error", first_sentence(trouble), found=False))
             raise SolverError(f"Clarabel failed: {trouble}") from trouble
@@ -219,6 +220,9 @@ class Relaxation:
 # How Clarabel ends with an answer: its tolerances are met, or its reduced ones (5e-5 of the gap, 1e-4 of feasibility),
 # which it also tries where it stops at a limit or makes no progress.
 _MET = ("Solved", "AlmostSolved")
+# For a second try where the factorisation lost its digits: ten times the default of 1e-8. Relaxations of Doppler shifts
+# of satellites then meet the full tolerances, in a third more iterations.
+_REGULAR = {"static_regularization_constant": 1e-7}
 # Back ends that call an answer inaccurate where reduced tolerances of theirs are met. Others, SCS for one, call the
 # last iterate so, wherever it is.
 _REDUCED = ("ECOS", "QOCO")

@@ -299,7 +299,7 @@ def test_the_formulation_starts_fixes_from_ranges_over_blocked_paths():
     truth = places(20, seed=2)
     template = optloc.assemble(STATIONS, optloc.measured("range", a=np.arange(8), sigma=5.0))
     drawn = optloc.simulate(template, truth=truth, seed=1)
-    rough, fine = solve(drawn, "discs"), solve(drawn, "discs+lsr")
+    rough, fine = solve(drawn, "discs", refine=False), solve(drawn, "discs+lsr")
     assert (np.linalg.norm(rough.position - truth, axis=1) < 1e3).all()
     assert alone(fine).all()
     np.testing.assert_allclose(fine.position, solve(drawn).position, atol=1e-4)

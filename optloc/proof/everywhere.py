@@ -26,13 +26,14 @@ from optloc.proof.box import (
     CENTRE,
     DEPTH,
     HALF,
-    LEAST,
     PIECE,
     cost_at,
     cube,
     cut_out,
     digits,
+    first_below,
     is_empty,
+    last_above_zero,
     least_left,
     least_residual,
     linearise_rows,
@@ -46,6 +47,7 @@ from optloc.proof.box import (
     share_left,
     shrink,
     steepest_side,
+    take_back,
     uncut,
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
@@ -162,28 +164,23 @@ def search_everywhere(
     box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
     stack, aside, d = np.empty((_CAPACITY, DEPTH)), np.empty((_CAPACITY, DEPTH)), atlas.dimension
     size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
-    floor, first, now, value = accuracy_floor_far(cost, atlas), zero(), levels.shape[0] - 1, levels[-1]
-    while now >= first and levels[now] <= 0.0:  # which no cost is below
-        now -= 1
-    if now < first:
+    floor, first, now, value = accuracy_floor_far(cost, atlas), zero(), last_above_zero(levels), levels[-1]
+    if now < first:  # no cost is below zero
         return CLEAR, 0, value, first, met
     while True:
         if size == 0:  # nothing below this level is left
             if now <= first:
                 return CLEAR, boxes, value, now, met
             now -= 1
-            size, waiting = _take_back(stack, aside, waiting, levels[now])
+            size, waiting = take_back(stack, aside, waiting, levels[now])
             continue
         shown, level = now + 1, levels[first]
         if boxes >= budget or size + _SPARE > _CAPACITY:
             spent = shown == levels.shape[0]
             return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
         size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
-        taken = _take(stack, size, atlas, chart, corners, box, piece)
-        if not (taken and _squeeze(cost, atlas, squares, level, box, piece)):
-            continue
-        low = _bound(cost, atlas, box, floor)
-        if reaches(low, level):
+        low = _bound_of_row(cost, atlas, chart, corners, squares, level, floor, box, stack, size)
+        if low == inf:
             continue
         here, noise = cost_at(cost.K, cost.w, box.nodes), rounding(cost.K, cost.weight, floor, box.nodes)
         if here < value:
@@ -203,7 +200,7 @@ def search_everywhere(
                 return ANOTHER, boxes, 0.0, shown, 0
             set_centre(atlas, piece, box.at)
         if touching and max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND):
-            first = _first_below(levels, first, _at_infinity(cost, atlas, box, piece))
+            first = first_below(levels, first, _at_infinity(cost, atlas, box, piece))
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
         if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
@@ -213,25 +210,26 @@ def search_everywhere(
 
 
 @compiled
-def _first_below(levels: Array, first: int, ends: float) -> int:
-    """Return the first level from one on that a cost reaches, or how many there are where it reaches none."""
-    while first < levels.shape[0] and ends < levels[first]:
-        first += 1
-    return first
-
-
-@compiled
-def _take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[int, int]:
-    """Move the boxes whose bound is below a level from aside to the stack; return how many there are on each."""
-    size, left = zero(), zero()
-    for i in range(waiting):
-        if aside[i, LEAST] * aside[i, LEAST] < level:
-            stack[size] = aside[i]
-            size += 1
-        else:
-            aside[left] = aside[i]
-            left += 1
-    return size, left
+def _bound_of_row(
+    cost: Cost,
+    atlas: Atlas,
+    chart: Chart,
+    corners: Array,
+    squares: Squares,
+    level: float,
+    floor: float,
+    box: Box,
+    stack: Array,
+    row: int,
+) -> float:
+    """Return a lower bound of the residual in a box of the stack, infinite where all costs exceed a level."""
+    piece = int(stack[row, PIECE])
+    if not _take(stack, row, atlas, chart, corners, box, piece):
+        return inf
+    if not _squeeze(cost, atlas, squares, level, box, piece):
+        return inf
+    low = _bound(cost, atlas, box, floor)
+    return inf if reaches(low, level) else low
 
 
 @inlined

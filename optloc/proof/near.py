@@ -361,8 +361,7 @@ def prove(
         return SINGULAR, 0, -inf
     least, sums, bent = cost_at(cost.K, cost.w, box.nodes), box.sums, chart.surface.shape[0] > 0
     slope, noise = (sums[G0], sums[G1], sums[G2]), blur_at(cost, chart, box) if not bent else 0.0
-    corners, alone, most, there = np.empty((2, 3)), True, max(COARSEST, eps), least
-    low, high = corners[0], corners[1]
+    low, high, alone, most, there = np.empty(3), np.empty(3), True, max(COARSEST, eps), least
     if not region_of(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
     if bent:
@@ -385,12 +384,10 @@ def prove(
         return STATIONARY, 0, -inf
     if not _extent(low, high, sides[0]) <= reach:
         return BUDGET, 0, -inf
-    if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
-        count = free
+    count = free if kappa <= 0.0 else count  # the value alone: boxes of other minima are bounded as all others are
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
-    better, whole = least - 0.5 * eps, closed or isnan(lower[0])
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
-    whole = whole and known.hidden == 0
+    better, whole = least - 0.5 * eps, (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
     aim, stack = Aim(level, least - eps, better, whole, free, own=1), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, sides[0], 0)

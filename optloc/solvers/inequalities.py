@@ -28,9 +28,10 @@ _GRAZE, _GROUND = 1.0 - 5e3 / WGS84_A, 1.0 - 50e3 / WGS84_A
 def is_hidden(problem: Problem, x: Array) -> Array:
     """Return which vectors x (N, size) place a target behind the Earth as seen from a station that hears it.
 
-    One end of the line is in space, above 100 km: no wave passes through the Earth and leaves it. The straight line may
-    pass 5 km below the ellipsoid to a satellite, and 50 km from the ground to a target in space. Between two points on
-    the ground the Earth hides nothing: waves of earthquakes pass through it, and radio waves go around it.
+    One end of the line is in space, above 100 km: no wave passes through the Earth and leaves it. Or the row is an
+    angle: a bearing follows the line of sight. The straight line may pass 5 km below the ellipsoid to a satellite, and
+    50 km from the ground. For all other rows the Earth hides nothing between two points on the ground: waves of
+    earthquakes pass through it, and radio waves go around it.
 
     Parameters
     ----------
@@ -58,16 +59,30 @@ def _blocked(problem: Problem, x: Array) -> Iterator[tuple[int, Array]]:
             continue
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
         point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3]) * stretch
+        sighted = {(epoch, station): seen for epoch, station, seen in _heard(problem, target, angles=True)}
         for epoch, station, heard in _heard(problem, target):
-            yield station, _is_blocked(point, stations[:, epoch, station], heard)
+            seen = sighted.get((epoch, station), np.zeros_like(heard))
+            yield station, _is_blocked(point, stations[:, epoch, station], heard, seen)
 
 
-def _heard(problem: Problem, target: int) -> list[tuple[int, int, Array]]:
-    """Return (epoch, station, mask (N,) of problems in which it is heard) of every station that measures a target."""
+def _heard(problem: Problem, target: int, *, angles: bool = False) -> list[tuple[int, int, Array]]:
+    """Return (epoch, station, mask (N,) of problems in which it has a row) of every station that measures a target.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    target : int
+        The target.
+    angles : bool
+        Whether only angles count as rows.
+    """
     moving = problem.stations.position.shape[-3] > 1
     weight = np.broadcast_to(problem.weight, (problem.batch_shape[0], problem.count))
     found: dict[tuple[int, int], Array] = {}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
+        if angles and MODELS[rows.kind].quantity != "angle":
+            continue
         present = weight[:, start : start + rows.count] > 0.0
         for index in (rows.a, rows.b)[: MODELS[rows.kind].stations]:
             for i in np.flatnonzero(rows.target == target):
@@ -76,13 +91,21 @@ def _heard(problem: Problem, target: int) -> list[tuple[int, int, Array]]:
     return [(epoch, station, mask) for (epoch, station), mask in found.items()]
 
 
-def _is_blocked(point: Array, station: Array, heard: Array) -> Array:
-    """Return whether the line from point to station dips too deep; unit sphere coordinates."""
+def _is_blocked(point: Array, station: Array, heard: Array, seen: Array) -> Array:
+    """Return whether the line from point to station dips too deep; unit sphere coordinates.
+
+    Parameters
+    ----------
+    point, station : array (N, 3)
+        Ends of the line.
+    heard, seen : bool array (N,)
+        Whether the station has a row, and whether it has an angle.
+    """
     satellite = (station**2).sum(-1) > _SATELLITE**2
     limit = np.where(satellite, _GRAZE, _GROUND)
     line = station - point
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        outside = satellite | ((point**2).sum(-1) > _SATELLITE**2)
+        outside = seen | satellite | ((point**2).sum(-1) > _SATELLITE**2)
         # the point of the segment next to the centre; at its ends nothing lies in between
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[:, None] * line) ** 2).sum(-1)

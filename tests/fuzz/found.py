@@ -174,4 +174,5 @@ FOUND = {
         {"l.toml": problems()["rss_difference.toml"]["rss_difference.toml"].replace(b"z = -4.19", b"z = -7027.9")},
         None,
     ),
+    "an empty kind": (FIX, problem('"range"', '""'), ["unknown kind ''"]),
 }  # fmt: skip
