@@ -137,6 +137,7 @@ NAMED_ALIKE = {
     "before, unit": ([f"dist_A{i}_cm" for i in range(1, 6)], "A5", "dist_A5_cm"),
     "before, another unit": ([*(f"dist_A{i}_cm" for i in range(1, 5)), "dist_A5_m"], "A5", "dist_A5_m"),
     "before, without its unit": ([*(f"dist_A{i}_cm" for i in range(1, 5)), "dist_A5"], "A5", "dist_A5"),
+    "another word, without its unit": ([*(f"dist_A{i}_cm" for i in range(1, 5)), "dist_Dam"], "Dam", "dist_Dam"),
     "behind": ([f"A{i} range [cm]" for i in range(1, 6)], "A5", "A5 range [cm]"),
     "name and unit": ([*(f"A{i}_cm" for i in range(1, 5)), "Mast_cm"], "Mast", "Mast_cm"),
     "name alone": ([*(f"A{i}" for i in range(1, 5)), "A7"], "A7", "A7"),

@@ -96,7 +96,9 @@ def _name_in(column: str, pattern: _Pattern, stations: Sequence[str]) -> str | N
         return name
     if not around and (pattern.unit is None or role_of(column) in _BESIDE):
         return None
-    return name if same else None
+    # The unit may be missing in one name among many.
+    forgotten = around > 0 and any_unit(column) is None and role_of(name) not in _BESIDE
+    return name if same or forgotten else None
 
 
 def _without_stations(words: Sequence[str], inner: range, stations: Sequence[str]) -> list[int]:
