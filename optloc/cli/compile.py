@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any
 
@@ -29,8 +30,8 @@ from optloc.calibration.likelihood import Estimate, likelihood
 from optloc.calibration.network import network_of
 from optloc.cli.output import Screen, dumps, meter
 from optloc.compute.filter import absorb
-from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, names_in, plain
-from optloc.compute.kept import alone, is_kept, kept_in
+from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, named, names_in, plain
+from optloc.compute.kept import CALLEES, alone, is_checkout, is_kept, kept_in
 from optloc.compute.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
@@ -150,7 +151,7 @@ class Part:
 
     def missing(self) -> list[str]:
         """Return the kernels of which there is no machine code on disk."""
-        return [name for name in self.entries if not is_kept(name)]
+        return [name for name in self.entries if not is_kept(named(name))]
 
 
 # The longest first: there are as many processes as processors, at most two, and memory is a gigabyte each. Those that
@@ -232,7 +233,7 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
     known, done, lock = {}, set(), Lock()
 
     def follow(name: str) -> None:
-        for line in _started(name):
+        for line in _started(name, shared):
             word, _, rest = line.partition(" ")
             with lock:
                 if word == "all":
@@ -241,7 +242,8 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
                     done.add(rest)
                 tell(len(done), len(set().union(*known.values(), done)))
 
-    with ThreadPoolExecutor(2) as pool:
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
+        shared = {} if is_checkout() else {CALLEES: folder}
         list(pool.map(follow, names))
     return missing()
 
@@ -252,12 +254,16 @@ def environment(**more: str) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": path, **more}
 
 
-def _started(name: str) -> Iterator[str]:
+def _started(name: str, variables: Mapping[str, str]) -> Iterator[str]:
     """Begin a process that compiles a part, and yield the lines that it writes; it ends with this process."""
     # -P: nothing is imported from the current folder.
     command = [sys.executable, "-P", "-m", "optloc.cli.compile", name]
     with subprocess.Popen(  # noqa: S603  (this interpreter, and this module)
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment(OPTLOC_COMPILE="wait")
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment(OPTLOC_COMPILE="wait", **variables),
     ) as process:
         try:
             assert process.stdout is not None

@@ -24,6 +24,7 @@ from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
 from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.base.units import LARGEST
+from optloc.compute.progress import keep_quiet
 from optloc.problem.fix import status_named
 
 if TYPE_CHECKING:
@@ -267,7 +268,7 @@ Allow = Annotated[
 Force = Annotated[
     bool, typer.Option("--force", callback=replace_files, help="Write over files that exist; never over what is read.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", callback=keep_quiet, help="Print nothing but errors.")]
 Verbose = Annotated[
     bool,
     typer.Option(

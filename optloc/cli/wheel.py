@@ -17,8 +17,8 @@ import typer
 from optloc.base.errors import InvalidProblem
 from optloc.cli.compile import environment, make
 from optloc.cli.output import dumps, meter
-from optloc.compute.jit import enabled
-from optloc.compute.kept import folder
+from optloc.compute.jit import enabled, named, names_in
+from optloc.compute.kept import files_of, folder
 from optloc.compute.manifest import FILE, INSTALLED, is_chosen, of_this_process
 
 # What wheels are made for: processors of the last ten years. The same bits come out on all of them, since no kernel has
@@ -99,7 +99,7 @@ def pack(place: Path, out: Path) -> Path:
         inside, info = root / INSTALLED, root / f"optloc_kernels-{number}.dist-info"
         inside.mkdir()
         info.mkdir()
-        for file in sorted(place.glob("*.nb[ic]")):
+        for file in (file for name in names_in("optloc") for file in files_of(named(name), place)):
             copyfile(file, inside / file.name)
         (inside / FILE).write_text(dumps(manifest._asdict()), encoding="utf-8")
         (info / "METADATA").write_text("\n".join(about) + "\n", encoding="utf-8")

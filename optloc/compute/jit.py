@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, partial, update_wrapper
+from importlib import import_module
 from threading import Lock
 from types import FunctionType
 from typing import Any, TypeVar, cast
@@ -14,7 +15,9 @@ from typing import Any, TypeVar, cast
 from optloc.base.errors import InvalidProblem
 from optloc.base.threads import held_by_forks
 from optloc.base.types import Array
-from optloc.compute.kept import begin_child, callee_compiler, folder, is_kept, kept, locked
+from optloc.compute.compilation import options
+from optloc.compute.digests import Compilable, callers
+from optloc.compute.kept import begin_child, folder, is_kept, kept, locked, name_of
 from optloc.compute.progress import Reporter
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -56,28 +59,15 @@ def plain() -> Iterator[None]:
         _PLAIN.reset(token)
 
 
-# Machine code on disk is found by the name of a function, and holds that of what it calls (`optloc.compute.kept`).
-# Where a kernel that others call is replaced, the callers get names of their own.
 _KERNELS: list[_Kernel] = []
-_MARKS: list[tuple[Callable[[str], bool], str]] = []
 
 
-def _marked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function, under a name of its own where its module is marked."""
-    marks = [mark for callers, mark in _MARKS if callers(function.__module__)]
-    if not marks:
-        return function
-    assert isinstance(function, FunctionType)
-    own = FunctionType(function.__code__, function.__globals__, function.__name__, function.__defaults__)
-    own.__qualname__ = f"{function.__name__}_{marks[-1]}"
-    return own
-
-
-class _Kernel:
+class _Kernel(Compilable):
     """A function of scalars and arrays: as it is, compiled for Python, and compiled for kernels that call it."""
 
     def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
-        self.function, self.taken_in, self.ready = _marked(function), taken_in, False
+        super().__init__(function, taken_in=taken_in)
+        self.ready = False
         self.seen, self.asked = False, 0  # machine code on disk; problems that it was asked for
         self._forms: dict[bool, Any] = {}
         update_wrapper(self, function)
@@ -94,26 +84,22 @@ class _Kernel:
         return self._form(callee=False)
 
     def _form(self, *, callee: bool) -> Any:
-        """Return a compiled form; without an entry for C, which nobody calls, it is made a fifth faster."""
+        """Return a compiled form, of which there is one for all threads: numba looks up types for each form anew."""
         made = self._forms.get(callee)  # by a name of its own: another thread may renew the kernel meanwhile
         if made is None:
-            with _LOCK:  # one form for all threads: numba compiles, and looks up types, for each form anew
+            with _LOCK:
                 made = self._forms.get(callee)
                 if made is None:
-                    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-                    options |= {"forceinline": self.taken_in}  # by LLVM: to join sources in Python takes longer
-                    if callee:
-                        options |= {"no_cpython_wrapper": True, "pipeline_class": callee_compiler()}
-                    made = _numba().njit(**options)(self.function)
+                    made = _numba().njit(**options(callee=callee, taken_in=self.taken_in))(self.function)
                     # What numba's own option `cache` sets; where nothing can be written, machine code is not kept.
-                    made._cache = kept(self.function, callee=callee) or made._cache  # noqa: SLF001
+                    made._cache = kept(self, callee=callee) or made._cache  # noqa: SLF001
                     self._forms[callee] = made
         return made
 
     def renew(self) -> None:
         """Forget the compiled forms."""
         with _LOCK:
-            self.function, self.ready, self.seen, self._forms = _marked(self.function), False, False, {}
+            self.ready, self.seen, self._forms = False, False, {}
 
     def __getattr__(self, name: str) -> Any:
         """Return what numba wants to know of a function that a kernel calls."""
@@ -132,7 +118,7 @@ class _Kernel:
         """Load or compile the form for arguments of these types, while other processes wait for it."""
         REPORTER.begin()
         try:
-            with locked(self.name), _LOADING:
+            with locked(self), _LOADING:
                 machine = self.machine
                 machine.compile(tuple(machine.typeof_pyval(value) for value in args))
         finally:
@@ -167,11 +153,14 @@ def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
     return partial(events.unregister, "numba:compile", listener)
 
 
-# What this process has compiled, by whole names, and what says so while it goes on.
+# The whole names of functions that this process has compiled, and of those that it compiles now.
 _DONE: set[str] = set()
+_BEGUN: set[str] = set()
 
 
 def _text() -> str:
+    if not _BEGUN:
+        return "loading machine code"
     loaded = {kernel.name for kernel in _KERNELS}
     return f"making machine code: {len(_DONE)} of about {len(loaded | _DONE)} functions, once; kept in {folder()}"
 
@@ -182,19 +171,22 @@ REPORTER = Reporter(_text)
 def _report(name: str, done: bool) -> None:
     if done:
         _DONE.add(name)
+        _BEGUN.discard(name)
         REPORTER.end()
     else:
+        _BEGUN.add(name)
         REPORTER.begin()
-
-
-def name_of(function: Callable[..., Any]) -> str:
-    """Return the whole name of a function."""
-    return f"{function.__module__}.{function.__qualname__}"
 
 
 def names_in(package: str) -> list[str]:
     """Return the whole names of all kernels of a package, as far as it is loaded."""
     return [kernel.name for kernel in _KERNELS if kernel.name.startswith(f"{package}.")]
+
+
+def named(name: str) -> Compilable:
+    """Return a kernel by its whole name; its module is imported."""
+    import_module(name.rpartition(".")[0])
+    return next(kernel for kernel in _KERNELS if kernel.name == name)
 
 
 # So many problems are few: plain Python answers them before machine code could be made.
@@ -222,7 +214,7 @@ def usable(kernel: Callable[..., Any], count: int) -> bool:
     assert isinstance(kernel, _Kernel)
     if not enabled():
         return False
-    kernel.seen = kernel.seen or ready(kernel) or is_kept(kernel.name)  # to look into the folder takes a millisecond
+    kernel.seen = kernel.seen or ready(kernel) or is_kept(kernel)  # to look into the folder takes a millisecond
     if kernel.seen:
         return True
     chosen = way()
@@ -255,34 +247,21 @@ def insist_on(kernel: Callable[..., Any]) -> None:
 def at_hand(kernel: Callable[..., Any]) -> bool:
     """Return whether machine code of a kernel was used in this process, or was on disk when that was first asked."""
     assert isinstance(kernel, _Kernel)
-    return enabled() and (kernel.ready or _was_kept(kernel.function))
+    return enabled() and (kernel.ready or _was_kept(kernel))
 
 
 @cache  # to look into the folder takes longer than what it is asked for
-def _was_kept(function: Callable[..., Any]) -> bool:
-    return is_kept(f"{function.__module__}.{function.__qualname__}")
+def _was_kept(kernel: _Kernel) -> bool:
+    return is_kept(kernel)
 
 
-def replace(kernel: Callable[..., Any], function: Callable[..., Any]) -> None:
-    """Replace the function of a kernel; what calls it must be renewed (`renew`)."""
-    assert isinstance(kernel, _Kernel)
-    kernel.function = _marked(function)
-
-
-def renew(callers: Callable[[str], bool], mark: str) -> None:
-    """Let all kernels of some modules be compiled anew at their next use, because one that they call was replaced.
-
-    Parameters
-    ----------
-    callers : callable
-        Whether a module (its dotted name) is one of them; asked of modules that are loaded later, too.
-    mark : str
-        Tells their machine code on disk from what was kept before.
-    """
-    _MARKS.append((callers, mark))
-    for kernel in _KERNELS:
-        if callers(kernel.function.__module__):
-            kernel.renew()
+def replace(functions: Mapping[Callable[..., Any], Callable[..., Any]]) -> None:
+    """Replace the functions of some kernels; these and all of their callers are compiled again at their next use."""
+    for kernel, function in functions.items():
+        assert isinstance(kernel, _Kernel)
+        kernel.function = function
+    for kernel in callers(cast(Iterable[_Kernel], functions), _KERNELS):
+        cast(_Kernel, kernel).renew()
 
 
 def compiled(function: _Function) -> _Function:

@@ -1,13 +1,11 @@
-"""Machine code on disk: kept under a digest of all the sources that it may hold.
+"""Machine code on disk: each kernel is kept under the digest of its call graph (`optloc.compute.digests`).
 
-numba renews what it keeps of a function when the file of that function changes, but machine code holds that of all
-functions it calls, wherever they stand: after an edit or an upgrade of one of those, stale code of the caller would go
-on answering. So the folder of machine code is named by a digest of all sources of kernels, of the versions of what
-compiles them, and of the processor that they are compiled for. What was installed for it (`optloc.compute.manifest`) is
-read first.
+numba renews its files of a function when the file of that function changes. But machine code contains all functions
+that it calls, in any file: after an edit or an upgrade of one of those, stale code would answer. So numba's own
+stamp is not used. The folder of machine code is named by the versions of the compilers and by the processor. The
+folder of an installed distribution (`optloc.compute.manifest`) comes first.
 
-What kernels call is only made ready to be taken in by them: to optimise and translate it by itself, and once more in
-each that takes it in, took half of the time of a compilation. It is kept as well, for kernels of other processes.
+Callees are kept too where they save time: in a checkout, and while `optloc compile` makes everything.
 """
 
 from __future__ import annotations
@@ -20,18 +18,20 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, partial
-from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import SimpleNamespace
 from typing import IO, Any
 
-from optloc.compute.borrowing import borrowing
-from optloc.compute.manifest import PACKAGE, PREFIX, digest_of, installed, of_this_process
+from optloc.compute.compilation import callee_library
+from optloc.compute.digests import Compilable, digest_of
+from optloc.compute.manifest import PACKAGE, PREFIX, installed, of_this_process
 
-# Folders of machine code of other sources that are left, the last used ones: branches of one checkout and versions that
-# share a folder by NUMBA_CACHE_DIR take turns. One is some 90 MB.
+# Folders for other compilers that are left, the last used ones, and versions of one function: branches of a checkout
+# and releases that share a folder by NUMBA_CACHE_DIR take turns.
 _LEFT = 4
+CALLEES = "OPTLOC_CALLEES"
+"""The variable that names a folder for callees while `optloc compile` makes everything in several processes."""
 _LOG = logging.getLogger("optloc")
 
 
@@ -62,7 +62,7 @@ def folder() -> Path | None:
 
 
 def _clear(place: Path) -> None:
-    """Remove machine code of other sources but that used last; a process that still uses it makes its own anew."""
+    """Remove folders for other compilers but the last used; a process that still uses one makes its own anew."""
     others = [path for path in place.parent.glob(f"{PREFIX}*") if path != place and path.is_dir()]
     for path in sorted(others, key=_used, reverse=True)[_LEFT:]:
         shutil.rmtree(path, ignore_errors=True)
@@ -75,77 +75,12 @@ def _used(path: Path) -> float:
         return 0.0
 
 
-@cache
-def _taken_in() -> Any:
-    """Return numba's type of the code of a function, for what callers take in: neither optimised nor translated."""
-    from llvmlite import binding
-    from numba.core import codegen
-
-    llvm: Any = binding
-    numba: Any = codegen
-
-    class TakenIn(numba.JITCodeLibrary):  # type: ignore[misc]
-        # Nothing of it is in the engine, so there is no place for an environment.
-        codegen = SimpleNamespace(set_env=lambda name, environment: None)
-
-        def _optimize_final_module(self) -> None:
-            pass
-
-        def _finalize_final_module(self) -> None:
-            self._finalize_dynamic_globals()
-            self._finalized = True
-
-        def get_pointer_to_function(self, name: str) -> int:
-            return 0
-
-        def serialize_using_object_code(self) -> Any:
-            return self.serialize_using_bitcode()
-
-        @classmethod
-        def read(cls, engine: Any, stored: tuple[str, str, bytes]) -> Any:
-            """Return what was stored, in the engine of this process."""
-            made = cls(engine, stored[0])
-            made._final_module = llvm.parse_bitcode(stored[2])
-            made._finalize_final_module()
-            return made
-
-    return TakenIn
-
-
-@cache
-def callee_compiler() -> Any:
-    """Return numba's compiler of what only compiled functions call, as its option `pipeline_class` takes it."""
-    from numba.core import compiler
-    from numba.core.typed_passes import AnnotateTypes
-
-    numba: Any = compiler
-
-    class Callees(numba.Compiler):  # type: ignore[misc]
-        def define_pipelines(self) -> Any:
-            state = self.state
-            state.library = _taken_in()(state.targetctx.codegen(), state.func_id.func_qualname)
-            pipelines = super().define_pipelines()
-            for pipeline in pipelines:
-                pipeline.add_pass_after(borrowing(), AnnotateTypes)
-                pipeline.finalize()
-            return pipelines
-
-    return Callees
-
-
 class _Place:
     """Where the machine code of a function is kept, as numba asks for it (a cache locator)."""
 
-    def __init__(self, function: Callable[..., Any], place: Path) -> None:
-        file = Path(function.__code__.co_filename).resolve()
-        self._py_file = str(file)
-        self._path = str(place)
-        line = str(function.__code__.co_firstlineno)
-        if PACKAGE in file.parents:
-            self._name, self._stamp = line, ""
-        else:  # a node from outside, whose kernels may call those of files beside it
-            self._name = f"{line}-{sha256(str(file).encode()).hexdigest()[:8]}"
-            self._stamp = digest_of(list(file.parent.glob("*.py")), file.parent)
+    def __init__(self, function: Callable[..., Any], place: Path, digest: str) -> None:
+        self._py_file = str(Path(function.__code__.co_filename).resolve())
+        self._path, self._digest = str(place), digest
 
     def ensure_cache_path(self) -> None:
         Path(self._path).mkdir(parents=True, exist_ok=True)
@@ -154,34 +89,28 @@ class _Place:
         return self._path
 
     def get_source_stamp(self) -> str:
-        return self._stamp
+        return ""  # the digest is in the name
 
     def get_disambiguator(self) -> str:
-        return self._name
+        return self._digest
 
 
 @cache
 def _entries() -> tuple[Any, Any]:
-    """Return numba's types of what is kept of a function: that Python calls, and that only kernels call."""
+    """Return numba's types of a stored function: one that Python calls, and one that only kernels call."""
     from numba.core import caching
 
     numba: Any = caching  # half typed
 
     class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
-        suffix = ""
-
         def __init__(self, place: _Place, function: Callable[..., Any]) -> None:
             self._locator, self._lineno = place, function.__code__.co_firstlineno
-            # By the whole name of the module: all lie in one folder.
-            name = f"{function.__module__}.{function.__qualname__}{self.suffix}"
-            self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
+            self._filename_base = base_of(name_of(function), place.get_disambiguator())
 
-    class TakenIn(Impl):
-        suffix = ".callee"
-
+    class Callee(Impl):
         def rebuild(self, target_context: Any, payload: Any) -> Any:
             def read(stored: Any) -> Any:
-                return _taken_in().read(target_context.codegen(), stored)
+                return callee_library().read(target_context.codegen(), stored)
 
             context = SimpleNamespace(
                 codegen=lambda: SimpleNamespace(unserialize_library=read),
@@ -190,7 +119,7 @@ def _entries() -> tuple[Any, Any]:
             )
             return super().rebuild(context, payload)._replace(target_context=target_context)
 
-    return Impl, TakenIn
+    return Impl, Callee
 
 
 @cache
@@ -201,13 +130,12 @@ def _cache_type() -> Any:
     numba: Any = caching  # half typed
 
     class Kept(numba.FunctionCache):  # type: ignore[misc]
-        def __init__(self, function: Callable[..., Any], place: Path, *, callee: bool) -> None:
-            locator = _Place(function, place)
-            self._impl_class = partial(_entries()[callee], locator)
+        def __init__(self, kernel: Compilable, place: Path, *, callee: bool) -> None:
+            function = kernel.function
+            self._impl_class = partial(_entries()[callee], _Place(function, place, digest_of(kernel)))
             super().__init__(function)
-            self._name = f"{function.__module__}.{function.__qualname__}"
-            # what stands outside of optloc was not installed with it
-            self._installed = None if locator.get_source_stamp() else installed()
+            self._name = name_of(function)
+            self._installed = None if callee else installed()
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             try:
@@ -230,16 +158,17 @@ def _cache_type() -> Any:
         def save_overload(self, sig: Any, data: Any) -> None:
             try:
                 super().save_overload(sig, data)
+                _leave_last(Path(self._cache_path), self._name, self._impl.filename_base)
             except OSError as error:  # a full disk: the code serves this process
                 _LOG.warning("machine code of %s cannot be kept on disk: %s", self._name, error)
 
     return Kept
 
 
-def kept(function: Callable[..., Any], *, callee: bool) -> Any:
-    """Return a cache for the machine code of a function, as a dispatcher of numba holds one; None without a folder."""
-    place = kept_in()
-    return None if place is None else _cache_type()(function, place, callee=callee)
+def kept(kernel: Compilable, *, callee: bool) -> Any:
+    """Return a cache for the machine code of a kernel, as a dispatcher of numba holds one; None without a folder."""
+    place = _callees() if callee else kept_in()
+    return None if place is None else _cache_type()(kernel, place, callee=callee)
 
 
 def kept_in() -> Path | None:
@@ -247,10 +176,50 @@ def kept_in() -> Path | None:
     return folder() or _installed_folder()
 
 
-def is_kept(name: str) -> bool:
-    """Return whether there is machine code on disk of a function, by its whole name."""
-    wanted = f"{name}-*.py{sys.version_info[0]}{sys.version_info[1]}*.nbi"
-    return any(place is not None and any(place.glob(wanted)) for place in (_installed_folder(), folder()))
+def _callees() -> Path | None:
+    """Return the folder for code that only kernels call; None where no later compilation will need it."""
+    named = os.environ.get(CALLEES)
+    if named:
+        return Path(named)
+    place = folder()
+    return place / "callees" if place is not None and is_checkout() else None
+
+
+def is_checkout() -> bool:
+    """Return whether this package is a checkout, whose kernels are edited."""
+    return (PACKAGE.parent / "pyproject.toml").is_file()
+
+
+def is_kept(kernel: Compilable) -> bool:
+    """Return whether there is machine code of a kernel on disk."""
+    return bool(files_of(kernel, _installed_folder(), folder()))
+
+
+def files_of(kernel: Compilable, *places: Path | None) -> list[Path]:
+    """Return the files that machine code of a kernel is kept in, in the first folder that has some; [] without any."""
+    index = f"{base_of(name_of(kernel.function), digest_of(kernel))}.nbi"
+    found = next((place for place in places if place is not None and (place / index).exists()), None)
+    return [] if found is None else [found / index, *found.glob(index.replace(".nbi", ".*.nbc"))]
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """Return the whole name of a function."""
+    return f"{function.__module__}.{function.__qualname__}"
+
+
+def base_of(name: str, digest: str) -> str:
+    """Return how the names of files of machine code begin, of a function by its whole name."""
+    # Windows forbids the brackets of a function inside another.
+    version = f"py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, 'abiflags', '')}"
+    return f"{name.replace('<', '').replace('>', '')}-{digest}.{version}"
+
+
+def _leave_last(place: Path, name: str, base: str) -> None:
+    """Remove files of other digests of a function, but the newest."""
+    others = [path for path in place.glob(f"{base_of(name, '*')}.nbi") if path.stem != base]
+    for path in sorted(others, key=_used, reverse=True)[_LEFT - 1 :]:
+        for file in (path, *place.glob(f"{path.stem}.*.nbc")):
+            file.unlink(missing_ok=True)
 
 
 def _installed_folder() -> Path | None:
@@ -305,15 +274,15 @@ def alone() -> Iterator[bool]:
 
 
 @contextmanager
-def locked(name: str) -> Iterator[None]:
-    """Hold the machine code of a function while it is made: a process that waits for it loads it afterwards."""
+def locked(kernel: Compilable) -> Iterator[None]:
+    """Hold the machine code of a kernel while it is made: a process that waits for it loads it afterwards."""
     place = folder()
-    if place is None or is_kept(name):
+    if place is None or is_kept(kernel):
         yield
         return
     with ExitStack() as stack:
         try:
-            file = stack.enter_context((place / f"{name}.lock").open("ab"))
+            file = stack.enter_context((place / f"{name_of(kernel.function)}.lock").open("ab"))
         except OSError:  # the folder was removed: it is made once more
             yield
             return

@@ -1,4 +1,4 @@
-"""What machine code is made of and made for: sources, versions, a processor; and such code that was installed."""
+"""What machine code is made by and made for: compilers and a processor; and such code that was installed."""
 
 from __future__ import annotations
 
@@ -14,16 +14,8 @@ from typing import Any, NamedTuple, cast
 PACKAGE = Path(__file__).resolve().parents[1]
 """The folder of optloc."""
 
-# All files and folders of optloc that kernels stand in, or take constants from: constants are part of machine code.
-SOURCES = (
-    "compute",
-    "proof",
-    "base/linalg.py",
-    "linear/normal.py",
-    "models/primitives.py",
-    "calibration/descent.py",
-    *(f"placement/{name}.py" for name in ("criteria", "relaxation", "branching", "completions")),
-)
+# How kernels are compiled. Their own code is known by digests of each (`optloc.compute.digests`).
+COMPILERS = ("compute/borrowing.py", "compute/compilation.py")
 
 PREFIX = "optloc-"
 """How the names of folders of machine code begin."""
@@ -34,37 +26,26 @@ INSTALLED, FILE = "optloc_kernels", "manifest.json"
 _LOG = logging.getLogger("optloc")
 
 
-def digest_of(files: list[Path], root: Path) -> str:
-    """Return the digest of files below a folder, by their names and contents."""
-    made = sha256()
-    for file in sorted(files):
-        text = file.read_bytes()
-        made.update(f"{file.relative_to(root).as_posix()} {len(text)}\n".encode())
-        made.update(text)
-    return made.hexdigest()
-
-
 @cache
-def sources_digest() -> str:
-    """Return the digest of all sources of kernels that optloc ships."""
-    found = [PACKAGE / name for name in SOURCES]
-    return digest_of([file for path in found for file in ([path] if path.is_file() else path.rglob("*.py"))], PACKAGE)
+def compiler_digest() -> str:
+    """Return the digest of the files that say how kernels are compiled."""
+    return sha256(b"".join((PACKAGE / name).read_bytes() for name in COMPILERS)).hexdigest()
 
 
 class Manifest(NamedTuple):
-    """What machine code was made of and for.
+    """The compilers of machine code, and its processor.
 
     Parameters
     ----------
-    sources : str
-        Digest of the sources.
+    compiler : str
+        Digest of the options and of the pipeline for numba.
     python, numba, llvmlite : str
         Versions; of Python the first two numbers.
     triple, processor, features : str
         As numba tells them, features with a sign before each and a comma between two.
     """
 
-    sources: str
+    compiler: str
     python: str
     numba: str
     llvmlite: str
@@ -75,7 +56,7 @@ class Manifest(NamedTuple):
     @property
     def name(self) -> str:
         """Return what such code is kept under."""
-        made = (self.sources, self.numba, self.llvmlite, self.triple, self.processor, self.features)
+        made = (self.compiler, self.numba, self.llvmlite, self.triple, self.processor, self.features)
         return PREFIX + sha256("\n".join(made).encode()).hexdigest()[:16]
 
     @property
@@ -85,7 +66,7 @@ class Manifest(NamedTuple):
 
     def misfit(self, here: Manifest) -> str:
         """Return what of this process the code was not made for; empty where it fits."""
-        for key in ("sources", "python", "numba", "llvmlite", "triple"):
+        for key in ("compiler", "python", "numba", "llvmlite", "triple"):
             if getattr(self, key) != getattr(here, key):
                 return f"{key} {getattr(self, key)}"
         lacking = sorted(self.needed - here.needed)
@@ -101,7 +82,7 @@ def of_this_process() -> Manifest:
     llvm, made, settings = cast("tuple[Any, Any, Any]", (binding, codegen, config))  # without types
     name, features = settings.CPU_NAME, settings.CPU_FEATURES
     return Manifest(
-        sources_digest(),
+        compiler_digest(),
         f"{sys.version_info[0]}.{sys.version_info[1]}",
         version("numba"),
         version("llvmlite"),

@@ -1,4 +1,4 @@
-"""No silence while machine code is made: within two seconds it is said, and said again every two seconds.
+"""A line every two seconds while machine code is made or loaded, unless the user wants none (`--quiet`).
 
 On a terminal one line is written over and over; elsewhere each is a warning of the log ``optloc.compile``, which goes
 to standard error unless a program has other plans for it.
@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from threading import Lock, Thread
 from time import monotonic, sleep
+from typing import ClassVar
 
 from optloc.base.threads import held_by_forks
 
@@ -28,8 +29,11 @@ class Reporter:
     Parameters
     ----------
     text : callable
-        What to say now.
+        Returns the line.
     """
+
+    # Whether the user wants no line at all, in this process.
+    quiet: ClassVar[bool] = False
 
     def __init__(self, text: Callable[[], str]) -> None:
         self._text, self.muted = text, False
@@ -47,7 +51,7 @@ class Reporter:
             now = monotonic()
             if self._depth == 1 and now - self._ended >= _PAUSE:
                 self._since = now
-            if not self._watching and not self.muted:
+            if not self._watching and not self.muted and not Reporter.quiet:
                 self._watching = True
                 Thread(target=self._watch, daemon=True, name="optloc progress").start()
 
@@ -86,3 +90,9 @@ def _say(text: str) -> None:
         sys.stderr.flush()
     else:
         _LOG.warning("%s", text)
+
+
+def keep_quiet(quiet: bool) -> bool:
+    """Switch progress off or on in this process, and return the argument, as the callback of an option must."""
+    Reporter.quiet = quiet
+    return quiet

@@ -1,18 +1,14 @@
 """Machine code on disk is that of the sources that are there: also where only what a kernel calls was edited."""
 
-import ast
-import importlib
 import os
 import subprocess
 import sys
-import types
-from functools import cache
 from pathlib import Path
 
 import pytest
 
 from optloc.compute import kept, manifest
-from optloc.compute.jit import _KERNELS, enabled
+from optloc.compute.jit import enabled
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
 
@@ -56,62 +52,45 @@ def asked(folder: Path, **environment: str) -> tuple[int, int, Path]:
 
 def test_an_edited_callee_renews_its_callers_and_damage_is_made_good(tmp_path):
     (tmp_path / "caller.py").write_text(CALLER)
-    cache = str(tmp_path / "cache")
-    place = Path(cache, manifest.of_this_process().name)
-    for step, damaged, compiled in ((1, False, 2), (1, False, 0), (1, True, 1), (2, False, 2)):
-        (tmp_path / "callee.py").write_text(CALLEE.format(step=step))
+    cache, callees = tmp_path / "cache", tmp_path / "callees"
+    place = cache / manifest.of_this_process().name
+    for text, damaged, answer, compiled in (
+        (CALLEE.format(step=1), False, 2, 2),
+        (CALLEE.format(step=1), False, 2, 0),
+        (CALLEE.format(step=1), True, 2, 1),  # the callee is kept, too
+        (f"# A comment moves all lines.\n{CALLEE.format(step=1)}\n\ndef unused():\n    return 1\n", False, 2, 0),
+        (CALLEE.format(step=2), False, 3, 2),
+        (CALLEE.format(step=1), False, 2, 0),  # the version before is kept
+    ):
+        (tmp_path / "callee.py").write_text(text)
         for file in place.glob("caller.answer-*.nbc") if damaged else ():
             file.write_bytes(file.read_bytes()[:100])
-        assert asked(tmp_path, NUMBA_CACHE_DIR=cache) == (step + 1, compiled, place)
+        asked_here = asked(tmp_path, NUMBA_CACHE_DIR=str(cache), OPTLOC_CALLEES=str(callees))
+        assert asked_here == (answer, compiled, place)
+    assert len(list(callees.glob("callee.level-*.nbi"))) == 2
+    assert not list(place.glob("*level*"))
 
 
-def test_every_source_counts(tmp_path, monkeypatch):
-    for name in manifest.SOURCES:
-        source, copy = manifest.PACKAGE / name, tmp_path / name
-        for file in [source] if source.is_file() else source.rglob("*.py"):
-            target = copy if source.is_file() else copy / file.relative_to(source)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(file.read_bytes())
-    monkeypatch.setattr(manifest, "PACKAGE", tmp_path)
-    made = manifest.sources_digest.__wrapped__
-    seen = {manifest.sources_digest(), made()}
-    assert len(seen) == 1  # the same sources at another place
-    for file in sorted(tmp_path.rglob("*.py")):
-        file.write_bytes(file.read_bytes() + b"#")
-        seen.add(made())
-    assert len(seen) == 1 + len(list(tmp_path.rglob("*.py"))) > 30
+def test_users_keep_no_callees(tmp_path):
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "callee.py").write_text(CALLEE.format(step=1))
+    _, _, place = asked(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"), OPTLOC_CALLEES="")
+    assert bool(list(place.rglob("callee.*.nbi"))) == kept.is_checkout()
+    assert list(place.glob("caller.answer-*.nbi"))
 
 
-@cache
-def imported(module: str) -> dict[str, str]:
-    """Return the module that each name of a module was imported from."""
-    tree = ast.parse(Path(sys.modules[module].__file__).read_text(encoding="utf-8"))
-    found = [(node, alias) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
-    return {alias.asname or alias.name: node.module for node, alias in found}
-
-
-def test_what_kernels_name_stands_in_the_sources():
-    """A constant from elsewhere would be part of machine code that does not change with it."""
-    for module in ("compute.refine", "compute.range_fixes", "proof.best_first", "proof.batch", "placement.completions"):
-        importlib.import_module(f"optloc.{module}")
-    inside = tuple("optloc." + name.replace("/", ".").removesuffix(".py") for name in manifest.SOURCES)
-    libraries = ("math", "numpy", "heapq", "typing")
-    origins = {}
-    for kernel in _KERNELS:
-        module = kernel.function.__module__
-        if not module.startswith("optloc."):
-            continue
-        assert module.startswith(inside), module
-        origin = origins.setdefault(module, imported(module))
-        for name in names(kernel.function.__code__):
-            assert origin.get(name, module).startswith((*inside, *libraries)), (module, name)
-    assert len(origins) > 15
-
-
-def names(code: types.CodeType) -> set[str]:
-    """Return all global names of a function, and of those inside."""
-    inner = [names(part) for part in code.co_consts if isinstance(part, types.CodeType)]
-    return set(code.co_names).union(*inner)
+def test_old_versions_of_a_function_leave_but_for_the_newest(tmp_path):
+    for name in ("f.g", "f.gg"):
+        for age in range(8):
+            for ending in (".nbi", ".1.nbc", ".2.nbc"):
+                file = tmp_path / f"{kept.base_of(name, f'{age:016}')}{ending}"
+                file.touch()
+                os.utime(file, (1e9 - age, 1e9 - age))
+    kept._leave_last(tmp_path, "f.g", kept.base_of("f.g", f"{7:016}"))
+    left = sorted(path.stem for path in tmp_path.glob("f.g-*.nbi"))
+    assert left == [kept.base_of("f.g", f"{age:016}") for age in (0, 1, 2, 7)]
+    assert len(list(tmp_path.glob("f.g-*.nbc"))) == 2 * len(left)
+    assert len(list(tmp_path.glob("f.gg-*.nbi"))) == 8
 
 
 def test_old_folders_leave_but_for_the_last_used(tmp_path):

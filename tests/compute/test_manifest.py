@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -14,7 +15,7 @@ from often import few
 
 import optloc
 from optloc.cli import wheel
-from optloc.cli.compile import make
+from optloc.cli.compile import PARTS, make
 from optloc.compute import manifest
 from optloc.compute.jit import enabled
 from optloc.compute.kept import folder
@@ -41,6 +42,10 @@ print(installed() is not None, len(made.buffer) // 2, done.mean.tolist())
 """
 
 
+# The digest of a kernel in a version before.
+BEFORE = 16 * "0"
+
+
 def scan():
     template = optloc.assemble(PLACES, optloc.measured("range", a=np.arange(4), sigma=1.0))
     return optloc.simulate(template, MEAN, 1)
@@ -65,6 +70,7 @@ def site(tmp_path):
     for file in folder().glob("optloc.compute.*.nb[ic]"):
         if file.name.startswith(("optloc.compute.filter.", "optloc.compute.lanes.", "optloc.compute.systems.")):
             (few / file.name).write_bytes(file.read_bytes())
+            (few / re.sub(r"-[0-9a-f]{16}\.", f"-{BEFORE}.", file.name)).write_bytes(b"of a version before")
     packed = wheel.pack(few, tmp_path / "dist")
     place = tmp_path / "site"
     with zipfile.ZipFile(packed) as file:
@@ -90,7 +96,7 @@ def test_installed_machine_code_is_used_where_it_fits(site, tmp_path):
 
 @pytest.mark.parametrize(
     "wrong",
-    few([{"sources": "0" * 64}, {"numba": "0.1"}, {"features": "+nothing-has-this"}, {"more": "1"}], 1),
+    few([{"compiler": "0" * 64}, {"numba": "0.1"}, {"features": "+nothing-has-this"}, {"more": "1"}], 1),
     ids=list,
 )
 def test_installed_machine_code_that_does_not_fit_is_not_loaded(site, tmp_path, wrong):
@@ -99,6 +105,12 @@ def test_installed_machine_code_that_does_not_fit_is_not_loaded(site, tmp_path, 
     fits, compiled, mean = asked(site, tmp_path / "cache")
     assert (fits, compiled) == (False, 0)
     np.testing.assert_allclose(mean, ekf(scan(), MEAN, np.eye(3)).mean, rtol=1e-9)
+
+
+def test_a_wheel_holds_the_kernels_of_this_version_alone(site, tmp_path):
+    code = {file.name for file in (site / manifest.INSTALLED).glob("*.nb[ic]")}
+    assert code == {file.name for file in (tmp_path / "few").iterdir() if BEFORE not in file.name}
+    assert {name.partition("-")[0] for name in code} <= {name for part in PARTS.values() for name in part.entries}
 
 
 def test_a_wheel_says_what_it_is_for(site):

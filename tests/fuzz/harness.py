@@ -5,6 +5,7 @@ and one of counts; ``python -m fuzz.harness SEED NUMBER`` writes the files of a 
 """
 
 import faulthandler
+import gc
 import hashlib
 import json
 import os
@@ -18,6 +19,7 @@ import traceback
 from collections import Counter
 from contextlib import chdir
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 
 from fuzz.cases import case_of
@@ -60,6 +62,10 @@ def warm(*, every: bool):
             Path("rec.ndjson").write_text(recording())
             runner.invoke(app, ["live", "live.toml", "--replay", "rec.ndjson"])
             study_folder()
+    parser()
+    # Forks share what is here; a collection of garbage would copy it.
+    gc.collect()
+    gc.freeze()
 
 
 def run(case, folder, *, again=False):
@@ -142,12 +148,20 @@ def _child(case, here, out, err, verdict):
         os._exit(code)
 
 
-def command(arguments):
-    """Return the exit code of a command; what it does not catch goes to standard error as of any process."""
+@cache
+def parser():
+    """Return the parser of all commands, which takes longer to build than most cases to run."""
+    from typer.main import get_command
+
     from optloc.cli import app
 
+    return get_command(app)
+
+
+def command(arguments):
+    """Return the exit code of a command; what it does not catch goes to standard error as of any process."""
     try:
-        app(list(arguments), prog_name="optloc")
+        parser()(list(arguments), prog_name="optloc")
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except BaseException:  # noqa: BLE001  (as the interpreter does)

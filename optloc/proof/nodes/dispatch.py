@@ -9,15 +9,12 @@ what calls it is compiled anew then, and kept on disk under a name of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from hashlib import sha256
-from inspect import unwrap
 from math import inf
-from pathlib import Path
 from threading import Lock
 from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.compute.jit import compiled, inlined, renew, replace
+from optloc.compute.jit import compiled, inlined, replace
 from optloc.proof.atlas import frame_of, set_line
 from optloc.proof.nodes import node as columns
 from optloc.proof.nodes.angles import HORIZONTAL_ANGLE, VERTICAL_ANGLE
@@ -263,21 +260,8 @@ def code_of(node: str | Node) -> int:
 
 
 def _renew() -> None:
-    """Write the chains anew, and let what calls them be compiled anew at its next use."""
-    for name in (*_LOOPS, *_QUESTIONS):
-        replace(globals()[name], _written(name, NODES))
-    renew(_calls_chains, f"nodes_{_digest(NODES[len(_SHIPPED) :])}")
-
-
-def _calls_chains(module: str) -> bool:
-    """Return whether a module of kernels may call a chain: all of the proof, but not the nodes, which chains call."""
-    return module == __name__ or (module.startswith("optloc.proof.") and not module.startswith("optloc.proof.nodes."))
-
-
-def _digest(nodes: Iterable[Node]) -> str:
-    """Return what tells the machine code of one table of nodes from that of another: the files of its functions."""
-    files = sorted({unwrap(kernel).__code__.co_filename for node in nodes for _, kernel in _kernels(node)})
-    return sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()[:16]
+    """Write the chains again, for all nodes."""
+    replace({globals()[name]: _written(name, NODES) for name in (*_LOOPS, *_QUESTIONS)})
 
 
 def width(kinds: Iterable[int]) -> int:

@@ -1,0 +1,145 @@
+"""The digest of a kernel: of its own code, its constants, and everything that it calls.
+
+Machine code of a kernel contains its callees and the values of module constants. So the digest covers the whole call
+graph below the kernel, and nothing else: an edit renews only the kernels that reach the edited function. Comments,
+docstrings and line numbers are not part of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from hashlib import sha256
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+
+# Modules whose functions belong to numba, so that its version speaks for them.
+_LIBRARIES = ("math", "numpy", "heapq", "typing", "operator", "numba")
+# Hexadecimal digits of a digest in a file name: 64 bits never meet by chance.
+_DIGITS = 16
+
+
+class Compilable:
+    """A function that numba compiles, alone or into its callers; it may be replaced.
+
+    Parameters
+    ----------
+    function : callable
+        The function in Python.
+    taken_in : bool
+        Whether each caller inlines it.
+    """
+
+    def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
+        self.function, self.taken_in = function, taken_in
+
+
+def digest_of(kernel: Compilable) -> str:
+    """Return the digest of a kernel's call graph; kernels that call each other share one."""
+    own = sorted(
+        f"{one.function.__module__}.{one.function.__qualname__} {one.taken_in} {_own(one.function)[0]}"
+        for one in closure(kernel)
+    )
+    return sha256("\n".join(own).encode()).hexdigest()[:_DIGITS]
+
+
+def closure(kernel: Compilable) -> set[Compilable]:
+    """Return a kernel and all that it calls, at any depth."""
+    found, left = {kernel}, [kernel]
+    while left:
+        new = set(callees(left.pop())) - found
+        found |= new
+        left += new
+    return found
+
+
+def callees(kernel: Compilable) -> tuple[Compilable, ...]:
+    """Return the compiled functions that a kernel names."""
+    return _own(kernel.function)[1]
+
+
+def callers(kernels: Iterable[Compilable], known: Iterable[Compilable]) -> set[Compilable]:
+    """Return kernels and all of those known that call one of them, at any depth."""
+    found, known = set(kernels), tuple(known)
+    while True:
+        more = {one for one in known if one not in found and not found.isdisjoint(callees(one))}
+        if not more:
+            return found
+        found |= more
+
+
+@cache
+def _own(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
+    """Return the digest of a function without its callees, and its callees."""
+    texts, called = list[str](), list[Compilable]()
+    for text, callee in _parts(function, set()):
+        texts.append(text)
+        if callee is not None:
+            called.append(callee)
+    return sha256("\n".join(texts).encode()).hexdigest(), tuple(called)
+
+
+def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
+    """Yield the texts that a function is made of, and a callee where a text is the name of one."""
+    assert isinstance(function, FunctionType)
+    if function in seen:
+        return
+    seen.add(function)
+    yield _text(function.__code__, function.__doc__), None
+    yield _text(function.__defaults__), None
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    named = dict(zip(function.__code__.co_freevars, cells, strict=True))
+    names = sorted(_names(function.__code__))
+    named |= {name: function.__globals__[name] for name in names if name in function.__globals__}
+    for name, value in named.items():
+        yield from _value(name, value, names, seen)
+
+
+def _value(name: str, value: Any, names: list[str], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
+    """Yield the texts of a value that a function names; of a module the attributes that the function may mean."""
+    if isinstance(value, Compilable):
+        yield f"{name} calls {value.function.__module__}.{value.function.__qualname__}", value
+    elif isinstance(value, ModuleType) and not _is_library(value.__name__):
+        for attribute in names:
+            if hasattr(value, attribute):
+                yield from _value(f"{name}.{attribute}", getattr(value, attribute), names, seen)
+    elif isinstance(inner := getattr(value, "py_func", value), FunctionType):  # compiled by numba's `njit`, or plain
+        yield f"{name} calls {inner.__module__}.{inner.__qualname__}", None
+        yield from () if _is_library(inner.__module__) else _parts(inner, seen)
+    else:
+        yield f"{name} = {_text(value)}", None
+
+
+def _is_library(module: str) -> bool:
+    return module.partition(".")[0] in _LIBRARIES
+
+
+def _names(code: CodeType) -> set[str]:
+    """Return the names of globals and attributes in a function, and in functions inside it.
+
+    An attribute with the name of a kernel counts as a call: to tell them apart would take a hundred times as long.
+    """
+    inner = [_names(part) for part in code.co_consts if isinstance(part, CodeType)]
+    return set(code.co_names).union(*inner)
+
+
+def _text(value: Any, documentation: str | None = None) -> str:
+    """Return a text that two values have in common only if they compile to the same machine code."""
+    if isinstance(value, CodeType):
+        # The docstring is the first constant; some versions of Python put None there without one.
+        constants = value.co_consts[value.co_consts[:1] in ((documentation,), (None,)) :]
+        return _text((value.co_code, value.co_names, value.co_varnames, value.co_argcount, constants))
+    if isinstance(value, tuple):
+        fields = getattr(value, "_fields", ())
+        return f"{type(value).__name__}{fields}({', '.join(map(_text, value))})"
+    if isinstance(value, frozenset):
+        return f"frozenset({', '.join(sorted(map(_text, value)))})"
+    if isinstance(value, np.ndarray):
+        return f"array {value.dtype} {value.shape} {value.tobytes().hex()}"
+    if isinstance(value, type):
+        return f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
+    if isinstance(value, ModuleType):
+        return value.__name__
+    return f"{type(value).__name__} {value!r}"
