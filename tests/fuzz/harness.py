@@ -192,7 +192,8 @@ def _wait(child, started):
 
 def outcome(code, err):
     """Return what is wrong with an exit code and what was said on standard error."""
-    said = err.strip().splitlines()
+    # A busy machine loads machine code slowly, which a line of progress shows.
+    said = [line for line in err.strip().splitlines() if "machine code" not in line]
     faults = [f"exit code {code}: {said[-1] if said else ''}"] if code not in (0, 1, 2) else []
     if "Traceback" in err:
         where = [line.strip() for line in said if line.lstrip().startswith("File") and "/optloc/" in line]
