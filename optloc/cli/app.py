@@ -478,7 +478,7 @@ def demo(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Walk through a fix, a registration and a proof; or fix one shipped problem."""
+    """Walk through a fix, two possible places and a registration; or fix one shipped problem."""
     from optloc.cli.starters import run_demo
 
     raise typer.Exit(run_demo(name, plot, as_json=as_json, quiet=quiet))
