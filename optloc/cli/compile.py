@@ -34,7 +34,7 @@ from optloc.compute.kept import alone, is_kept, kept_in
 from optloc.compute.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
-from optloc.placement import Plan, place
+from optloc.placement import SiteSelection, place
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -127,7 +127,7 @@ def _cover() -> None:
 
 def _place() -> None:
     # the criteria differ by numbers, not by types
-    place(Plan(_posed("toa"), _TARGET[None], choose=4, gap=0.5))
+    place(SiteSelection(_posed("toa"), _TARGET[None], choose=4, gap=0.5))
 
 
 def _calibrate() -> None:
