@@ -531,7 +531,7 @@ def _quartiles(values: tuple[float, ...] | None) -> str:
 def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
     """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
     from optloc.cli.output import bar, say
-    from optloc.papers import Size, paper, planned, write
+    from optloc.papers import Size, paper, reproduction, write
 
     paper(name)
     if size not in get_args(Size):
@@ -540,9 +540,9 @@ def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool
     # before the work, so that a place that cannot be written is known at once
     make_folder(folder)
     claim(folder / "README.md")
-    plan = planned(name, cast(Size, size), seed)
-    with bar(name, plan.work, quiet) as advance:
-        report = plan.run(lambda: advance(1))
+    ready = reproduction(name, cast(Size, size), seed)
+    with bar(name, ready.work, quiet) as advance:
+        report = ready.run(lambda: advance(1))
     written = write(report, folder)
     console = Screen(quiet=quiet)
     for found in report.tables:
