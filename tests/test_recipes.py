@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from monte_carlo.test_consistency import band
 from recipes import TABLES, files_of_the_page, installed, write_package
-from study.texts import plan
+from study.texts import design
 from typer.testing import CliRunner
 from verdicts import alone
 
@@ -192,7 +192,7 @@ method = "gtrs+lsr"
 
 
 def test_studies_take_it_in_a_layout():
-    (made,) = plan(STUDY).chunks
+    (made,) = design(STUDY).chunks
     found = compute(made).table.to_pandas()
     assert len(found) == 40
     assert np.isfinite(found["crlb"]).all()
