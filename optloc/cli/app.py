@@ -378,8 +378,7 @@ def place(
 ) -> None:
     """Choose where stations go: which of many sites give the best fixes, with a bound of what any choice can reach.
 
-    FILE is a selection file (choice, candidates, targets), or a problem file. Of a problem file, some stations are
-    chosen for one target.
+    FILE is a selection file (choice, candidates, targets), or a problem file, whose stations are the candidates.
     """
     from optloc.cli.place import Wanted, run_place
 
