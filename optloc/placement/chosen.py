@@ -11,7 +11,7 @@ import numpy as np
 from formulations.placement import covariances
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.bounds.bound_map import bound_map, extent, plan_of
+from optloc.bounds.bound_map import bound_map, extent, map_coordinates
 from optloc.bounds.crlb import crlb
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.simulate import simulate
@@ -423,7 +423,7 @@ def picture(selection: SiteSelection, found: Placement) -> Figure:
     places = np.atleast_2d(np.asarray(selection.places, dtype=float))[:, : problem.dimension]
     truth = np.zeros(problem.layout.size)
     truth[: problem.dimension] = places[0]
-    flat = plan_of(problem.frame, places, problem.frame.geodetic and problem.dimension == 3)
+    flat = map_coordinates(problem.frame, places, problem.frame.geodetic and problem.dimension == 3)
     height = float(np.median(flat[:, 2])) if problem.dimension == 3 else 0.0
     x0, x1, y0, y1 = extent(problem, places, widen=0.08)
     grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)

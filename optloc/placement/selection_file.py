@@ -37,7 +37,7 @@ from optloc.files.stations import survey
 from optloc.files.table import Table, distinct, of_rows, table_of
 from optloc.files.unknowns import settle_frame
 from optloc.files.writer import toml_text
-from optloc.placement.areas import convex_parts, ground_of, inside, plan_of, polygons_of, region_of, visible
+from optloc.placement.areas import convex_parts, corners_in_frame, ground_of, inside, polygons_of, region_of, visible
 from optloc.placement.sites import Group, Name, SiteSelection
 from optloc.problem.problem import Problem
 
@@ -396,7 +396,8 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
         raise InvalidProblem(f"the spacing {step:g} m is not positive", where, 'write spacing = "5 m"')
     height = 0.0 if section.height is None else Units("length").plain(section.height, section.unit, where)
     rings = [
-        plan_of(r, frame, where) for r in polygons_of(within(folder, section.polygon, join(where, "key 'polygon'")))
+        corners_in_frame(r, frame, where)
+        for r in polygons_of(within(folder, section.polygon, join(where, "key 'polygon'")))
     ]
     low, high = np.min([r.min(0) for r in rings], axis=0), np.max([r.max(0) for r in rings], axis=0)
     if np.prod((high - low) / step + 1.0) > _MANY:
@@ -463,7 +464,7 @@ def _regions(
     if low > high:
         raise InvalidProblem("the least height is above the greatest", join(where, "key 'height'"), "swap them")
     path = within(folder, section.polygon, join(where, "key 'polygon'"))
-    parts = [part for ring in polygons_of(path) for part in convex_parts(plan_of(ring, frame, where))]
+    parts = [part for ring in polygons_of(path) for part in convex_parts(corners_in_frame(ring, frame, where))]
     ground = None
     if section.terrain is not None and dimension == 3:
         ground = ground_of(within(folder, section.terrain, join(where, "key 'terrain'")), join(where, "key 'terrain'"))

@@ -13,7 +13,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import claim, make_folder, together, write_text, written
 from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
+from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
 from optloc.files.writer import harmless_column
 from optloc.papers.report import Picture
 from optloc.plot.bound_map import plot_bound_map
@@ -97,7 +97,7 @@ def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
     )
     position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_REACH, :d]
     earth = problem.frame.geodetic and d == 3
-    plain = plan_of(problem.frame, position, earth)
+    plain = map_coordinates(problem.frame, position, earth)
     # The height of the middle trial, whole metres because the page says it.
     height = float(np.round(np.median(plain[:, 2]))) if d == 3 and len(plain) else 0.0
     west, east, south, north = extent(problem, position, widen=_WIDEN)
