@@ -142,7 +142,7 @@ def test_two_biases_of_one_family_on_one_row_add_up():
     assert np.allclose(dense_jacobian(problem, x)[:, 2:], [[1, -1], [2, 0], [0, 0]])
 
 
-def test_problems_that_differ_in_coefficients_alone_do_not_share_a_plan():
+def test_problems_that_differ_in_coefficients_alone_do_not_share_links():
     def problem_of(coefficient, form, kind):
         bias = Bias("turn", ("all",), np.arange(3), np.zeros(3, int), np.full(3, coefficient), form)
         return assemble(STATIONS[2], measured(kind, a=[0, 1, 2], sigma=1.0), biases=(bias,))

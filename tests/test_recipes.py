@@ -21,7 +21,7 @@ from optloc import MODELS, InvalidProblem, Motion, Status, solve
 from optloc.cli import app
 from optloc.compute.sums import equations_at
 from optloc.compute.trace import evaluate, trace
-from optloc.linear.evaluate import given, plans
+from optloc.linear.evaluate import block_links, given
 from optloc.linear.normal import linearise
 from optloc.study.trial import compute
 from optloc.track import collected, polynomial, tracked
@@ -99,7 +99,7 @@ def test_its_bound_is_that_of_the_fisher_information_by_hand():
 def test_machine_code_symbols_and_numpy_agree():
     problem = optloc.simulate(strengths(), truth=[900.0, 400.0], seed=1)
     x = np.array([1200.0, -300.0])
-    (only,) = plans(problem)
+    (only,) = block_links(problem)
     inputs = given(problem, only)
     tape = trace(problem, only, frozenset(inputs), frozenset(feed.seed for feed in only.feeds)).tape
     for feed in only.feeds:
