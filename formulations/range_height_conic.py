@@ -108,7 +108,7 @@ def lift(
     guess = float(np.linalg.norm(near - stations[0]))
     forms, change = _forms(curve, surface, near, guess)
     if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
-        nothing = Answer({}, np.nan, -np.inf, "not posed", solved=False, iterations=0)
+        nothing = Answer({}, np.nan, -np.inf, "not formulated", solved=False, iterations=0)
         return Lifted(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
     # each form divided by its largest entry: an equality may be, and the bound is multiplied back
     scale = float(np.abs(forms["objective"]).max())

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from optloc.models import MODELS, Model
     from optloc.models.medium import Atmosphere, Layers
     from optloc.placement.chosen import Placement, place
-    from optloc.placement.sites import Plan
+    from optloc.placement.sites import SiteSelection
     from optloc.problem import epochs, noise
     from optloc.problem.bias import with_bias, with_known_bias
     from optloc.problem.build import assemble, measured, station_array
@@ -126,7 +126,6 @@ __all__ = [
     "Observability",
     "OptlocError",
     "Placement",
-    "Plan",
     "Prepared",
     "Prior",
     "Problem",
@@ -136,6 +135,7 @@ __all__ = [
     "Running",
     "Samples",
     "Signal",
+    "SiteSelection",
     "Stage",
     "Stations",
     "Status",
@@ -217,7 +217,7 @@ _HOMES = {
     "models": "MODELS Model",
     "models.medium": "Atmosphere Layers",
     "placement.chosen": "Placement place",
-    "placement.sites": "Plan",
+    "placement.sites": "SiteSelection",
     "problem.bias": "with_bias with_known_bias",
     "problem.build": "assemble measured station_array",
     "problem.chart": "Chart",

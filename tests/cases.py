@@ -126,7 +126,7 @@ def _range_rate(d: int) -> Problem:
     return assemble(stations(d, velocity=rate), measured("range_rate", a=np.arange(count), sigma=0.05))
 
 
-# How to pose each kind alone (a height with the ranges it needs): a kind without a line here has no case.
+# How to measure with each kind alone (a height with the ranges it needs): a kind without a line here has no case.
 BUILD: dict[str, Callable[[int], Problem]] = {
     "tdoa": _tdoa,
     "groa": _groa,

@@ -14,7 +14,7 @@ from optloc.linear.normal import linearise, prior_parts
 from optloc.papers import registration as scenes
 
 
-def posed(epochs, *, moving=True, prior=None, span="noise", station_sigma=1.0, scene=scenes.SPATIAL, gain=None):
+def problem_of(epochs, *, moving=True, prior=None, span="noise", station_sigma=1.0, scene=scenes.SPATIAL, gain=None):
     """Return a run of a scene and its true vector; states and offsets of stations are zero."""
     scene = scenes.MOVING if moving and scene is scenes.PRINTED else scene
     problem = scenes.problem(scene, epochs, prior=prior, station_sigma=station_sigma, gain_sigma=gain)
@@ -60,7 +60,7 @@ def by_hand(problem, truth):
 @pytest.mark.parametrize("prior", [None, 200.0])
 @pytest.mark.parametrize("span", ["epoch", "run"])
 def test_eliminated_station_errors_are_those_of_the_full_matrix(span, prior):
-    problem, truth = posed(12, span=span, prior=prior)
+    problem, truth = problem_of(12, span=span, prior=prior)
     assert problem.layout.size == 7 + (12 if span == "epoch" else 1) * 15
     full = by_hand(problem, truth)
     np.testing.assert_allclose(crlb(problem, truth), full, rtol=1e-8, atol=1e-8 * np.abs(full).max())
@@ -70,7 +70,7 @@ def test_eliminated_station_errors_are_those_of_the_full_matrix(span, prior):
 
 @pytest.mark.parametrize("prior", [None, 200.0])
 def test_station_errors_as_noise_or_as_unknowns_bound_alike(prior):
-    one, two = (crlb_course(*posed(60, span=span, prior=prior)) for span in ("noise", "epoch"))
+    one, two = (crlb_course(*problem_of(60, span=span, prior=prior)) for span in ("noise", "epoch"))
     np.testing.assert_allclose(one.covariance[10:], two.covariance[10:], rtol=1e-6)
 
 
@@ -84,7 +84,7 @@ def test_station_errors_as_noise_or_as_unknowns_bound_alike(prior):
     ],
 )
 def test_numbers_of_an_independent_computation(scene, epochs, sigma, expected):
-    problem, truth = posed(epochs, scene=getattr(scenes, scene), moving=scene == "MOVING", station_sigma=sigma)
+    problem, truth = problem_of(epochs, scene=getattr(scenes, scene), moving=scene == "MOVING", station_sigma=sigma)
     course = crlb_course(problem, truth, [epochs])
     assert course.total("position")[0] == pytest.approx(expected, rel=2e-5)
 
@@ -95,12 +95,12 @@ def test_numbers_of_an_independent_computation(scene, epochs, sigma, expected):
     ids=["unknown", "prior", "gain ratios", "moving target"],
 )
 def test_the_course_is_the_bound_of_each_shorter_run(options):
-    problem, truth = posed(120, **options)
+    problem, truth = problem_of(120, **options)
     course = crlb_course(problem, truth)
     np.testing.assert_array_equal(course.counts, np.arange(1, 121))
     np.testing.assert_array_equal(course.times, problem.times)
     for count in (30, 77, 120):
-        own, x = posed(count, **options)
+        own, x = problem_of(count, **options)
         bound = crlb(own, x)
         scale = np.sqrt(np.diagonal(bound))
         difference = (course.covariance[count - 1] - bound) / scale / scale[:, None]
@@ -112,7 +112,7 @@ def test_the_course_is_the_bound_of_each_shorter_run(options):
 
 
 def test_known_biases_leave_the_bound_of_a_problem_without_them():
-    problem, truth = posed(200, moving=False, scene=scenes.PRINTED)
+    problem, truth = problem_of(200, moving=False, scene=scenes.PRINTED)
     free = assemble(
         problem.stations,
         measured("tdoa", a=problem.rows[0].a, b=0, epoch=problem.rows[0].epoch, arrival_sigma=3.0),
@@ -125,17 +125,17 @@ def test_known_biases_leave_the_bound_of_a_problem_without_them():
     assert unknown.total("position")[0] > 3.0 * course.total("position")[1]
     # A prior as narrow as the noise of the mean is worth as much as knowledge; a wide one nothing.
     for prior, rel in ((1e-4, 1e-4), (1e6, None)):
-        with_prior, _ = posed(200, moving=False, scene=scenes.PRINTED, prior=prior)
+        with_prior, _ = problem_of(200, moving=False, scene=scenes.PRINTED, prior=prior)
         wanted = course.total("position")[1] if rel else unknown.total("position")[0]
         assert crlb_course(with_prior, truth, [200]).total("position")[0] == pytest.approx(wanted, rel=1e-4)
 
 
 def test_what_is_not_yet_determined_is_nan():
-    problem, truth = posed(30)
+    problem, truth = problem_of(30)
     course = crlb_course(problem, truth)
     assert np.isnan(course.covariance[0]).all()
     assert np.isfinite(course.covariance[-1]).all()
-    assert np.isfinite(crlb_course(posed(5, prior=200.0)[0], truth).covariance[0]).all()
+    assert np.isfinite(crlb_course(problem_of(5, prior=200.0)[0], truth).covariance[0]).all()
 
 
 def test_free_positions_and_emission_times_are_eliminated():
@@ -170,17 +170,17 @@ def test_equalities_leave_the_bound_of_their_surface():
     rows = measured("range", a=np.tile(np.arange(5), 3), epoch=np.repeat(np.arange(3), 5), sigma=3.0)
     x = np.array([9e3, 3e3, 800.0, 0.0])
     h = float(frame.to_geodetic(x[:3])[2])
-    posed = with_bias(assemble(places, rows, frame=frame, constraints=[height(exactly=h)]), "delay", per="kind")
+    biased = with_bias(assemble(places, rows, frame=frame, constraints=[height(exactly=h)]), "delay", per="kind")
     measuring = measured("height", z=[h], sigma=1e-4)
     free = with_bias(assemble(places, rows, measuring, frame=frame), "delay", per="kind", kind="range")
-    bound = crlb(posed, x)
+    bound = crlb(biased, x)
     np.testing.assert_allclose(bound, crlb(free, x), rtol=1e-5, atol=1e-5)
     assert np.linalg.matrix_rank(bound, tol=1e-9) == 3
-    np.testing.assert_allclose(crlb(posed, np.stack([x, x]))[1], bound)
-    np.testing.assert_allclose(crlb_course(posed, x, [3]).covariance[0], bound, rtol=1e-9, atol=1e-9)
-    known = crlb_course(posed, x, [3], known=["delay"]).covariance[0]
-    np.testing.assert_allclose(known[:3, :3], crlb(replace(posed, biases=()), x[:3]), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(bound)), observability(posed, x).posterior, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(crlb(biased, np.stack([x, x]))[1], bound)
+    np.testing.assert_allclose(crlb_course(biased, x, [3]).covariance[0], bound, rtol=1e-9, atol=1e-9)
+    known = crlb_course(biased, x, [3], known=["delay"]).covariance[0]
+    np.testing.assert_allclose(known[:3, :3], crlb(replace(biased, biases=()), x[:3]), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(bound)), observability(biased, x).posterior, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_equalities_leave_the_bound_of_their_surface():
     ],
 )
 def test_mistakes(options, words):
-    problem, truth = posed(4, scene=scenes.PRINTED)
+    problem, truth = problem_of(4, scene=scenes.PRINTED)
     with pytest.raises(InvalidProblem, match=words):
         crlb_course(problem, truth, **options)
 

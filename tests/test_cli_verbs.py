@@ -217,17 +217,6 @@ def test_verbose_tells_the_steps_on_standard_error(tmp_path):
     assert RUN.invoke(app, ["fix", "demo", "--json"]).stderr == ""
 
 
-@pytest.mark.slow
-def test_the_demo_walks_through_three_problems(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = RUN.invoke(app, ["demo"])
-    assert result.exit_code == 0, result.output
-    for words in ("1. A fix", "2. A registration", "3. A proof", "ambiguous", "Biases", "optloc new tdoa"):
-        assert words in result.stdout
-    assert (tmp_path / "optloc-demo.png").read_bytes().startswith(b"\x89PNG")
-    assert "\x1b" not in result.output
-
-
 def test_without_matplotlib_the_demo_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)

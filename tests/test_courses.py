@@ -30,7 +30,7 @@ PLACES = geodetic_to_ecef(
 LAT, LON = np.radians([46.9, 8.2])
 
 
-def posed(motion, demands, *, epochs=70, step=5.0, sigma=10.0, kinds=("tdoa",), frame=ECEF):
+def problem_of(motion, demands, *, epochs=70, step=5.0, sigma=10.0, kinds=("tdoa",), frame=ECEF):
     """Return a run of differences to the first of five stations, whose target moves."""
     pairs = {"a": np.tile([1, 2, 3, 4], epochs), "b": 0, "epoch": np.repeat(np.arange(epochs), 4)}
     rows = [measured(kind, **pairs, sigma=sigma if kind == "tdoa" else 0.05 * sigma) for kind in kinds]
@@ -84,7 +84,7 @@ def test_a_course_is_the_geodesic_that_keeps_its_speed(lat, turn):
 def test_derivatives_and_rates_along_a_course(frame, order):
     times = 5.0 * np.arange(8)
     motion, held = constraints.reported(3e3 + 8.0 * times + 2e2 * np.sin(times / 9.0), times, order=order)
-    problem = posed(motion, held, epochs=8, kinds=("tdoa", "fdoa"), frame=frame)
+    problem = problem_of(motion, held, epochs=8, kinds=("tdoa", "fdoa"), frame=frame)
     x = state(3e3, order, frame)
     _, jacobian = differentiate(problem, x)
     for i, step in enumerate(np.repeat([1.0, 1e-2, 1e-4], 3)[: len(x)]):
@@ -93,7 +93,7 @@ def test_derivatives_and_rates_along_a_course(frame, order):
         )
         np.testing.assert_allclose(jacobian[:, i], numeric, atol=1e-7 * np.abs(numeric).max())
     # rates are those of the differences of ranges along a course of constant climb
-    plain = posed(Motion(order, over="ground"), (), epochs=8, kinds=("tdoa", "fdoa"), step=0.02, frame=frame)
+    plain = problem_of(Motion(order, over="ground"), (), epochs=8, kinds=("tdoa", "fdoa"), step=0.02, frame=frame)
     x = x + np.concatenate([np.zeros(3), 1e-2 * x[:3] / np.linalg.norm(x[:3]), np.zeros(3 * order - 3)])
     z = predict(plain, x)
     there, rate = z[:32].reshape(8, 4), z[32:].reshape(8, 4)
@@ -120,7 +120,7 @@ def test_heights_hold_at_every_epoch(case, frame):
     for epochs, step, method in ((70, 5.0, "gtrs+lsr"), (8, 50.0, "gtrs+nlp")):
         times = step * np.arange(epochs)
         motion, held = CASES[case](times)
-        problem = posed(motion, held, epochs=epochs, step=step, frame=frame)
+        problem = problem_of(motion, held, epochs=epochs, step=step, frame=frame)
         level = 1e4 if motion.rise is None else 1e4 + 50.0 * np.sin(times / 30.0) - 6.0 * times
         truth = restore(problem.flat(), exact(problem), state(1e4, motion.order, frame)[None])[0]
         fix = solve(simulate(problem, truth, 3), method)
@@ -135,7 +135,7 @@ def test_frames_of_one_process_do_not_share_what_is_traced():
     times = 50.0 * np.arange(8)
     motion, held = CASES["level"](times)
     for frame in (ECEF, Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0), Frame.enu(lat_deg=-20.0, lon_deg=100.0)):
-        problem = posed(motion, held, epochs=8, step=50.0, frame=frame)
+        problem = problem_of(motion, held, epochs=8, step=50.0, frame=frame)
         x = state(1e4, motion.order, frame)
         equations, linear = equations_at(problem.flat(), x[None]), differentiate(problem, x)[1]
         white = linear / 10.0  # the rows are independent, of one sigma
@@ -143,7 +143,7 @@ def test_frames_of_one_process_do_not_share_what_is_traced():
 
 
 def test_a_straight_course_leaves_the_height_that_it_has_at_the_reference_time():
-    problem = posed(Motion(1), constraints.height(exactly=1e4, along=False))
+    problem = problem_of(Motion(1), constraints.height(exactly=1e4, along=False))
     fix = solve(simulate(problem, state(1e4), 3), "gtrs+lsr")
     off = np.abs(heights(problem, fix.x) - 1e4)
     assert off[0] < 1e-6
@@ -151,7 +151,7 @@ def test_a_straight_course_leaves_the_height_that_it_has_at_the_reference_time()
 
 
 def _scatter(trials, seed):
-    problem = posed(Motion(1, over="ground"), constraints.height(exactly=1e4), epochs=20, step=15.0)
+    problem = problem_of(Motion(1, over="ground"), constraints.height(exactly=1e4), epochs=20, step=15.0)
     truth = state(1e4)
     fix = solve(simulate(problem, truth, seed, trials), "gtrs+lsr")
     error, bound = fix.x - truth, crlb(problem, truth)
@@ -189,7 +189,7 @@ def test_covariances_agree_with_monte_carlo_within_five_per_cent(seed):
 )
 def test_bands_along_a_course(low, high, climb, names):
     held = constraints.height(low, high)
-    problem = posed(Motion(1, over="ground"), held, epochs=15, step=25.0, sigma=30.0)
+    problem = problem_of(Motion(1, over="ground"), held, epochs=15, step=25.0, sigma=30.0)
     truth = state(1e4)
     truth[3:] += climb * ECEF.enu_axes(truth[:3])[2]
     drawn = simulate(problem, truth, 2)
@@ -208,7 +208,7 @@ def test_bands_along_a_course(low, high, climb, names):
 def test_free_targets_have_the_height_of_each_epoch():
     level = np.array([9e3, 1e4, 1.1e4])
     rise = np.stack([level - 9e3, 0.0 * level], axis=-1)
-    problem = posed(Motion(span="epoch", rise=rise), constraints.height(exactly=9e3), epochs=3)
+    problem = problem_of(Motion(span="epoch", rise=rise), constraints.height(exactly=9e3), epochs=3)
     truth = np.stack([geodetic_to_ecef(LAT + 0.01 * k, LON, h) for k, h in enumerate(level)])
     fix = solve(simulate(problem, truth.reshape(-1), 1))
     np.testing.assert_allclose(ecef_to_geodetic(fix.position)[2], level, atol=1e-6)
@@ -216,17 +216,19 @@ def test_free_targets_have_the_height_of_each_epoch():
 
 
 BAD = {
-    "straight": (lambda: posed(Motion(1), constraints.height(exactly=1e4)), "keeps no height.*over='ground'"),
-    "box": (lambda: posed(Motion(1, over="ground"), [replace(constraints.box([0.0] * 3, [1e9] * 3)[0], along=True)]),
-            "plane is not held along"),
-    "turning band": (lambda: posed(Motion(2, over="ground"), constraints.height(0.0)), "constant acceleration"),
+    "straight": (lambda: problem_of(Motion(1), constraints.height(exactly=1e4)), "keeps no height.*over='ground'"),
+    "box": (
+        lambda: problem_of(Motion(1, over="ground"), [replace(constraints.box([0.0] * 3, [1e9] * 3)[0], along=True)]),
+        "plane is not held along",
+    ),
+    "turning band": (lambda: problem_of(Motion(2, over="ground"), constraints.height(0.0)), "constant acceleration"),
     "plain frame": (lambda: assemble(PLACES, measured("range", [1.0], a=[0], sigma=1.0),
                                      motions=[Motion(1, over="ground")]), "needs a geodetic frame"),
-    "over water": (lambda: posed(Motion(1, over="water"), ()), "over 'water'"),
-    "free": (lambda: posed(Motion(1, span="epoch", over="ground"), ()), "only a state of the run"),
-    "rise": (lambda: posed(Motion(1, over="ground", rise=np.zeros((3, 2))), ()), "rise of shape"),
-    "rise in space": (lambda: posed(Motion(1, rise=np.zeros((70, 2))), ()), "does not fit this motion"),
-    "rise nan": (lambda: posed(Motion(1, over="ground", rise=np.full((70, 2), np.nan)), ()), "a rise is"),
+    "over water": (lambda: problem_of(Motion(1, over="water"), ()), "over 'water'"),
+    "free": (lambda: problem_of(Motion(1, span="epoch", over="ground"), ()), "only a state of the run"),
+    "rise": (lambda: problem_of(Motion(1, over="ground", rise=np.zeros((3, 2))), ()), "rise of shape"),
+    "rise in space": (lambda: problem_of(Motion(1, rise=np.zeros((70, 2))), ()), "does not fit this motion"),
+    "rise nan": (lambda: problem_of(Motion(1, over="ground", rise=np.full((70, 2), np.nan)), ()), "a rise is"),
     "report": (lambda: constraints.reported([1.0, 2.0], [0.0]), "one height for each epoch"),
 }  # fmt: skip
 

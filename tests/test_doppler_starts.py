@@ -21,12 +21,12 @@ def aircraft(count=4, d=2, epochs=1, seed=0, motion=None):
     stations = Stations(place, tuple(f"s{i}" for i in range(count)), velocity=np.broadcast_to(speed, place.shape))
     a, epoch = np.tile(np.arange(1, count), epochs), np.repeat(np.arange(epochs), count - 1)
     rows = measured("fdoa", a=a, b=0 * a, epoch=epoch, sigma=0.1)
-    posed = assemble(stations, rows, times=time, motions=(motion or Motion(),))
-    return posed, rng.uniform(-30e3, 30e3, d)
+    bare = assemble(stations, rows, times=time, motions=(motion or Motion(),))
+    return bare, rng.uniform(-30e3, 30e3, d)
 
 
-def seen(posed, truth, seed=1):
-    return simulate(posed, truth, np.random.SeedSequence(seed))
+def seen(bare, truth, seed=1):
+    return simulate(bare, truth, np.random.SeedSequence(seed))
 
 
 def satellite(rows, seconds=240.0, sigma=1.0, frame=ECEF, level=0.0):
@@ -47,7 +47,7 @@ def satellite(rows, seconds=240.0, sigma=1.0, frame=ECEF, level=0.0):
     place, speed = frame.from_ecef(place), speed @ frame.rotation_to_ecef()
     stations = Stations(place[:, None], ("low",), velocity=speed[:, None])
     own = np.arange(rows)
-    posed = assemble(
+    bare = assemble(
         stations,
         measured("range_rate", a=0 * own, epoch=own, sigma=sigma),
         times=time,
@@ -55,30 +55,30 @@ def satellite(rows, seconds=240.0, sigma=1.0, frame=ECEF, level=0.0):
         constraints=height(exactly=level),
         biases=(Bias("offset", ("emitter",), own, 0 * own, np.ones(rows)),),
     )
-    return posed, np.append(frame.from_ecef(geodetic_to_ecef(0.62, 0.2, level)), 1234.0)
+    return bare, np.append(frame.from_ecef(geodetic_to_ecef(0.62, 0.2, level)), 1234.0)
 
 
 def test_differences_of_aircraft_lead_to_the_fix_from_the_truth():
     found = 0
     for seed in range(4):
-        posed, truth = aircraft(seed=seed)
-        problem = seen(posed, truth)
+        bare, truth = aircraft(seed=seed)
+        problem = seen(bare, truth)
         fix, best = solve(problem, "sdp+lsr"), solve(problem, "lsr", start=truth)
         found += bool(fix.cost <= best.cost * (1 + 1e-6) + 1e-6)
     assert found == 4
 
 
 def test_one_pair_over_its_epochs():
-    posed, truth = aircraft(count=2, epochs=5, seed=3)
-    problem = seen(posed, truth)
+    bare, truth = aircraft(count=2, epochs=5, seed=3)
+    problem = seen(bare, truth)
     fix, best = solve(problem, "sdp+lsr"), solve(problem, "lsr", start=truth)
     assert fix.cost <= best.cost * (1 + 1e-6) + 1e-6
 
 
 @pytest.mark.parametrize("rows", few([120, 8], 1))
 def test_a_pass_with_an_offset_has_both_sides(rows):
-    posed, truth = satellite(rows)
-    problem = seen(posed, truth)
+    bare, truth = satellite(rows)
+    problem = seen(bare, truth)
     fix, best = solve(problem, "sdp+lsr"), solve(problem, "lsr", start=truth)
     assert fix.cost <= best.cost * (1 + 1e-6) + 1e-6
     ends = np.concatenate([fix.position[None], fix.alternatives.x[:, :3]])
@@ -94,23 +94,23 @@ def test_rows_beside_and_stations_by_the_dozen():
     place, speed = rng.uniform(-10e3, 10e3, (60, 2)), rng.normal(0, 120, (60, 2))
     stations = Stations(place[None], tuple(map(str, range(60))), velocity=speed[None])
     a = np.arange(1, 60)
-    posed = assemble(
+    bare = assemble(
         stations,
         measured("fdoa", a=a, b=0 * a, sigma=0.1),
         measured("tdoa", a=a[:3], b=0 * a[:3], arrival_sigma=30.0),
         measured("azimuth", a=[0], sigma=0.3),
     )
-    problem, truth = seen(posed, np.array([12e3, -21e3])), np.array([12e3, -21e3])
+    problem, truth = seen(bare, np.array([12e3, -21e3])), np.array([12e3, -21e3])
     assert np.linalg.norm(solve(problem, "sdp+lsr").position - truth) < 500.0
 
 
 def test_who_is_served():
-    posed, truth = aircraft()
-    assert dopplered(posed)
+    bare, truth = aircraft()
+    assert dopplered(bare)
     assert not dopplered(aircraft(motion=Motion(1))[0])
     assert not dopplered(assemble(np.eye(2), measured("range", a=[0, 1], sigma=1.0)))
     # without a row of rates that is present there is nothing to start from
-    problem = seen(posed, truth).flat()
+    problem = seen(bare, truth).flat()
     assert np.isnan(doppler_starts(problem.with_rows(weight=np.zeros(problem.count)))).all()
 
 
@@ -127,27 +127,27 @@ def agrees(problem, truth, away):
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_ipopt_finds_the_minimum_of_differences(d):
-    posed, truth = aircraft(count=6, d=d, seed=5)
-    agrees(seen(posed, truth), truth, 300.0)
+    bare, truth = aircraft(count=6, d=d, seed=5)
+    agrees(seen(bare, truth), truth, 300.0)
     # an emitter that moves, its speed told by differences of arrival beside
     moving = Motion(1)
-    posed, truth = aircraft(count=6, d=d, seed=5, motion=moving)
+    bare, truth = aircraft(count=6, d=d, seed=5, motion=moving)
     a = np.arange(1, 6)
-    posed = assemble(
-        posed.stations,
+    bare = assemble(
+        bare.stations,
         measured("fdoa", a=a, b=0 * a, sigma=0.1),
         measured("tdoa", a=a, b=0 * a, arrival_sigma=5.0),
         motions=(moving,),
     )
-    agrees(seen(posed, np.append(truth, np.full(d, 9.0))), np.append(truth, np.full(d, 9.0)), 20.0)
+    agrees(seen(bare, np.append(truth, np.full(d, 9.0))), np.append(truth, np.full(d, 9.0)), 20.0)
 
 
 @pytest.mark.parametrize("frame", [ECEF, Frame.enu(lat_deg=35.0, lon_deg=11.0, height=20.0)])
 def test_ipopt_stays_at_a_known_height(frame):
-    posed, truth = satellite(8, frame=frame, level=350.0)
-    fix = agrees(seen(posed, truth), truth, np.array([500.0, -800.0, 400.0, 3.0]))
-    assert abs(posed.frame.to_geodetic(fix.position)[2] - 350.0) < 1e-6
+    bare, truth = satellite(8, frame=frame, level=350.0)
+    fix = agrees(seen(bare, truth), truth, np.array([500.0, -800.0, 400.0, 3.0]))
+    assert abs(bare.frame.to_geodetic(fix.position)[2] - 350.0) < 1e-6
     # far from it the start, by the relaxation
-    found = solve(seen(posed, truth), "sdp+nlp")
+    found = solve(seen(bare, truth), "sdp+nlp")
     assert found.cost <= fix.cost * (1 + 1e-6)
-    assert abs(posed.frame.to_geodetic(found.position)[2] - 350.0) < 1e-6
+    assert abs(bare.frame.to_geodetic(found.position)[2] - 350.0) < 1e-6

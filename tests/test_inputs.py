@@ -21,7 +21,7 @@ from optloc.base.inputs import Budget, access, budget_of, files_read, json_of, r
 from optloc.cli import app
 from optloc.files import table as tables
 from optloc.files.reader import read
-from optloc.study.plan import plan_of
+from optloc.study.design import design_of
 
 RUN = CliRunner()
 ROWS = HEAD + '[[measurements]]\nkind = "tdoa"\nsigma = 1.0\n'
@@ -163,7 +163,7 @@ def refused(arguments):
 @pytest.mark.parametrize("name", ["/dev/zero", "/dev/random", "/proc/self/fd"])
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no devices here")
 def test_devices_are_no_files(name):
-    for call in (lambda: read(Path(name)), lambda: plan_of(Path(name)), lambda: read_bytes(Path(name))):
+    for call in (lambda: read(Path(name)), lambda: design_of(Path(name)), lambda: read_bytes(Path(name))):
         with pytest.raises(InvalidProblem, match=r"a device|a folder"):
             call()
 

@@ -131,12 +131,13 @@ def test_no_loose_module():
 # front door: one call to a fix, and what a fix says of itself, as columns and in words (both were parts of the command
 # line); tables of strangers: their cells with all digits, files of other programs, sorts of readings, long and wide,
 # and the options that say the rest; places over ground with bounds of how they bend, and bounds over boxes of states;
-# what inequalities admit, and the edges of it; media, and rays through them; which of many sites to take: plans as
-# numbers and as files, criteria, relaxation, branching and completions as machine code, the search, what became of it,
-# refinement, areas, its command and its map; files of navigation and of receivers, and satellites by what they say;
-# formats in which others take fixes: their table, marks, what is XML, and what is lines; what an installation lacks;
-# minimizers of others in studies, methods on the same trials, and the leaderboard; networks of unknown places:
-# fits of low rank and their upgrade, the network, its likelihood, starts, blocks, search, frame and verdict, its files,
+# what inequalities admit, and the edges of it; media, and rays through them; which of many sites to take: selections
+# as numbers and as files, criteria, relaxation, branching and completions as machine code, the search, what became of
+# it, refinement, areas, its command and its map; files of navigation and of receivers, and satellites by what they
+# say; formats in which others take fixes: their table, marks, what is XML, and what is lines; what an installation
+# lacks; minimizers of others in studies, methods on the same trials, and the leaderboard; networks of unknown places:
+# fits of low rank and their upgrade, the network, its likelihood, starts, blocks, search, frame and verdict, its
+# files,
 # its command and its map; chains of Stone Soup's detections; what methods of a study solve within how much work, and
 # their way down; the nuclear norm of a network, and studies of networks; their random places as machine code; convex
 # boxes around known minima (parts of two searches before); squared rows over a box, kernels that only borrow arrays;

@@ -142,15 +142,15 @@ def test_two_biases_of_one_family_on_one_row_add_up():
     assert np.allclose(dense_jacobian(problem, x)[:, 2:], [[1, -1], [2, 0], [0, 0]])
 
 
-def test_problems_that_differ_in_coefficients_alone_do_not_share_a_plan():
-    def posed(coefficient, form, kind):
+def test_problems_that_differ_in_coefficients_alone_do_not_share_links():
+    def problem_of(coefficient, form, kind):
         bias = Bias("turn", ("all",), np.arange(3), np.zeros(3, int), np.full(3, coefficient), form)
         return assemble(STATIONS[2], measured(kind, a=[0, 1, 2], sigma=1.0), biases=(bias,))
 
     for form, kind in (("rotation", "azimuth"), ("scale", "range"), ("offset", "range"), ("drift", "range")):
         x = np.r_[TARGET[2], 0.02]
         for coefficient in (1.0, -0.5, 3.0):
-            problem = posed(coefficient, form, kind)
+            problem = problem_of(coefficient, form, kind)
             assert np.allclose(predict(problem, x), plain_predict(problem, x), atol=1e-10)
 
 

@@ -305,7 +305,7 @@ CASES = [
 IDS = [case[0] for case in CASES]
 
 
-def posed(medium, stations, truth, rows, options, trials=100, seed=1):
+def problem_of(medium, stations, truth, rows, options, trials=100, seed=1):
     parts = [rows_of(kind, len(stations), sigma) for kind, sigma in rows.items()]
     problem = assemble(stations, *parts, medium=medium, **options)
     x = np.zeros(problem.layout.size)
@@ -321,7 +321,7 @@ def posed(medium, stations, truth, rows, options, trials=100, seed=1):
 )
 def test_fixes_are_as_good_as_the_bound_and_say_so(name, medium, stations, truth, rows, options, seed):
     trials = 50 if medium is SEA else 25
-    problem, x = posed(medium, stations, truth, rows, options, trials, seed + 1)
+    problem, x = problem_of(medium, stations, truth, rows, options, trials, seed + 1)
     fix = solve(problem)
     # Nothing proves that rays which bend have no other place: never ok, and never a false one.
     assert not fix.has(optloc.Status.OK).any()
@@ -337,7 +337,7 @@ def test_fixes_are_as_good_as_the_bound_and_say_so(name, medium, stations, truth
 
 
 def test_straight_lines_at_the_mean_speed_are_off():
-    problem, x = posed(*CASES[1][1:], trials=4)
+    problem, x = problem_of(*CASES[1][1:], trials=4)
     straight = solve(problem.straightened(), "gtrs+lsr")
     assert np.linalg.norm(straight.position - x[:3], axis=1).min() > 10.0
     assert np.linalg.norm(solve(problem).position - x[:3], axis=1).max() < 5.0
@@ -424,9 +424,9 @@ def test_what_does_not_go_together_is_told(stations, row, options, words):
 
 
 def test_programs_of_ipopt_take_air_and_refuse_layers():
-    problem, _ = posed(*CASES[-1][1:], trials=2)
+    problem, _ = problem_of(*CASES[-1][1:], trials=2)
     np.testing.assert_allclose(solve(problem, "roots+nlp").x, solve(problem).x, rtol=1e-5)
-    problem, _ = posed(*CASES[0][1:], trials=2)
+    problem, _ = problem_of(*CASES[0][1:], trials=2)
     with pytest.raises(InvalidProblem, match="leave out the stage 'nlp'"):
         solve(problem, "roots+nlp")
 
@@ -501,7 +501,7 @@ def test_a_file_that_says_it_wrongly_is_told(tmp_path, medium, head, words):
 def test_refraction_needs_no_truth():
     # Aircraft on Earth: without air the ranges are off by some 30 m; with it the fix knows no more than the file.
     truth = np.array([9e4, 5e4, 10e3])
-    problem, _ = posed(Atmosphere(), HILLS, truth, {"range": 1.0, "elevation": 2e-4}, {"frame": ENU}, trials=30)
+    problem, _ = problem_of(Atmosphere(), HILLS, truth, {"range": 1.0, "elevation": 2e-4}, {"frame": ENU}, trials=30)
     error = solve(problem).position - truth
     blind = solve(problem.straightened(), "gtrs+lsr").position - truth
     assert np.abs(error.mean(0)).max() < 0.5 * np.abs(blind.mean(0)).max()

@@ -29,7 +29,7 @@ from optloc import Stations, assemble, measured, simulate
 from optloc.files import read
 from optloc.study.draws import draw
 from optloc.study.networks import NetworkCase
-from optloc.study.plan import plan_of, planned, shipped
+from optloc.study.design import design_of, design_of_text, shipped
 
 
 def note(name, *data):
@@ -50,7 +50,7 @@ note("dense", simulate(assemble(place, measured("range", a=np.arange(7), covaria
 spread = Stations(place[None], tuple("ABCDEFG"), covariance=np.tile(np.eye(3) + 0.5, (7, 1, 1)), span="noise")
 note("station errors", simulate(assemble(spread, measured("range", a=np.arange(7), sigma=1.0)), place[0] + 1, 7, 50).z)
 for name in shipped():
-    for cell in {cell.case.key: cell for cell in plan_of(Path(name), trials=20).cells}.values():
+    for cell in {cell.case.key: cell for cell in design_of(Path(name), trials=20).cells}.values():
         drawn = cell.case.draw(0, 20)
         if isinstance(cell.case, NetworkCase):
             truth = drawn.truth.stations, drawn.truth.pulses, drawn.truth.emission
@@ -70,7 +70,7 @@ truth = { kind = "shell", distance = ["1 km", "20 km"] }
 method = "gtrs+lsr"
 '''
 for kind in ('"shell", distance = ["1 km", "20 km"]', '"box", box = ["9 km", "9 km", "1 km"]'):
-    case = planned(EARTH.replace('"shell", distance = ["1 km", "20 km"]', kind), "x", Path()).cells[0].case
+    case = design_of_text(EARTH.replace('"shell", distance = ["1 km", "20 km"]', kind), "x", Path()).cells[0].case
     drawn = draw(case, 0, 20)
     note(f"on Earth {kind[:5]}", drawn.problem.z, drawn.truth, drawn.problem.stations.position)
 matrix = np.random.default_rng(3).standard_normal((200, 6, 6))

@@ -224,7 +224,7 @@ def many_epochs(seed=2, moving=False, d=3, uncertain=False):
 
 
 def alone(problem, k):
-    """The problem of one epoch, posed by hand."""
+    """The problem of one epoch, built by hand."""
     s = problem.stations
     moving = len(s.position) > 1
     stations = replace(

@@ -33,7 +33,7 @@ H = {
 }
 
 
-def posed(structure, number):
+def problem_of(structure, number):
     """Return one problem of a structure: kinds, stations and dimension are drawn by it, the target by the number."""
     rng = np.random.default_rng([7, structure])
     d = int(rng.integers(2, 4))
@@ -67,7 +67,7 @@ def held():
 def grown(total, structures, warm):
     """Return how much memory, file descriptors and threads grow, after the first `warm` of a number of single fixes."""
     for number in range(total):
-        solve(posed(number % structures, number))
+        solve(problem_of(number % structures, number))
         if number == warm:
             before = held()
     after = held()
@@ -88,7 +88,7 @@ def said(fix):
 
 
 def told(number):
-    return said(solve(posed(number, 0)))
+    return said(solve(problem_of(number, 0)))
 
 
 def child(number, pipe):
@@ -141,7 +141,7 @@ def test_threads_forks_and_workers_give_one_answer():
             process = fork.Process(target=child, args=(number, theirs))
             process.start()
             ends.append((mine, process))
-        workers = [said(fix) for fix in Parallel(n_jobs=2)(delayed(solve)(posed(number, 0)) for number in numbers)]
+        workers = [said(fix) for fix in Parallel(n_jobs=2)(delayed(solve)(problem_of(number, 0)) for number in numbers)]
         assert list(threads) == expected
     assert workers == expected
     for (mine, process), answer in zip(ends, expected, strict=True):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from monte_carlo.test_consistency import band
 from recipes import TABLES, files_of_the_page, installed, write_package
-from study.texts import plan
+from study.texts import design
 from typer.testing import CliRunner
 from verdicts import alone
 
@@ -21,7 +21,7 @@ from optloc import MODELS, InvalidProblem, Motion, Status, solve
 from optloc.cli import app
 from optloc.compute.sums import equations_at
 from optloc.compute.trace import evaluate, trace
-from optloc.linear.evaluate import given, plans
+from optloc.linear.evaluate import block_links, given
 from optloc.linear.normal import linearise
 from optloc.study.trial import compute
 from optloc.track import collected, polynomial, tracked
@@ -99,7 +99,7 @@ def test_its_bound_is_that_of_the_fisher_information_by_hand():
 def test_machine_code_symbols_and_numpy_agree():
     problem = optloc.simulate(strengths(), truth=[900.0, 400.0], seed=1)
     x = np.array([1200.0, -300.0])
-    (only,) = plans(problem)
+    (only,) = block_links(problem)
     inputs = given(problem, only)
     tape = trace(problem, only, frozenset(inputs), frozenset(feed.seed for feed in only.feeds)).tape
     for feed in only.feeds:
@@ -192,7 +192,7 @@ method = "gtrs+lsr"
 
 
 def test_studies_take_it_in_a_layout():
-    (made,) = plan(STUDY).chunks
+    (made,) = design(STUDY).chunks
     found = compute(made).table.to_pandas()
     assert len(found) == 40
     assert np.isfinite(found["crlb"]).all()

@@ -248,7 +248,7 @@ def solved_in_threads(problems: list[Problem], methods: tuple[str, ...], solves:
     count = len(problems)
     tasks = [(i % count, methods[(i + i // count) % len(methods)]) for i in range(solves)]
     alone = {task: solve(problems[task[0]], task[1]) for task in set(tasks)}
-    for cache in (evaluate._PLANS, tables._KEPT, trace._TRACED, range_fixes._KEPT, ipopt._PROGRAMS):
+    for cache in (evaluate._LINKS, tables._KEPT, trace._TRACED, range_fixes._KEPT, ipopt._PROGRAMS):
         cache.clear()
 
     def again(task: tuple[int, str]) -> None:

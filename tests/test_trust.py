@@ -17,9 +17,9 @@ from optloc.files.reader import read
 from optloc.files.schema import ProblemFile
 from optloc.files.writer import toml_text
 from optloc.solvers import solve
+from optloc.study.design import design_of
 from optloc.study.document import StudyFile
 from optloc.study.methods import SETTINGS
-from optloc.study.plan import plan_of
 from optloc.study.trial import compute
 
 ROW = {"a": "A", "z": 5000.0}
@@ -164,7 +164,7 @@ def used(kind, path):
     if kind == "problem":
         solve(read(path).problem, "gtrs+lsr")
     else:
-        chunk = next(iter(plan_of(path).chunks))
+        chunk = next(iter(design_of(path).chunks))
         compute(chunk)
 
 

@@ -12,7 +12,7 @@ TRUTH = np.array([4e3, -3e3])
 SPANS = pytest.mark.parametrize("span", ["epoch", "run", "noise"])
 
 
-def posed(span="noise", sigma=2.0, *, epochs=3, rate=0.5, place=None, kind="range_rate", step=50.0, far=300.0):
+def problem_of(span="noise", sigma=2.0, *, epochs=3, rate=0.5, place=None, kind="range_rate", step=50.0, far=300.0):
     """Return ranges and rates of an emitter at rest by five stations that move, whose velocities are known to sigma."""
     rng = np.random.default_rng(0)
     position = rng.uniform(-8e3, 8e3, (1, 5, 2)) + step * np.arange(epochs)[:, None, None]
@@ -31,36 +31,36 @@ def posed(span="noise", sigma=2.0, *, epochs=3, rate=0.5, place=None, kind="rang
 @pytest.mark.parametrize("kind", ["range_rate", "fdoa"])
 def test_noise_of_equal_velocities_is_noise_of_the_rates(kind):
     # Along any line of sight an isotropic error is one of the same size; a station's is common to its differences.
-    noisy, x = posed(sigma=2.0, rate=0.5, kind=kind)
-    exact, _ = posed(sigma=None, rate=np.hypot(2.0, 0.5), kind=kind)
+    noisy, x = problem_of(sigma=2.0, rate=0.5, kind=kind)
+    exact, _ = problem_of(sigma=None, rate=np.hypot(2.0, 0.5), kind=kind)
     np.testing.assert_allclose(crlb(noisy, x), crlb(exact, x), rtol=1e-9)
 
 
 @pytest.mark.parametrize("place", [None, 20.0])
 def test_noise_and_unknowns_of_each_epoch_bound_alike(place):
-    noise, unknown = (crlb(*posed(span, place=place)) for span in ("noise", "epoch"))
+    noise, unknown = (crlb(*problem_of(span, place=place)) for span in ("noise", "epoch"))
     np.testing.assert_allclose(noise, unknown, rtol=1e-8)
 
 
 def test_errors_that_last_do_not_average_out():
     # Seen along the same lines, twelve epochs make the noise smaller and leave the error of a velocity as it is.
-    many, x = posed("run", epochs=12, step=0.0)
-    once, _ = posed(sigma=None, epochs=1, step=0.0, rate=np.hypot(2.0, 0.5 / np.sqrt(12)), far=300.0 / np.sqrt(12))
+    many, x = problem_of("run", epochs=12, step=0.0)
+    once, _ = problem_of(sigma=None, epochs=1, step=0.0, rate=np.hypot(2.0, 0.5 / np.sqrt(12)), far=300.0 / np.sqrt(12))
     np.testing.assert_allclose(crlb(many, x)[:2, :2], crlb(once, x[:2]), rtol=1e-8)
 
 
 def test_the_layout_has_a_slot_of_velocities():
-    problem, _ = posed("run", place=20.0)
+    problem, _ = problem_of("run", place=20.0)
     slots = {slot.name: slot for slot in problem.layout.shared}
     assert slots["station velocities"].unit == "m/s"
     assert slots["station velocities"].entries[:3] == ("A x", "A y", "B x")
     assert [slot.size for slot in problem.layout.shared] == [2, 10, 10]
-    assert not posed("noise")[0].layout.local
+    assert not problem_of("noise")[0].layout.local
 
 
 @SPANS
 def test_fixes_are_consistent(span, seed):
-    problem, x = posed(span, place=20.0)
+    problem, x = problem_of(span, place=20.0)
     trials, rng = 40, np.random.default_rng(seed)
     truth = np.broadcast_to(x, (trials, len(x))).copy()
     shared, n = problem.layout, problem.layout.n_shared
@@ -82,14 +82,14 @@ def test_fixes_are_consistent(span, seed):
 
 
 def test_nothing_is_proven_of_rates_with_unsure_velocities():
-    problem, x = posed("noise", epochs=1)
+    problem, x = problem_of("noise", epochs=1)
     fix = solve(simulate(problem, x, 1))
     assert fix.status is not optloc.Status.OK
     assert "velocities enter range_rate rows" in fix.certificate.reason
 
 
 def test_rows_without_rates_do_not_feel_them():
-    problem, x = posed("noise", epochs=1, kind="range")
+    problem, x = problem_of("noise", epochs=1, kind="range")
     stations = replace(problem.stations, velocity_covariance=None)
     np.testing.assert_allclose(crlb(problem, x), crlb(replace(problem, stations=stations), x), rtol=1e-12)
     drawn = simulate(problem, x, 1)
@@ -101,7 +101,7 @@ def test_rows_without_rates_do_not_feel_them():
     [(np.eye(2), "the errors of station velocities"), (-np.tile(np.eye(2), (5, 1, 1)), "velocity error of station")],
 )
 def test_wrong_covariances_are_told(covariance, words):
-    problem, _ = posed()
+    problem, _ = problem_of()
     rows = measured("range_rate", a=np.arange(5), sigma=1.0)
     with pytest.raises(InvalidProblem, match=words):
         assemble(replace(problem.stations, velocity_covariance=covariance), rows)

@@ -1,6 +1,6 @@
 """What is made once for problems of equal structure and kept: one type of cache for all of optloc, safe in threads.
 
-Plans, tables, traces, linear maps and programs of IPOPT live in caches of this type, keyed by
+Links, tables, traces, linear maps and programs of IPOPT live in caches of this type, keyed by
 `optloc.problem.problem.Problem.structure` and what else they depend on. Functions of a few plain numbers, such as the
 moments of a loss, are kept by `functools.lru_cache` instead, which is locked and bounded as well; there two threads may
 make the same value at once, which costs microseconds.
@@ -75,7 +75,7 @@ class Cache(Generic[Value]):
             place = self._places.pop(key, None) or _Place()
             self._places[key] = place
         if place.value is _NOTHING:
-            # Not under the lock of all: a program takes a second, and plans are needed to make tables.
+            # Not under the lock of all: a program takes a second, and links are needed to make tables.
             with place.lock:
                 if place.value is _NOTHING:
                     self._fill(key, place, make)

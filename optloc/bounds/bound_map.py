@@ -108,7 +108,7 @@ def bound_map(
     plan, shape = np.sqrt(variance[:, :2].sum(-1)), east.shape
     up = np.sqrt(variance[:, 2]) if problem.dimension == 3 else np.full(len(places), np.nan)
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
-    marks = plan_of(problem.frame, stations, earth)[:, :2]
+    marks = map_coordinates(problem.frame, stations, earth)[:, :2]
     if earth:  # a map across the date line has longitudes beyond 180 degrees, and its stations have, too
         marks[:, 0] = (marks[:, 0] - np.mean(x) + 180.0) % 360.0 - 180.0 + np.mean(x)
     return BoundMap(
@@ -146,7 +146,7 @@ def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, ear
     return np.stack([x, y, np.full(len(x), height)][:dimension], axis=-1)
 
 
-def plan_of(frame: Frame, position: Array, earth: bool) -> Array:
+def map_coordinates(frame: Frame, position: Array, earth: bool) -> Array:
     """Return positions (n, d) as longitude, latitude (deg) and height (m) where they are on Earth, else as they are."""
     if not earth:
         return position
@@ -169,7 +169,7 @@ def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5)
     earth = problem.frame.geodetic and problem.dimension == 3
     stations = problem.stations.position.reshape(-1, problem.dimension)
     points = stations if places is None else np.concatenate([stations, places])
-    flat = plan_of(problem.frame, points[np.isfinite(points).all(-1)], earth)[:, :2]
+    flat = map_coordinates(problem.frame, points[np.isfinite(points).all(-1)], earth)[:, :2]
     if earth:  # longitudes as one piece, also across the date line
         flat[:, 0] = (flat[:, 0] - flat[0, 0] + 180.0) % 360.0 - 180.0 + flat[0, 0]
     low, high = flat.min(0), flat.max(0)

@@ -378,7 +378,7 @@ def place(
 ) -> None:
     """Choose where stations go: which of many sites give the best fixes, with a bound of what any choice can reach.
 
-    FILE is a plan (choice, candidates, targets), or a problem file, of whose stations some are chosen for one target.
+    FILE is a selection file (choice, candidates, targets), or a problem file, whose stations are the candidates.
     """
     from optloc.cli.place import Wanted, run_place
 
@@ -478,7 +478,7 @@ def demo(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Walk through a fix, a registration and a proof; or fix one shipped problem."""
+    """Walk through a fix, two possible places and a registration; or fix one shipped problem."""
     from optloc.cli.starters import run_demo
 
     raise typer.Exit(run_demo(name, plot, as_json=as_json, quiet=quiet))

@@ -35,7 +35,7 @@ from optloc.compute.kept import CALLEES, alone, is_checkout, is_kept, kept_in
 from optloc.compute.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
-from optloc.placement import Plan, place
+from optloc.placement import SiteSelection, place
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -53,13 +53,13 @@ _TARGET = np.array([2e3, 3e3, 4e3])
 _FEW, _MANY = 40, 500
 
 
-def _posed(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+def _problem_of(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
     rows = {"b": np.zeros(5, dtype=int)} if kind in ("tdoa", "fdoa") else {}
     return assemble(stations, measured(kind, a=np.arange(1, 6), sigma=1.0, **rows), **more)
 
 
 def _drawn(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
-    problem = _posed(kind, stations, **more)
+    problem = _problem_of(kind, stations, **more)
     place = np.append(_TARGET, np.zeros(problem.layout.size - 3)) if problem.layout.size > 3 else _TARGET
     return simulate(problem, place, 1, count).flat()
 
@@ -67,7 +67,7 @@ def _drawn(kind: str, count: int, stations: Stations | Array = _STATIONS, **more
 def _fix_ranges() -> None:
     problem = _drawn("tdoa", _FEW)
     solve(problem, "gtrs+lsr")
-    prepare(_posed("tdoa"), "gtrs+lsr")(problem.z[0])
+    prepare(_problem_of("tdoa"), "gtrs+lsr")(problem.z[0])
 
 
 def _filter() -> None:
@@ -122,13 +122,13 @@ def _search() -> None:
 def _cover() -> None:
     # of a fix inside, and of one so far outside that infinity is as likely
     for times in (1.0, 1000.0):
-        problem = simulate(_posed("tdoa"), times * _TARGET, 1)
+        problem = simulate(_problem_of("tdoa"), times * _TARGET, 1)
         likelihood_region(problem, _plainly_solved(problem))
 
 
 def _place() -> None:
     # the criteria differ by numbers, not by types
-    place(Plan(_posed("toa"), _TARGET[None], choose=4, gap=0.5))
+    place(SiteSelection(_problem_of("toa"), _TARGET[None], choose=4, gap=0.5))
 
 
 def _calibrate() -> None:

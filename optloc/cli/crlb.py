@@ -15,7 +15,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import at_most
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
+from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
 from optloc.bounds.crlb import Course, crlb_course
 from optloc.cli.options import coordinates
 from optloc.cli.output import PICTURES, Screen, claim_outputs, dumps, say, write_picture, write_text
@@ -338,7 +338,7 @@ def _height(problem: Problem, place: Array | None, height: str | None) -> float:
     if height is not None:
         return float(Units("length").plain(height, "m", "--height"))
     assert place is not None
-    return float(plan_of(problem.frame, place, problem.frame.geodetic)[0, 2])
+    return float(map_coordinates(problem.frame, place, problem.frame.geodetic)[0, 2])
 
 
 def _limits(text: str, problem: Problem) -> tuple[float, float, float, float]:

@@ -139,7 +139,7 @@ def _solvers() -> Rows:
 def _studies() -> Rows:
     import tomllib
 
-    from optloc.study.plan import shipped
+    from optloc.study.design import shipped
 
     texts = {name: tomllib.loads(entry.read_text(encoding="utf-8")) for name, entry in shipped().items()}
     return [{"study": name, "summary": data.get("title", data["name"])} for name, data in texts.items()]

@@ -14,10 +14,10 @@ from optloc.base.outputs import is_stream
 from optloc.cli.crlb import vector
 from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
 from optloc.files import read
-from optloc.placement import Placement, Plan, picture, place
+from optloc.placement import Placement, SiteSelection, picture, place
 from optloc.placement.chosen import PRIOR
-from optloc.placement.plan_file import Planned, criterion_name, is_plan, read_plan, write_chosen
 from optloc.placement.refinement import refined
+from optloc.placement.selection_file import LoadedSelection, criterion_name, is_selection, read_selection, write_chosen
 from optloc.problem.epochs import by_epoch, separable
 
 # Lines of a table of places or stations: what a screen holds.
@@ -31,7 +31,7 @@ class Wanted:
     Parameters
     ----------
     choose, budget, criterion, worst, fail_one, gap, seconds
-        As of a plan.
+        As of `SiteSelection`.
     at : str, optional
         The one place of interest.
     rows : bool
@@ -57,35 +57,35 @@ def run_place(
 ) -> int:
     """Choose sites, print and write what was chosen, and return the exit code: 1 where the gap did not close."""
     claim_outputs(out, picture=plot, inputs=[file])
-    planned = read_plan(file) if is_plan(file) else _of_problem(file, wanted)
-    plan = _with(planned.plan, wanted)
+    loaded = read_selection(file) if is_selection(file) else _of_problem(file, wanted)
+    selection = _with(loaded.selection, wanted)
     with line(quiet or as_json) as tell:
 
         def told(bound: float, value: float, nodes: int) -> None:
             tell(f"best {value:.5g}, no set below {bound:.5g}, {nodes} nodes")
 
         tell("searching")
-        found = place(plan, draws=wanted.draws, tell=told)
-        if planned.regions:
+        found = place(selection, draws=wanted.draws, tell=told)
+        if loaded.regions:
             tell("refining")
-            found = refined(plan, found, planned.regions, planned.ground)
+            found = refined(selection, found, loaded.regions, loaded.ground)
     if out is not None:
-        if not planned.settings or plan.by == "row":
-            raise InvalidProblem("only a plan with candidates is written", str(out), "leave --out out")
-        write_chosen(planned, (*found.chosen, *found.kept), out, file)
+        if not loaded.settings or selection.by == "row":
+            raise InvalidProblem("only the choice of a selection file is written", str(out), "leave --out out")
+        write_chosen(loaded, (*found.chosen, *found.kept), out, file)
     if plot is not None:
-        write_picture(picture(plan, found), plot)
+        write_picture(picture(selection, found), plot)
     if as_json:
-        write_text(Path("-"), dumps(_record(planned, plan, found)))
+        write_text(Path("-"), dumps(_record(loaded, selection, found)))
     elif not quiet:
-        _show(planned, plan, found)
+        _show(loaded, selection, found)
         if out is not None and not is_stream(out):
             say(Screen(), f"The chosen stations are in {out}: try optloc crlb {out} --map map.png.")
     return 0 if found.closed and (found.draws is None or found.draws.clean) else 1
 
 
-def _of_problem(file: Path, wanted: Wanted) -> Planned:
-    """Return the plan of an ordinary problem file: which of its stations, for a target at a place or the fix."""
+def _of_problem(file: Path, wanted: Wanted) -> LoadedSelection:
+    """Return the selection of stations of an ordinary problem file, for a target at a place or the fix."""
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
@@ -100,11 +100,11 @@ def _of_problem(file: Path, wanted: Wanted) -> Planned:
         places = solve(read(file).problem).position.reshape(-1, problem.dimension)[:1]
         if not np.isfinite(places).all():
             raise InvalidProblem("the file has no fix to choose stations for", loaded.source, "give a place with --at")
-    return Planned(Plan(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
+    return LoadedSelection(SiteSelection(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
 
 
-def _with(plan: Plan, wanted: Wanted) -> Plan:
-    """Return a plan with what the command line says."""
+def _with(selection: SiteSelection, wanted: Wanted) -> SiteSelection:
+    """Return a selection with the options of the command line."""
     given: dict[str, Any] = {
         key: value
         for key in ("choose", "budget", "worst", "fail_one", "gap", "seconds")
@@ -115,22 +115,22 @@ def _with(plan: Plan, wanted: Wanted) -> Plan:
     if wanted.choose is not None and wanted.budget is None:
         given |= {"budget": None, "cost": None}
     if wanted.at is not None:
-        place_ = vector(plan.problem, wanted.at, None, False)[None, : plan.problem.dimension]
+        place_ = vector(selection.problem, wanted.at, None, False)[None, : selection.problem.dimension]
         given |= {"places": place_, "names": ("here",), "weights": None, "sight": None}
     if wanted.rows:
         given["by"] = "row"
-    return replace(plan, **given)
+    return replace(selection, **given)
 
 
-def _names_of(plan: Plan) -> tuple[str, ...]:
-    count = len(np.atleast_2d(plan.places))
-    return plan.names or tuple(f"P{i + 1}" for i in range(count))
+def _names_of(selection: SiteSelection) -> tuple[str, ...]:
+    count = len(np.atleast_2d(selection.places))
+    return selection.names or tuple(f"P{i + 1}" for i in range(count))
 
 
-def _record(planned: Planned, plan: Plan, found: Placement) -> dict[str, Any]:
+def _record(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -> dict[str, Any]:
     drawn = found.draws
     return {
-        "file": planned.source,
+        "file": loaded.source,
         "chosen": found.chosen,
         "kept": found.kept,
         "criterion": found.criterion,
@@ -149,7 +149,7 @@ def _record(planned: Planned, plan: Plan, found: Placement) -> dict[str, Any]:
                 "spare": spare,
             }
             for name, sigma, before, failed, share, spare in zip(
-                _names_of(plan),
+                _names_of(selection),
                 found.per_place,
                 found.before,
                 found.failed,
@@ -180,26 +180,26 @@ def _record(planned: Planned, plan: Plan, found: Placement) -> dict[str, Any]:
     }
 
 
-def _show(planned: Planned, plan: Plan, found: Placement) -> None:
+def _show(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -> None:
     console = Screen()
     sure = "" if found.closed else " (open)"
-    say(console, f"{planned.title}: take {', '.join(found.chosen) or 'nothing'}.")
+    say(console, f"{loaded.title}: take {', '.join(found.chosen) or 'nothing'}.")
     words = {"rms": "mean bound", "volume": "mean axis of the ellipsoid", "axis": "longest axis of the ellipsoid"}
     least = f"{words[found.criterion]} {found.sigma:.4g} m, no choice below {np.sqrt(max(found.bound, 0.0)):.4g} m"
     say(console, f"{least[0].upper()}{least[1:]}{sure}: {found.reason}.")
-    console.print(_places_table(plan, found))
+    console.print(_places_table(selection, found))
     console.print(_losses_table(found))
-    for text in _remarks(plan, found):
+    for text in _remarks(selection, found):
         say(console, text)
 
 
-def _places_table(plan: Plan, found: Placement) -> Table:
+def _places_table(selection: SiteSelection, found: Placement) -> Table:
     before = "kept stations" if set(found.before_sites) == set(found.kept) else "random set"
     table = Table(title="Bound of the position error, m", title_justify="left")
     for heading in ("place", f"before ({before})", "after", "one failed", "spare rows"):
         table.add_column(heading, justify="left" if heading == "place" else "right")
     order = np.argsort(-found.per_place, kind="stable")[:_LINES]
-    names = _names_of(plan)
+    names = _names_of(selection)
     for i in order:
         values = (found.before[i], found.per_place[i], found.failed[i])
         table.add_row(names[i], *(f"{v:.4g}" for v in values), str(found.redundancy[i]))
@@ -218,8 +218,8 @@ def _losses_table(found: Placement) -> Table:
     return table
 
 
-def _remarks(plan: Plan, found: Placement) -> list[str]:
-    names, out = _names_of(plan), []
+def _remarks(selection: SiteSelection, found: Placement) -> list[str]:
+    names, out = _names_of(selection), []
     weak = [names[i] for i in np.flatnonzero(found.share_of_prior > PRIOR)]
     if weak:
         out.append(f"No fix of its own, the prior holds it: {', '.join(weak)}.")

@@ -103,20 +103,20 @@ def run(
 ) -> None:
     """Run a study, or go on with one that was stopped: finished parts are kept, and new methods run alone."""
     from optloc.base.registry import load_plugin
+    from optloc.study.design import design_of
     from optloc.study.execute import executor as chosen
-    from optloc.study.execute import run_plan
+    from optloc.study.execute import run_design
     from optloc.study.methods import added
-    from optloc.study.plan import plan_of
 
     for name in plugin or ():
         load_plugin(name)
     # A scheduler can only be meant for dask.
     by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler, limit)
-    plan = plan_of(file, trials=trials, seed=seed, more=added(methods or ()))
-    folder = Path(f"{plan.study.name}-study".replace(" ", "-").replace("/", "-")) if out is None else out
+    design = design_of(file, trials=trials, seed=seed, more=added(methods or ()))
+    folder = Path(f"{design.study.name}-study".replace(" ", "-").replace("/", "-")) if out is None else out
     try:
-        with _bar(plan.study.name, plan.rows, quiet or as_json) as tell:
-            found = run_plan(plan, folder, by, tell, lambda line: typer.echo(line, err=True))
+        with _bar(design.study.name, design.rows, quiet or as_json) as tell:
+            found = run_design(design, folder, by, tell, lambda line: typer.echo(line, err=True))
     # Not an error: parts are written as they are finished.
     except KeyboardInterrupt:
         typer.echo(f"Stopped. What is finished is in {folder}; the same command goes on from there.", err=True)
@@ -207,20 +207,20 @@ def bench(
     """Solve the public test set by a few methods and yours, and write who is right how often as a page."""
     from optloc.base.registry import load_plugin
     from optloc.cli.output import write_text
-    from optloc.study.execute import executor, run_plan
+    from optloc.study.design import design_of
+    from optloc.study.execute import executor, run_design
     from optloc.study.leaderboard import SET
     from optloc.study.leaderboard import page as made
     from optloc.study.methods import added
-    from optloc.study.plan import plan_of
 
     claim(page)
     for name in plugin or ():
         load_plugin(name)
-    plan = plan_of(Path(SET), trials=trials, more=added(methods or ()))
-    with _bar(plan.study.name, plan.rows, quiet) as tell:
-        run_plan(plan, out, executor("processes", jobs), tell, lambda line: typer.echo(line, err=True))
+    design = design_of(Path(SET), trials=trials, more=added(methods or ()))
+    with _bar(design.study.name, design.rows, quiet) as tell:
+        run_design(design, out, executor("processes", jobs), tell, lambda line: typer.echo(line, err=True))
     if page is not None or not quiet:
-        write_text(Path("-") if page is None else page, made(out, plan))
+        write_text(Path("-") if page is None else page, made(out, design))
 
 
 @study.command(epilog=example("optloc study pairs runs/my --against auto"))
@@ -273,14 +273,14 @@ def profiles(
     """Say which share of the trials each method solves, within how much work: data and performance profiles."""
     from optloc.cli.output import claim_outputs, write_picture
     from optloc.study import summary
-    from optloc.study.folder import plan_again, read_frame, read_manifest, references
+    from optloc.study.folder import design_of_manifest, read_frame, read_manifest, references
     from optloc.study.profiles import profiles as profiled
 
     claim_outputs(picture=plot)
     frame = read_frame(folder, summary.COLUMNS)
     if not len(frame):
         raise InvalidProblem("nothing of the study is finished yet", str(folder), "run the study")
-    known = references(plan_again(read_manifest(folder)))
+    known = references(design_of_manifest(read_manifest(folder)))
     found = profiled(frame, tau=tau, work=work, out=known)
     if plot is not None:
         from optloc.report.figures import marks, profile_picture
@@ -531,7 +531,7 @@ def _quartiles(values: tuple[float, ...] | None) -> str:
 def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
     """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
     from optloc.cli.output import bar, say
-    from optloc.papers import Size, paper, planned, write
+    from optloc.papers import Size, paper, reproduction, write
 
     paper(name)
     if size not in get_args(Size):
@@ -540,9 +540,9 @@ def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool
     # before the work, so that a place that cannot be written is known at once
     make_folder(folder)
     claim(folder / "README.md")
-    plan = planned(name, cast(Size, size), seed)
-    with bar(name, plan.work, quiet) as advance:
-        report = plan.run(lambda: advance(1))
+    ready = reproduction(name, cast(Size, size), seed)
+    with bar(name, ready.work, quiet) as advance:
+        report = ready.run(lambda: advance(1))
     written = write(report, folder)
     console = Screen(quiet=quiet)
     for found in report.tables:

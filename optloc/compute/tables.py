@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.cache import Cache
 from optloc.base.types import Array
 from optloc.compute.trace import Traced, trace
-from optloc.linear.evaluate import Plan, Terms, given, plans
+from optloc.linear.evaluate import BlockLinks, Terms, block_links, given
 from optloc.problem.problem import Problem
 
 # The order in which rows are evaluated, and the unknowns that each group of them touches.
@@ -95,12 +95,12 @@ class Entries:
         return cls(start + terms.row, terms.column, terms.coefficient, np.zeros_like(terms.row))
 
     @classmethod
-    def feeds(cls, plan: Plan, trace: Traced, start: int) -> Entries:
+    def feeds(cls, links: BlockLinks, trace: Traced, start: int) -> Entries:
         """Return those of the inputs of a block that its function needs."""
         place, parts = {seed: i for i, (seed, _) in enumerate(trace.tape.inputs)}, []
-        for feed in plan.feeds:
+        for feed in links.feeds:
             if feed.seed in place:
-                rows = np.arange(plan.block.count)[feed.rows]
+                rows = np.arange(links.block.count)[feed.rows]
                 gain = np.broadcast_to(np.asarray(feed.gain, dtype=float), rows.shape)
                 parts.append(cls(start + rows, feed.column, gain, np.full(rows.shape, place[feed.seed])))
         return cls.joined(parts)
@@ -323,13 +323,13 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ke
     # What is done to the data on their way to the inputs is done to their numbers: so it is known what comes from
     # where.
     numbered, found = sources.numbered(problem), []
-    for plan in plans(problem):
-        inputs = given(numbered, plan)
-        moved = frozenset(feed.seed for feed in plan.feeds)
-        made = trace(problem, plan, frozenset(inputs), moved)
+    for links in block_links(problem):
+        inputs = given(numbered, links)
+        moved = frozenset(feed.seed for feed in links.feeds)
+        made = trace(problem, links, frozenset(inputs), moved)
         if made is None:
             return None
-        found.append(_Kind(plan, made, inputs))
+        found.append(_Kind(links, made, inputs))
     return _fill(problem, Groups.sorted(problem, groups), found, sources.lookup())
 
 
@@ -344,20 +344,20 @@ def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
 class _Kind:
     """A block of rows, its tape, and the number of each input of each row among the sources."""
 
-    plan: Plan
+    links: BlockLinks
     trace: Traced
     inputs: dict[int, Array]
 
 
 def _fill(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -> Kept:
     pairs = list(zip(found, problem.starts, strict=True))
-    feeds = Entries.joined([Entries.feeds(kind.plan, kind.trace, start) for kind, start in pairs])
-    scales = Entries.joined([Entries.terms(kind.plan.gains, start) for kind, start in pairs])
-    adds = Entries.joined([Entries.terms(kind.plan.adds, start) for kind, start in pairs])
+    feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
+    scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])
+    adds = Entries.joined([Entries.terms(kind.links.adds, start) for kind, start in pairs])
     columns, slots = Columns.of(problem, groups, [feeds, scales, adds])
     count, tapes = np.diff(columns.at), [kind.trace.tape for kind in found]
     order = Order.of(problem, groups, int(count.max()) + 1)
-    inputs = np.concatenate([np.full(k.plan.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
+    inputs = np.concatenate([np.full(k.links.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
     source_at = starts(inputs[order.row])
     place = source_at[order.at[feeds.row]] + feeds.place
     term, factor, at = _list(
@@ -413,7 +413,7 @@ def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) 
     """Return where each input of each row evaluated is found."""
     out, start = np.zeros(int(source_at[-1]), dtype=np.int64), 0
     for kind in found:
-        count = kind.plan.block.count
+        count = kind.links.block.count
         first = source_at[order.at[start : start + count]]
         for i, (seed, _) in enumerate(kind.trace.tape.inputs):
             if seed in kind.inputs:
@@ -448,7 +448,7 @@ def _tapes(found: list[_Kind]) -> tuple[Array, dict[str, Array]]:
     kinds = _table(
         *(starts(part) for part in parts),
         np.array([tape.outputs[0] for tape in tapes]),
-        np.array([kind.plan.model.period is not None for kind in found]),
+        np.array([kind.links.model.period is not None for kind in found]),
     )
     return np.array([value for _, value in constants], dtype=float), {
         "code": np.concatenate([tape.code for tape in tapes]),

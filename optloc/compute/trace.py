@@ -14,7 +14,7 @@ import numpy as np
 from optloc.base.cache import Cache
 from optloc.base.types import Array
 from optloc.linear.courses import over_ground
-from optloc.linear.evaluate import Plan, join
+from optloc.linear.evaluate import BlockLinks, join
 from optloc.models import Model
 from optloc.models.primitives import Jet
 from optloc.problem.problem import Problem
@@ -357,21 +357,21 @@ class Traced:
 _TRACED = Cache["Traced | None"](256)
 
 
-def trace(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
+def trace(problem: Problem, links: BlockLinks, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
     """Return the tape of a block of rows, or None where its function cannot be traced.
 
     Parameters
     ----------
     problem : Problem
         Gives dimension and frame.
-    plan : Plan
+    links : BlockLinks
         The block.
     given : set of int
         Inputs that are data.
     moved : set of int
         Inputs that unknowns move: those that derivatives are wanted of.
     """
-    model = plan.model
+    model = links.model
     medium = problem.medium if model.straight else None
     frame = problem.frame if model.ecef or medium is not None or over_ground(problem) else None
     key = (model, given, moved, problem.dimension, frame, medium)

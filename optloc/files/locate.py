@@ -190,7 +190,7 @@ def locate(
             raise InvalidProblem(f"{type(text).__name__} is no name", name, "give text, such as 'ns' for a unit")
     north = _North(azimuth, declination)
     _check_north(north, given)
-    problem = _pose(stations, latlon, given, sigma, unit, reference, height, frame, _speed(speed), north)
+    problem = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, _speed(speed), north)
     return solve(problem, method=method)
 
 
@@ -221,7 +221,7 @@ def _texts(unit: Any) -> list[tuple[str, Any]]:
     return [("unit", each) for each in (unit.values() if isinstance(unit, Mapping) else (unit,))]
 
 
-def _pose(
+def _problem_of(
     stations: Any,
     latlon: Any,
     given: Mapping[str, Any],

@@ -422,7 +422,7 @@ def violation(problem: Problem, x: Array) -> Array:
     worst = np.zeros(len(x))
     for c in problem.constraints:
         if isinstance(c, Polygon):
-            worst = np.maximum(worst, _outside(c, _plan(problem, c.target, x)))
+            worst = np.maximum(worst, _outside(c, _horizontal(problem, c.target, x)))
             continue
         with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
             values = [_quantity(problem, c, x, epoch)[0].value for epoch in decisive(problem, c)]
@@ -493,7 +493,7 @@ def bounded(
     return surface.g(Point(used, states[1] if surface.velocity else None, None, ecef), coefficients)
 
 
-def _plan(problem: Problem, target: int, x: Array) -> Array:
+def _horizontal(problem: Problem, target: int, x: Array) -> Array:
     slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
     return x[:, slot.start : slot.start + 2]
 

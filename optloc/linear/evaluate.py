@@ -96,8 +96,8 @@ class Terms:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """The indices of one block of rows: measurement = h(fed inputs) * (1 + gains) + adds.
+class BlockLinks:
+    """The links from the unknowns to one block of rows: measurement = h(fed inputs) * (1 + gains) + adds.
 
     Parameters
     ----------
@@ -126,33 +126,35 @@ def columns(layout: Layout, name: str, epoch: Array) -> Array:
     return np.broadcast_to(np.asarray(base)[..., None] + np.arange(slot.size), (len(epoch), slot.size))
 
 
-# Plans of problems: made once for each structure.
+# Links from unknowns to rows: made once for each structure.
 
-# Rows of a problem whose plans are kept, half of what all kept ones may have: a longer problem is planned anew, which
-# takes less time than its rows do, and no memory that lasts.
+# Rows of a problem whose links are kept, half of what all kept ones may have: the links of a longer problem are made
+# each time, which takes less time than its rows do, and no memory that lasts.
 _KEPT_ROWS = 4096
-_PLANS = Cache[tuple[Plan, ...]](2 * _KEPT_ROWS, lambda kept: sum(plan.block.count for plan in kept))
+_LINKS = Cache[tuple[BlockLinks, ...]](2 * _KEPT_ROWS, lambda kept: sum(links.block.count for links in kept))
 
 
-def plans(problem: Problem) -> tuple[Plan, ...]:
-    """Return the plan of each block of rows; kept for problems of equal structure that are not long."""
+def block_links(problem: Problem) -> tuple[BlockLinks, ...]:
+    """Return the links of each block of rows; kept for problems of equal structure that are not long."""
     if problem.count > _KEPT_ROWS:
-        return _plans(problem)
-    return _PLANS.find(problem.structure, lambda: _plans(problem))
+        return _links_of_all(problem)
+    return _LINKS.find(problem.structure, lambda: _links_of_all(problem))
 
 
-def _plans(problem: Problem) -> tuple[Plan, ...]:
-    return tuple(_plan(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True))
+def _links_of_all(problem: Problem) -> tuple[BlockLinks, ...]:
+    return tuple(_links_of(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True))
 
 
-def _plan(problem: Problem, block: Rows, start: int) -> Plan:
+def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
     model = MODELS[block.kind]
     if (block.target < 0).any():
         where = f"{block.kind} row {int(np.argmax(block.target < 0))}"
         raise InvalidProblem("the row names no target", where, "give the index of its target")
     feeds = [*_motion_feeds(problem, block, model), *_station_feeds(problem, block, model)]
     feeds += [*_turn_feeds(problem, block, start), *_course_feeds(problem, block, model, start)]
-    return Plan(block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start))
+    return BlockLinks(
+        block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start)
+    )
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
@@ -267,14 +269,14 @@ def fitting(problem: Problem, x: Array) -> Array:
     return x
 
 
-def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple[Point, Point, Point]:
+def points(problem: Problem, links: BlockLinks, x: Array, differentiate: bool) -> tuple[Point, Point, Point]:
     """Return target, first and second station of every row of a block.
 
     Parameters
     ----------
     problem : Problem
         Its numbers.
-    plan : Plan
+    links : BlockLinks
         The block's indices.
     x : array (..., size)
         Parameter vector.
@@ -282,17 +284,17 @@ def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple
         Whether fed inputs become `Jet` values seeded with one.
     """
     # Data first, then what unknowns add: an offset of a station adds to its surveyed place.
-    inputs = {seed: placed(value, x) for seed, value in given(problem, plan).items()}
-    for feed in plan.feeds:
-        inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
+    inputs = {seed: placed(value, x) for seed, value in given(problem, links).items()}
+    for feed in links.feeds:
+        inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, links.block.count)
     if isinstance(x, Portable):  # what is data only is computed like what the vector feeds
         inputs = {seed: np.asarray(value).view(Portable) for seed, value in inputs.items()}
     if differentiate:
-        fed = {feed.seed for feed in plan.feeds}
+        fed = {feed.seed for feed in links.feeds}
         # Arrays of other libraries need not hand arithmetic with a Jet on the right to the Jet: there all are jets.
         for seed in inputs if foreign(x) else fed:
             inputs[seed] = Jet(inputs[seed], {seed: placed(np.ones(1), x)} if seed in fed else {})
-    return join(problem, plan.model, inputs)
+    return join(problem, links.model, inputs)
 
 
 def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point, Point, Point]:
@@ -336,9 +338,9 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
     return target, a, station(B, RATE_B, AXES_B) if model.stations > 1 else a
 
 
-def given(problem: Problem, plan: Plan) -> dict[int, Any]:
+def given(problem: Problem, links: BlockLinks) -> dict[int, Any]:
     """Return the inputs that are data, each (..., m): surveyed stations, their rates and axes, known targets."""
-    block, model, stations = plan.block, plan.model, problem.stations
+    block, model, stations = links.block, links.model, problem.stations
     inputs: dict[int, Any] = {}
     for place, rate, axes, index in ((A, RATE_A, AXES_A, block.a), (B, RATE_B, AXES_B, block.b))[: model.stations]:
         inputs |= _at_rows(stations.position, 1, block, index, place)
@@ -395,10 +397,10 @@ _undefined = np.errstate(divide="ignore", invalid="ignore")
 def predict(problem: Problem, x: Array) -> Array:
     """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
     values, x, xp = [], fitting(problem, x), library(x)
-    for plan in plans(problem):
-        value = placed(plan.model.h(*points(problem, plan, x, differentiate=False)), x)
-        value = xp.broadcast_to(value, np.broadcast_shapes(value.shape, (plan.block.count,)))
-        values.append(_bias(plan, x, value)[0])
+    for links in block_links(problem):
+        value = placed(links.model.h(*points(problem, links, x, differentiate=False)), x)
+        value = xp.broadcast_to(value, np.broadcast_shapes(value.shape, (links.block.count,)))
+        values.append(_bias(links, x, value)[0])
     return _joined(values)
 
 
@@ -426,10 +428,10 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     # In numpy derivatives are written where they belong; other libraries stack columns.
     place = None if foreign(x) else np.zeros((*batch, problem.count, width))
     residuals, jacobians = [], []
-    for plan, block, start in zip(plans(problem), problem.rows, problem.starts, strict=True):
+    for links, block, start in zip(block_links(problem), problem.rows, problem.starts, strict=True):
         m = block.count
-        value, terms = _derive(problem, plan, x)
-        residual = _residual(block, value, plan.model.period is not None)
+        value, terms = _derive(problem, links, x)
+        residual = _residual(block, value, links.model.period is not None)
         residuals.append(xp.broadcast_to(residual, (*batch, m)))
         if place is None:
             jacobians.append(_stack(terms, (*batch, m), width, x))
@@ -442,21 +444,25 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
 _Terms = list[tuple[Array, Array, Any]]
 
 
-def _derive(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
+def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]:
     """Return the values (..., m) of one block, biases included, and their derivatives."""
-    jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _fold(problem.layout)
+    jet, m, fold = (
+        links.model.h(*points(problem, links, x, differentiate=True)),
+        links.block.count,
+        _fold(problem.layout),
+    )
     # A kind that nothing moves (known targets and stations) has a value without derivatives.
     if not isinstance(jet, Jet):
         jet = Jet(placed(np.asarray(jet), x), {})
-    value, gain = _bias(plan, x, jet.value)
+    value, gain = _bias(links, x, jet.value)
     terms: _Terms = []
-    for feed in plan.feeds:
+    for feed in links.feeds:
         partial = jet.partials.get(feed.seed)
         if partial is not None:
             column, coefficient = feed.table(m)
             terms.append((fold(column), coefficient, partial if gain is None else partial * gain))
     unit = placed(np.ones(1), x)
-    for found, factor in ((plan.gains, jet.value), (plan.adds, unit)):
+    for found, factor in ((links.gains, jet.value), (links.adds, unit)):
         terms += [(fold(column), coefficient, factor) for column, coefficient in found.tables(m)]
     return value, terms
 
@@ -471,13 +477,13 @@ def _fold(layout: Layout) -> Any:
     return fold
 
 
-def _bias(plan: Plan, x: Array, value: Any) -> tuple[Any, Any]:
+def _bias(links: BlockLinks, x: Array, value: Any) -> tuple[Any, Any]:
     """Return values with scales, offsets, drifts and emission times, and the factor that scales them or None."""
-    m, gain = plan.block.count, None
-    if plan.gains.row.size:
-        gain = 1.0 + plan.gains.total(x, m)
+    m, gain = links.block.count, None
+    if links.gains.row.size:
+        gain = 1.0 + links.gains.total(x, m)
         value = value * gain
-    return value + plan.adds.total(x, m) if plan.adds.row.size else value, gain
+    return value + links.adds.total(x, m) if links.adds.row.size else value, gain
 
 
 def _residual(block: Rows, value: Any, periodic: bool) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.linear.constraints import bounded, conjunction, decisive
-from optloc.linear.evaluate import Terms, given, join, plans
+from optloc.linear.evaluate import Terms, block_links, given, join
 from optloc.models.primitives import wrap
 from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names
@@ -18,9 +18,9 @@ from optloc.problem.problem import Problem
 def parameters(problem: Problem) -> Array:
     """Return the numbers (p,) that the symbolic residual of a single problem needs beside x and z."""
     values = [np.zeros(0)]
-    for plan in plans(problem):
-        inputs = given(problem, plan)
-        values.extend(np.ravel(inputs[seed] + np.zeros(plan.block.count)) for seed in sorted(inputs))
+    for links in block_links(problem):
+        inputs = given(problem, links)
+        values.extend(np.ravel(inputs[seed] + np.zeros(links.block.count)) for seed in sorted(inputs))
     return np.concatenate(values)
 
 
@@ -39,23 +39,23 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
         Measurements less their corrections.
     """
     out, used = [], 0
-    for plan, start in zip(plans(problem), problem.starts, strict=True):
+    for links, start in zip(block_links(problem), problem.starts, strict=True):
         # Sorted in `parameters` too: numbers and symbols meet by their place.
-        seeds = sorted(given(problem, plan))
-        for i in range(plan.block.count):
-            inputs = {seed: p[used + j * plan.block.count + i] for j, seed in enumerate(seeds)}
-            for feed in plan.feeds:
-                rows = np.arange(plan.block.count)[feed.rows]
+        seeds = sorted(given(problem, links))
+        for i in range(links.block.count):
+            inputs = {seed: p[used + j * links.block.count + i] for j, seed in enumerate(seeds)}
+            for feed in links.feeds:
+                rows = np.arange(links.block.count)[feed.rows]
                 # Row by row: symbols are scalars, and the expression is built once for each structure.
                 for at in np.flatnonzero(rows == i):
                     gain = np.broadcast_to(feed.gain, feed.column.shape)[at]
                     inputs[feed.seed] = inputs.get(feed.seed, 0.0) + float(gain) * x[int(feed.column[at])]
-            value = plan.model.h(*join(problem, plan.model, inputs))
+            value = links.model.h(*join(problem, links.model, inputs))
             # The same order as in `optloc.linear.evaluate`: scaled, then shifted.
-            value = value * (1.0 + _total(plan.gains, i, x)) + _total(plan.adds, i, x)
+            value = value * (1.0 + _total(links.gains, i, x)) + _total(links.adds, i, x)
             misfit = z[start + i] - value
-            out.append(wrap(misfit) if plan.model.period is not None else misfit)
-        used += len(seeds) * plan.block.count
+            out.append(wrap(misfit) if links.model.period is not None else misfit)
+        used += len(seeds) * links.block.count
     return out
 
 

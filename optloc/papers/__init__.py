@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.papers.report import Plan, Report, Size, Table, write
+from optloc.papers.report import Report, Reproduction, Size, Table, write
 
-__all__ = ["PAPERS", "Paper", "Plan", "Report", "Size", "Table", "paper", "planned", "write"]
+__all__ = ["PAPERS", "Paper", "Report", "Reproduction", "Size", "Table", "paper", "reproduction", "write"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def paper(name: str) -> Paper:
     return PAPERS[name]
 
 
-def planned(name: str, size: Size, seed: int) -> Plan:
+def reproduction(name: str, size: Size, seed: int) -> Reproduction:
     """Return the reproduction of a paper, ready to run; only its own modules are loaded.
 
     Raises
@@ -75,5 +75,5 @@ def planned(name: str, size: Size, seed: int) -> Plan:
         For an unknown paper, or where matplotlib is missing.
     """
     study = import_module(f"optloc.papers.{paper(name).module}").STUDY
-    plan: Plan = study.plan(study.sizes[size], seed)
-    return plan
+    ready: Reproduction = study.reproduction(study.sizes[size], seed)
+    return ready

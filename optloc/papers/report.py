@@ -138,7 +138,7 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Reproduction:
     """A reproduction that is ready to run.
 
     Parameters
@@ -171,7 +171,7 @@ class Study(Generic[S]):
     work: Callable[[S], int]
     run: Callable[[S, int, Tick], Report]
 
-    def plan(self, sample: S, seed: int) -> Plan:
+    def reproduction(self, sample: S, seed: int) -> Reproduction:
         """Return the reproduction with a sample of any size; the seed decides all draws.
 
         Raises
@@ -180,7 +180,7 @@ class Study(Generic[S]):
             Where matplotlib is missing: before the work, not after it.
         """
         canvas(1.0, 1.0)  # raises where there is none
-        return Plan(self.work(sample), partial(self.run, sample, seed))
+        return Reproduction(self.work(sample), partial(self.run, sample, seed))
 
 
 # The page: a Markdown template whose numbers are cells of the tables.

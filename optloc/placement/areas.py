@@ -42,8 +42,8 @@ def polygons_of(path: Path) -> list[Array]:
     return rings
 
 
-def plan_of(ring: Array, frame: Frame, where: str) -> Array:
-    """Return corners (q, 2) in the plan of the frame: longitudes and latitudes on Earth, else as they are."""
+def corners_in_frame(ring: Array, frame: Frame, where: str) -> Array:
+    """Return corners (q, 2) in coordinates of the frame: from longitudes and latitudes on Earth, else as they are."""
     if not frame.geodetic:
         return ring
     if frame.kind != "enu":

@@ -11,12 +11,12 @@ import numpy as np
 from formulations.placement import covariances
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.bounds.bound_map import bound_map, extent, plan_of
+from optloc.bounds.bound_map import bound_map, extent, map_coordinates
 from optloc.bounds.crlb import crlb
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.simulate import simulate
 from optloc.placement.best_set import Searched, Task, random_sets, search
-from optloc.placement.sites import LETTER, Plan, Posed, pose
+from optloc.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -172,17 +172,20 @@ class Placement:
 
 
 def place(
-    plan: Plan, *, draws: int = 0, tell: Callable[[float, float, int], None] = lambda bound, value, nodes: None
+    selection: SiteSelection,
+    *,
+    draws: int = 0,
+    tell: Callable[[float, float, int], None] = lambda bound, value, nodes: None,
 ) -> Placement:
     """Return which sites to take, with a bound of what any choice of the candidates can reach.
 
     Parameters
     ----------
-    plan : Plan
-        What is asked.
+    selection : SiteSelection
+        Candidates, places and rules.
     draws : int
         Simulated fixes at each place that check the set for ambiguity; a set that fails is given up for the next best,
-        as often as `plan.alternatives` says. 0: none.
+        as often as `selection.alternatives` says. 0: none.
     tell : callable of (bound, value, nodes)
         Told now and then how far the search is; in the units of the criterion.
 
@@ -200,31 +203,39 @@ def place(
     ----------
     S. Joshi and S. Boyd, "Sensor selection via convex optimization", IEEE Trans. Signal Process. 57 (2009).
     """
-    posed = pose(plan)
-    task, banned = task_of(posed), list[Array]()
+    candidates = candidates_of(selection)
+    task, banned = task_of(candidates), list[Array]()
     while True:
         found = search(
             _without(task, banned),
-            gap=plan.gap,
-            seconds=plan.seconds,
-            keep=plan.alternatives,
-            seed=plan.seed,
+            gap=selection.gap,
+            seconds=selection.seconds,
+            keep=selection.alternatives,
+            seed=selection.seed,
             tell=tell,
         )
         if not found.best:
             what = "no set of sites meets the rules" if not banned else "every set that meets the rules is ambiguous"
             raise InvalidProblem(what, "groups", "allow more sites of a group, ask for fewer, or name more candidates")
         chosen = found.best[0][1]
-        checked = drawn(posed, chosen, draws, plan.seed) if draws else None
-        if checked is None or checked.clean or len(banned) >= plan.alternatives:
-            return _answer(posed, task, found, checked, banned)
+        checked = drawn(candidates, chosen, draws, selection.seed) if draws else None
+        if checked is None or checked.clean or len(banned) >= selection.alternatives:
+            return _answer(candidates, task, found, checked, banned)
         banned.append(chosen)
 
 
-def task_of(posed: Posed) -> Task:
-    """Return what is searched for a plan."""
-    plan = posed.plan
-    return Task(posed.design, LETTER[plan.criterion], plan.worst, plan.fail_one, posed.rules, posed.limits, posed.state)
+def task_of(candidates: Candidates) -> Task:
+    """Return the search for the best set of some candidates."""
+    selection = candidates.selection
+    return Task(
+        candidates.design,
+        LETTER[selection.criterion],
+        selection.worst,
+        selection.fail_one,
+        candidates.rules,
+        candidates.limits,
+        candidates.state,
+    )
 
 
 def _without(task: Task, banned: Sequence[Array]) -> Task:
@@ -234,35 +245,39 @@ def _without(task: Task, banned: Sequence[Array]) -> Task:
     return replace(task, rules=np.vstack([task.rules, rules]), limits=np.concatenate([task.limits, limits]))
 
 
-def _answer(posed: Posed, task: Task, found: Searched, checked: Draws | None, banned: Sequence[Array]) -> Placement:
-    plan, names = posed.plan, posed.names
+def _answer(
+    candidates: Candidates, task: Task, found: Searched, checked: Draws | None, banned: Sequence[Array]
+) -> Placement:
+    selection, names = candidates.selection, candidates.names
     value, chosen = found.best[0]
     bound, reached = task.scale(found.bound), task.scale(value)
     gap = max(0.0, 1.0 - bound / reached)
-    before, sites = _before(posed, task)
-    per_place, share = _per_place(posed, chosen)
+    before, sites = _before(candidates, task)
+    per_place, share = _per_place(candidates, chosen)
     told = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
     reason = told if found.closed else f"the time was up: {told}; give it more time, or accept a larger gap"
-    new = (chosen == 1) & (posed.state != 1)
-    if plan.choose is not None and (count := int(new.sum())) < plan.choose:
-        reason += f"; {count} of the {plan.choose} sites that were asked for: more exceed the budget, or do not help"
+    new = (chosen == 1) & (candidates.state != 1)
+    if selection.choose is not None and (count := int(new.sum())) < selection.choose:
+        reason += (
+            f"; {count} of the {selection.choose} sites that were asked for: more exceed the budget, or do not help"
+        )
     return Placement(
         _named(names, new),
-        _named(names, posed.state == 1),
-        plan.criterion,
+        _named(names, candidates.state == 1),
+        selection.criterion,
         reached,
         bound,
         gap,
         found.closed,
         reason,
         per_place,
-        _failed(posed, chosen),
+        _failed(candidates, chosen),
         before,
         sites,
         share,
-        _redundancy(posed, chosen),
+        _redundancy(candidates, chosen),
         tuple(_swaps(task, names, chosen)),
-        tuple((_named(names, (one == 1) & (posed.state != 1)), task.scale(v)) for v, one in found.best),
+        tuple((_named(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
         tuple(_following(task, names, chosen)),
         _course(task, found.course),
         found.nodes,
@@ -281,41 +296,41 @@ def _named(names: Sequence[str], mask: Array) -> tuple[str, ...]:
     return tuple(names[i] for i in np.flatnonzero(mask).tolist())
 
 
-def _per_place(posed: Posed, chosen: Array) -> tuple[Array, Array]:
+def _per_place(candidates: Candidates, chosen: Array) -> tuple[Array, Array]:
     """Return the bound (P,) of the position error of a set, metres, and the prior's share of its variance."""
-    covariance = np.asarray(crlb(posed.assembled(chosen), posed.vectors))
-    d = posed.design.dimension
+    covariance = np.asarray(crlb(candidates.assembled(chosen), candidates.vectors))
+    d = candidates.design.dimension
     variance = np.trace(covariance[..., :d, :d], axis1=-2, axis2=-1)
-    information = posed.design.prior + np.einsum(
-        "prmn,n,prkn->pmk", posed.design.rows, chosen.astype(float), posed.design.rows
+    information = candidates.design.prior + np.einsum(
+        "prmn,n,prkn->pmk", candidates.design.rows, chosen.astype(float), candidates.design.rows
     )
     inverse = np.linalg.inv(information)[:, :d]
-    owed = np.trace(inverse @ posed.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
+    owed = np.trace(inverse @ candidates.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
     return np.sqrt(variance), owed / variance
 
 
-def _failed(posed: Posed, chosen: Array) -> Array:
+def _failed(candidates: Candidates, chosen: Array) -> Array:
     """Return the bound (P,) at each place after the loss of the site that is worst there, metres."""
     lost = np.repeat(chosen[None], int(chosen.sum()), axis=0)
     lost[np.arange(len(lost)), np.flatnonzero(chosen)] = 0
-    variance = np.trace(covariances(posed.design, lost), axis1=-2, axis2=-1)
+    variance = np.trace(covariances(candidates.design, lost), axis1=-2, axis2=-1)
     return np.asarray(np.sqrt(variance.max(0)))
 
 
-def _before(posed: Posed, task: Task) -> tuple[Array, tuple[str, ...]]:
-    kept = (posed.state == 1).astype(np.int64)
+def _before(candidates: Candidates, task: Task) -> tuple[Array, tuple[str, ...]]:
+    kept = (candidates.state == 1).astype(np.int64)
     if kept.any():
-        per_place, share = _per_place(posed, kept)
+        per_place, share = _per_place(candidates, kept)
         if (share <= PRIOR).all():
-            return per_place, _named(posed.names, kept)
-    sets = np.array(list(random_sets(task, _RANDOM, posed.plan.seed)))
+            return per_place, _named(candidates.names, kept)
+    sets = np.array(list(random_sets(task, _RANDOM, candidates.selection.seed)))
     middle = sets[np.argsort(task.score(sets))[len(sets) // 2]]
-    return _per_place(posed, middle)[0], _named(posed.names, middle)
+    return _per_place(candidates, middle)[0], _named(candidates.names, middle)
 
 
-def _redundancy(posed: Posed, chosen: Array) -> Array:
-    """Return the degrees of freedom (P,) of a fix from chosen sites, with the priors of the plan alone."""
-    problem = replace(posed.assembled(chosen), priors=posed.plan.problem.priors)
+def _redundancy(candidates: Candidates, chosen: Array) -> Array:
+    """Return the degrees of freedom (P,) of a fix from chosen sites, with the priors of the selection alone."""
+    problem = replace(candidates.assembled(chosen), priors=candidates.selection.problem.priors)
     return np.asarray(degrees_of_freedom(problem))
 
 
@@ -347,20 +362,20 @@ def _following(task: Task, names: Sequence[str], chosen: Array) -> Iterator[tupl
     yield from ((names[others[i]], task.scale(float(values[i]))) for i in np.argsort(values, kind="stable").tolist())
 
 
-def drawn(posed: Posed, chosen: Array, count: int, seed: int = 0) -> Draws:
+def drawn(candidates: Candidates, chosen: Array, count: int, seed: int = 0) -> Draws:
     """Return what becomes of simulated fixes with a set (n,) of sites: `count` at each place, by the method "auto"."""
     from optloc.solvers import solve
 
-    places, d = len(posed.vectors), posed.design.dimension
-    flat = replace(posed.assembled(chosen), priors=posed.plan.problem.priors).flat()
-    bounds = _per_place(posed, chosen)[0]
+    places, d = len(candidates.vectors), candidates.design.dimension
+    flat = replace(candidates.assembled(chosen), priors=candidates.selection.problem.priors).flat()
+    bounds = _per_place(candidates, chosen)[0]
     ambiguous, ratio, coverage = np.zeros(places), np.full(places, np.nan), np.full(places, np.nan)
     for p in range(places):
         one = flat.take(np.array([p]))
-        fix = solve(simulate(one, posed.vectors[p], seed + p, count), "auto")
+        fix = solve(simulate(one, candidates.vectors[p], seed + p, count), "auto")
         codes = np.broadcast_to(np.asarray(fix.code), fix.cost.shape).ravel()
         position = fix.position.reshape(len(codes), -1)
-        error = position - posed.vectors[p, :d]
+        error = position - candidates.vectors[p, :d]
         good = (codes != Status.AMBIGUOUS) & np.isfinite(error).all(-1)
         ambiguous[p] = np.mean(~good)
         if good.any():
@@ -369,14 +384,14 @@ def drawn(posed: Posed, chosen: Array, count: int, seed: int = 0) -> Draws:
             coverage[p] = np.mean(
                 np.einsum("qi,qij,qj->q", error[good], np.linalg.inv(cov), error[good]) <= _QUANTILE[d]
             )
-    return Draws(count, ambiguous, ratio, coverage, _flat(posed, chosen, bounds))
+    return Draws(count, ambiguous, ratio, coverage, _flat(candidates, chosen, bounds))
 
 
-def _flat(posed: Posed, chosen: Array, bounds: Array) -> Array:
-    stations = posed.problem.stations.position.reshape(-1, posed.design.dimension)
-    weight = posed.assembled(chosen).weight
+def _flat(candidates: Candidates, chosen: Array, bounds: Array) -> Array:
+    stations = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
+    weight = candidates.assembled(chosen).weight
     out = np.empty(len(bounds))
-    owner = np.concatenate([rows.a for rows in posed.problem.rows])
+    owner = np.concatenate([rows.a for rows in candidates.problem.rows])
     for p in range(len(bounds)):
         heard = stations[np.unique(owner[weight[p] > 0.0])]
         off = np.linalg.svd(heard - heard.mean(0), compute_uv=False)[-1] if len(heard) > 1 else 0.0
@@ -384,12 +399,12 @@ def _flat(posed: Posed, chosen: Array, bounds: Array) -> Array:
     return out
 
 
-def picture(plan: Plan, found: Placement) -> Figure:
+def picture(selection: SiteSelection, found: Placement) -> Figure:
     """Return maps of the bound before and after on one scale, and how the gap closed while it was searched.
 
     Parameters
     ----------
-    plan : Plan
+    selection : SiteSelection
         As it was given to `place`.
     found : Placement
         Its answer.
@@ -401,14 +416,14 @@ def picture(plan: Plan, found: Placement) -> Figure:
     """
     from optloc.plot.placement_map import plot_placement
 
-    problem, names = plan.problem, np.array(plan.problem.stations.names)
-    if plan.by == "row":
+    problem, names = selection.problem, np.array(selection.problem.stations.names)
+    if selection.by == "row":
         raise InvalidProblem("rows that are chosen have no map", "plot", "choose stations")
     single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
-    places = np.atleast_2d(np.asarray(plan.places, dtype=float))[:, : problem.dimension]
+    places = np.atleast_2d(np.asarray(selection.places, dtype=float))[:, : problem.dimension]
     truth = np.zeros(problem.layout.size)
     truth[: problem.dimension] = places[0]
-    flat = plan_of(problem.frame, places, problem.frame.geodetic and problem.dimension == 3)
+    flat = map_coordinates(problem.frame, places, problem.frame.geodetic and problem.dimension == 3)
     height = float(np.median(flat[:, 2])) if problem.dimension == 3 else 0.0
     x0, x1, y0, y1 = extent(problem, places, widen=0.08)
     grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
@@ -418,12 +433,12 @@ def picture(plan: Plan, found: Placement) -> Figure:
         mask = np.isin(names, sites)
         maps.append(bound_map(single.with_rows(weight=single.weight * mask[end]), truth, *grid, height))
         taken.append(mask)
-    weights = np.ones(len(places)) if plan.weights is None else np.asarray(plan.weights)
+    weights = np.ones(len(places)) if selection.weights is None else np.asarray(selection.weights)
     course: Array = found.course.copy()
     course[:, 1:] = np.sqrt(np.maximum(course[:, 1:], 0.0))
     kept = set(found.before_sites) == set(found.kept)
     titles = (
         "before: kept stations" if kept else "before: a random set",
-        f"after: {found.sigma:.3g} m{', one failed' * plan.fail_one}",
+        f"after: {found.sigma:.3g} m{', one failed' * selection.fail_one}",
     )
     return plot_placement(maps, taken, flat[:, :2], weights, course, titles)

@@ -15,7 +15,7 @@ from optloc.base.types import Array
 from optloc.models import MODELS, Point
 from optloc.placement.best_set import exchanged, random_sets
 from optloc.placement.chosen import Placement, task_of
-from optloc.placement.sites import LETTER, Plan, Posed, pose
+from optloc.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 
 # Random sets whose places are starts beside that of the grid: from these the best was lower by 7, 16 and 1 % in trials.
 _STARTS = 10
@@ -24,7 +24,12 @@ _EDGE = 1e-6
 
 
 def refined(
-    plan: Plan, found: Placement, regions: Sequence[Region], ground: Ground | None = None, *, starts: int = _STARTS
+    selection: SiteSelection,
+    found: Placement,
+    regions: Sequence[Region],
+    ground: Ground | None = None,
+    *,
+    starts: int = _STARTS,
 ) -> Placement:
     """Return a placement with the places of its new sites refined; the kept sites stay.
 
@@ -34,7 +39,7 @@ def refined(
 
     Parameters
     ----------
-    plan : Plan
+    selection : SiteSelection
         As it was given to `place`.
     found : Placement
         Its answer.
@@ -51,22 +56,22 @@ def refined(
         Where the rows of the sites depend on more than the distance and direction to a target at rest, or no set lies
         in the regions.
     """
-    posed = pose(plan)
-    _check(posed)
-    task, free = task_of(posed), posed.state != 1
-    taken = np.isin(posed.names, (*found.chosen, *found.kept)).astype(np.int64)
-    sets = [taken, *(exchanged(task, one)[1] for one in random_sets(task, starts, plan.seed))]
+    candidates = candidates_of(selection)
+    _check(candidates)
+    task, free = task_of(candidates), candidates.state != 1
+    taken = np.isin(candidates.names, (*found.chosen, *found.kept)).astype(np.int64)
+    sets = [taken, *(exchanged(task, one)[1] for one in random_sets(task, starts, selection.seed))]
     best: tuple[float, Array | None] = (np.inf, None)
-    position = posed.problem.stations.position.reshape(-1, posed.design.dimension)
-    owner = _stations(posed)
+    position = candidates.problem.stations.position.reshape(-1, candidates.design.dimension)
+    owner = _stations(candidates)
     for chosen in sets:
         sites = np.flatnonzero((chosen == 1) & free)
         start = position[owner[sites]]
         homes = [_home(place, regions, ground) for place in start]
         begin = np.array([home[1] for home in homes])
         parts = [home[0] for home in homes]
-        for places in _candidates(posed, sites, begin, parts, ground):
-            reached = _value(posed, sites, places)
+        for places in _optima(candidates, sites, begin, parts, ground):
+            reached = _value(candidates, sites, places)
             if reached < best[0]:
                 best = reached, places
     if best[1] is None:
@@ -74,21 +79,21 @@ def refined(
     return replace(found, refined=best[1], refined_value=task.scale(best[0]))
 
 
-def _candidates(
-    posed: Posed, sites: Array, begin: Array, parts: Sequence[Region], ground: Ground | None
+def _optima(
+    candidates: Candidates, sites: Array, begin: Array, parts: Sequence[Region], ground: Ground | None
 ) -> list[Array]:
     """Return the start and, where it has one inside the regions, the local optimum from it."""
-    plan, out = posed.plan, [begin]
+    selection, out = candidates.selection, [begin]
     try:
         places = refine(
-            lambda symbols: _information(posed, sites, symbols),
+            lambda symbols: _information(candidates, sites, symbols),
             begin,
             parts,
-            posed.design.weight,
-            posed.design.dimension,
-            LETTER[plan.criterion],
-            worst=plan.worst,
-            fail=plan.fail_one,
+            candidates.design.weight,
+            candidates.design.dimension,
+            LETTER[selection.criterion],
+            worst=selection.worst,
+            fail=selection.fail_one,
             ground=ground,
         )
     except SolverError:
@@ -100,17 +105,17 @@ def _candidates(
     return out
 
 
-def _check(posed: Posed) -> None:
-    kinds = {rows.kind for rows in posed.problem.rows}
+def _check(candidates: Candidates) -> None:
+    kinds = {rows.kind for rows in candidates.problem.rows}
     odd = [kind for kind in kinds if MODELS[kind].velocity or MODELS[kind].ecef]
-    if odd or posed.plan.by == "row" or any(len(b.row[0]) > 1 for b in posed.problem.noise.blocks):
+    if odd or candidates.selection.by == "row" or any(len(b.row[0]) > 1 for b in candidates.problem.noise.blocks):
         what = f"{odd[0]} rows" if odd else "single rows, or rows with common noise,"
         raise InvalidProblem(f"{what} cannot be refined", "refine", "leave the refinement out")
 
 
-def _stations(posed: Posed) -> Array:
+def _stations(candidates: Candidates) -> Array:
     """Return the station of each site."""
-    return np.unique(np.concatenate([rows.a for rows in posed.problem.rows]))
+    return np.unique(np.concatenate([rows.a for rows in candidates.problem.rows]))
 
 
 def _home(place: Array, regions: Sequence[Region], ground: Ground | None) -> tuple[Region, Array]:
@@ -123,38 +128,40 @@ def _inside(place: Array, region: Region, ground: Ground | None) -> bool:
     return bool((region.excess(place, ground) <= _EDGE).all())
 
 
-def _value(posed: Posed, sites: Array, places: Array) -> float:
+def _value(candidates: Candidates, sites: Array, places: Array) -> float:
     """Return the criterion with the new sites at places (k, d): rows are linearised there, as for any problem."""
-    plan, stations = posed.plan, posed.plan.problem.stations
+    selection, stations = candidates.selection, candidates.selection.problem.stations
     position = np.array(stations.position)
-    position[..., _stations(posed)[sites], :] = places
-    moved = replace(plan, problem=replace(plan.problem, stations=replace(stations, position=position)))
-    # kept and new ones are all there is; priors stay those of the plan, as they were made
-    moved = replace(moved, problem=replace(moved.problem, priors=posed.problem.priors))
-    there = pose(moved)
-    chosen = (posed.state == 1).astype(float)
+    position[..., _stations(candidates)[sites], :] = places
+    moved = replace(selection, problem=replace(selection.problem, stations=replace(stations, position=position)))
+    # kept and new ones are all there is; priors stay those of the selection, as they were made
+    moved = replace(moved, problem=replace(moved.problem, priors=candidates.problem.priors))
+    there = candidates_of(moved)
+    chosen = (candidates.state == 1).astype(float)
     chosen[sites] = 1.0
-    return float(value(there.design, chosen, LETTER[plan.criterion], worst=plan.worst, fail=plan.fail_one))
+    return float(
+        value(there.design, chosen, LETTER[selection.criterion], worst=selection.worst, fail=selection.fail_one)
+    )
 
 
-def _information(posed: Posed, sites: Array, symbols: Sequence[Any]) -> list[Any]:
+def _information(candidates: Candidates, sites: Array, symbols: Sequence[Any]) -> list[Any]:
     """Return the information (m, m) at each place: numbers of the prior and the kept sites, symbols of the others."""
     import casadi as ca
 
-    design, d = posed.design, posed.design.dimension
-    kept = (posed.state == 1).astype(float)
+    design, d = candidates.design, candidates.design.dimension
+    kept = (candidates.state == 1).astype(float)
     base = design.prior + np.einsum("prmn,n,prkn->pmk", design.rows, kept, design.rows)
     totals = [ca.SX(ca.DM(matrix)) for matrix in base]
     t, a = ca.SX.sym("t", d), ca.SX.sym("a", d)
     slopes: dict[tuple[str, bytes, bytes], Any] = {}
-    for row in _numbers(posed):
+    for row in _numbers(candidates):
         at = np.flatnonzero(sites == row.site)
         if not len(at) or symbols[at[0]] is None:
             continue
         key = (row.kind, row.axes.tobytes(), row.other.tobytes())
         if key not in slopes:
             slopes[key] = ca.Function("slope", [t, a], [ca.jacobian(row.h(ca, t, a), t)])
-        for p, place in enumerate(posed.vectors[:, :d]):
+        for p, place in enumerate(candidates.vectors[:, :d]):
             if row.scale[p] > 0.0:
                 slope = slopes[key](ca.DM(place), symbols[at[0]])
                 line = ca.horzcat(slope * row.scale[p], ca.DM(row.rest[p][None]))
@@ -165,8 +172,8 @@ def _information(posed: Posed, sites: Array, symbols: Sequence[Any]) -> list[Any
 class _Row:
     """A row of a site: its kind, ends, and what of it does not depend on where the site stands."""
 
-    def __init__(self, posed: Posed, kind: str, site: int, a: int, b: int, scale: Array, rest: Array) -> None:
-        stations, d = posed.problem.stations, posed.design.dimension
+    def __init__(self, candidates: Candidates, kind: str, site: int, a: int, b: int, scale: Array, rest: Array) -> None:
+        stations, d = candidates.problem.stations, candidates.design.dimension
         self.kind, self.site, self.scale, self.rest = kind, site, scale, rest
         axes = stations.axes
         self.axes = np.zeros(0) if axes is None else axes.reshape(-1, stations.count, d, d)[0, a]
@@ -180,21 +187,21 @@ class _Row:
         return MODELS[self.kind].h(Point(tuple(ca.vertsplit(t))), own, other)
 
 
-def _numbers(posed: Posed) -> list[_Row]:
+def _numbers(candidates: Candidates) -> list[_Row]:
     """Return the rows of all sites."""
     from optloc.linear.normal import linearise
 
-    linear, d = linearise(posed.problem, posed.vectors), posed.design.dimension
+    linear, d = linearise(candidates.problem, candidates.vectors), candidates.design.dimension
     jacobian = np.concatenate([linear.shared, linear.local], axis=-1)
-    places = len(posed.vectors)
-    scale = np.zeros((places, posed.problem.count))
+    places = len(candidates.vectors)
+    scale = np.zeros((places, candidates.problem.count))
     for whitener in linear.noise:
         scale[:, whitener.row[:, 0]] = np.broadcast_to(whitener.matrix[..., 0, 0], (places, len(whitener.row)))
     out = []
-    for block, start in zip(posed.problem.rows, posed.problem.starts, strict=True):
+    for block, start in zip(candidates.problem.rows, candidates.problem.starts, strict=True):
         for i in range(block.count):
             g = start + i
             rest = np.broadcast_to(jacobian[:, g, d:], (places, jacobian.shape[-1] - d)) * scale[:, g, None]
             ends = int(block.a[i]), int(block.b[i])
-            out.append(_Row(posed, block.kind, int(posed.site[g]), *ends, scale[:, g], rest))
+            out.append(_Row(candidates, block.kind, int(candidates.site[g]), *ends, scale[:, g], rest))
     return out

@@ -1,4 +1,4 @@
-"""What is asked of a placement, and what every site would say: rows of the house's own linearisation, site by site."""
+"""Which sites to take for which places: the selection as it is given, and the linearised rows of each candidate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from optloc.problem.problem import Problem
 Name = Literal["rms", "volume", "axis"]
 """Criteria: mean-square error, volume and longest axis of the error ellipsoid."""
 
-__all__ = ["LETTER", "Group", "Name", "Plan", "Posed", "pose"]
+__all__ = ["LETTER", "Candidates", "Group", "Name", "SiteSelection", "candidates_of"]
 
 LETTER: dict[str, Criterion] = {"rms": "A", "volume": "D", "axis": "E"}
 """The criteria's names in the literature."""
@@ -38,8 +38,8 @@ _EXTENT = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """What is asked: of these sites, for these places, which to take.
+class SiteSelection:
+    """The question which of some sites to take: candidates, places, rules and the criterion.
 
     Parameters
     ----------
@@ -109,12 +109,12 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Posed:
-    """A plan as numbers.
+class Candidates:
+    """The candidate sites of a selection as numbers: their rows at each place, the rules and the states.
 
     Parameters
     ----------
-    plan : Plan
+    selection : SiteSelection
         As it was given.
     problem : Problem
         A batch of P problems: that of all sites for a target at each place, with priors, rows out of sight left out.
@@ -132,7 +132,7 @@ class Posed:
         -1 for a free site, 0 for one that is forbidden, 1 for one that is kept.
     """
 
-    plan: Plan
+    selection: SiteSelection
     problem: Problem
     vectors: Array
     site: Array
@@ -148,46 +148,46 @@ class Posed:
         return self.problem.with_rows(weight=self.problem.weight * taken)
 
 
-def pose(plan: Plan) -> Posed:
-    """Return a plan as numbers.
+def candidates_of(selection: SiteSelection) -> Candidates:
+    """Return the candidate sites of a selection as numbers.
 
     Raises
     ------
     InvalidProblem
         Naming the argument, site or place that cannot be right.
     """
-    plan = _checked(plan)
-    problem = _arrivals(plan.problem)
-    site, names = _sites(problem, plan)
+    selection = _checked(selection)
+    problem = _arrivals(selection.problem)
+    site, names = _sites(problem, selection)
     size, d = problem.layout.size, problem.dimension
-    places = np.atleast_2d(np.asarray(plan.places, dtype=float))
+    places = np.atleast_2d(np.asarray(selection.places, dtype=float))
     if places.ndim != 2 or places.shape[1] not in (d, size) or not np.isfinite(places).all() or not len(places):
-        what = f"the places have shape {np.shape(plan.places)}"
+        what = f"the places have shape {np.shape(selection.places)}"
         raise InvalidProblem(what, "places", f"give finite numbers (places, {d}), metres")
     vectors = np.zeros((len(places), size))
     vectors[:, : places.shape[1]] = places
     _check_apart(problem, site, names, places[:, :d])
-    batch = problem.with_rows(weight=_weights(plan, problem, places[:, :d]))
+    batch = problem.with_rows(weight=_weights(selection, problem, places[:, :d]))
     batch = _with_prior(batch, places[:, :d])
-    weight = _weight(plan, len(places))
+    weight = _weight(selection, len(places))
     design = Design(_rows(batch, vectors, site, len(names)), _prior(batch, vectors), weight, d)
-    rules, limits, state = _rules(plan, names, site)
-    posed = Posed(plan, batch, vectors, site, names, design, rules, limits, state)
-    _check_seen(posed)
-    return posed
+    rules, limits, state = _rules(selection, names, site)
+    candidates = Candidates(selection, batch, vectors, site, names, design, rules, limits, state)
+    _check_seen(candidates)
+    return candidates
 
 
-def _checked(plan: Plan) -> Plan:
-    if plan.criterion not in LETTER:
-        what = f"there is no criterion {plan.criterion!r}"
-        raise InvalidProblem(what, "criterion", nearest(str(plan.criterion), list(LETTER)))
-    if not 0.0 < plan.gap < 1.0:
-        raise InvalidProblem(f"the gap {plan.gap:g} is not between 0 and 1", "gap", "give a share, such as 0.01")
-    if not plan.seconds > 0.0:
-        raise InvalidProblem(f"the time {plan.seconds:g} s is not positive", "time", "give seconds, such as 60")
-    if plan.choose is None and plan.budget is None:
+def _checked(selection: SiteSelection) -> SiteSelection:
+    if selection.criterion not in LETTER:
+        what = f"there is no criterion {selection.criterion!r}"
+        raise InvalidProblem(what, "criterion", nearest(str(selection.criterion), list(LETTER)))
+    if not 0.0 < selection.gap < 1.0:
+        raise InvalidProblem(f"the gap {selection.gap:g} is not between 0 and 1", "gap", "give a share, such as 0.01")
+    if not selection.seconds > 0.0:
+        raise InvalidProblem(f"the time {selection.seconds:g} s is not positive", "time", "give seconds, such as 60")
+    if selection.choose is None and selection.budget is None:
         raise InvalidProblem("nothing says how many sites to take", "choose", "give choose, or budget with cost")
-    return plan
+    return selection
 
 
 def _arrivals(problem: Problem) -> Problem:
@@ -206,14 +206,14 @@ def _arrivals(problem: Problem) -> Problem:
     return made.problem.take(np.zeros(1, dtype=int))
 
 
-def _sites(problem: Problem, plan: Plan) -> tuple[Array, tuple[str, ...]]:
+def _sites(problem: Problem, selection: SiteSelection) -> tuple[Array, tuple[str, ...]]:
     """Return the site of each row, and the names of the sites."""
     a, b = (np.concatenate([getattr(rows, end) for rows in problem.rows]) for end in ("a", "b"))
     stations = problem.stations.names
     if (a < 0).any():
         what = "a row without a station belongs to no site"
         raise InvalidProblem(what, "measurements", "leave heights out, or give them as a prior of the position")
-    if plan.by == "row":
+    if selection.by == "row":
         kinds = [rows.kind for rows in problem.rows for _ in range(rows.count)]
         named = [f"{kind} {stations[i]}" for kind, i in zip(kinds, a, strict=True)]
         seen = {name: named.count(name) for name in named}
@@ -223,7 +223,7 @@ def _sites(problem: Problem, plan: Plan) -> tuple[Array, tuple[str, ...]]:
     measuring = np.unique(a)
     site = np.searchsorted(measuring, a)
     names = tuple(stations[i] for i in measuring)
-    lone = set(names) - set(plan.kept)
+    lone = set(names) - set(selection.kept)
     for other in np.unique(b[b >= 0]):
         if stations[other] in lone:
             what = f"{stations[other]!r} is a candidate and the other end of a row"
@@ -245,28 +245,28 @@ def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Ar
         raise InvalidProblem(f"station {name!r} stands where another one does", "candidates", "remove one of them")
 
 
-def _weight(plan: Plan, count: int) -> Array:
-    weight = np.ones(count) if plan.weights is None else np.asarray(plan.weights, dtype=float)
+def _weight(selection: SiteSelection, count: int) -> Array:
+    weight = np.ones(count) if selection.weights is None else np.asarray(selection.weights, dtype=float)
     if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
         what = f"the weights of {count} places are not so many positive numbers"
         raise InvalidProblem(what, "weights", "give each place a weight above 0, or leave it out")
     return np.asarray(weight / weight.sum())
 
 
-def _weights(plan: Plan, problem: Problem, places: Array) -> Array:
+def _weights(selection: SiteSelection, problem: Problem, places: Array) -> Array:
     """Return the weights (P, m) of the rows: rows out of sight or range have none, less exact ones less."""
     count, stations = len(places), problem.stations.count
     weight = np.broadcast_to(problem.weight, (count, problem.count)).copy()
     end = np.concatenate([rows.a for rows in problem.rows])
-    if plan.sight is not None:
-        sight = np.asarray(plan.sight, dtype=float)
+    if selection.sight is not None:
+        sight = np.asarray(selection.sight, dtype=float)
         if sight.shape != (count, stations) or not ((sight == 0.0) | (sight >= 1.0)).all():
             what = f"the sight of {count} places and {stations} stations is not 0, 1 or a larger factor for each"
             raise InvalidProblem(what, "sight", "give 0 where a station is out of sight, else a factor of sigma")
         factor = sight[:, end]
         weight = np.where(factor > 0.0, weight / np.maximum(factor, 1.0) ** 2, 0.0)
-    if plan.reach is not None:
-        reach = np.asarray(plan.reach, dtype=float)
+    if selection.reach is not None:
+        reach = np.asarray(selection.reach, dtype=float)
         if reach.shape != (problem.count,) or not (reach > 0.0).all():
             what = f"the reach of {problem.count} rows is not so many positive numbers"
             raise InvalidProblem(what, "reach", "give each row a distance in metres")
@@ -330,7 +330,7 @@ def _prior(problem: Problem, vectors: Array) -> Array:
     return out
 
 
-def _rules(plan: Plan, names: tuple[str, ...], site: Array) -> tuple[Array, Array, Array]:
+def _rules(selection: SiteSelection, names: tuple[str, ...], site: Array) -> tuple[Array, Array, Array]:
     """Return rules, limits and states of the sites; what is kept counts in groups alone."""
     n, place = len(names), {name: i for i, name in enumerate(names)}
 
@@ -341,30 +341,30 @@ def _rules(plan: Plan, names: tuple[str, ...], site: Array) -> tuple[Array, Arra
         return np.array([place[name] for name in wanted], dtype=int)
 
     state = np.full(n, -1, dtype=np.int64)
-    kept = where(plan.kept, "kept")
-    state[where(plan.forbidden, "forbidden")] = 0
+    kept = where(selection.kept, "kept")
+    state[where(selection.forbidden, "forbidden")] = 0
     if (state[kept] == 0).any():
         raise InvalidProblem("a site is kept and forbidden", "forbidden", "say one of the two")
     state[kept] = 1
     free = (state == -1).astype(float)
     rules, limits = [], []
-    if plan.choose is not None:
-        if not 1 <= plan.choose <= free.sum():
-            what = f"{plan.choose} sites are wanted of {int(free.sum())} candidates"
+    if selection.choose is not None:
+        if not 1 <= selection.choose <= free.sum():
+            what = f"{selection.choose} sites are wanted of {int(free.sum())} candidates"
             raise InvalidProblem(what, "choose", "ask for fewer, or name more candidates")
         rules.append(free + 0.0)
-        limits.append(float(plan.choose))
-    if plan.budget is not None:
-        rules.append(_costs(plan, n, site) * free)
-        limits.append(float(plan.budget))
-    own = [np.isin(np.arange(n), where(g.members, f"groups, entry {i + 1}")) for i, g in enumerate(plan.groups)]
+        limits.append(float(selection.choose))
+    if selection.budget is not None:
+        rules.append(_costs(selection, n, site) * free)
+        limits.append(float(selection.budget))
+    own = [np.isin(np.arange(n), where(g.members, f"groups, entry {i + 1}")) for i, g in enumerate(selection.groups)]
     inside = np.array(own, dtype=bool).reshape(-1, n)
-    check_groups(plan.groups, inside, names, state, plan.choose)
-    if plan.choose is not None and plan.budget is None and plan.groups:
+    check_groups(selection.groups, inside, names, state, selection.choose)
+    if selection.choose is not None and selection.budget is None and selection.groups:
         # one site more is always better, but for groups: there so many sites are a rule of their own
         rules.append(-free)
-        limits.append(-float(plan.choose))
-    for group, taken in zip(plan.groups, inside, strict=True):
+        limits.append(-float(selection.choose))
+    for group, taken in zip(selection.groups, inside, strict=True):
         members = taken.astype(float)
         if group.most is not None:
             rules.append(members)
@@ -377,35 +377,35 @@ def _rules(plan: Plan, names: tuple[str, ...], site: Array) -> tuple[Array, Arra
     return np.array(rules) / size[:, None], np.array(limits) / size, state
 
 
-def _costs(plan: Plan, n: int, site: Array) -> Array:
-    stations = np.concatenate([rows.a for rows in plan.problem.rows])
-    cost = None if plan.cost is None else np.asarray(plan.cost, dtype=float)
-    if cost is None or cost.shape != (plan.problem.stations.count,) or not (cost >= 0.0).all():
+def _costs(selection: SiteSelection, n: int, site: Array) -> Array:
+    stations = np.concatenate([rows.a for rows in selection.problem.rows])
+    cost = None if selection.cost is None else np.asarray(selection.cost, dtype=float)
+    if cost is None or cost.shape != (selection.problem.stations.count,) or not (cost >= 0.0).all():
         what = "a budget needs a cost of each station that is not negative"
         raise InvalidProblem(what, "cost", "give one number for each station")
-    if not np.isfinite(cost).all() or not 0.0 <= float(plan.budget or 0.0) < np.inf:
+    if not np.isfinite(cost).all() or not 0.0 <= float(selection.budget or 0.0) < np.inf:
         raise InvalidProblem("a cost or the budget is no finite number", "budget", "correct it")
     out = np.zeros(n)
-    measuring = np.unique(stations) if plan.by == "station" else None
+    measuring = np.unique(stations) if selection.by == "station" else None
     if measuring is None:
         return np.asarray(cost[stations])
     out[:] = cost[measuring]
     return out
 
 
-def _check_seen(posed: Posed) -> None:
+def _check_seen(candidates: Candidates) -> None:
     """Refuse a place at which all sites together leave the position open: no choice has a fix there."""
-    heard = (posed.design.rows != 0.0).any(axis=(1, 2)) & (posed.state != 0)
-    rows = posed.design.rows[..., posed.state != 0]
+    heard = (candidates.design.rows != 0.0).any(axis=(1, 2)) & (candidates.state != 0)
+    rows = candidates.design.rows[..., candidates.state != 0]
     places, r, m, n = rows.shape
     flat = np.moveaxis(rows, -1, 1).reshape(places, n * r, m)
-    prior = posed.design.prior
+    prior = candidates.design.prior
     scale = 1.0 / np.sqrt(np.diagonal(prior, axis1=1, axis2=2))
     for p in range(places):
         # In units of what the prior knows, a direction that rows know no better than it is open.
         singular = np.linalg.svd(flat[p] * scale[p], compute_uv=False)
         known = int((singular > 1.0).sum())
         if known < m:
-            name = posed.plan.names[p] if posed.plan.names else str(p + 1)
+            name = candidates.selection.names[p] if candidates.selection.names else str(p + 1)
             what = f"place {name!r} is in sight of {int(heard[p].sum())} sites, which leave its position open"
             raise InvalidProblem(what, "places", "add candidates that see it, or leave the place out")

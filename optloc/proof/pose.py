@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.linear.evaluate import columns, plans
+from optloc.linear.evaluate import block_links, columns
 from optloc.linear.normal import prior_parts, weighed
 from optloc.models import MODELS, Model
 from optloc.problem.noise import Whitener, variances, whiten
@@ -411,8 +411,8 @@ class Others:
         """Return the unknowns of a problem beside the target's state, those of stations apart."""
         size = problem.layout.size
         touch = np.zeros((problem.count, size))
-        for plan, start in zip(plans(problem), problem.starts, strict=True):
-            np.add.at(touch, (start + plan.adds.row, plan.adds.column), plan.adds.coefficient)
+        for links, start in zip(block_links(problem), problem.starts, strict=True):
+            np.add.at(touch, (start + links.adds.row, links.adds.column), links.adds.coefficient)
         parts = [part for part in prior_parts(problem) if part[0] not in ("position", "velocity")]
         wide = max(
             (len(array) for _, m, p in parts for array, core in ((m, 1), (p, 2)) if array.ndim > core), default=1

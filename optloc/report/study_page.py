@@ -13,7 +13,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import claim, make_folder, together, write_text, written
 from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
+from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
 from optloc.files.writer import harmless_column
 from optloc.papers.report import Picture
 from optloc.plot.bound_map import plot_bound_map
@@ -24,10 +24,10 @@ from optloc.report.map import Canvas
 from optloc.report.page import Part, map_element, write_page
 from optloc.report.sheets import Sheet, latex, sheets
 from optloc.study import summary
+from optloc.study.design import StudyDesign
 from optloc.study.draws import Case, draw
-from optloc.study.folder import Manifest, plan_again, read_frame, read_manifest, references
+from optloc.study.folder import Manifest, design_of_manifest, read_frame, read_manifest, references
 from optloc.study.networks import NetworkCase
-from optloc.study.plan import Plan
 from optloc.study.profiles import Profiles, profiles
 from optloc.study.summary import case_label, noise_text
 
@@ -67,13 +67,13 @@ class Place:
     off: Array
 
 
-def scenario_maps(plan: Plan, frame: pd.DataFrame) -> Iterator[Place]:
+def scenario_maps(design: StudyDesign, frame: pd.DataFrame) -> Iterator[Place]:
     """Yield the map of every case whose stations are the same in all trials, at its first noise level.
 
     Cases that have no map are left out.
     """
     first: dict[str, Case | NetworkCase] = {}
-    for cell in plan.cells:
+    for cell in design.cells:
         first.setdefault(case_label(cell.case.table.name, cell.case.sweep), cell.case)
     for title, case in list(first.items())[:_MOST]:
         if isinstance(case, NetworkCase):
@@ -97,7 +97,7 @@ def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
     )
     position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_REACH, :d]
     earth = problem.frame.geodetic and d == 3
-    plain = plan_of(problem.frame, position, earth)
+    plain = map_coordinates(problem.frame, position, earth)
     # The height of the middle trial, whole metres because the page says it.
     height = float(np.round(np.median(plain[:, 2]))) if d == 3 and len(plain) else 0.0
     west, east, south, north = extent(problem, position, widen=_WIDEN)
@@ -201,8 +201,8 @@ def _found(folder: Path) -> _Found:
     frame = summary.judged(rows)
     # Best first: the order of tables, legends and colours.
     order, cells = summary.methods(frame), summary.cells(frame)
-    plan = plan_again(manifest)
-    known = references(plan)
+    design = design_of_manifest(manifest)
+    known = references(design)
     # Nobody competes with methods that know the truth, unless there are no others.
     rivals = frame[~frame["method"].isin(known)]
     rivals = rivals if len(rivals) else frame
@@ -210,7 +210,7 @@ def _found(folder: Path) -> _Found:
     some = frame["processor"].notna().any()
     profiled = profiles(rivals) if some else None
     tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order, profiled)}
-    places = [] if plan is None else list(scenario_maps(plan, frame))
+    places = [] if design is None else list(scenario_maps(design, frame))
     return _Found(manifest, frame, cells, marks(order), tables, places, profiled)
 
 

@@ -31,7 +31,7 @@ class Prepared:
         What it was prepared from; its own measurements do not matter.
     method : str
         As of `optloc.solve`.
-    plan : Direct, optional
+    direct : Direct, optional
         What fixes its measurements directly; None where they take the stages of the method.
     place : array (B, stations, d)
         Positions of all stations, metres.
@@ -43,7 +43,7 @@ class Prepared:
 
     problem: Problem
     method: str
-    plan: Direct | None
+    direct: Direct | None
     place: Array
     shape: tuple[int, ...]
     short: Single | None
@@ -83,7 +83,7 @@ class Prepared:
                 if fix is not None:
                     return fix
         # nothing is ready: the stages of the method do it as ever
-        if self.plan is None or not at_hand(prod(shape)):
+        if self.direct is None or not at_hand(prod(shape)):
             wide = np.broadcast_to(values, (*shape, values.shape[-1]))
             return solve_in_stages(self.problem.with_rows(z=wide), Method.parse(self.method))
         flat = np.broadcast_to(values, (*shape, values.shape[-1])).reshape(-1, values.shape[-1])
@@ -92,7 +92,7 @@ class Prepared:
             wide = np.broadcast_to(place.reshape(*self.shape, *place.shape[1:]), (*shape, *place.shape[1:]))
             place = wide.reshape(-1, *place.shape[1:])
         try:
-            pool = settle_directly(self.plan, flat, place, lambda items: self._flat(values, shape).take(items))
+            pool = settle_directly(self.direct, flat, place, lambda items: self._flat(values, shape).take(items))
             fix = verdict(self._flat(values, shape), pool)
         except NUMERICAL:
             # one of them fails: which one is told where all take the stages
@@ -151,10 +151,10 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     # without measurements, so that nothing prepared can depend on them
     bare = problem.with_rows(z=np.zeros(problem.count))
-    plan = short = None
+    ready = short = None
     with suppress(*NUMERICAL):  # the stages tell which of its fixes fails
-        plan = direct(bare) if shortcut(parsed) and not separable(bare) else None
+        ready = direct(bare) if shortcut(parsed) and not separable(bare) else None
         short = single(bare, parsed)
     position = problem.stations.position
     place = position.reshape(-1, *position.shape[-2:])
-    return Prepared(bare, method, plan, place, bare.batch_shape, short)
+    return Prepared(bare, method, ready, place, bare.batch_shape, short)

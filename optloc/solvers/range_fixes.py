@@ -256,12 +256,12 @@ class Quick:
         """Return the settled pools of a flat batch of problems."""
         count = problem.batch_shape[0]
         quick = at_hand(count)
-        plan = direct(problem) if pool is None and (self.alone or quick) else None
+        ready = direct(problem) if pool is None and (self.alone or quick) else None
         refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
-        if plan is None or not quick:
+        if ready is None or not quick:
             start = pool
-            if plan is not None:
-                refinement = partial(lsr_with_mirror, descend=partial(_descend, plan))
+            if ready is not None:
+                refinement = partial(lsr_with_mirror, descend=partial(_descend, ready))
 
             def work(some: Problem, part: slice) -> Pool:
                 return refinement(some, gtrs(some, None if start is None else take(start, part)))
@@ -270,14 +270,14 @@ class Quick:
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         place = problem.stations.position.reshape(-1, *problem.stations.position.shape[-2:])
         z = z if z.ndim == 2 and len(z) == count else np.broadcast_to(z, (count, problem.count))
-        return settle_directly(plan, z, place, problem.take, refinement)
+        return settle_directly(ready, z, place, problem.take, refinement)
 
 
 def settle_directly(
     direct: Direct,
     z: Array,
     position: Array,
-    pose: Callable[[Array], Problem],
+    problems_at: Callable[[Array], Problem],
     refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror,
     threads: int | None = None,
 ) -> Pool:
@@ -291,7 +291,7 @@ def settle_directly(
         Measurements.
     position : array (N or 1, stations, d)
         Of all stations.
-    pose : callable
+    problems_at : callable
         Maps the numbers of problems whose answer is not plain to the problems.
     refinement : callable
         What takes the starts of those that are not plain by any means.
@@ -300,17 +300,17 @@ def settle_directly(
     """
     began = perf_counter()
     answer, steps = fix_directly(direct, z, position, threads)
-    left = np.flatnonzero(~_is_final(direct, answer, pose))
+    left = np.flatnonzero(~_is_final(direct, answer, problems_at))
     if not len(left):
-        return _pool(direct, _preferred(answer, pose), steps, began)
+        return _pool(direct, _preferred(answer, problems_at), steps, began)
     # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
-    some = pose(left)
+    some = problems_at(left)
     start = in_parts(some, lambda part, _: gtrs(part, None))
     place = position[left] if len(position) > 1 else position
     more, again = fix_directly(direct, z[left], place, threads, start.x[:, 0])
     for whole, part in zip(answer, more, strict=True):
         whole[left] = part
-    pool = _pool(direct, _preferred(answer, pose), max(steps, again), began)
+    pool = _pool(direct, _preferred(answer, problems_at), max(steps, again), began)
     lost = np.flatnonzero(~_is_final(direct, more, some.take))
     if not len(lost):
         return pool
@@ -401,7 +401,7 @@ def fix_directly(
     return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
 
 
-def _is_final(direct: Direct, answer: Answer, pose: Callable[[Array], Problem]) -> Array:
+def _is_final(direct: Direct, answer: Answer, problems_at: Callable[[Array], Problem]) -> Array:
     """Return which fixes (N,) need no other means: settled ones.
 
     On Earth those which it hides from a station are not final: what lies before it competes, and is told.
@@ -409,16 +409,16 @@ def _is_final(direct: Direct, answer: Answer, pose: Callable[[Array], Problem]) 
     if not direct.frame.geodetic:
         return answer.settled
     out, items = np.array(answer.settled), np.flatnonzero(answer.settled)
-    out[items] = ~is_hidden(pose(items), answer.x[items])
+    out[items] = ~is_hidden(problems_at(items), answer.x[items])
     return out
 
 
-def _preferred(answer: Answer, pose: Callable[[Array], Problem]) -> Answer:
+def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answer:
     """Return the answer with the likelier by its place of two minima that cost the same, as the verdict has it."""
     tied = np.flatnonzero(answer.settled & (np.abs(answer.rival_cost - answer.cost) <= equal_cost(answer.cost)))
     if not len(tied):
         return answer
-    some = pose(tied)
+    some = problems_at(tied)
     (first, second), (other, another) = likelihood_of(some, answer.x[tied]), likelihood_of(some, answer.rival[tied])
     changed = (other > first) | ((other == first) & (another > second))
     items, some = tied[changed], some.take(np.flatnonzero(changed))

@@ -32,7 +32,7 @@ from optloc.proof.near import UNIQUE
 from optloc.proof.pose import Affine, Posed, pose_affinely
 from optloc.proof.scope import is_run, unsupported
 from optloc.solvers.certify.branch_and_bound import METHOD, budgets, certify_stage, gaps_below, sentence
-from optloc.solvers.certify.posed import agrees
+from optloc.solvers.certify.position_cost import agrees
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.methods import Method
 from optloc.solvers.policy import COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
@@ -91,7 +91,7 @@ class _Room:
         Measurements.
     found : tuple of array
         Fields of `optloc.compute.range_start.Answer`, without position and covariance.
-    pose : Posed
+    costs : Posed
         With the whitened measurements; empty without a proof.
     asked, answered : Asked, Answered
         Of the proofs.
@@ -104,12 +104,12 @@ class _Room:
     many : Problem, optional
         n times the problem, on Earth: of what it hides no measurement matters.
     checked : bool
-        Whether the posed cost of a fix was compared with its own.
+        Whether the position cost of a fix was compared with its own.
     """
 
     z: Array
     found: tuple[Array, ...]
-    pose: Posed
+    costs: Posed
     asked: Asked
     answered: Answered
     centre: Array
@@ -127,10 +127,10 @@ class Single:
     ----------
     problem : Problem
         What it was made of; its own measurements do not matter.
-    plan : Direct
+    direct : Direct
         What fixes it.
     model : Model
-        The maps of the plan, as machine code takes them.
+        The maps of `direct`, as machine code takes them.
     station : array (1, s, d)
         Stations that take part, metres.
     map : Affine, optional
@@ -149,7 +149,7 @@ class Single:
     """
 
     problem: Problem
-    plan: Direct
+    direct: Direct
     model: Any
     station: Array
     map: Affine | None
@@ -178,7 +178,7 @@ class Single:
         if self.absent is not None:
             room.z[:, self.absent] = 0.0
         d = self.station.shape[-1]
-        x, covariance = np.empty((n, self.plan.layout.size)), np.empty((n, d, d))
+        x, covariance = np.empty((n, self.direct.layout.size)), np.empty((n, d, d))
         answer = Answer(x, covariance, *room.found)
         steps = kernel(self.model, room.z, self.station, TOLERANCE, LIMIT, False, answer)
         costs = answer.cost.tolist()
@@ -199,14 +199,14 @@ class Single:
             return fix if room.checked else None
         return fix
 
-    def _proves(self, posed: Affine, position: Array, costs: list[float], room: _Room) -> bool:
+    def _proves(self, affine: Affine, position: Array, costs: list[float], room: _Room) -> bool:
         """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
         asked, answered = room.asked, room.answered
         for i, cost in enumerate(costs):
-            posed.write(room.z[i], room.pose.w[i])
+            affine.write(room.z[i], room.costs.w[i])
             asked.eps[i] = equal_cost(cost)
         asked.x[:] = position
-        prove_here(room.pose, asked, answered)
+        prove_here(room.costs, asked, answered)
         told = zip(costs, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
         for cost, verdict, bound, everywhere, shown, met in told:
             if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
@@ -217,9 +217,9 @@ class Single:
         return True
 
     def _agrees(self, fix: Fix, room: _Room) -> bool:
-        """Return whether the posed costs are the problem's own, at the first fixes of a thread and beside them."""
+        """Return whether the position costs are the problem's own, at the first fixes of a thread and beside them."""
         many = self.problem.with_rows(z=room.z.copy())
-        return self.map is None or bool(agrees(many, fix.flat(), room.pose).all())
+        return self.map is None or bool(agrees(many, fix.flat(), room.costs).all())
 
     def _judge(
         self,
@@ -272,7 +272,7 @@ class Single:
         return rooms[shape]
 
     def _make_room(self, shape: tuple[int, ...]) -> _Room:
-        n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.station.shape[-1], self.problem.count
+        n, size, d, m = max(1, *shape, 1), self.direct.layout.size, self.station.shape[-1], self.problem.count
         found = (
             np.empty(n),
             np.empty(n, dtype=np.bool_),
@@ -281,9 +281,9 @@ class Single:
             np.empty((n, 2)),
             np.empty(n),
         )
-        posed = self.map
+        affine = self.map
         none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0))
-        kinds, data, K = none if posed is None else (posed.kinds, posed.data, posed.K)
+        kinds, data, K = none if affine is None else (affine.kinds, affine.data, affine.K)
         gap, nowhere = np.full(n, LISTED_GAP), np.full((n, 2, d), np.nan)
         asked = Asked(
             x=np.empty((n, d)),
@@ -299,21 +299,21 @@ class Single:
             planes=np.empty((n, 0, 3)),
             surface=np.empty((n, 0)),
         )
-        pose = Posed(kinds, data, K, np.empty((n, K.shape[1])), np.full(n, np.inf))
+        costs = Posed(kinds, data, K, np.empty((n, K.shape[1])), np.full(n, np.inf))
         centre = np.broadcast_to(self.centre, (*shape, d))
         kept = {
-            "layout": self.plan.layout,
-            "frame": self.plan.frame,
+            "layout": self.direct.layout,
+            "frame": self.direct.frame,
             "alternatives": Alternatives(np.empty((*shape, 0, size)), np.empty((*shape, 0))),
             # views that nobody can write into
-            "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
-            "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
+            "dof": np.broadcast_to(np.int32(self.direct.dof), shape),
+            "weights": np.broadcast_to(self.direct.weight, (*shape, m)),
             "active": np.broadcast_to(_NOTHING, shape),  # constraints that hold fixes: none
             "reach": np.broadcast_to(centre_and_spread(self.problem.stations.places)[1].reshape(()), shape),
         }
-        claims = alike(NO_PROOF if posed is None else _PROVEN, shape)
+        claims = alike(NO_PROOF if affine is None else _PROVEN, shape)
         many = self.problem.with_rows(z=np.zeros((n, m))) if self.problem.frame.geodetic else None
-        return _Room(np.empty((n, m)), found, pose, asked, empty_answer(n, d), centre, claims, kept, many)
+        return _Room(np.empty((n, m)), found, costs, asked, empty_answer(n, d), centre, claims, kept, many)
 
 
 class _Told(NamedTuple):
@@ -360,23 +360,23 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     if proves is None or (method.then is not None and not proves) or separable(problem):
         return None
     bare = _alone(problem)
-    plan = None if bare.batch_shape else direct(bare)
-    if plan is None or (proves and (unsupported(bare) or is_run(bare))):
+    ready = None if bare.batch_shape else direct(bare)
+    if ready is None or (proves and (unsupported(bare) or is_run(bare))):
         return None
-    posed = pose_affinely(bare) if proves else None
-    if proves and posed is None:
+    affine = pose_affinely(bare) if proves else None
+    if proves and affine is None:
         return None
     weight, d = bare.weight, problem.dimension
     return Single(
         bare,
-        plan,
-        Model(*plan.maps),  # type: ignore[arg-type]
-        np.require(bare.stations.position[:, plan.station], dtype=float, requirements=["C", "W"]),
-        posed,
+        ready,
+        Model(*ready.maps),  # type: ignore[arg-type]
+        np.require(bare.stations.position[:, ready.station], dtype=float, requirements=["C", "W"]),
+        affine,
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),
-        largest(plan.dof, DOUBT),
-        largest(plan.dof, REFUTED),
+        largest(ready.dof, DOUBT),
+        largest(ready.dof, REFUTED),
         quantile(COVERED, d),
         often,
     )

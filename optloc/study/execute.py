@@ -22,8 +22,8 @@ from warnings import catch_warnings, filterwarnings, warn
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import plugins
 from optloc.study.apart import Pool
+from optloc.study.design import Chunk, StudyDesign, workers
 from optloc.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
-from optloc.study.plan import Chunk, Plan, workers
 from optloc.study.trial import DIED, LATE, Lost, Part, join_parts, part_of_lost
 
 CONNECT = 10.0
@@ -72,14 +72,14 @@ def executor(name: str, jobs: int | None = None, address: str | None = None, lim
     return Executor(name, jobs, address, limit)
 
 
-def run_plan(
-    plan: Plan, folder: Path, by: Executor, tell: Tell | None = None, say: Callable[[str], None] = warn
+def run_design(
+    design: StudyDesign, folder: Path, by: Executor, tell: Tell | None = None, say: Callable[[str], None] = warn
 ) -> Progress:
     """Compute what is missing of a study, and return how far it is.
 
     Parameters
     ----------
-    plan : Plan
+    design : StudyDesign
         The study.
     folder : Path
         Its output folder: new, or begun by the same study and the same version.
@@ -97,13 +97,13 @@ def run_plan(
     """
     with locked(folder):
         # From here to the end nobody else writes: what is counted as finished stays so.
-        manifest = begin(plan, folder)
+        manifest = begin(design, folder)
         done = finished_parts(folder, manifest, say)
-        known = known_data(plan, folder, done)
+        known = known_data(design, folder, done)
         if tell is not None and done:
             had = progress(folder)
             tell(had.rows, had.counts)
-        left = [chunk for chunk in plan.chunks if chunk.key not in done]
+        left = [chunk for chunk in design.chunks if chunk.key not in done]
         with closing(compute_all(left, by)) as parts:
             for part in parts:
                 note_data(known, part.table, folder)
@@ -171,7 +171,7 @@ _LEAST, _BUILD = 1 / 8, 10.0
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """Some trials of a chunk of the plan; `again` where its process has died once."""
+    """Some trials of a chunk of the design; `again` where its process has died once."""
 
     chunk: Chunk
     whole: Chunk
@@ -201,7 +201,7 @@ class _Work:
             yield task.chunk, self._seconds(task)
 
     def take(self, found: Part | Lost) -> Iterator[Part]:
-        """Yield the part of a chunk of the plan where it is complete with what was found."""
+        """Yield the part of a chunk of the design where it is complete with what was found."""
         task = self.out.pop(found.key)
         part = self._judge(task, found) if isinstance(found, Lost) else found
         if part is None:

@@ -19,8 +19,8 @@ from optloc.base.inputs import json_of, read_bytes
 from optloc.base.outputs import written
 from optloc.base.types import Status
 from optloc.study.baselines import BASELINES
+from optloc.study.design import StudyDesign, design_of_text
 from optloc.study.methods import version_of
-from optloc.study.plan import Plan, planned
 from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
@@ -50,13 +50,13 @@ class Manifest:
     seed : int
         Of the study.
     fingerprint : str
-        Of the plan.
+        Of the design.
     version : str
         Version of optloc that computes it.
     columns : tuple of str
         Columns of its parts.
     chunks : dict of str to int
-        Keys of the chunks of the plan and their rows.
+        Keys of the chunks of the design and their rows.
     created : str
         When it was begun, UTC.
     machine, versions : str
@@ -91,32 +91,32 @@ class Manifest:
         return sum(self.chunks.values())
 
 
-def manifest_of(plan: Plan) -> Manifest:
-    """Return the manifest of a plan that is about to begin."""
-    study = plan.study
+def manifest_of(design: StudyDesign) -> Manifest:
+    """Return the manifest of a design that is about to begin."""
+    study = design.study
     return Manifest(
         study.name,
         study.title or "",
         study.note or "",
-        plan.text,
+        design.text,
         study.seed,
-        plan.fingerprint,
+        design.fingerprint,
         version_of("optloc"),
         tuple(column.name for column in COLUMNS),
-        {chunk.key: chunk.count for chunk in plan.chunks},
+        {chunk.key: chunk.count for chunk in design.chunks},
         f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
         machine(),
         versions(),
-        plan.folder,
-        plan.data,
-        {cell.key: cell.method.name for cell in plan.cells},
+        design.folder,
+        design.data,
+        {cell.key: cell.method.name for cell in design.cells},
     )
 
 
 def joined(found: Manifest, wanted: Manifest) -> Manifest | None:
-    """Return the manifest of a folder that gets the methods of a plan, too; None where the data are others.
+    """Return the manifest of a folder that gets the methods of a design, too; None where the data are others.
 
-    What was computed stays, but for methods that the plan has by the same name: those are as the plan says now.
+    What was computed stays, but for methods that the design has by the same name: those are as the design says now.
     """
     if not found.data or found.data != wanted.data:
         return None
@@ -147,32 +147,32 @@ def read_manifest(folder: Path) -> Manifest:
         raise InvalidProblem("the manifest is incomplete", str(path), "write to another folder") from None
 
 
-def plan_again(manifest: Manifest) -> Plan | None:
-    """Return the plan of a study from its manifest, None where a problem file cannot be read any more."""
+def design_of_manifest(manifest: Manifest) -> StudyDesign | None:
+    """Return the design of a study from its manifest, None where a problem file cannot be read any more."""
     try:
-        return planned(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
+        return design_of_text(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
     except InvalidProblem:
         return None
 
 
-def references(plan: Plan | None) -> set[str]:
+def references(design: StudyDesign | None) -> set[str]:
     """Return the names of the methods that begin at the truth, with which nobody competes."""
-    # A method that was added to the folder has the name of its baseline, and is in no plan.
+    # A method that was added to the folder has the name of its baseline, and is in no design.
     known = {name for name, baseline in BASELINES.items() if baseline.reference}
-    return known | ({cell.method.name for cell in plan.cells if cell.method.reference} if plan else set())
+    return known | ({cell.method.name for cell in design.cells if cell.method.reference} if design else set())
 
 
-def begin(plan: Plan, folder: Path) -> Manifest:
-    """Return the manifest of a folder for a plan, written where it is new; call it while the folder is `locked`.
+def begin(design: StudyDesign, folder: Path) -> Manifest:
+    """Return the manifest of a folder for a design, written where it is new; call it while the folder is `locked`.
 
-    A folder of the same data by other methods gets those of the plan, too: see `joined`.
+    A folder of the same data by other methods gets those of the design, too: see `joined`.
 
     Raises
     ------
     InvalidProblem
         Where the folder cannot be written, or belongs to another study or another version of optloc.
     """
-    wanted = manifest_of(plan)
+    wanted = manifest_of(design)
     before, found = None, wanted
     if (folder / MANIFEST).exists():
         before = read_manifest(folder)
@@ -343,7 +343,7 @@ def note_data(known: dict[str, str], table: Any, folder: Path) -> None:
             raise InvalidProblem(what, str(folder), advice)
 
 
-def known_data(plan: Plan, folder: Path, done: dict[str, Path]) -> dict[str, str]:
+def known_data(design: StudyDesign, folder: Path, done: dict[str, Path]) -> dict[str, str]:
     """Return the digests of the blocks of finished chunks, whose part files are given, by their seeds.
 
     Raises
@@ -352,7 +352,7 @@ def known_data(plan: Plan, folder: Path, done: dict[str, Path]) -> dict[str, str
         Where they contradict each other, or what is drawn here for the first finished trial of a case.
     """
     known: dict[str, str] = {}
-    first = {chunk.cell.case.key: chunk for chunk in reversed(list(plan.chunks)) if chunk.key in done}
+    first = {chunk.cell.case.key: chunk for chunk in reversed(list(design.chunks)) if chunk.key in done}
     for path in done.values():
         note_data(known, read_part(path, ["seed", "data"]), folder)
     for chunk in first.values():
@@ -407,7 +407,7 @@ class Progress:
     manifest : Manifest
         Of its folder.
     done, chunks : int
-        Finished chunks, and those of the plan.
+        Finished chunks, and those of the design.
     rows : int
         Finished rows.
     counts : dict of str to int

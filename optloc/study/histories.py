@@ -30,7 +30,7 @@ from optloc.solvers.pool import Pool, begin
 from optloc.solvers.refine import refine
 from optloc.study.baselines import Baseline, heard, start_of
 from optloc.study.draws import Case, Drawn, draw
-from optloc.study.folder import plan_again, read_frame, read_manifest
+from optloc.study.folder import design_of_manifest, read_frame, read_manifest
 from optloc.study.methods import SETTINGS, Method, added
 from optloc.study.minimizers import baseline_of
 from optloc.study.networks import NetworkCase
@@ -422,11 +422,11 @@ def question(
 
 def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Question:
     manifest = read_manifest(folder)
-    plan = plan_again(manifest)
-    if plan is None:
+    design = design_of_manifest(manifest)
+    if design is None:
         raise InvalidProblem("a problem file of the study cannot be read any more", str(folder), "put it back")
     cells: dict[str, dict[str, Case | NetworkCase]] = {}
-    for cell in plan.cells:
+    for cell in design.cells:
         own = cells.setdefault(case_label(cell.case.table.name, cell.case.sweep), {})
         own.setdefault(noise_text(cell.case.label), cell.case)
     title = _chosen(case, cells, "case")
@@ -435,9 +435,9 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
     if isinstance(wanted, NetworkCase):
         raise InvalidProblem(f"{title} is of networks, which have no histories", str(folder), "name a case of fixes")
     drawn, least = _known(folder, wanted, count)
-    methods = {cell.method.name: cell.method for cell in plan.cells if not cell.method.reference}
+    methods = {cell.method.name: cell.method for cell in design.cells if not cell.method.reference}
     methods |= {method.name: method for method in added(names)}
-    known = {*methods, *(cell.method.name for cell in plan.cells)}
+    known = {*methods, *(cell.method.name for cell in design.cells)}
     missing = tuple(
         f"{name}: it was added to the folder; name it with --method, and it is followed"
         for name in dict.fromkeys(manifest.methods.values())

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from optloc.study.design import StudyDesign
 from optloc.study.folder import Manifest, read_frame, read_manifest
 from optloc.study.paired import paired
-from optloc.study.plan import Plan
 from optloc.study.summary import COLUMNS, judged, methods, wilson
 
 if TYPE_CHECKING:
@@ -21,28 +21,28 @@ SET = "bench"
 _JUDGE = "truth"
 
 
-def page(folder: Path, plan: Plan) -> str:
+def page(folder: Path, design: StudyDesign) -> str:
     """Return the leaderboard of a folder as Markdown.
 
     Parameters
     ----------
     folder : Path
         Output folder of a run of the test set.
-    plan : Plan
-        Its plan: tells which data these are.
+    design : StudyDesign
+        Its design: tells which data these are.
     """
     rows, manifest = judged(read_frame(folder, COLUMNS)), read_manifest(folder)
     # The judge knows the truth: it is compared with nobody.
     ranked = rows[rows["method"].astype(str) != _JUDGE]
-    lines = ["---", "orphan: true", "---", "", "<!-- table -->", "", _about(manifest, plan), ""]
+    lines = ["---", "orphan: true", "---", "", "<!-- table -->", "", _about(manifest, design), ""]
     lines += [*_ranks(ranked), "", "Share of right answers by scene, %:", "", *_by_case(ranked)]
     return "\n".join(lines)
 
 
-def _about(manifest: Manifest, plan: Plan) -> str:
+def _about(manifest: Manifest, design: StudyDesign) -> str:
     return (
-        f"optloc {manifest.version}, {manifest.created[:10]}, test set {plan.data[:16]}, seed {manifest.seed}, "
-        f"{plan.cells[0].case.trials} trials a scene; {manifest.machine}."
+        f"optloc {manifest.version}, {manifest.created[:10]}, test set {design.data[:16]}, seed {manifest.seed}, "
+        f"{design.cells[0].case.trials} trials a scene; {manifest.machine}."
     )
 
 

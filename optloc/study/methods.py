@@ -81,7 +81,7 @@ class Method:
     @property
     def identity(self) -> str:
         """Return what decides the answers, as text."""
-        # Not the chunk: it decides how the work is cut, and the fingerprint of a plan has that.
+        # Not the chunk: it decides how the work is cut, and the fingerprint of a design has that.
         settings = json.dumps(self.settings, sort_keys=True)
         parts = (self.name, self.method, self.baseline, self.solver, settings, self.start, self.width, self.batch)
         return json.dumps((*parts, self.code) if self.code else parts)
@@ -284,7 +284,7 @@ def require_program(method: Method, found: Run) -> None:
 def _solved(method: Method, drawn: Drawn | Networks) -> Any:
     if isinstance(drawn, Networks):
         finds = calibrated if method.baseline is None else baseline_of(method.baseline).networks
-        assert finds is not None  # the plan has asked
+        assert finds is not None  # `design_of_text` refuses other methods
         return finds(drawn)
     if method.baseline is not None:
         return baseline_of(method.baseline).run(drawn, start_of(method.start, method.width, drawn))

@@ -24,6 +24,7 @@ from optloc.linear.normal import covariance, eliminated
 from optloc.problem.claims import PROOFS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.study.design import Cell, Chunk
 from optloc.study.draws import Case, Drawn
 from optloc.study.methods import Nonsense, require_program, run, version_of
 from optloc.study.networks import (
@@ -35,7 +36,6 @@ from optloc.study.networks import (
     known_networks,
     true_columns,
 )
-from optloc.study.plan import Cell, Chunk
 
 # The long table of a study, one row for each trial of each method: columns, units and meaning in one place.
 
@@ -173,7 +173,7 @@ COLUMNS: tuple[Column, ...] = (
         value=False,
     ),
     Column("batch", "int", "", "Number of fixes in the call."),
-    Column("chunk", "category", "", "Chunk of the plan that holds the row."),
+    Column("chunk", "category", "", "Chunk of the design that holds the row."),
     Column("machine", "category", "", "Processor, number of cores and system of the worker.", value=False),
     Column("versions", "category", "", "Versions of optloc, Python and the libraries, as text.", value=False),
 )

@@ -212,12 +212,12 @@ def _cover(surface: Surface, threshold: float, boxes: int | None) -> tuple[Cells
     why = unsupported(surface.problem) or crowded(surface.problem)
     if why:
         return None, False, why
-    pose = pose_costs(surface.problem)
-    cost, x = _present(pose.kinds, pose.data[0], pose.K[0], pose.w[0]), np.array(surface.position)
+    costs = pose_costs(surface.problem)
+    cost, x = _present(costs.kinds, costs.data[0], costs.K[0], costs.w[0]), np.array(surface.position)
     box, d = empty_box(cost.K.shape[0], cost.K.shape[1]), len(x)
     level = cost_of_point(cost, box, x) + threshold - surface.least
     level += _EQUAL * (1.0 + level)
-    if pose.level[0] < level:
+    if costs.level[0] < level:
         return None, False, TURNS
     most = boxes or (_MOST[d] if enabled() else _MOST_PLAIN)
     lists, endless = room(most), bool(reaches_infinity(cost.kinds, cost.K))

@@ -96,7 +96,7 @@ def test_where_all_that_starts_lead_to_is_hidden_a_search_finds_what_is_in_sight
 # Satellites below the horizon of the place that fits, and networks on the ground.
 
 
-def posed(kind, places, sigma, **more):
+def problem_of(kind, places, sigma, **more):
     """Return rows of one kind from all stations to one target, in ECEF."""
     every = np.arange(len(places))
     if kind == "tdoa":
@@ -126,7 +126,7 @@ def test_satellites_below_the_horizon_are_named(kind, radius, sigma):
     rng = np.random.default_rng(5)
     direction = rng.normal(size=(8, 3))
     places = radius * direction / np.linalg.norm(direction, axis=1)[:, None]
-    template = posed(kind, places, sigma)
+    template = problem_of(kind, places, sigma)
     where = ECEF.from_geodetic(np.arcsin(rng.uniform(-1, 1, 12)), rng.uniform(-np.pi, np.pi, 12), np.full(12, 300.0))
     z = np.stack([drawn(template, place, seed).z for seed, place in enumerate(where)])
     fix = optloc.solve(template.with_rows(z=z), "gtrs+lsr")
@@ -146,7 +146,7 @@ def test_satellites_above_the_horizon_are_fixed(kind):
     rng = np.random.default_rng(2)
     side = rng.normal(size=(7, 3))
     direction = place / np.linalg.norm(place) + 0.45 * side / np.linalg.norm(side, axis=1)[:, None]
-    fix = optloc.solve(drawn(posed(kind, 26.56e6 * direction, 5.0), place, 3))
+    fix = optloc.solve(drawn(problem_of(kind, 26.56e6 * direction, 5.0), place, 3))
     assert np.linalg.norm(fix.position - place) < 4.0 * np.sqrt(np.trace(fix.cov[:3, :3]))
     assert fix.status == Status.OK
 
@@ -212,7 +212,7 @@ def ground(count, span, seed):
 def test_a_network_on_the_ground_reaches_beyond_its_horizon(span, lon):
     place = np.array(ECEF.from_geodetic(np.radians(30.0), np.radians(lon), 5e3))
     bounds = optloc.constraints.height(0.0, 20e3)
-    fix = optloc.solve(drawn(posed("tdoa", ground(7, span, 1), 100.0, constraints=bounds), place, 1))
+    fix = optloc.solve(drawn(problem_of("tdoa", ground(7, span, 1), 100.0, constraints=bounds), place, 1))
     assert np.linalg.norm(fix.position - place) < 20e3
     assert fix.answered
 
@@ -224,7 +224,7 @@ def test_a_network_on_the_ground_reaches_beyond_its_horizon(span, lon):
 def test_a_network_on_the_ground_is_told_its_own_reason(kind, lat, lon, row):
     """A wrong row moves the best minimum into space, where the Earth hides it from some of the stations."""
     place = np.array(ECEF.from_geodetic(np.radians(lat), np.radians(lon), 5e3))
-    problem = drawn(posed(kind, ground(7, 15.0, 3), 50.0), place, 2)
+    problem = drawn(problem_of(kind, ground(7, 15.0, 3), 50.0), place, 2)
     z = problem.z.copy()
     z[row] += 400e3
     fix = optloc.solve(problem.with_rows(z=z))
@@ -237,7 +237,7 @@ def test_what_ground_stations_measure_of_a_satellite_has_no_image_behind_the_ear
     """A flat network of ranges has a mirror image: that of a satellite is behind the Earth."""
     places = ground(6, 0.4, 5)
     place = np.array(ECEF.from_geodetic(np.radians(46.0), np.radians(12.0), 20.2e6))
-    problem = drawn(posed("range", places, 30.0), place, 1)
+    problem = drawn(problem_of("range", places, 30.0), place, 1)
     fix = optloc.solve(problem)
     assert fix.status != Status.AMBIGUOUS
     found = fix.alternatives.x[np.isfinite(fix.alternatives.gap)]

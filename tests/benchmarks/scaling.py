@@ -66,7 +66,7 @@ def scene(stations: int, count: int) -> Scene:
     return Scene(places, layouts.model(kind, places, SIGMA).exact(truth) + noise, truth, covariance)
 
 
-def posed(made: Scene, epochs: int = 1) -> Problem:
+def problem_of(made: Scene, epochs: int = 1) -> Problem:
     """Return the problems of a scene; with several epochs each is a run of a fixed emitter with the same stations."""
     s = made.stations.shape[1]
     a, epoch = np.tile(np.arange(1, s), epochs), np.repeat(np.arange(epochs), s - 1)
@@ -123,7 +123,7 @@ def with_stations(rounds: int, most: int = STATIONS[-1]) -> list[Curve]:
     works: dict[tuple[str, int], tuple[Callable[[], Any], int]] = {}
     for s in (s for s in STATIONS if s <= most):
         made = scene(s, ROWS // (s - 1))
-        works |= _solved(s, posed(made), len(made.z))
+        works |= _solved(s, problem_of(made), len(made.z))
         works[SCIPY, s] = (scipy_from_the_truth(made.first(GENERAL)), GENERAL)
     with threads(1):
         return curves("stations", quietest(works, rounds))
@@ -134,7 +134,7 @@ def with_epochs(rounds: int, most: int = EPOCHS[-1]) -> list[Curve]:
     works: dict[tuple[str, int], tuple[Callable[[], Any], int]] = {}
     for k in (k for k in EPOCHS if k <= most):
         made = scene(6, max(1, ROWS // (5 * k)))
-        works |= _solved(k, posed(made, k), len(made.z))
+        works |= _solved(k, problem_of(made, k), len(made.z))
     with threads(1):
         return curves("epochs", quietest(works, rounds))
 
@@ -143,7 +143,7 @@ def with_batch(rounds: int, most: int = BATCH[-1]) -> list[Curve]:
     """Return the time of a fix against the number of fixes of one call, six stations, on one and two threads."""
     made, works = scene(6, most), {}
     for n in (n for n in BATCH if n <= most):
-        for (method, place), (work, _) in _solved(n, posed(made.first(n)), n).items():
+        for (method, place), (work, _) in _solved(n, problem_of(made.first(n)), n).items():
             # The proof of a million takes its time: the curve is flat long before.
             if n <= most // 10 or method == METHODS[0]:
                 for count in THREADS:
@@ -178,7 +178,7 @@ def _million(method: str, count: int, inside: float) -> tuple[float, float, floa
     noise = rng.standard_normal(made.z.shape) @ np.linalg.cholesky(made.covariance).T
     exact = layouts.model(kind, made.stations, SIGMA).exact(truth)
     mixed = rng.permutation(count)
-    problem = posed(Scene(made.stations[mixed], (exact + noise)[mixed], truth[mixed], made.covariance))
+    problem = problem_of(Scene(made.stations[mixed], (exact + noise)[mixed], truth[mixed], made.covariance))
     solve(problem.take(np.arange(min(count, 5000))), method)
     with resident() as held:
         began = perf_counter()

@@ -42,7 +42,7 @@ def scene(place):
     return Scene(np.broadcast_to(STATIONS, (COUNT, 6, 3)), z, truth, SIGMA**2 * (np.eye(5) + 1.0))
 
 
-def posed(z, order=(1, 2, 3, 4, 5)):
+def problem_of(z, order=(1, 2, 3, 4, 5)):
     return assemble(STATIONS, measured("tdoa", z, a=np.array(order), b=FIRST, arrival_sigma=SIGMA))
 
 
@@ -76,7 +76,7 @@ def general(place):
 
 def kernels(place):
     """The machine code of fix and proof alone, on arrays that are ready."""
-    ready, z = prepare(posed(scene(place).z[0]), "auto"), scene(place).z
+    ready, z = prepare(problem_of(scene(place).z[0]), "auto"), scene(place).z
     ready(z[0])
     short = ready.short
     room = short._room(())
@@ -86,41 +86,41 @@ def kernels(place):
     def work(i):
         room.z[0] = z[i]
         few_fixes(short.model, room.z, short.station, TOLERANCE, LIMIT, False, answer)
-        short.map.write(z[i], room.pose.w[0])
+        short.map.write(z[i], room.costs.w[0])
         room.asked.x[0] = x[0]
-        prove_here(room.pose, room.asked, room.answered)
+        prove_here(room.costs, room.asked, room.answered)
 
     return timed(work)
 
 
 def prepared(method, place):
-    ready, z = prepare(posed(scene(place).z[0]), method), scene(place).z
+    ready, z = prepare(problem_of(scene(place).z[0]), method), scene(place).z
     return timed(lambda i: ready(z[i]))
 
 
 def fresh(place):
     """Problems of a structure that was seen before, each made for itself."""
-    made = [posed(z) for z in scene(place).z]
+    made = [problem_of(z) for z in scene(place).z]
     return timed(lambda i: solve(made[i]))
 
 
 def few(count):
     """Sets of measurements of one scene, so many in one call."""
     z = scene(PLACES[0]).z
-    made = [posed(z[i : i + count]) for i in range(COUNT - count)]
+    made = [problem_of(z[i : i + count]) for i in range(COUNT - count)]
     return timed(lambda i: solve(made[i]), len(made))
 
 
 def new():
     """Structures that nobody has seen: the stations in another order each time."""
     orders = list(permutations(range(1, 6)))[1:101]
-    made = [posed(z[np.array(order) - 1], order) for z, order in zip(scene(PLACES[0]).z, orders, strict=False)]
+    made = [problem_of(z[np.array(order) - 1], order) for z, order in zip(scene(PLACES[0]).z, orders, strict=False)]
     return timed(lambda i: solve(made[i]), len(made), 0)
 
 
 def assembled():
     z = scene(PLACES[0]).z
-    return timed(lambda i: posed(z[i]))
+    return timed(lambda i: problem_of(z[i]))
 
 
 def update(name):

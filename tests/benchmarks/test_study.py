@@ -4,11 +4,11 @@ import resource
 from time import perf_counter
 
 import pytest
-from study.texts import plan
+from study.texts import design
 
-from optloc.study.execute import executor, run_plan
+from optloc.study.design import workers
+from optloc.study.execute import executor, run_design
 from optloc.study.folder import read_frame
-from optloc.study.plan import workers
 
 MILLION = """
 format = 1
@@ -28,7 +28,7 @@ SLOW = MILLION.replace("1_000_000", "2000").replace('"gtrs+lsr"', '"socp"\nchunk
 @pytest.mark.full
 def test_a_million_fixes_in_two_minutes_and_two_gigabytes(tmp_path):
     began = perf_counter()
-    found = run_plan(plan(MILLION), tmp_path / "out", executor("processes", 2))
+    found = run_design(design(MILLION), tmp_path / "out", executor("processes", 2))
     seconds = perf_counter() - began
     own, theirs = (resource.getrusage(who).ru_maxrss / 1e6 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     print(f"{found.rows} fixes in {seconds:.1f} s; memory {own:.2f} GB here, {theirs:.2f} GB at most in a worker")  # noqa: T201  (what a benchmark is for)
@@ -47,7 +47,7 @@ def test_two_workers_do_the_work_of_nearly_two(tmp_path):
         for jobs in (1, 2):
             told: list[tuple[float, int]] = []
             by, out = executor("processes", jobs), tmp_path / f"{i}-{jobs}"
-            run_plan(plan(text), out, by, lambda rows, _, told=told: told.append((perf_counter(), rows)))
+            run_design(design(text), out, by, lambda rows, _, told=told: told.append((perf_counter(), rows)))
             steady = told[2 * jobs :]
             rate = sum(rows for _, rows in steady[1:]) / (steady[-1][0] - steady[0][0])
             rates[jobs] = max(rates[jobs], rate)
@@ -58,7 +58,7 @@ def test_two_workers_do_the_work_of_nearly_two(tmp_path):
 def test_overhead_of_the_machinery_at_tasks_of_a_millisecond(tmp_path):
     """Everything but the solver, storing included, costs less than a tenth of the solver's time."""
     told: list[float] = []
-    run_plan(plan(SLOW), tmp_path / "out", executor("processes", 1), lambda *_: told.append(perf_counter()))
+    run_design(design(SLOW), tmp_path / "out", executor("processes", 1), lambda *_: told.append(perf_counter()))
     # From the first part on: processes and machine code have begun by then.
     frame = read_frame(tmp_path / "out", ["chunk", "trial", "seconds"])
     first = frame["chunk"] == frame["chunk"][frame["trial"] == 0].iloc[0]

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from benchmarks.scenes import Scene
 from benchmarks.with_general import STEPS
-from benchmarks.with_optloc import posed
+from benchmarks.with_optloc import problem_of
 
 from optloc import gauss_newton
 
@@ -17,7 +17,7 @@ jax.config.update("jax_enable_x64", True)
 
 def steps(scene: Scene) -> Any:
     """Gauss-Newton steps from the truth, with covariance."""
-    problem = posed(scene)
+    problem = problem_of(scene)
 
     def taken(x: Any) -> tuple[Any, Any]:
         found = gauss_newton(problem, x, steps=STEPS)

@@ -11,7 +11,7 @@ import optloc
 from optloc import Fix, Problem, assemble, measured, solve
 
 
-def posed(scene: Scene) -> Problem:
+def problem_of(scene: Scene) -> Problem:
     """Return the batch of problems of a scene."""
     a = np.arange(1, scene.stations.shape[1])
     rows = measured("tdoa", scene.z, a=a, b=np.zeros_like(a), arrival_sigma=SIGMA / np.sqrt(2.0))
@@ -28,7 +28,7 @@ def batch(method: str) -> Any:
     """Return a method that fixes all emitters in one call."""
 
     def make(scene: Scene) -> Any:
-        problem = posed(scene)
+        problem = problem_of(scene)
 
         def work() -> Any:
             fix = solve(problem, method)
@@ -43,7 +43,7 @@ def single(method: str) -> Any:
     """Return a method that fixes one emitter a call: a prepared problem with new measurements."""
 
     def make(scene: Scene) -> Any:
-        problems = [posed(scene.first(i + 1)).take(np.array([i])) for i in range(len(scene.z))]
+        problems = [problem_of(scene.first(i + 1)).take(np.array([i])) for i in range(len(scene.z))]
         ready = [optloc.prepare(problem, method) for problem in problems]
 
         def work() -> np.ndarray:

@@ -8,7 +8,7 @@ from cases import CASES, kitchen_sink, random_vector
 
 from optloc import MODELS
 from optloc.compute.trace import OPERATIONS, Recorder, Symbol, evaluate, operate, tape, trace
-from optloc.linear.evaluate import given, plans, points
+from optloc.linear.evaluate import block_links, given, points
 from optloc.models.primitives import Jet, namespace
 
 SINKS = {f"sink-{d}d-{span}": kitchen_sink(d, span) for d in (2, 3) for span in ("epoch", "run")}
@@ -17,9 +17,9 @@ PROBLEMS |= {name: (problem, random_vector(problem)) for name, problem in SINKS.
 
 
 def tapes(problem):
-    for plan in plans(problem):
-        inputs = given(problem, plan)
-        yield plan, inputs, trace(problem, plan, frozenset(inputs), frozenset(feed.seed for feed in plan.feeds))
+    for links in block_links(problem):
+        inputs = given(problem, links)
+        yield links, inputs, trace(problem, links, frozenset(inputs), frozenset(feed.seed for feed in links.feeds))
 
 
 def recorded(function, *names):
@@ -31,16 +31,16 @@ def recorded(function, *names):
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_value_and_derivatives_are_those_of_the_jets(name):
     problem, x = PROBLEMS[name]
-    for plan, inputs, found in tapes(problem):
-        t, a, b = points(problem, plan, x, differentiate=True)
-        jet = plan.model.h(t, a, b)
+    for links, inputs, found in tapes(problem):
+        t, a, b = points(problem, links, x, differentiate=True)
+        jet = links.model.h(t, a, b)
         parts = jet.partials if isinstance(jet, Jet) else {}
-        for feed in plan.feeds:  # the inputs as the jets had them
-            full = np.zeros(plan.block.count)
+        for feed in links.feeds:  # the inputs as the jets had them
+            full = np.zeros(links.block.count)
             full[feed.rows] = x[feed.column] * feed.gain
             inputs[feed.seed] = inputs.get(feed.seed, 0.0) + full
         value, *partials = evaluate(found.tape, inputs)
-        size = np.abs(jet.value) + (6.4e6 if plan.model.ecef else 1.0)
+        size = np.abs(jet.value) + (6.4e6 if links.model.ecef else 1.0)
         assert (np.abs(value - jet.value) <= 1e-13 * size).all()
         nonzero = {seed for seed, part in parts.items() if np.any(part)}
         assert nonzero <= set(found.seeds)

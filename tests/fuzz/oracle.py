@@ -108,7 +108,7 @@ def of_fixes(own, problem, told):
     if lacks or own.count > EPOCHS:
         return f"same: its fix is not judged: {', '.join(lacks) or 'many epochs'}"
     for epoch, said in enumerate(told["fixes"]):
-        fix = optloc.solve(posed(own, epoch))
+        fix = optloc.solve(problem_of(own, epoch))
         # Which refusal it is may hang on the last digit; what is claimed may not.
         if fix.status.label != said["status"] and "ok" in (fix.status.label, said["status"]):
             return f"mismatch: epoch {epoch} is {said['status']}, of the plain numbers {fix.status.label}"
@@ -122,7 +122,7 @@ def of_fixes(own, problem, told):
     return "same fix"
 
 
-def posed(own, epoch):
+def problem_of(own, epoch):
     """Return the problem of one epoch of a plain reading."""
     here = own.place[epoch if len(own.place) > 1 else 0]
     known = next(at for at in here if at is not None)

@@ -323,16 +323,16 @@ OF_STUDIES = (
 @cache
 def study_folder():
     """Return the files of a study that is done, by their names: computed once in a process."""
+    from optloc.study.design import design_of_text
     from optloc.study.folder import begin, locked, store
-    from optloc.study.plan import planned
     from optloc.study.trial import compute
 
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "out"
-        plan = planned(STUDY, "small.toml", Path())
+        design = design_of_text(STUDY, "small.toml", Path())
         with locked(folder):
-            begin(plan, folder)
-            for chunk in plan.chunks:
+            begin(design, folder)
+            for chunk in design.chunks:
                 store(folder, compute(chunk))
         files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock"]
         return {str(path.relative_to(place)): path.read_bytes() for path in files}

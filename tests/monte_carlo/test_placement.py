@@ -18,7 +18,8 @@ from optloc.placement.best_set import exchanged, random_sets, search
 PART = float(os.environ.get("OPTLOC_PART", "1"))
 # Random sets that are exchanged, over all searches of a case.
 RANDOM = 500
-# Sets below which a node is looked at set by set while 16 choose 6 is counted, so that bounds decide as in large plans.
+# Sets below which a node is looked at set by set while 16 choose 6 is counted, so that bounds decide as they do among
+# many sites.
 FEW = 50
 # Wall seconds after which a search stops: CPU seconds are what counts, and the machine may have other work.
 PATIENCE = 4.0

@@ -16,7 +16,7 @@ from proof.test_targets_over_ground import drawn as over_ground
 from optloc import Problem, Status, simulate, solve
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import exact, restore
-from optloc.solvers.certify.posed import state_columns
+from optloc.solvers.certify.position_cost import state_columns
 from optloc.solvers.refine import refine
 from optloc.solvers.starts.position import vectors
 

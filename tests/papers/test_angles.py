@@ -151,11 +151,11 @@ TINY = angles_tables.Sample(8, 12, 3, 1)
 def report():
     # Simulation 3 as printed lasts 3000 s; here it has two minutes.
     short = tuple(replace(s, states=s.states[:121], phases=(40, 80, 120)) for s in READINGS)
-    ticks, plan = [], angles_tables.STUDY.plan(TINY, 3)
+    ticks, ready = [], angles_tables.STUDY.reproduction(TINY, 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(angles_tables, "READINGS", short)
-        made = plan.run(lambda: ticks.append(1))
-    assert len(ticks) == plan.work
+        made = ready.run(lambda: ticks.append(1))
+    assert len(ticks) == ready.work
     return made
 
 

@@ -97,9 +97,9 @@ TINY = bistatic.Sample(20, 4, 4, epochs=60)
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], bistatic.STUDY.plan(TINY, 3)
-    made = plan.run(lambda: ticks.append(1))
-    assert len(ticks) == plan.work
+    ticks, ready = [], bistatic.STUDY.reproduction(TINY, 3)
+    made = ready.run(lambda: ticks.append(1))
+    assert len(ticks) == ready.work
     return made
 
 

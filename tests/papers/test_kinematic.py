@@ -248,9 +248,9 @@ TINY = kinematic_tables.Sample(6, 3)
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], kinematic_tables.STUDY.plan(TINY, 3)
-    made = plan.run(lambda: ticks.append(1))
-    assert len(ticks) == plan.work
+    ticks, ready = [], kinematic_tables.STUDY.reproduction(TINY, 3)
+    made = ready.run(lambda: ticks.append(1))
+    assert len(ticks) == ready.work
     return made
 
 

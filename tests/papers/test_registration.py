@@ -256,9 +256,9 @@ TINY = registration_tables.Sample(4, 6, (150, 200, 300, 400), (300, 400, 550, 70
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], registration_tables.STUDY.plan(TINY, 3)
-    made = plan.run(lambda: ticks.append(1))
-    assert len(ticks) == plan.work
+    ticks, ready = [], registration_tables.STUDY.reproduction(TINY, 3)
+    made = ready.run(lambda: ticks.append(1))
+    assert len(ticks) == ready.work
     return made
 
 

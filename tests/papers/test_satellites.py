@@ -117,9 +117,9 @@ TINY = satellites.Sample(4, 4, (100e3,), steps=20, far=12)
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], satellites.STUDY.plan(TINY, 3)
-    made = plan.run(lambda: ticks.append(1))
-    assert len(ticks) == plan.work
+    ticks, ready = [], satellites.STUDY.reproduction(TINY, 3)
+    made = ready.run(lambda: ticks.append(1))
+    assert len(ticks) == ready.work
     return made
 
 

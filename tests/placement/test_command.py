@@ -11,8 +11,8 @@ import optloc
 from optloc.cli import app
 from optloc.files import read
 from optloc.placement.areas import convex_parts, inside, visible
-from optloc.placement.plan_file import read_plan
-from optloc.placement.sites import pose
+from optloc.placement.selection_file import read_selection
+from optloc.placement.sites import candidates_of
 
 SITES = "\n".join(
     ["name,x,y,z,cost,group"]
@@ -24,7 +24,7 @@ SITES = "\n".join(
     ]
 )
 PLACES = "name,x,y,z,weight\nhall,3,6,2,3\ngate,-36,-20,1,1\nroof,-10,15,9,1"
-PLAN = """format = 1
+SELECTION = """format = 1
 title = "Yard"
 [choice]
 choose = 5
@@ -45,12 +45,12 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sites.csv").write_text(SITES)
     (tmp_path / "places.csv").write_text(PLACES)
-    (tmp_path / "plan.toml").write_text(PLAN)
+    (tmp_path / "selection.toml").write_text(SELECTION)
     return tmp_path
 
 
 def run(*words):
-    return CliRunner().invoke(app, ["place", "plan.toml", "--draws", "0", *words])
+    return CliRunner().invoke(app, ["place", "selection.toml", "--draws", "0", *words])
 
 
 def test_the_command_says_what_it_chose_and_how_good_that_is(folder):
@@ -63,10 +63,13 @@ def test_the_command_says_what_it_chose_and_how_good_that_is(folder):
 
 def test_the_written_file_has_the_bound_that_was_told(folder):
     told = json.loads(run("--json", "--out", "chosen.toml").stdout)
-    loaded, posed = read("chosen.toml", values=False).problem, pose(read_plan(folder / "plan.toml").plan)
+    loaded, candidates = (
+        read("chosen.toml", values=False).problem,
+        candidates_of(read_selection(folder / "selection.toml").selection),
+    )
     assert {*loaded.stations.names} == {*told["chosen"], "Old"}
-    priors = tuple(replace(prior, mean=prior.mean[..., : len(prior.mean)]) for prior in posed.problem.priors)
-    for place, vector, record in zip(posed.names, posed.vectors, told["places"], strict=False):
+    priors = tuple(replace(prior, mean=prior.mean[..., : len(prior.mean)]) for prior in candidates.problem.priors)
+    for place, vector, record in zip(candidates.names, candidates.vectors, told["places"], strict=False):
         bound = optloc.crlb(replace(loaded, priors=priors), vector)[:3, :3]
         assert np.sqrt(np.trace(bound)) == pytest.approx(record["sigma"], rel=1e-9), place
     assert told["value"] == pytest.approx(np.average([p["sigma"] ** 2 for p in told["places"]], weights=[3, 1, 1]))
@@ -76,29 +79,29 @@ def test_the_written_file_has_the_bound_that_was_told(folder):
 def test_budgets_groups_ranges_and_sight_are_read(folder):
     sight = "candidate,place,sight\nC0,hall,0\nC1,gate,2\n"
     (folder / "sight.csv").write_text(sight)
-    text = PLAN.replace("choose = 5", "budget = 24.0") + 'range_max = "60 m"\n[sight]\nfile = "sight.csv"\n'
-    (folder / "plan.toml").write_text(text + '[[groups]]\ngroup = "a"\nmost = 3\n')
+    text = SELECTION.replace("choose = 5", "budget = 24.0") + 'range_max = "60 m"\n[sight]\nfile = "sight.csv"\n'
+    (folder / "selection.toml").write_text(text + '[[groups]]\ngroup = "a"\nmost = 3\n')
     told = json.loads(run("--json").stdout)
     numbers = [int(name[1:]) for name in told["chosen"]]
     assert sum(number + 1 for number in numbers) <= 24
     assert sum(number % 2 == 0 for number in numbers) <= 3
-    plan = read_plan(folder / "plan.toml").plan
-    assert plan.sight[0, 0] == 0.0
-    assert plan.sight[1, 1] == 2.0
-    posed = pose(plan)
-    far = np.linalg.norm(posed.vectors[:, None, :3] - posed.problem.stations.position[0], axis=-1) > 60.0
-    assert (posed.problem.weight[far] == 0.0).all()
+    selection = read_selection(folder / "selection.toml").selection
+    assert selection.sight[0, 0] == 0.0
+    assert selection.sight[1, 1] == 2.0
+    candidates = candidates_of(selection)
+    far = np.linalg.norm(candidates.vectors[:, None, :3] - candidates.problem.stations.position[0], axis=-1) > 60.0
+    assert (candidates.problem.weight[far] == 0.0).all()
 
 
 def test_an_area_and_a_refinement(folder):
     ring = [[-40, -40], [40, -40], [40, 40], [0, 40], [0, 0], [-40, 0], [-40, -40]]
     (folder / "area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
     area = '[targets]\npolygon = "area.json"\nspacing = "20 m"\nheight = "1 m"'
-    text = PLAN.replace('[targets]\nfile = "places.csv"', area)
-    (folder / "plan.toml").write_text(text)
-    plan = read_plan(folder / "plan.toml").plan
-    assert len(plan.places) == 12
-    assert (plan.places[:, 2] == 1.0).all()
+    text = SELECTION.replace('[targets]\nfile = "places.csv"', area)
+    (folder / "selection.toml").write_text(text)
+    selection = read_selection(folder / "selection.toml").selection
+    assert len(selection.places) == 12
+    assert (selection.places[:, 2] == 1.0).all()
     parts = convex_parts(np.array(ring[:-1], float))
     points = np.random.default_rng(0).uniform(-45, 45, (500, 2))
     held = sum(inside(points, part).astype(int) for part in parts)
@@ -109,11 +112,11 @@ def test_ground_hides_what_is_behind_it(folder):
     x = np.linspace(-40, 40, 9)
     rows = [f"{a},{b},{20.0 if abs(a) < 5 else 0.0}" for a in x for b in x]
     (folder / "ground.csv").write_text("x,y,z\n" + "\n".join(rows))
-    (folder / "plan.toml").write_text(PLAN + '[sight]\nterrain = "ground.csv"\n')
-    plan = read_plan(folder / "plan.toml").plan
-    assert plan.sight is not None
-    names = plan.problem.stations.names
-    assert plan.sight[1, names.index("C2")] == 0.0  # the gate is west of the ridge, C2 east of it
+    (folder / "selection.toml").write_text(SELECTION + '[sight]\nterrain = "ground.csv"\n')
+    selection = read_selection(folder / "selection.toml").selection
+    assert selection.sight is not None
+    names = selection.problem.stations.names
+    assert selection.sight[1, names.index("C2")] == 0.0  # the gate is west of the ridge, C2 east of it
     assert visible is not None
 
 
@@ -147,10 +150,10 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_broken_plans_are_one_sentence(folder, name):
+def test_broken_selections_are_one_sentence(folder, name):
     change, said = BROKEN[name]
     if isinstance(change, tuple):
-        (folder / "plan.toml").write_text(PLAN.replace(*change))
+        (folder / "selection.toml").write_text(SELECTION.replace(*change))
     else:
         (folder / "places.csv").write_text(PLACES.replace("hall,3,6,2,3", change))
     done = run()
@@ -161,7 +164,9 @@ def test_broken_plans_are_one_sentence(folder, name):
 
 
 def test_groups_that_allow_fewer_sites_are_one_sentence(folder):
-    (folder / "plan.toml").write_text(PLAN + '[[groups]]\ngroup = "a"\nmost = 1\n[[groups]]\ngroup = "b"\nmost = 2\n')
+    (folder / "selection.toml").write_text(
+        SELECTION + '[[groups]]\ngroup = "a"\nmost = 1\n[[groups]]\ngroup = "b"\nmost = 2\n'
+    )
     done = run()
     assert done.exit_code == 2
     assert "5 sites are wanted, and the groups allow 3 at most" in " ".join(done.output.split())

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, assemble, measured, place
-from optloc.placement.sites import Group, Plan
+from optloc.placement.sites import Group, SiteSelection
 
 SITES = 8
 
 
-def plan(seed=0, kind="range", names=None, **asked):
+def selection(seed=0, kind="range", names=None, **asked):
     """Return what is asked of eight sites and three places in the plane."""
     rng = np.random.default_rng(seed)
     stations, places = rng.uniform(-30.0, 30.0, (SITES, 2)), rng.uniform(-40.0, 40.0, (3, 2))
     problem = assemble(stations, measured(kind, a=np.arange(SITES), sigma=0.3))
-    return Plan(problem, places, **asked)
+    return SiteSelection(problem, places, **asked)
 
 
 def at_most(count, *numbers):
@@ -40,7 +40,7 @@ def at_least(count, *numbers):
 )
 def test_a_number_that_groups_do_not_allow_is_refused(choose, groups, kept, said):
     with pytest.raises(InvalidProblem, match=said):
-        place(plan(choose=choose, groups=groups, kept=kept))
+        place(selection(choose=choose, groups=groups, kept=kept))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -54,7 +54,7 @@ def test_a_number_that_groups_do_not_allow_is_refused(choose, groups, kept, said
     ],
 )
 def test_as_many_as_were_asked_for_are_taken(seed, choose, groups):
-    found = place(plan(seed, choose=choose, groups=groups))
+    found = place(selection(seed, choose=choose, groups=groups))
     assert len(found.chosen) == choose
     assert found.closed
     for group in groups:
@@ -64,7 +64,7 @@ def test_as_many_as_were_asked_for_are_taken(seed, choose, groups):
 
 
 def test_a_budget_that_pays_for_fewer_is_told():
-    found = place(plan(choose=7, budget=3.0, cost=np.ones(SITES), groups=(at_most(1, 0, 5),)))
+    found = place(selection(choose=7, budget=3.0, cost=np.ones(SITES), groups=(at_most(1, 0, 5),)))
     assert len(found.chosen) == 3
     assert "3 of the 7 sites that were asked for" in found.reason
-    assert "asked for" not in place(plan(budget=3.0, cost=np.ones(SITES))).reason
+    assert "asked for" not in place(selection(budget=3.0, cost=np.ones(SITES))).reason

@@ -192,20 +192,20 @@ def test_where_infinity_is_near_the_gap_of_the_region_is_tried(why, margin, monk
 def test_costs_beside_the_fix_are_compared_too(name, monkeypatch):
     """Rows that are turned about the fix leave its cost and its slope as they are, but nothing else."""
     problem = CASES[name].problem
-    fix, real = solve(problem, "gtrs+lsr"), branch_and_bound.pose
+    fix, real = solve(problem, "gtrs+lsr"), branch_and_bound.eliminate_nuisance
 
     def steeper(given):
-        pose = real(given)
-        phi = node_values(given, pose.kinds, pose.data[:1], fix.position.reshape(1, -1))
-        rest = (pose.K @ phi[..., None])[..., 0] - pose.w
-        return pose._replace(K=1.001 * pose.K, w=1.001 * (pose.w + rest) - rest)
+        costs = real(given)
+        phi = node_values(given, costs.kinds, costs.data[:1], fix.position.reshape(1, -1))
+        rest = (costs.K @ phi[..., None])[..., 0] - costs.w
+        return costs._replace(K=1.001 * costs.K, w=1.001 * (costs.w + rest) - rest)
 
     assert certify(problem, fix).certificate.reason != branch_and_bound.MISMATCHED
-    monkeypatch.setattr(branch_and_bound, "pose", steeper)
+    monkeypatch.setattr(branch_and_bound, "eliminate_nuisance", steeper)
     turned = certify(problem, fix)
     assert turned.certificate.proof == "unknown"
     assert turned.certificate.reason == branch_and_bound.MISMATCHED
-    assert turned.stages[-1].detail.endswith("1 posed cost did not match")
+    assert turned.stages[-1].detail.endswith("1 position cost did not match")
 
 
 # Station errors that last a run, of stations that move.

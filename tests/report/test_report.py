@@ -19,9 +19,9 @@ from optloc.report.figures import panel, svg_text
 from optloc.report.map import Canvas, Curve, Label
 from optloc.report.page import Part, write_page
 from optloc.report.sheets import Sheet, duration, latex, number, percent
-from optloc.study.execute import executor, run_plan
+from optloc.study.design import design_of
+from optloc.study.execute import executor, run_design
 from optloc.study.folder import begin, read_frame
-from optloc.study.plan import plan_of
 
 RUN = CliRunner()
 TEXT = """
@@ -57,7 +57,7 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "site"
     file = folder.with_suffix(".toml")
     file.write_text(TEXT, encoding="utf-8")
-    run_plan(plan_of(file), folder, executor("processes", 1))
+    run_design(design_of(file), folder, executor("processes", 1))
     return folder
 
 
@@ -70,7 +70,7 @@ def made(site):
 def shipped(tmp_path_factory):
     """The report of a shipped study, with few trials."""
     folder = tmp_path_factory.mktemp("report") / "divergence"
-    run_plan(plan_of(folder.relative_to(folder.parent), trials=2), folder, executor("processes", 1))
+    run_design(design_of(folder.relative_to(folder.parent), trials=2), folder, executor("processes", 1))
     return write_report(folder)
 
 
@@ -270,7 +270,7 @@ def test_a_study_that_is_not_finished_says_so(site, tmp_path):
 @pytest.mark.slow
 def test_bad_places_are_sentences(site, tmp_path):
     empty = tmp_path / "empty"
-    begin(plan_of(site.with_suffix(".toml")), empty)
+    begin(design_of(site.with_suffix(".toml")), empty)
     with pytest.raises(InvalidProblem, match="nothing of the study is finished yet"):
         write_report(empty)
     (tmp_path / "file").write_text("")

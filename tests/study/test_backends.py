@@ -15,8 +15,8 @@ from optloc.cli import app
 from optloc.solvers.methods import Choice, using
 from optloc.study import backends as module
 from optloc.study.backends import backend_kind, backends, faults_of, installed, try_apart
+from optloc.study.design import design_of_text
 from optloc.study.folder import progress, read_frame
-from optloc.study.plan import planned
 from optloc.study.summary import COLUMNS, judged, methods
 
 RUN = CliRunner()
@@ -125,7 +125,7 @@ def test_of_a_batch_those_without_an_answer_have_none(word, limit):
 
 
 def test_a_solver_that_solved_nothing_is_not_the_first(tmp_path):
-    folder = run_here(planned(STUDY, "s.toml", tmp_path), tmp_path / "out")
+    folder = run_here(design_of_text(STUDY, "s.toml", tmp_path), tmp_path / "out")
     frame = judged(read_frame(folder, [*COLUMNS]))
     assert methods(frame)[0] == "good"
     assert not frame.loc[frame["method"] != "good", "located"].any()

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from study.texts import plan
+from study.texts import design
 
 import optloc
 from optloc.study import trial
+from optloc.study.design import Chunk
 from optloc.study.draws import draw
 from optloc.study.methods import run
-from optloc.study.plan import Chunk
 from optloc.study.trial import COLUMNS, DIED, arrow_schema, compute
 
 
@@ -17,7 +17,7 @@ def frame(made):
 
 
 def test_columns_are_what_they_say():
-    made = next(plan().chunks)
+    made = next(design().chunks)
     found, drawn = frame(made), draw(made.cell.case, 0, 10)
     assert compute(made).table.schema.equals(arrow_schema())
     assert list(found) == [column.name for column in COLUMNS]
@@ -44,14 +44,14 @@ def test_columns_are_what_they_say():
 def test_costs_of_unrefined_starts_are_those_of_the_likelihood():
     text = 'format = 1\nname = "x"\ntrials = 20\n[[scenario]]\nname = "s"\nlayout = { kinds = ["toa"] }\n'
     text += 'truth = { kind = "hull" }\nnoise = ["3 m"]\n[[method]]\nmethod = ["gtrs", "gtrs+lsr"]\n'
-    rough, fine = (frame(made) for made in plan(text).chunks)
+    rough, fine = (frame(made) for made in design(text).chunks)
     assert (rough["located"] & ~rough["answered"]).all()
     assert (rough["cost"] >= fine["cost"] - 1e-9).all()
     assert (rough["cost"] - fine["cost"]).median() < 5.0
 
 
 def test_a_failing_trial_costs_its_row(monkeypatch):
-    made = next(plan().chunks)
+    made = next(design().chunks)
     whole, bad, solved = frame(made), draw(made.cell.case, 4, 1).truth, run
 
     def brittle(method, drawn):
@@ -70,7 +70,7 @@ def test_a_failing_trial_costs_its_row(monkeypatch):
 
 
 def test_a_chunk_in_which_all_trials_fail_keeps_what_is_known_of_them(monkeypatch):
-    made = next(plan().chunks)
+    made = next(design().chunks)
     whole = frame(made)
 
     def broken(method, drawn):
@@ -84,8 +84,8 @@ def test_a_chunk_in_which_all_trials_fail_keeps_what_is_known_of_them(monkeypatc
 
 
 def test_chunks_cover_every_trial_once():
-    text = plan().text.replace("trials = 60", "trials = 1237")
-    made = plan(text)
+    text = design().text.replace("trials = 60", "trials = 1237")
+    made = design(text)
     seen = {}
     for one in made.chunks:
         assert isinstance(one, Chunk)
@@ -100,7 +100,7 @@ def test_other_back_ends_find_the_same_points(method, solver):
     text = 'format = 1\nname = "x"\ntrials = 6\n[[scenario]]\nname = "s"\nlayout = { stations = 6 }\n'
     text += 'truth = { kind = "hull" }\nnoise = ["3 m"]\n[[method]]\nmethod = "gtrs+lsr"\n'
     text += f'[[method]]\nmethod = "{method}"\nsolver = "{solver}"\n'
-    plain, other = (frame(made) for made in plan(text).chunks)
+    plain, other = (frame(made) for made in design(text).chunks)
     assert set(other["solver"]) == {solver}
     assert (other["iterations"] > 1.0).all()
     assert np.allclose(other[["error_x", "error_y", "error_z"]], plain[["error_x", "error_y", "error_z"]], atol=1e-2)
@@ -111,12 +111,12 @@ def test_settings_reach_the_solver():
     text += 'truth = { kind = "hull" }\nnoise = ["3 m"]\n'
     text += '[[method]]\nname = "a"\nmethod = "sdp"\nsolver = "SCS"\n'
     text += '[[method]]\nname = "b"\nmethod = "sdp"\nsolver = "SCS"\nsettings = { max_iters = 7 }\n'
-    free, held = (frame(made) for made in plan(text).chunks)
+    free, held = (frame(made) for made in design(text).chunks)
     assert held["iterations"].max() <= 14.0  # two weightings
     assert free["iterations"].min() > 14.0
 
 
 def test_a_solver_without_a_program_is_refused():
-    text = plan().text.replace('method = "gtrs+lsr"', 'method = "gtrs+lsr"\nsolver = "SCS"')
+    text = design().text.replace('method = "gtrs+lsr"', 'method = "gtrs+lsr"\nsolver = "SCS"')
     with pytest.raises(optloc.InvalidProblem, match="no program that SCS solves"):
-        compute(next(plan(text).chunks))
+        compute(next(design(text).chunks))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
-from study.texts import plan
+from study.texts import design
 
 from optloc import MODELS, predict
 from optloc.study.draws import block_size, draw
@@ -12,7 +12,7 @@ HEAD = 'format = 1\nname = "x"\nseed = 3\ntrials = 2000\n[[method]]\nmethod = "g
 
 
 def case(text, number=0):
-    return plan(HEAD + text).cells[number].case
+    return design(HEAD + text).cells[number].case
 
 
 SHELL = 'layout = { stations = 6 }\ntruth = { kind = "shell", distance = ["5 km", "20 km"] }\nnoise = ["10 m"]\n'
@@ -35,13 +35,13 @@ def test_a_trial_does_not_depend_on_what_else_is_drawn():
 def test_other_scenarios_methods_and_numbers_of_trials_leave_the_data_alone():
     alone = case(SHELL)
     before = 'noise = ["1 m"]\nlayout = { stations = 5 }\ntruth = { kind = "hull" }\n[[scenario]]\nname = "t"\n'
-    behind = plan(HEAD + before + SHELL + '[[method]]\nmethod = "roots+lsr"\n', trials=77).cells[-1].case
-    renamed = plan(HEAD.replace('"s"', '"t"') + SHELL).cells[0].case
+    behind = design(HEAD + before + SHELL + '[[method]]\nmethod = "roots+lsr"\n', trials=77).cells[-1].case
+    renamed = design(HEAD.replace('"s"', '"t"') + SHELL).cells[0].case
     assert behind.key == renamed.key
     assert np.array_equal(draw(behind, 5, 9).problem.z, draw(renamed, 5, 9).problem.z)
     assert draw(behind, 5, 9).digest == draw(renamed, 5, 9).digest
     assert case(SHELL.replace("10 m", "11 m")).key != alone.key
-    assert plan(HEAD + SHELL, seed=4).cells[0].case.key != alone.key
+    assert design(HEAD + SHELL, seed=4).cells[0].case.key != alone.key
 
 
 def test_truths_are_where_the_file_says():
@@ -136,5 +136,5 @@ def test_the_share_of_gross_errors_can_be_swept():
     text = 'format = 1\nname = "x"\ntrials = 50\n[[scenario]]\nname = "s"\nnoise = ["1 m"]\ntruth = { kind = "hull" }\n'
     text += 'layout = { stations = 8, kinds = ["toa"] }\nsweep = { "error.outliers.share" = [0.01, 0.5] }\n'
     text += 'error = { outliers = { share = 0.1, size = "100 m" } }\n[[method]]\nmethod = "gtrs+lsr"\n'
-    few, many = (draw(cell.case, 0, 50) for cell in plan(text).cells)
+    few, many = (draw(cell.case, 0, 50) for cell in design(text).cells)
     assert few.bad.mean() < 0.5 < many.bad.mean()

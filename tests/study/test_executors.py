@@ -10,11 +10,11 @@ import time
 from contextlib import ExitStack, contextmanager
 
 import pytest
-from study.texts import QUICK, SMALL, assert_identical, plan, run_here
+from study.texts import QUICK, SMALL, assert_identical, design, run_here
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import execute
-from optloc.study.execute import EXECUTORS, executor, run_plan
+from optloc.study.execute import EXECUTORS, executor, run_design
 from optloc.study.folder import progress
 
 # Thirty parts or so: enough that a worker, and then the run, is killed between them.
@@ -28,7 +28,7 @@ TWO = SMALL.replace("socp+lsr", "roots+lsr")
 @pytest.fixture(scope="module", params=[TWO, pytest.param(SMALL, marks=pytest.mark.full)], ids=["quick", "relaxed"])
 def undisturbed(request, tmp_path_factory):
     """Return a study's text and the folder where it was computed in this process."""
-    return request.param, run_here(plan(request.param), tmp_path_factory.mktemp("study") / "plain")
+    return request.param, run_here(design(request.param), tmp_path_factory.mktemp("study") / "plain")
 
 
 @contextmanager
@@ -82,21 +82,21 @@ def cluster(tmp_path_factory):
 
 def test_local_processes_give_the_same_table(undisturbed, tmp_path):
     text, expected = undisturbed
-    assert run_plan(plan(text), tmp_path / "processes", executor("processes", 2)).complete
+    assert run_design(design(text), tmp_path / "processes", executor("processes", 2)).complete
     assert_identical(expected, tmp_path / "processes")
 
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_table(undisturbed, cluster, tmp_path):
     text, expected = undisturbed
-    assert run_plan(plan(text), tmp_path / "dask", executor("dask", None, cluster[0])).complete
+    assert run_design(design(text), tmp_path / "dask", executor("dask", None, cluster[0])).complete
     assert_identical(expected, tmp_path / "dask")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
 def test_ray_gives_the_same_table(undisturbed, tmp_path):
     text, expected = undisturbed
-    assert run_plan(plan(text), tmp_path / "ray", executor("ray", 2)).complete
+    assert run_design(design(text), tmp_path / "ray", executor("ray", 2)).complete
     assert_identical(expected, tmp_path / "ray")
 
 
@@ -105,7 +105,7 @@ def test_a_killed_worker_and_a_killed_run_lose_nothing(cluster, tmp_path):
     address, another, workers = cluster
     (tmp_path / "long.toml").write_text(LONG)
     whole = tmp_path / "whole"
-    run_here(plan(LONG), whole)
+    run_here(design(LONG), whole)
     out = tmp_path / "out"
     command = ["-m", "optloc.cli", "study", "run", str(tmp_path / "long.toml"), "--out", str(out)]
 
@@ -123,9 +123,9 @@ def test_a_killed_worker_and_a_killed_run_lose_nothing(cluster, tmp_path):
     assert 0 < found.done < found.chunks
     another()
     told = []
-    assert run_plan(plan(LONG), out, executor("dask", None, address), lambda rows, _: told.append(rows)).complete
+    assert run_design(design(LONG), out, executor("dask", None, address), lambda rows, _: told.append(rows)).complete
     assert told[0] == found.rows  # what was finished is not done again
-    assert sum(told) == plan(LONG).rows
+    assert sum(told) == design(LONG).rows
     assert_identical(whole, out)
 
 
@@ -142,7 +142,7 @@ def test_an_unreachable_scheduler_is_one_sentence_and_nothing_is_lost(tmp_path, 
     monkeypatch.setattr(execute, "CONNECT", 1.0)
     out = tmp_path / "out"
     with pytest.raises(InvalidProblem, match=r"tcp://127\.0\.0\.1:1: the scheduler cannot be reached"):
-        run_plan(plan(), out, executor("dask", None, "tcp://127.0.0.1:1"))
+        run_design(design(), out, executor("dask", None, "tcp://127.0.0.1:1"))
     assert progress(out).done == 0
 
 

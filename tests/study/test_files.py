@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from study.texts import QUICK, plan
+from study.texts import QUICK, design
 from typer.testing import CliRunner
 
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.solvers.methods import Choice, counting, using
+from optloc.study.design import design_of, shipped
 from optloc.study.methods import SETTINGS, backends, check_settings
-from optloc.study.plan import plan_of, shipped
 from optloc.study.trial import compute
 
 RUN = CliRunner()
@@ -152,7 +152,7 @@ def test_lists_show_what_studies_are_made_of():
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_shipped_studies_run(name):
-    made = plan_of(Path(name), trials=1)
+    made = design_of(Path(name), trials=1)
     methods = {}
     for one in made.chunks:
         methods.setdefault(one.cell.method.name, []).append(one)
@@ -162,7 +162,7 @@ def test_shipped_studies_run(name):
 
 
 def test_options_take_the_place_of_what_the_file_says():
-    assert plan(QUICK, trials=7).rows == 21
-    assert plan(QUICK, seed=9).fingerprint != plan(QUICK).fingerprint
+    assert design(QUICK, trials=7).rows == 21
+    assert design(QUICK, seed=9).fingerprint != design(QUICK).fingerprint
     with pytest.raises(InvalidProblem):
-        plan(QUICK.replace("trials = 60", "trials = 0"))
+        design(QUICK.replace("trials = 60", "trials = 0"))

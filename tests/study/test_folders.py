@@ -11,11 +11,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from study.texts import QUICK, assert_identical, plan, run_here, values
+from study.texts import QUICK, assert_identical, design, run_here, values
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import draws, execute
-from optloc.study.execute import executor, run_plan
+from optloc.study.execute import executor, run_design
 from optloc.study.folder import (
     finished_parts,
     part_files,
@@ -36,7 +36,7 @@ HERE = executor("processes", 1)
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study") / "whole"
-    return run_here(plan(QUICK), folder)
+    return run_here(design(QUICK), folder)
 
 
 @pytest.mark.slow
@@ -51,11 +51,11 @@ def test_a_full_disk_is_a_sentence_and_the_same_command_goes_on(whole, tmp_path,
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(InvalidProblem, match=r"No space left on device.*goes on from there"):
-        run_plan(plan(QUICK), out, HERE)
+        run_design(design(QUICK), out, HERE)
     monkeypatch.undo()
     assert progress(out).done == 3  # the first file is the manifest
     assert not list((out / "parts").glob(".*"))
-    assert run_plan(plan(QUICK), out, HERE).complete
+    assert run_design(design(QUICK), out, HERE).complete
     assert_identical(whole, out)
 
 
@@ -98,7 +98,7 @@ def test_damaged_parts_are_named_and_computed_again(whole, tmp_path):
     victim = next(iter(part_files(out).values()))
     victim.write_bytes(victim.read_bytes()[:100])
     with pytest.warns(UserWarning, match=f"{victim.name}: the part is damaged, and is made again"):
-        assert run_plan(plan(QUICK), out, HERE).complete
+        assert run_design(design(QUICK), out, HERE).complete
     assert len(told) == len(ways)
     assert not (out / "parts" / ".left.1").exists()
     assert_identical(whole, out)
@@ -107,12 +107,12 @@ def test_damaged_parts_are_named_and_computed_again(whole, tmp_path):
 @pytest.mark.parametrize(("old", "new"), [("seed = 5", "seed = 6"), ("3 m", "4 m"), ("trials = 60", "trials = 61")])
 def test_the_folder_of_another_study_is_refused(old, new, whole):
     with pytest.raises(InvalidProblem, match="holds another study"):
-        run_plan(plan(QUICK.replace(old, new)), whole, HERE)
+        run_design(design(QUICK.replace(old, new)), whole, HERE)
     assert progress(whole).complete
 
 
 def test_remarks_are_not_another_study(whole):
-    assert run_plan(plan("# a remark\n" + QUICK), whole, HERE).complete
+    assert run_design(design("# a remark\n" + QUICK), whole, HERE).complete
 
 
 def test_the_folder_of_another_version_is_refused(whole, tmp_path):
@@ -121,17 +121,17 @@ def test_the_folder_of_another_version_is_refused(whole, tmp_path):
     manifest = json.loads((out / "manifest.json").read_text())
     (out / "manifest.json").write_text(json.dumps({**manifest, "version": "0.0.1"}))
     with pytest.raises(InvalidProblem, match=r"written by optloc 0\.0\.1"):
-        run_plan(plan(QUICK), out, HERE)
+        run_design(design(QUICK), out, HERE)
 
 
 def test_folders_that_hold_no_study(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InvalidProblem, match="holds no study"):
-        run_plan(plan(QUICK), tmp_path, HERE)
+        run_design(design(QUICK), tmp_path, HERE)
     with pytest.raises(InvalidProblem, match="holds no study"):
         progress(tmp_path)
     with pytest.raises(InvalidProblem, match="cannot be written"):
-        run_plan(plan(QUICK), tmp_path / "file" / "out", HERE)
+        run_design(design(QUICK), tmp_path / "file" / "out", HERE)
     with pytest.raises(InvalidProblem, match="no such folder"):
         progress(tmp_path / "nowhere")
     (tmp_path / "manifest.json").write_text("{")
@@ -153,14 +153,14 @@ def test_two_runs_do_not_write_to_one_folder(whole):
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "held\n"
         with pytest.raises(InvalidProblem, match="another run writes"):
-            run_plan(plan(QUICK), whole, HERE)
+            run_design(design(QUICK), whole, HERE)
         other.communicate("")
-    assert run_plan(plan(QUICK), whole, HERE).complete
+    assert run_design(design(QUICK), whole, HERE).complete
 
 
 def test_the_gap_is_to_the_best_method_of_the_same_trial(tmp_path):
     text = QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]')
-    run_here(plan(text), tmp_path / "out")
+    run_here(design(text), tmp_path / "out")
     frame = read_frame(tmp_path / "out")
     best = frame.groupby(["data", "trial"], observed=True)["cost"].transform("min")
     assert (frame["gap"] == frame["cost"] - best).all()
@@ -173,7 +173,7 @@ def test_the_gap_is_to_the_best_method_of_the_same_trial(tmp_path):
 def test_swept_values_become_columns(tmp_path):
     text = QUICK.replace("[[method]]", '[[method]]\nname = "m"').replace("trials = 60", "trials = 10")
     text = text.replace('noise = ["3 m"]', 'noise = ["3 m"]\nsweep = { "layout.stations" = [5, 7] }')
-    run_here(plan(text), tmp_path / "out")
+    run_here(design(text), tmp_path / "out")
     frame = swept(read_frame(tmp_path / "out"))
     arrivals = frame[frame["scenario"] == "arrivals"]
     assert (arrivals["layout.stations"] == arrivals["stations"]).all()
@@ -185,11 +185,11 @@ def test_studies_are_compared_cell_by_cell(whole, tmp_path):
     same = compared(whole, whole)
     assert len(same) == 3
     assert all(d.identical and d.same_data for d in same)
-    run_here(plan(QUICK, seed=6), tmp_path / "other")
+    run_here(design(QUICK, seed=6), tmp_path / "other")
     other = compared(whole, tmp_path / "other")
     assert not any(d.identical or d.same_data for d in other)
     assert all(d.two.rmse < 3.0 * d.two.bound for d in other)
-    run_here(plan(QUICK.replace('"arrivals"', '"a"').replace('"differences"', '"d"')), tmp_path / "names")
+    run_here(design(QUICK.replace('"arrivals"', '"a"').replace('"differences"', '"d"')), tmp_path / "names")
     with pytest.raises(InvalidProblem, match="no cell in common"):
         compared(whole, tmp_path / "names")
 
@@ -202,7 +202,7 @@ def elsewhere(monkeypatch):
 
 
 def test_the_same_seed_is_not_the_same_data(whole, tmp_path, elsewhere):
-    run_here(plan(QUICK), tmp_path / "other")
+    run_here(design(QUICK), tmp_path / "other")
     other = compared(whole, tmp_path / "other")
     assert not any(d.identical or d.same_data for d in other)
     seeds = [set(values(folder)["seed"]) for folder in (whole, tmp_path / "other")]
@@ -215,7 +215,7 @@ def test_a_study_does_not_go_on_with_other_data(whole, tmp_path, elsewhere):
     victim = sorted((out / "parts").glob("*.parquet"))[1]
     victim.unlink()
     with pytest.raises(InvalidProblem, match=r"finished trials of scenario '.*' hold other data than are drawn here"):
-        run_plan(plan(QUICK), out, HERE)
+        run_design(design(QUICK), out, HERE)
     assert not victim.exists()
 
 
@@ -230,12 +230,12 @@ def test_parts_that_contradict_each_other_are_refused(whole, tmp_path):
     key = part.name.partition(".")[0]
     store(out, Part(key, table.set_column(column, table.schema.field(column), other), {}))
     with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
-        run_plan(plan(QUICK), out, HERE)
+        run_design(design(QUICK), out, HERE)
 
 
 def test_a_part_with_other_data_is_not_stored(tmp_path, monkeypatch):
     """Two methods, of which the second is computed where the same seed draws other data."""
-    made = plan(QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]'))
+    made = design(QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]'))
     here = draws.simulate
 
     def strays(chunks, by):
@@ -247,7 +247,7 @@ def test_a_part_with_other_data_is_not_stored(tmp_path, monkeypatch):
 
     monkeypatch.setattr(execute, "compute_all", strays)
     with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
-        run_plan(made, tmp_path / "out", HERE)
+        run_design(made, tmp_path / "out", HERE)
     assert progress(tmp_path / "out").done >= 1
 
 

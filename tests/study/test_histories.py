@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from doc_pages import DOCS, blocks
-from study.texts import QUICK, plan, run_here
+from study.texts import QUICK, design, run_here
 from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
@@ -17,18 +17,18 @@ from optloc.plot.style import save
 from optloc.report.figures import history_picture, marks, profile_picture
 from optloc.solvers.methods import counting
 from optloc.study.baselines import BASELINES, Baseline, start_of, whiten_one
+from optloc.study.design import design_of
 from optloc.study.draws import draw
 from optloc.study.folder import read_frame
 from optloc.study.histories import Histories, band, histories, question, reach, way_of
 from optloc.study.methods import added, run
 from optloc.study.minimizers import Minimizer
-from optloc.study.plan import plan_of
 from optloc.study.profiles import profiles
 from optloc.study.summary import COLUMNS
 
 RUN = CliRunner()
 TEXT = QUICK.replace("trials = 60", "trials = 8")
-CASE = plan(TEXT).cells[0].case
+CASE = design(TEXT).cells[0].case
 DRAWN = draw(CASE, 0, 5)
 
 
@@ -141,7 +141,7 @@ def test_reach_counts_who_came_there_and_how_soon():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     text = TEXT + '\n[[method]]\nbaseline = ["gauss-newton", "truth"]\n'
-    return run_here(plan(text, more=added(["taylor"])), tmp_path_factory.mktemp("histories") / "out")
+    return run_here(design(text, more=added(["taylor"])), tmp_path_factory.mktemp("histories") / "out")
 
 
 def test_a_study_knows_its_trials_and_the_least_cost_of_each(folder):
@@ -173,7 +173,7 @@ def test_what_cannot_be_followed_is_a_sentence(folder, tmp_path):
     flown = 'truth = { kind = "hull" }\nnoise = ["3 m"]\n\n[[method]]'
     held = TEXT.replace("layout = { stations = 6, kinds", 'layout = { survey = "20 m", stations = 6, kinds')
     held = held.replace('["toa"]', '["azimuth"]').replace(flown, flown.replace("3 m", "1 deg"))
-    drawn = draw(plan(held).cells[2].case, 0, 2)
+    drawn = draw(design(held).cells[2].case, 0, 2)
     asked = question(folder, [], 2)
     with pytest.raises(InvalidProblem, match="depend on the place"):
         histories(type(asked)("t", drawn, asked.methods, asked.least))
@@ -222,7 +222,7 @@ def test_the_pictures_of_the_page_are_of_the_public_test_set(tmp_path):
     mine = next(b.text for b in blocks(DOCS / "studies.md") if b.mark == "file: mine.py")
     (tmp_path / "mine.py").write_text(mine)
     names = ["ipopt", f"{tmp_path}/mine.py:bfgs", f"{tmp_path}/mine.py:simplex"]
-    out = run_here(plan_of(Path("bench"), trials=40, more=added(names)), tmp_path / "out")
+    out = run_here(design_of(Path("bench"), trials=40, more=added(names)), tmp_path / "out")
     found = profiles(read_frame(out, COLUMNS), out=["truth"])
     assert found.spent.shape == (8, 240)
     save(profile_picture(found, marks(list(found.methods))), DOCS / "measured" / "profiles.png")

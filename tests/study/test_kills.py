@@ -9,7 +9,7 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from study.texts import QUICK, assert_identical, plan, run_here
+from study.texts import QUICK, assert_identical, design, run_here
 
 psutil = pytest.importorskip("psutil")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="asks the system for the environment of processes")
@@ -22,7 +22,7 @@ GONE = 5.0  # seconds after which nobody may be left
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    return run_here(plan(TEXT), tmp_path_factory.mktemp("kills") / "whole")
+    return run_here(design(TEXT), tmp_path_factory.mktemp("kills") / "whole")
 
 
 @contextmanager

@@ -10,20 +10,20 @@ from doc_pages import DOCS
 from recipes import files_of_the_page
 from scipy.optimize import minimize
 from scipy.stats import quantile_test
-from study.texts import QUICK, plan, run_here
+from study.texts import QUICK, design, run_here
 from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.compute.sums import equations_at
 from optloc.study.baselines import BASELINES, start_of, whiten_one
+from optloc.study.design import design_of_text
 from optloc.study.draws import draw
-from optloc.study.execute import executor, run_plan
+from optloc.study.execute import executor, run_design
 from optloc.study.folder import part_files, progress, read_frame
 from optloc.study.methods import added
 from optloc.study.minimizers import Minimizer, baseline_of, cost_of
 from optloc.study.paired import median_of, paired
-from optloc.study.plan import planned
 from optloc.study.summary import COLUMNS, judged
 
 RUN, HERE = CliRunner(), executor("processes", 1)
@@ -50,11 +50,11 @@ def mine(tmp_path_factory):
 def folder(mine, tmp_path_factory):
     """Return the folder of a study that was run by its own method, then with one more."""
     out = tmp_path_factory.mktemp("study") / "out"
-    assert run_plan(plan(FEW), out, HERE).complete
+    assert run_design(design(FEW), out, HERE).complete
     before = {path: path.stat().st_mtime_ns for path in part_files(out).values()}
     told = []
-    more = plan(FEW, more=added([f"{mine}:bfgs"]))
-    assert run_plan(more, out, HERE, lambda rows, _: told.append(rows)).complete
+    more = design(FEW, more=added([f"{mine}:bfgs"]))
+    assert run_design(more, out, HERE, lambda rows, _: told.append(rows)).complete
     # First what was there, then the new method alone.
     assert told[0] == sum(told[1:]) == 30
     assert {path: path.stat().st_mtime_ns for path in before} == before
@@ -72,11 +72,11 @@ def test_a_second_run_computes_the_new_method_alone(folder):
 def test_what_is_there_stays_whatever_is_asked_for_next(folder, mine):
     told = []
     for more in ([], [f"{mine}:bfgs"]):
-        run_plan(plan(FEW, more=added(more)), folder, HERE, lambda rows, _: told.append(rows))
+        run_design(design(FEW, more=added(more)), folder, HERE, lambda rows, _: told.append(rows))
     assert told == [60, 60]
     assert progress(folder).complete
     with pytest.raises(InvalidProblem, match="holds another study"):
-        run_plan(plan(FEW.replace("seed = 5", "seed = 6")), folder, HERE)
+        run_design(design(FEW.replace("seed = 5", "seed = 6")), folder, HERE)
 
 
 def test_another_text_of_the_file_is_another_method(folder, mine):
@@ -95,7 +95,7 @@ def test_no_file_names_code(mine, tmp_path):
     for name in (f"{secret}:f", "antigravity:f", "os:system"):
         text = FEW.replace('method = "gtrs+lsr"', f"baseline = {json.dumps(name)}")
         with pytest.raises(InvalidProblem, match="unknown baseline"):
-            plan(text)
+            design(text)
 
 
 def test_what_cannot_be_loaded_is_a_sentence(mine, tmp_path):
@@ -159,15 +159,15 @@ method = "gtrs+lsr"
 
 
 def site(folder, more, names=()):
-    """Return the plan of a study of the shipped site with more in its file."""
+    """Return the design of a study of the shipped site with more in its file."""
     text = (files("optloc") / "scenarios" / "demo.toml").read_text()
     (folder / "site.toml").write_text(text + more)
-    return planned(SITE, "site", folder, more=added(names))
+    return design_of_text(SITE, "site", folder, more=added(names))
 
 
 def problems(folder):
-    yield draw(plan(FEW).cells[0].case, 0, 1)
-    yield draw(plan(FEW).cells[2].case, 0, 1)  # with an unknown emission
+    yield draw(design(FEW).cells[0].case, 0, 1)
+    yield draw(design(FEW).cells[2].case, 0, 1)  # with an unknown emission
     yield draw(site(folder, KNOWN).cells[0].case, 0, 1)
 
 
@@ -190,7 +190,7 @@ def test_the_cost_of_a_minimizer_is_the_one_that_judges_it_and_has_its_gradient(
 
 
 def test_errors_of_stations_weigh_for_minimizers_as_for_the_others():
-    drawn = draw(plan(BEARINGS).cells[0].case, 0, 4)
+    drawn = draw(design(BEARINGS).cells[0].case, 0, 4)
     start = start_of("centre", 0.0, drawn)
     wanted = BASELINES["gauss-newton"].run(drawn, start)
     mine = Minimizer(lambda cost, x: minimize(cost, x, jac=True, method="BFGS").x)(drawn, start)
@@ -220,7 +220,9 @@ def test_nlopt_and_a_method_of_ones_own_are_one_file(mine, tmp_path):
 
     def run(*names):
         told.clear()
-        return run_plan(plan(few, more=added(list(names))), tmp_path / "out", HERE, lambda rows, _: told.append(rows))
+        return run_design(
+            design(few, more=added(list(names))), tmp_path / "out", HERE, lambda rows, _: told.append(rows)
+        )
 
     assert run(f"{path}:bobyqa", f"{path}:downhill").complete
     rows = judged(read_frame(tmp_path / "out", COLUMNS))

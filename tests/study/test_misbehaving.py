@@ -9,11 +9,11 @@ import time
 import numpy as np
 import pytest
 from recipes import installed, write_package
-from study.texts import assert_identical, plan, run_here
+from study.texts import assert_identical, design, run_here
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import apart
-from optloc.study.execute import executor, run_plan
+from optloc.study.execute import executor, run_design
 from optloc.study.folder import read_frame
 from optloc.study.trial import DIED, FAILED, INVALID, LATE
 
@@ -122,13 +122,13 @@ def package(tmp_path_factory):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is none on this system")
 @pytest.mark.slow
 def test_a_method_that_forks_answers_once(tmp_path):
-    assert run_plan(plan(study(["fork"])), tmp_path / "out", executor("processes", 1)).counts == {"unproven": 6}
+    assert run_design(design(study(["fork"])), tmp_path / "out", executor("processes", 1)).counts == {"unproven": 6}
 
 
 @FULL
 def test_a_method_that_keeps_memory_harms_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr(apart, "memory_of", lambda count: 3 << 30)
-    found = run_plan(plan(study(["hoard"])), tmp_path / "out", executor("processes", 1))
+    found = run_design(design(study(["hoard"])), tmp_path / "out", executor("processes", 1))
     assert found.methods["gtrs+lsr", "unproven"] == 3
     assert found.methods["hoard", DIED] == 3
 
@@ -158,7 +158,7 @@ def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_
     deadly = {"exit", "exit-well", "segfault", "kill", "interrupt", "garbage", "small-memory"}
     names = [name for name in ROGUES if (name in deadly) == (some == "processes")]
     names = ["raise", "nan", "segfault"] if some == "few" else names
-    found = run_plan(plan(study(names, 1 if some == "few" else 3)), tmp_path / "out", executor("processes", jobs))
+    found = run_design(design(study(names, 1 if some == "few" else 3)), tmp_path / "out", executor("processes", jobs))
     assert found.complete
     check(tmp_path / "out", names)
     assert {method for method, _ in found.failures} == set(names)
@@ -168,7 +168,7 @@ def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_methods_that_end_or_hold_up_their_process_are_named(jobs, tmp_path):
     names = ["segfault", "sleep"] if jobs == 1 else ["exit", "deaf"]
-    found = run_plan(plan(study(names, trials=1)), tmp_path / "out", executor("processes", jobs, limit=3.0))
+    found = run_design(design(study(names, trials=1)), tmp_path / "out", executor("processes", jobs, limit=3.0))
     assert found.complete
     check(tmp_path / "out", names)
 
@@ -178,8 +178,8 @@ def test_methods_that_end_or_hold_up_their_process_are_named(jobs, tmp_path):
 def test_all_that_hang_are_given_up_after_a_few_limits(jobs, tmp_path):
     names, limit = list(HANGING), 2.0
     began = time.monotonic()
-    made = plan(study(names, trials=40))
-    found = run_plan(made, tmp_path / "out", executor("processes", jobs, limit=limit))
+    made = design(study(names, trials=40))
+    found = run_design(made, tmp_path / "out", executor("processes", jobs, limit=limit))
     assert found.complete
     check(tmp_path / "out", names)
     # Four limits for each cell, those that were under way, and what processes take to begin.
@@ -190,13 +190,13 @@ def test_all_that_hang_are_given_up_after_a_few_limits(jobs, tmp_path):
 @FULL
 @pytest.mark.parametrize("way", ["die", "hang"])
 def test_of_many_trials_one_is_to_blame(way, tmp_path, monkeypatch):
-    made = plan(study(["once"], 8).replace("chunk = 2", "chunk = 4"))
+    made = design(study(["once"], 8).replace("chunk = 2", "chunk = 4"))
     monkeypatch.setenv("BAD_WAY", way)
     monkeypatch.setenv("BAD_TRIAL", "0.0")
     whole = read_frame(run_here(made, tmp_path / "whole"))
     bad = (whole["method"] == "once") & (whole["trial"] == 5)
     monkeypatch.setenv("BAD_TRIAL", repr(float(whole["truth_x"][bad].item())))
-    found = run_plan(made, tmp_path / "out", executor("processes", 2, limit=3.0))
+    found = run_design(made, tmp_path / "out", executor("processes", 2, limit=3.0))
     assert found.complete
     table = read_frame(tmp_path / "out")
     lost = table["status"].isin(FAILED)
@@ -210,7 +210,7 @@ def test_of_many_trials_one_is_to_blame(way, tmp_path, monkeypatch):
 def test_a_process_that_cannot_begin_is_a_sentence_and_stores_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(apart, "_BEGIN", "import sys; sys.exit(7)")
     with pytest.raises(InvalidProblem, match=r"no process can be begun \(its process ended with exit code 7\)"):
-        run_plan(plan(), tmp_path / "out", executor("processes", 1))
+        run_design(design(), tmp_path / "out", executor("processes", 1))
     assert not list((tmp_path / "out" / "parts").iterdir())
 
 
@@ -219,7 +219,9 @@ def test_a_process_that_cannot_begin_is_a_sentence_and_stores_nothing(tmp_path, 
 def test_what_a_method_began_ends_with_it(tmp_path, monkeypatch):
     psutil = pytest.importorskip("psutil")
     monkeypatch.setenv("OPTLOC_MARK", str(tmp_path))
-    assert run_plan(plan(study(["spawn"], trials=1)), tmp_path / "out", executor("processes", 1, limit=1.0)).complete
+    assert run_design(
+        design(study(["spawn"], trials=1)), tmp_path / "out", executor("processes", 1, limit=1.0)
+    ).complete
     marked = [one for one in psutil.process_iter() if one.pid != os.getpid() and mark_of(one) == str(tmp_path)]
     assert not marked
 
@@ -246,4 +248,4 @@ def test_methods_do_not_speak_on_standard_output(tmp_path):
     assert done.stdout.startswith("{")
     assert '"reason": "ZeroDivisionError: division by zero"' in done.stdout
     assert not done.stderr
-    assert_identical(tmp_path / "o", run_here(plan(text), tmp_path / "here"))
+    assert_identical(tmp_path / "o", run_here(design(text), tmp_path / "here"))

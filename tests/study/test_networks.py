@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import orthogonal_procrustes
 from scipy.stats import chi2
-from study.texts import QUICK, plan
+from study.texts import QUICK, design
 
 from optloc.base.errors import InvalidProblem
 from optloc.study.networks import apart, rms
@@ -30,7 +30,7 @@ FLAWS = 'missing = 0.3\nsynchronised = false\noutliers = { share = 0.1, size = "
 
 
 def changed(text, lines="", **options):
-    return plan(text.replace("[[method]]", f"{lines}\n[[method]]", 1), **options)
+    return design(text.replace("[[method]]", f"{lines}\n[[method]]", 1), **options)
 
 
 def frames(made):
@@ -99,7 +99,7 @@ def test_covariances_are_those_of_errors_after_the_best_motion(flaw):
 
 def test_calibration_and_the_convex_start_arrive_at_the_judge():
     text = HALL.replace('baseline = ["truth", "one-random"]', 'method = "calibrate"')
-    found = frames(plan(text + '\n[[method]]\nbaseline = ["truth", "nuclear-norm"]\n', trials=1))
+    found = frames(design(text + '\n[[method]]\nbaseline = ["truth", "nuclear-norm"]\n', trials=1))
     judge = found["truth"]["cost"][0]
     assert found["calibrate"]["cost"][0] == pytest.approx(judge, abs=0.01)
     assert found["nuclear-norm"]["cost"][0] == pytest.approx(judge, abs=0.01)
@@ -133,6 +133,6 @@ def test_the_convex_start_leaves_out_what_it_does_not_serve():
 )
 def test_studies_that_do_not_fit_are_one_sentence(text, words):
     with pytest.raises(InvalidProblem, match=r".") as refused:
-        plan(text)
+        design(text)
     assert words in str(refused.value)
     assert len(str(refused.value)) < 300

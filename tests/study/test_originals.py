@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from study.texts import QUICK, plan
+from study.texts import QUICK, design
 
 from optloc.base.types import Status
 from optloc.papers.registration import PRINTED, Setting
@@ -24,7 +24,7 @@ def test_the_recursion_is_that_of_the_paper():
 
 
 def test_a_single_step_is_the_first_of_an_iteration():
-    drawn = draw(next(plan().chunks).cell.case, 0, 5)
+    drawn = draw(next(design().chunks).cell.case, 0, 5)
     start = drawn.truth + 500.0
     once = judge(drawn.problem, lsr(drawn.problem, begin(drawn.problem, start), damped=False, limit=1))
     np.testing.assert_allclose(single_step(drawn.problem, start), once.x, rtol=1e-9)
@@ -33,13 +33,13 @@ def test_a_single_step_is_the_first_of_an_iteration():
 def test_a_recursion_over_runs_with_unknowns_of_their_epochs_has_no_answer():
     text = 'format = 1\nname = "x"\ntrials = 4\n[[scenario]]\nname = "s"\nlayout = { kinds = ["toa"] }\n'
     text += 'truth = { kind = "hull" }\nnoise = ["3 m"]\n[[method]]\nbaseline = "recursion"\n'
-    frame = compute(next(plan(text).chunks)).table.to_pandas()
+    frame = compute(next(design(text).chunks)).table.to_pandas()
     assert not frame["answered"].any()
 
 
 @pytest.mark.parametrize("name", ["single-step", "recursion"])
 def test_originals_claim_what_they_arrive_at(name):
-    drawn = draw(next(plan().chunks).cell.case, 0, 5)
+    drawn = draw(next(design().chunks).cell.case, 0, 5)
     fix = BASELINES[name].run(drawn, drawn.truth)
     assert (fix.code == Status.UNPROVEN).all()
     assert fix.answered.all()
@@ -50,5 +50,5 @@ def test_originals_claim_what_they_arrive_at(name):
 def test_methods_that_know_the_truth_are_references_whatever_their_names():
     text = QUICK + '[[method]]\nname = "judge"\nbaseline = "truth"\n[[method]]\nname = "a"\nbaseline = "taylor"\n'
     text += '[[method]]\nname = "b"\nbaseline = "taylor"\nstart = "truth"\n'
-    methods = {cell.method.name: cell.method for cell in plan(text).cells}
+    methods = {cell.method.name: cell.method for cell in design(text).cells}
     assert {name for name, method in methods.items() if method.reference} == {"judge", "b"}

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from study.texts import QUICK, plan, run_here
+from study.texts import QUICK, design, run_here
 from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
@@ -108,7 +108,7 @@ def folder(tmp_path_factory):
     (place / "others.py").write_text(COUNTING)
     names = ["gauss-newton", "scipy", "truth", f"{place}/others.py:bfgs", f"{place}/others.py:breaks"]
     text = QUICK.replace("trials = 60", "trials = 6")
-    return run_here(plan(text, more=added(names)), place / "out")
+    return run_here(design(text, more=added(names)), place / "out")
 
 
 def test_the_table_tells_the_work_of_every_method(folder):

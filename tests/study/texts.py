@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from optloc.study.design import design_of_text
 from optloc.study.folder import begin, locked, read_arrow, store
-from optloc.study.plan import planned
 from optloc.study.trial import VALUES, compute
 
 SMALL = """
@@ -39,8 +39,8 @@ chunk = 20
 QUICK = SMALL[: SMALL.rindex("[[method]]")]
 
 
-def plan(text=SMALL, folder=Path(), **options):
-    return planned(text, "small.toml", folder, **options)
+def design(text=SMALL, folder=Path(), **options):
+    return design_of_text(text, "small.toml", folder, **options)
 
 
 def values(folder):

@@ -36,7 +36,7 @@ def _direction(rng, d):
     return way / np.linalg.norm(way)
 
 
-def _posed(stations, truth, rng, *parts):
+def _problem_of(stations, truth, rng, *parts):
     template = optloc.assemble(stations, *parts)
     return optloc.simulate(template, truth, int(rng.integers(2**31))), truth
 
@@ -45,38 +45,38 @@ def _tdoa(rng, d, n, far):
     d, n = int(d), int(n)
     stations = rng.uniform(-0.5, 0.5, (n, d)) * np.array([10e3, 10e3, 6e3])[:d]
     truth = far * 1e3 * _direction(rng, d) if far else rng.uniform(-0.5, 0.5, d) * np.array([10e3, 10e3, 6e3])[:d]
-    return _posed(stations, truth, rng, optloc.measured("tdoa", a=np.arange(1, n), b=0, arrival_sigma=10.0))
+    return _problem_of(stations, truth, rng, optloc.measured("tdoa", a=np.arange(1, n), b=0, arrival_sigma=10.0))
 
 
 def _azel(rng, n, far):
     n = int(n)
     stations, way = rng.uniform(-0.5, 0.5, (n, 3)) * [10e3, 10e3, 6e3], _direction(rng, 3)
     rows = [optloc.measured(kind, a=np.arange(n), sigma=0.01) for kind in ("azimuth", "elevation")]
-    return _posed(stations, far * 1e3 * way, rng, *rows)
+    return _problem_of(stations, far * 1e3 * way, rng, *rows)
 
 
 def _aoa(rng, n, far, sigma):
     n = int(n)
     stations = rng.uniform(-1e3, 1e3, (n, 2))
     rows = optloc.measured("azimuth", a=np.arange(n), sigma=sigma * 1e-3)
-    return _posed(stations, far * 1e3 * _direction(rng, 2), rng, rows)
+    return _problem_of(stations, far * 1e3 * _direction(rng, 2), rng, rows)
 
 
 def _plane(rng, high, z):
     stations = np.column_stack([rng.uniform(-5e3, 5e3, (5, 2)), high * rng.standard_normal(5)])
     truth = np.append(rng.uniform(-5e3, 5e3, 2), z)
-    return _posed(stations, truth, rng, optloc.measured("range", a=np.arange(5), sigma=10.0))
+    return _problem_of(stations, truth, rng, optloc.measured("range", a=np.arange(5), sigma=10.0))
 
 
 def _line(rng):
     stations = np.column_stack([np.linspace(-5e3, 5e3, 8), rng.uniform(-1, 1, (8, 2))])
     truth = np.append(rng.uniform(-5e3, 5e3), 3e3 * _direction(rng, 2))
-    return _posed(stations, truth, rng, optloc.measured("range", a=np.arange(8), sigma=1.0))
+    return _problem_of(stations, truth, rng, optloc.measured("range", a=np.arange(8), sigma=1.0))
 
 
 def _ranges(rng):
     stations, truth = rng.uniform(-5e3, 5e3, (4, 2)), rng.uniform(-5e3, 5e3, 2)
-    return _posed(stations, truth, rng, optloc.measured("range", a=np.arange(4), sigma=10.0))
+    return _problem_of(stations, truth, rng, optloc.measured("range", a=np.arange(4), sigma=10.0))
 
 
 _CASES = {"tdoa": _tdoa, "azel": _azel, "aoa": _aoa, "plane": _plane, "line": _line, "r2": _ranges}

@@ -12,7 +12,7 @@ from optloc.compute.jit import enabled
 from optloc.linear.evaluate import predict
 from optloc.proof.near import COARSE
 from optloc.solvers.certify.branch_and_bound import FINE
-from optloc.solvers.certify.posed import pose, prove
+from optloc.solvers.certify.position_cost import eliminate_nuisance, prove
 
 Array = np.ndarray
 needs_code = pytest.mark.skipif(not enabled(), reason="proofs around the Earth take thousands of boxes")
@@ -177,7 +177,7 @@ def test_a_question_that_rounding_cannot_answer_has_a_verdict_of_its_own():
         planes=np.zeros((1, 0, 3)),
         surface=np.zeros((1, 0)),
     )
-    answer = prove(pose(problem), asked)
+    answer = prove(eliminate_nuisance(problem), asked)
     assert answer.verdict[0] == COARSE
     assert answer.bound[0] == -np.inf
 

@@ -51,7 +51,16 @@ from optloc.solvers.certify.branch_and_bound import (
     to_prove,
     unknown,
 )
-from optloc.solvers.certify.posed import Costs, admitted, costs_of, is_free, pose, prove, state_columns, surfaces_of
+from optloc.solvers.certify.position_cost import (
+    Costs,
+    admitted,
+    costs_of,
+    eliminate_nuisance,
+    is_free,
+    prove,
+    state_columns,
+    surfaces_of,
+)
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
@@ -168,7 +177,7 @@ def _beside(problem: Problem, pool: Pool, minima: Minima) -> Pool:
 
 def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: int) -> tuple[Claims, Minima]:
     """Return claims (n,) about fixes, and all minima that are admitted."""
-    sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), pose(problem)
+    sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), eliminate_nuisance(problem)
     sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
     why, seeds, tight = fill(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
     for number, face in enumerate(sides):
@@ -267,7 +276,7 @@ def _cheapest(on: Problem, costs: Costs, seeds: Array) -> tuple[Array, Array]:
 
 
 def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
-    """Return posed costs (n, q) of vectors (n, q, size); infinite where there is none."""
+    """Return position costs (n, q) of vectors (n, q, size); infinite where there is none."""
     with np.errstate(all="ignore"):
         cost = costs_of(costs, x[..., state_columns(problem)])[0]
     return np.where(np.isfinite(cost), cost, np.inf)
@@ -398,7 +407,7 @@ def certify(
         Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
         or where that cannot be bounded a box around the stations that the certificate names. Of a target that moves
         (2 d,), velocities in metres per second after the coordinates; None: what its constraints admit, see
-        `optloc.solvers.certify.posed.regions_of`.
+        `optloc.solvers.certify.position_cost.regions_of`.
     margin : float
         Gap between the cost of the fix and that of any other minimum that is tried to prove first; where the proof is
         not finished, 9, the gap of `ambiguous`, and the value alone follow. 0 asks for the value alone: quicker.

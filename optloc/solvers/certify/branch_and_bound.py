@@ -22,13 +22,13 @@ from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, UNIQUE, VALUE
 from optloc.proof.scope import unsupported
 from optloc.proof.search_space import HIDDEN_REACH
-from optloc.solvers.certify.posed import (
+from optloc.solvers.certify.position_cost import (
     Costs,
     agrees,
     around,
+    eliminate_nuisance,
     is_free,
     lacks,
-    pose,
     prove,
     regions_of,
     state_columns,
@@ -156,7 +156,7 @@ class Work:
         The verdict of the pool.
     proven : Claims
         What is claimed of each.
-    pose : Posed or Runs
+    costs : Posed, Runs or Courses
         Their costs over the position, equalities apart.
     ignored : array (N, h, d)
         Minima that the Earth hides; NaN in empty slots.
@@ -185,7 +185,7 @@ class Work:
     pool: Pool
     fix: Fix
     proven: Claims
-    pose: Costs
+    costs: Costs
     ignored: Array
     region: Array
     fallback: Array
@@ -212,7 +212,7 @@ class Work:
             pool,
             fix,
             claims_before(pool),
-            pose(problem),
+            eliminate_nuisance(problem),
             np.full((size, 0, d), np.nan),
             corners,
             around(problem, state),
@@ -232,7 +232,7 @@ class Work:
         more = [f"{self.replaced} fixes replaced by better ones"] if self.replaced else []
         more += [f"{self.listed} other minima found"] if self.listed else []
         if self.mismatched:
-            more.append(f"{self.mismatched} posed cost{'s' if self.mismatched > 1 else ''} did not match")
+            more.append(f"{self.mismatched} position cost{'s' if self.mismatched > 1 else ''} did not match")
         return ", ".join(counts + more)
 
 
@@ -261,7 +261,7 @@ def _compare(work: Work, items: Array) -> None:
     proven = items[np.isin(work.proven.proof[items], (GLOBAL, REGION))]
     if not len(proven):
         return
-    off = proven[~agrees(work.problem.take(proven), work.fix[proven], work.pose.take(proven))]
+    off = proven[~agrees(work.problem.take(proven), work.fix[proven], work.costs.take(proven))]
     _give_up(work, off, MISMATCHED)
     work.mismatched += len(off)
 
@@ -270,7 +270,7 @@ def _round(work: Work, items: Array) -> None:
     """Try to prove some fixes once, and settle or change what can be."""
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
-    asked, costs = _asked(work, items), work.pose.take(items)
+    asked, costs = _asked(work, items), work.costs.take(items)
     # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
     turning = free & (costs.level < work.fix.cost[items] + asked.gaps[:, 0])
     _lower(work, items[turning], TURNS)
@@ -290,7 +290,7 @@ def _round(work: Work, items: Array) -> None:
     # What the budget of a gap did not show, that of the value may.
     below = short & (answer.gap < asked.gaps[:, 0])
     work.level[items[below]] = last - 1
-    _lower(work, items[short], _unfinished(work.pose, len(items)))
+    _lower(work, items[short], _unfinished(work.costs, len(items)))
     remote = answer.verdict == UNBOUNDED
     work.level[items[remote & (answer.gap == 0.0)]] = last
     _lower(work, items[remote], REMOTE, remote=True)
@@ -300,7 +300,7 @@ def _round(work: Work, items: Array) -> None:
     fine, unclosed = answer.verdict == COARSE, answer.verdict == OPEN
     _give_up(work, items[fine], FINE)
     # Boxes ran out over all of the surface of a height before a region of it was tried.
-    _give_up(work, items[unclosed], AROUND if work.limited else _unfinished(work.pose, len(items)))
+    _give_up(work, items[unclosed], AROUND if work.limited else _unfinished(work.costs, len(items)))
     _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
 
@@ -325,7 +325,7 @@ def _asked(work: Work, items: Array) -> Asked:
         eps=equal_cost(fix.cost[items]),
         region=work.region[items],
         fallback=work.fallback[items],
-        budget=budgets(kappa, work.pose.dense, work.effort) * (_AROUND if surface.shape[1] else 1),
+        budget=budgets(kappa, work.costs.dense, work.effort) * (_AROUND if surface.shape[1] else 1),
         planes=planes,
         surface=surface,
     )
@@ -429,7 +429,7 @@ def _stick(work: Work, items: Array, points: Array, better: Array) -> None:
     """Say what becomes of fixes beside which points (n, d) were found that are no candidates."""
     stuck = np.flatnonzero(~_ignore(work, items, points))
     _bar(work, items, points, stuck[better[stuck]])
-    _lower(work, items[stuck[~better[stuck]]], _unfinished(work.pose, len(items)))
+    _lower(work, items[stuck[~better[stuck]]], _unfinished(work.costs, len(items)))
 
 
 def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:

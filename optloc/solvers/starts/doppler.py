@@ -12,7 +12,7 @@ from formulations.range_height import Ellipsoid, ellipsoid
 from optloc.base.linalg import whitening
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
-from optloc.linear.evaluate import plans
+from optloc.linear.evaluate import block_links
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.noise import dense, variances
@@ -96,9 +96,9 @@ def _gather(problem: Problem) -> _Told:
     shared, parts = problem.layout.n_shared, list(_parts(problem))
     row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
     design = np.zeros((problem.count, shared))
-    for plan, start in zip(plans(problem), problem.starts, strict=True):
-        mine = plan.adds.column < shared
-        np.add.at(design, (start + plan.adds.row[mine], plan.adds.column[mine]), plan.adds.coefficient[mine])
+    for links, start in zip(block_links(problem), problem.starts, strict=True):
+        mine = links.adds.column < shared
+        np.add.at(design, (start + links.adds.row[mine], links.adds.column[mine]), links.adds.coefficient[mine])
     _, group = np.unique(np.stack([kind, a, b]), axis=1, return_inverse=True)
     return _Told(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
 

@@ -60,17 +60,17 @@ def moving_starts(problem: Problem) -> Array:
     problem : Problem
         N problems of which `moves_at_once` holds.
     """
-    posed, d = pose_costs(held(problem)), problem.dimension
+    costs, d = pose_costs(held(problem)), problem.dimension
     out = np.full((problem.batch_shape[0], _MOST, d), np.nan)
     for i in range(len(out)):
-        found = _search(posed.take(slice(i, i + 1)), d)
+        found = _search(costs.take(slice(i, i + 1)), d)
         out[i, : len(found)] = found
     return out
 
 
-def _search(posed: Posed, d: int) -> Array:
+def _search(costs: Posed, d: int) -> Array:
     """Return the cheapest centres (q, d) of boxes that are far apart."""
-    kinds, data, K, w = posed.kinds, posed.data[0], posed.K[0], posed.w[0]
+    kinds, data, K, w = costs.kinds, costs.data[0], costs.K[0], costs.w[0]
     with plain():
         if not reaches_infinity(kinds, K):
             return np.empty((0, d))

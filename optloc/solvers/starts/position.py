@@ -11,7 +11,7 @@ from formulations.range_height import Ellipsoid, ellipsoid, locate, locate_by_ra
 from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Band
-from optloc.linear.evaluate import columns, plans, predict
+from optloc.linear.evaluate import block_links, columns, predict
 from optloc.models import MODELS, Model
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.layout import emission_name
@@ -173,9 +173,9 @@ def _fit_emission_times(problem: Problem, x: Array) -> Array:
     left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
     present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
     # an emission enters each of its rows with factor one: the mean of the rest fits it; one nobody hears stays zero
-    for plan, start in zip(plans(problem), problem.starts, strict=True):
-        own = np.isin(plan.adds.column, emissions) & plan.model.emission
-        column, rows = plan.adds.column[own], start + plan.adds.row[own]
+    for links, start in zip(block_links(problem), problem.starts, strict=True):
+        own = np.isin(links.adds.column, emissions) & links.model.emission
+        column, rows = links.adds.column[own], start + links.adds.row[own]
         heard, total = np.zeros(out.shape), np.zeros(out.shape)
         np.add.at(heard, (..., column), present[:, rows])  # type: ignore[arg-type]
         np.add.at(total, (..., column), np.where(present[:, rows], left[:, rows], 0.0))  # type: ignore[arg-type]
@@ -201,8 +201,8 @@ def without_biases(problem: Problem) -> Problem:
     Offsets, drifts and scales without a prior are taken for zero, rotations always are.
     """
     x, rows = vectors(problem, None), []
-    for plan, block in zip(plans(problem), problem.rows, strict=True):
-        gain, added = plan.gains.total(x, block.count), plan.adds.total(x, block.count)
+    for links, block in zip(block_links(problem), problem.rows, strict=True):
+        gain, added = links.gains.total(x, block.count), links.adds.total(x, block.count)
         # a row says z = (1 + gain) h(x) + added + correction: solved for h(x)
         z = (block.z - block.correction - added) / (1.0 + gain)
         # rows that no bias touches stay as they are, to the last bit

@@ -13,7 +13,7 @@ from optloc.base import linalg
 from optloc.base.types import Array, Bias, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.courses import elapsed
-from optloc.linear.evaluate import plans
+from optloc.linear.evaluate import block_links
 from optloc.linear.normal import covariance, prior_parts
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.walks import places, state_of, walks
@@ -501,10 +501,10 @@ def _units(problem: Problem) -> tuple[Array, Array]:
     """Return the columns (q,) of offsets and drifts of range rows, and the rows (q, m) that one unit of each makes."""
     size = problem.layout.n_shared
     unit = np.zeros((size, problem.count))
-    for plan, start in zip(plans(problem), problem.starts, strict=True):
-        shared = plan.adds.column < size
-        if plan.model.ranges is not None:
-            np.add.at(unit, (plan.adds.column[shared], start + plan.adds.row[shared]), plan.adds.coefficient[shared])
+    for links, start in zip(block_links(problem), problem.starts, strict=True):
+        shared = links.adds.column < size
+        if links.model.ranges is not None:
+            np.add.at(unit, (links.adds.column[shared], start + links.adds.row[shared]), links.adds.coefficient[shared])
     column = np.flatnonzero(unit.any(1))
     return column, unit[column]
 

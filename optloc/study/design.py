@@ -1,4 +1,4 @@
-"""From a study file to its plan: cases times methods are cells; some trials of a cell, a chunk, are a task and a file.
+"""The design of a study: cases times methods are cells; some trials of a cell, a chunk, are a task and a file.
 
 A case is one geometry at one noise level with one set of swept values.
 """
@@ -38,7 +38,7 @@ from optloc.study.networks import NetworkCase, check_network, noise_of
 
 # Trials of a chunk, whose part should take seconds: less, and files and tasks cost as much as fixes; more, and a run
 # that is stopped loses minutes. A fast fix takes about 0.1 ms with everything beside it (a million in two minutes is
-# what tests/benchmarks/test_study.py asks), a slow one 1 to 100 ms. Other values are another plan: a study that has
+# what tests/benchmarks/test_study.py asks), a slow one 1 to 100 ms. Other values are another design: a study that has
 # begun would not go on.
 _FAST, _SLOW = 10_000, 250
 # Fewest trials of a chunk of a slow and of a fast method; the latter is a block of draws, which is drawn whole.
@@ -105,8 +105,8 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A study that is ready to run.
+class StudyDesign:
+    """The experimental design of a study, ready to run.
 
     Parameters
     ----------
@@ -170,8 +170,10 @@ def shipped() -> dict[str, Traversable]:
 _CASES, _PARTS = 10_000, 1_000_000
 
 
-def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None, more: Sequence[Method] = ()) -> Plan:
-    """Return the plan of a study file, or of a shipped study by its name.
+def design_of(
+    file: Path, *, trials: int | None = None, seed: int | None = None, more: Sequence[Method] = ()
+) -> StudyDesign:
+    """Return the design of a study file, or of a shipped study by its name.
 
     Parameters
     ----------
@@ -193,11 +195,11 @@ def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None, m
             advice = f"{nearest(str(file), known)}, or give the path of a study file"
             raise InvalidProblem(f"there is no study {str(file)!r}", "study", advice)
         with as_file(known[str(file)]) as path:
-            return planned(read_text(path), path.name, path.parent, trials=trials, seed=seed, more=more)
-    return planned(read_text(file), file.name, file.parent, trials=trials, seed=seed, more=more)
+            return design_of_text(read_text(path), path.name, path.parent, trials=trials, seed=seed, more=more)
+    return design_of_text(read_text(file), file.name, file.parent, trials=trials, seed=seed, more=more)
 
 
-def planned(
+def design_of_text(
     text: str,
     source: str,
     folder: Path,
@@ -205,8 +207,8 @@ def planned(
     trials: int | None = None,
     seed: int | None = None,
     more: Sequence[Method] = (),
-) -> Plan:
-    """Return the plan of the text of a study file; `folder` is where its problem files are."""
+) -> StudyDesign:
+    """Return the design of the text of a study file; `folder` is where its problem files are."""
     study = conform(StudyFile, parse_toml(text, source), source)
     new = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     study = study.model_copy(update=new)
@@ -233,7 +235,9 @@ def planned(
     _distinct([method.name for method in methods], source, "method")
     _distinct([table.name for table in study.scenario], source, "scenario")
     _distinct([table.name for table in study.network], source, "network")
-    return Plan(study, text, tuple(Cell(case, method) for case in cases for method in methods), str(folder.resolve()))
+    return StudyDesign(
+        study, text, tuple(Cell(case, method) for case in cases for method in methods), str(folder.resolve())
+    )
 
 
 def _one_kind(study: StudyFile, methods: list[Method]) -> None:

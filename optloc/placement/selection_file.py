@@ -1,4 +1,4 @@
-"""Plans as files: candidates, places, kinds and rules in tables of problem files; and the file of what is chosen."""
+"""Site selections as files: candidates, places, kinds and rules in tables; and the problem file of the chosen sites."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from optloc.files.stations import survey
 from optloc.files.table import Table, distinct, of_rows, table_of
 from optloc.files.unknowns import settle_frame
 from optloc.files.writer import toml_text
-from optloc.placement.areas import convex_parts, ground_of, inside, plan_of, polygons_of, region_of, visible
-from optloc.placement.sites import Group, Name, Plan
+from optloc.placement.areas import convex_parts, corners_in_frame, ground_of, inside, polygons_of, region_of, visible
+from optloc.placement.sites import Group, Name, SiteSelection
 from optloc.problem.problem import Problem
 
 # Columns of stations and candidates that a problem file knows.
@@ -114,7 +114,7 @@ class TargetsTable(DataTable):
     """Their height, or third coordinate."""
 
 
-class PlannedTable(MeasurementsTable):
+class ExpectedTable(MeasurementsTable):
     """What each station would measure: as in a problem file, without values; by default every station has a row."""
 
     range_max: Amount | None = None
@@ -152,8 +152,8 @@ class RefineTable(_Table):
     """CSV file with columns x, y, z on a grid."""
 
 
-class PlanFile(_Table):
-    """A plan: which of these candidates to take."""
+class SelectionFile(_Table):
+    """A site selection: which of these candidates to take."""
 
     format: Literal[1]
     """Version of the format."""
@@ -168,7 +168,7 @@ class PlanFile(_Table):
     candidates: StationsTable
     """Where stations may stand. Columns as of stations; optional: cost, group, and sigma of their measurements."""
     targets: TargetsTable
-    measurements: list[PlannedTable] = Field(min_length=1)
+    measurements: list[ExpectedTable] = Field(min_length=1)
     sight: SightTable | None = None
     groups: list[GroupTable] = Field(default_factory=list)
     priors: list[PriorTable] = Field(default_factory=list)
@@ -177,13 +177,13 @@ class PlanFile(_Table):
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
-    """A plan and what its file says beyond it.
+class LoadedSelection:
+    """A site selection, and the other contents of its file.
 
     Parameters
     ----------
-    plan : Plan
-        The plan.
+    selection : SiteSelection
+        Candidates, places and rules.
     source, title : str
         Name of the file, and what it says it is.
     settings : dict
@@ -194,7 +194,7 @@ class Planned:
         What their heights are above.
     """
 
-    plan: Plan
+    selection: SiteSelection
     source: str
     title: str
     settings: dict[str, Any]
@@ -202,14 +202,14 @@ class Planned:
     ground: Ground | None = None
 
 
-def is_plan(path: Path) -> bool:
-    """Return whether a file is a plan: it has a table [choice] or [candidates]."""
+def is_selection(path: Path) -> bool:
+    """Return whether a file is a selection file: it has a table [choice] or [candidates]."""
     found = parse_toml(read_text(path), name_of(path), formats=(1, 2))
     return "choice" in found or "candidates" in found
 
 
-def read_plan(path: Path) -> Planned:
-    """Return the plan of a file.
+def read_selection(path: Path) -> LoadedSelection:
+    """Return the site selection of a file.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def read_plan(path: Path) -> Planned:
         Naming the file, the row and the column or key.
     """
     source, folder = name_of(path), path.parent
-    file = conform(PlanFile, parse_toml(read_text(path), source), source)
+    file = conform(SelectionFile, parse_toml(read_text(path), source), source)
     candidates = table_of(_bare(file.candidates), folder, join(source, "[candidates]"))
     tables = [(candidates, file.candidates)]
     if file.stations is not None:
@@ -236,7 +236,7 @@ def read_plan(path: Path) -> Planned:
     settings["frame"] = wanted.model_dump(exclude_none=True)
     places, labels, weights = _places(file.targets, wanted, problem, folder, source)
     choice = file.choice
-    plan = Plan(
+    selection = SiteSelection(
         problem,
         places,
         weights,
@@ -259,7 +259,7 @@ def read_plan(path: Path) -> Planned:
         choice.seed,
     )
     regions, ground = _regions(file.refine, problem.frame, problem.dimension, folder, source)
-    return Planned(plan, source, file.title or source, settings, regions, ground)
+    return LoadedSelection(selection, source, file.title or source, settings, regions, ground)
 
 
 def _bare(section: StationsTable) -> DataTable:
@@ -267,7 +267,7 @@ def _bare(section: StationsTable) -> DataTable:
 
 
 def _settings(
-    file: PlanFile, tables: Sequence[tuple[Table, StationsTable]], folder: Path, source: str
+    file: SelectionFile, tables: Sequence[tuple[Table, StationsTable]], folder: Path, source: str
 ) -> dict[str, Any]:
     """Return the tables of a problem file with all stations and the rows that each would have."""
     units = {(section.unit, section.speed_unit) for _, section in tables}
@@ -282,10 +282,10 @@ def _settings(
     own = {str(n): v for n, v in zip(*_own_sigma(tables[0][0]), strict=True)}
     station = file.candidates.model_dump(exclude_defaults=True, exclude=_ROWS)
     measurements = []
-    for i, planned in enumerate(file.measurements):
-        given = planned.model_dump(exclude_defaults=True, exclude=_ROWS | {"range_max"})
+    for i, expected in enumerate(file.measurements):
+        given = expected.model_dump(exclude_defaults=True, exclude=_ROWS | {"range_max"})
         place = join(source, f"[[measurements]] {i + 1}")
-        measurements.append(given | {"rows": _planned_rows(planned, rows, own, folder, place)})
+        measurements.append(given | {"rows": _expected_rows(expected, rows, own, folder, place)})
         if own:
             measurements[-1].pop("sigma", None)
     out = {
@@ -313,8 +313,8 @@ def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
     return table.labels("name").tolist(), table.numbers("sigma").tolist()
 
 
-def _planned_rows(
-    section: PlannedTable, stations: Sequence[dict[str, Any]], own: dict[str, float], folder: Path, where: str
+def _expected_rows(
+    section: ExpectedTable, stations: Sequence[dict[str, Any]], own: dict[str, float], folder: Path, where: str
 ) -> list[dict[str, Any]]:
     """Return the rows that a section lists, or one of each station but the other end."""
     if section.kind is None:
@@ -396,7 +396,8 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
         raise InvalidProblem(f"the spacing {step:g} m is not positive", where, 'write spacing = "5 m"')
     height = 0.0 if section.height is None else Units("length").plain(section.height, section.unit, where)
     rings = [
-        plan_of(r, frame, where) for r in polygons_of(within(folder, section.polygon, join(where, "key 'polygon'")))
+        corners_in_frame(r, frame, where)
+        for r in polygons_of(within(folder, section.polygon, join(where, "key 'polygon'")))
     ]
     low, high = np.min([r.min(0) for r in rings], axis=0), np.max([r.max(0) for r in rings], axis=0)
     if np.prod((high - low) / step + 1.0) > _MANY:
@@ -409,7 +410,7 @@ def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, whe
     return points if dimension == 2 else np.column_stack([points, np.full(len(points), height)])
 
 
-def _reach(file: PlanFile, counts: Sequence[int], source: str) -> Array | None:
+def _reach(file: SelectionFile, counts: Sequence[int], source: str) -> Array | None:
     """Return the greatest range (m,) of each row, metres; None where all are without end."""
     if all(section.range_max is None for section in file.measurements):
         return None
@@ -463,19 +464,19 @@ def _regions(
     if low > high:
         raise InvalidProblem("the least height is above the greatest", join(where, "key 'height'"), "swap them")
     path = within(folder, section.polygon, join(where, "key 'polygon'"))
-    parts = [part for ring in polygons_of(path) for part in convex_parts(plan_of(ring, frame, where))]
+    parts = [part for ring in polygons_of(path) for part in convex_parts(corners_in_frame(ring, frame, where))]
     ground = None
     if section.terrain is not None and dimension == 3:
         ground = ground_of(within(folder, section.terrain, join(where, "key 'terrain'")), join(where, "key 'terrain'"))
     return tuple(region_of(part, low, high) for part in parts), ground
 
 
-def write_chosen(planned: Planned, taken: Sequence[str], out: Path, source: Path) -> None:
+def write_chosen(loaded: LoadedSelection, taken: Sequence[str], out: Path, source: Path) -> None:
     """Write an ordinary problem file with the taken stations and their rows, ready for `crlb --map` and studies."""
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the chosen stations are written as a problem file", str(out), "let its name end in .toml")
     claim(out, inputs=[source])
-    kept, settings = {*taken}, dict(planned.settings)
+    kept, settings = {*taken}, dict(loaded.settings)
     others = {s.get("b") for s in settings["measurements"]}
     stations = [row for row in settings["stations"]["rows"] if row["name"] in kept | others]
     settings["stations"] = settings["stations"] | {"rows": stations}
@@ -483,7 +484,7 @@ def write_chosen(planned: Planned, taken: Sequence[str], out: Path, source: Path
     settings["measurements"] = [
         section | {"rows": own} for section, own in zip(settings["measurements"], rows, strict=True) if own
     ]
-    settings["title"] = f"{planned.title}: the chosen stations"
+    settings["title"] = f"{loaded.title}: the chosen stations"
     text = "format = 1\n" + toml_text({key: value for key, value in settings.items() if key != "format"})
     write_text(out, text)
 

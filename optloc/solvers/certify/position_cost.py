@@ -1,4 +1,4 @@
-"""What a proof is posed of: costs, surfaces that hold a fix, regions; and whether a cost is the fix's own."""
+"""The inputs of a proof: costs over the position, surfaces, regions; and whether a cost belongs to its fix."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from optloc.solvers.starts.position import spread_of
 Costs = Posed | Runs | Courses
 
 
-def pose(problem: Problem) -> Costs:
-    """Return the costs of a flat batch of problems over the target's state."""
+def eliminate_nuisance(problem: Problem) -> Costs:
+    """Return the costs of a flat batch of problems over the target's state, all other unknowns at their best values."""
     if problem.motions[0].order > 0:
         return pose_courses(problem)
     return pose_runs(problem) if is_run(problem) else pose_costs(problem)
 
 
 def prove(costs: Costs, asked: Asked) -> Answered:
-    """Return the outcome of the proofs of n fixes of n posed problems."""
+    """Return the outcome of the proofs of n fixes of n problems by their costs."""
     if isinstance(costs, Courses):
         return prove_courses(costs, asked)
     return prove_runs(costs, asked) if isinstance(costs, Runs) else prove_all(costs, asked)
@@ -46,7 +46,7 @@ def lacks(costs: Costs, count: int) -> bool:
 
 
 def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
-    """Return posed costs (N, P) of states (N, P, n) and the rounding of their residuals."""
+    """Return position costs (N, P) of states (N, P, n) and the rounding of their residuals."""
     if isinstance(costs, Courses):
         return costs_of_courses(costs, states)
     return costs_of_runs(costs, states) if isinstance(costs, Runs) else costs_at(costs, states)
@@ -197,7 +197,7 @@ def around(problem: Problem, state: Array) -> Array:
     return np.stack([middle - reach, middle + reach], axis=1)
 
 
-# Whether a posed cost is that of its fix.
+# Whether a position cost belongs to its fix.
 
 # Places beside each fix, about a standard deviation away: two ways to write the same cost agree there to the rounding,
 # two different costs differ by a share of one. A second place would cost half as much time again.
@@ -212,7 +212,7 @@ _STEPS = 6
 
 
 def agrees(problem: Problem, fix: Fix, costs: Costs) -> Array:
-    """Return of which of a flat batch of N problems the posed cost is their own (N,), at the fix and beside it.
+    """Return of which of a flat batch of N problems the position cost is their own (N,), at the fix and beside it.
 
     Parameters
     ----------
@@ -220,14 +220,14 @@ def agrees(problem: Problem, fix: Fix, costs: Costs) -> Array:
         N problems within the scope of the proof.
     fix : Fix
         Their fixes.
-    costs : Posed or Runs
+    costs : Posed, Runs or Courses
         Their costs over the position, equalities apart.
     """
     places = _places(problem, fix)
     own = _own_costs(problem, fix, places)
     with np.errstate(all="ignore"):
-        posed, blur = costs_of(costs, places)
-        good = np.abs(posed - own) <= _tolerance(own, blur)
+        found, blur = costs_of(costs, places)
+        good = np.abs(found - own) <= _tolerance(own, blur)
         good[:, 0] &= np.abs(own[:, 0] - fix.cost) <= _tolerance(fix.cost, blur[:, 0])
     return np.asarray(good.all(1))
 
