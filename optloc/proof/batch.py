@@ -13,7 +13,7 @@ from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, wor
 from optloc.proof.box import bound_nodes, cost_at, rounding
 from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.near import OPEN, prove
-from optloc.proof.pose import Posed
+from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import LINES, Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 
 # Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
@@ -80,7 +80,7 @@ class Answered(NamedTuple):
     boxes : int array (n,)
         Boxes looked at.
     bound : array (n,)
-        Certified lower bounds of the posed cost.
+        Certified lower bounds of the cost.
     everywhere : bool array (n,)
         Whether the claim is for all positions, not for the region asked for or the fallback.
     gap : array (n,)
@@ -107,44 +107,44 @@ class Answered(NamedTuple):
         return Answered(*(array[index] for array in self))
 
 
-def prove_all(pose: Posed, asked: Asked) -> Answered:
-    """Return the outcome of the proofs of n fixes of n posed problems.
+def prove_all(costs: PositionCosts, asked: Asked) -> Answered:
+    """Return the outcome of the proofs of n fixes of n problems, by their costs.
 
     The first few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
     """
     n = len(asked.x)
-    if worth_loading(_loop, n) or (len(pose.kinds) > SMALL and usable(_loop, n)):
-        return _prove(pose, asked)
+    if worth_loading(_loop, n) or (len(costs.kinds) > SMALL and usable(_loop, n)):
+        return _prove(costs, asked)
     parts = []
     for first in range(0, n, FEW):
         # Where machine code is made meanwhile, it goes on with the rest.
         last = n if first > 0 and usable(_loop, n) else min(first + FEW, n)
         some = slice(first, last)
-        parts.append((_prove if last - first > FEW else _prove_few)(pose.take(some), asked.take(some)))
+        parts.append((_prove if last - first > FEW else _prove_few)(costs.take(some), asked.take(some)))
         if last == n:
             break
     return parts[0] if len(parts) == 1 else Answered(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _prove_few(pose: Posed, asked: Asked) -> Answered:
+def _prove_few(costs: PositionCosts, asked: Asked) -> Answered:
     """Return the outcome of a few proofs, begun in plain Python; who needs more begins anew in machine code."""
     n = len(asked.x)
     few = max(_AT_LEAST, FIRST_BOXES // max(n, 1))
-    out = _prove_plainly(pose, asked, few)
+    out = _prove_plainly(costs, asked, few)
     # With more boxes a larger gap may be proven than with few, and minima may be met: only who has some left is done.
     short = np.flatnonzero((out.boxes >= few) & (asked.budget > few))
     if len(short) and enabled():
-        pose, asked = pose.take(short), asked.take(short)
+        costs, asked = costs.take(short), asked.take(short)
         plenty = max(_AT_LEAST, PLAIN_BOXES // len(short))
-        more = _prove(pose, asked) if usable(_loop, n) else _prove_plainly(pose, asked, plenty)
+        more = _prove(costs, asked) if usable(_loop, n) else _prove_plainly(costs, asked, plenty)
         for array, found in zip(out, more, strict=True):
             array[short] = found
     return out
 
 
-def _prove_plainly(pose: Posed, asked: Asked, boxes: int) -> Answered:
+def _prove_plainly(costs: PositionCosts, asked: Asked, boxes: int) -> Answered:
     with plain():
-        return _prove(pose, asked._replace(budget=np.minimum(asked.budget, boxes)))
+        return _prove(costs, asked._replace(budget=np.minimum(asked.budget, boxes)))
 
 
 def lacks_code(count: int) -> bool:
@@ -175,16 +175,16 @@ def without_rivals(
     return Answered(verdict, boxes, bound, everywhere, asked.gaps[:, 0], none, np.full((n, 0, d), np.nan), found)
 
 
-def _prove(pose: Posed, asked: Asked) -> Answered:
+def _prove(costs: PositionCosts, asked: Asked) -> Answered:
     n, d = asked.x.shape
     out = empty_answer(n, d)
-    pose, asked = Posed(*(plainly(array) for array in pose)), Asked(*(plainly(array) for array in asked))
+    costs, asked = PositionCosts(*(plainly(array) for array in costs)), Asked(*(plainly(array) for array in asked))
     length = max(_STRETCH[0], min(_STRETCH[1], n // _PARTS))
 
     def stretch(first: int) -> None:
         part = slice(first, min(first + length, n))
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
-            _loop(pose.take(part), asked.take(part), out.take(part))
+            _loop(costs.take(part), asked.take(part), out.take(part))
 
     if enabled():
         mapped(stretch, range(0, n, length))
@@ -194,12 +194,12 @@ def _prove(pose: Posed, asked: Asked) -> Answered:
     return out
 
 
-def prove_here(pose: Posed, asked: Asked, out: Answered) -> None:
+def prove_here(costs: PositionCosts, asked: Asked, out: Answered) -> None:
     """Write what becomes of proofs to arrays, by machine code in the calling thread; see `prove_all`.
 
     All arrays are writable and in C order: nothing is looked at, copied or shared out.
     """
-    _loop(pose, asked, out)
+    _loop(costs, asked, out)
 
 
 def loaded() -> bool:
@@ -207,14 +207,14 @@ def loaded() -> bool:
     return ready(_loop)
 
 
-def costs_at(pose: Posed, x: Array) -> tuple[Array, Array]:
-    """Return posed costs (n, P) at positions x (n, P, d), and what rounding may have made of their residuals (n, P)."""
+def costs_at(costs: PositionCosts, x: Array) -> tuple[Array, Array]:
+    """Return costs (n, P) at positions x (n, P, d), and what rounding may have made of their residuals (n, P)."""
     out = np.zeros((2, *x.shape[:2]))
     if worth_loading(_evaluate, len(x)):
-        _evaluate(Posed(*(plainly(array) for array in pose)), plainly(x), out)
+        _evaluate(PositionCosts(*(plainly(array) for array in costs)), plainly(x), out)
         return out[0], out[1]
     with plain(), np.errstate(all="ignore"):  # as few proofs are: machine code takes longer to load
-        _evaluate(pose, x, out)
+        _evaluate(costs, x, out)
     return out[0], out[1]
 
 
@@ -224,10 +224,10 @@ def plainly(array: Array) -> Array:
 
 
 @compiled
-def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
+def _loop(costs: PositionCosts, asked: Asked, out: Answered) -> None:
     """Prove what is asked of each fix, and write what became of it."""
     # Taken out of the records once: every look into one counts the references of an array.
-    kinds, data, K, w = pose.kinds, pose.data, pose.K, pose.w
+    kinds, data, K, w = costs.kinds, costs.data, costs.K, costs.w
     fixes, others, known, steps, tolerances = asked.x, asked.others, asked.known, asked.gaps, asked.eps
     regions, fallbacks, budgets = asked.region, asked.fallback, asked.budget
     hidden, planes, surfaces = asked.hidden, asked.planes, asked.surface
@@ -288,14 +288,14 @@ def present_in(cost: Cost) -> Cost:
 
 
 @compiled
-def _evaluate(pose: Posed, x: Array, out: Array) -> None:
+def _evaluate(costs: PositionCosts, x: Array, out: Array) -> None:
     """Write costs, and lengths of the rounding of their residuals."""
-    J, q = pose.K.shape[2], pose.K.shape[1]
+    J, q = costs.K.shape[2], costs.K.shape[1]
     box, weight, axes, origin = empty_box(q, J), np.empty(J), np.eye(3), np.zeros(3)
     for k in range(x.shape[2], 3):
         axes[k, k] = 0.0
     for i in range(len(x)):
-        K, data, w = pose.K[i if len(pose.K) > 1 else 0], pose.data[i if len(pose.data) > 1 else 0], pose.w[i]
+        K, data, w = costs.K[i if len(costs.K) > 1 else 0], costs.data[i if len(costs.data) > 1 else 0], costs.w[i]
         for j in range(J):
             weight[j] = 0.0
             for row in range(q):
@@ -304,7 +304,7 @@ def _evaluate(pose: Posed, x: Array, out: Array) -> None:
         for p in range(x.shape[1]):
             for k in range(x.shape[2]):
                 origin[k] = x[i, p, k]
-            bound_nodes(pose.kinds, data, origin, axes, axes, box.half, box.line, box.nodes)
+            bound_nodes(costs.kinds, data, origin, axes, axes, box.half, box.line, box.nodes)
             out[0, i, p] = cost_at(K, w, box.nodes)
-            floor = accuracy_floor(pose.kinds, data, weight, w, origin, LINES)
+            floor = accuracy_floor(costs.kinds, data, weight, w, origin, LINES)
             out[1, i, p] = rounding(K, weight, floor, box.nodes)

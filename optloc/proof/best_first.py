@@ -42,7 +42,7 @@ from optloc.proof.descents import descend
 from optloc.proof.everywhere import is_left, leaves, push_pieces
 from optloc.proof.near import cut_side, lay_or_halve, region_of
 from optloc.proof.nodes.dispatch import bound_pieces
-from optloc.proof.pose import Posed
+from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import (
     Box,
     Chart,
@@ -330,7 +330,7 @@ def _search_region(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, region: 
 
 
 class Places(NamedTuple):
-    """Where the minima of n posed costs are looked for.
+    """Where the minima of n costs are looked for.
 
     Parameters
     ----------
@@ -352,12 +352,12 @@ class Places(NamedTuple):
         return Places(*(array[i] for array in self))
 
 
-def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int) -> tuple[Array, Array]:
-    """Return the minima of n posed costs that a best-first search meets, from nothing.
+def find_minima(costs: PositionCosts, places: Places, gap: float, budget: int, most: int) -> tuple[Array, Array]:
+    """Return the minima of n costs that a best-first search meets, from nothing.
 
     Parameters
     ----------
-    pose : Posed
+    costs : PositionCosts
         The costs.
     places : Places
         Where they are looked for.
@@ -377,14 +377,14 @@ def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int)
     """
     n, d = places.x.shape
     points, boxes = np.full((n, most, d), np.nan), np.zeros(n, dtype=np.int64)
-    pose, places = Posed(*map(plainly, pose)), Places(*map(plainly, places))
+    costs, places = PositionCosts(*map(plainly, costs)), Places(*map(plainly, places))
 
     def search(i: int, budget: int) -> None:
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
-            points[i], boxes[i] = _search(pose.take(slice(i, i + 1)), places.take(i), gap, budget, most)
+            points[i], boxes[i] = _search(costs.take(slice(i, i + 1)), places.take(i), gap, budget, most)
 
     asked = list(range(n))
-    if n <= FEW and len(pose.kinds) <= SMALL and not ready(present_in):
+    if n <= FEW and len(costs.kinds) <= SMALL and not ready(present_in):
         # As few proofs are: most need few boxes, and machine code takes longer to load.
         first = min(budget, FIRST_BOXES // n)
         with plain():
@@ -402,9 +402,9 @@ def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int)
     return points, boxes
 
 
-def _search(pose: Posed, place: Places, gap: float, budget: int, most: int) -> tuple[Array, int]:
-    """Return the minima (most, d) of one posed cost, and the boxes that it took; places without their first axis."""
-    cost = present_in(cost_of(pose.kinds, pose.data[0], pose.K[0], pose.w[0]))
+def _search(costs: PositionCosts, place: Places, gap: float, budget: int, most: int) -> tuple[Array, int]:
+    """Return the minima (most, d) of one cost, and the boxes that it took; places without their first axis."""
+    cost = present_in(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = cube(cost.kinds, cost.data, place.x)
     found, costs = np.zeros((most, len(place.x))), np.full(most, inf)
     aim = Aim(place.planes, place.surface, gap, _AWAY * radius, found, costs)

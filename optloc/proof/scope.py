@@ -12,7 +12,7 @@ from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
 from optloc.problem.problem import Problem
-from optloc.proof.pose import own_epochs
+from optloc.proof.position_costs import own_epochs
 
 # Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time: a
 # box of ten thousand nodes takes a millisecond, and plain Python takes a thousand times longer.
@@ -49,7 +49,7 @@ def _reasons(problem: Problem) -> Iterator[str]:
     yield from _beyond_constraints(problem)
     known = {"position", "velocity", *(bias.name for bias in problem.biases)}
     known |= {name for name, _, _ in problem.stations.errors}
-    # What `optloc.proof.pose` does not write as rows would be left out of the cost without a word.
+    # What `optloc.proof.position_costs` does not write as rows would be left out of the cost without a word.
     for name, _, _ in prior_parts(problem):
         if name not in known:
             yield f"the prior on {name} is not covered"

@@ -26,7 +26,7 @@ from optloc.problem.fix import Stage
 from optloc.problem.layout import Layout
 from optloc.problem.noise import variances, whiten
 from optloc.problem.problem import Problem
-from optloc.proof.pose import project_out, whiten_rows
+from optloc.proof.position_costs import project_out, whiten_rows
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import equal_cost
 from optloc.solvers.pool import Curvature, Pool, in_parts

@@ -29,7 +29,7 @@ from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_here
 from optloc.proof.near import UNIQUE
-from optloc.proof.pose import Affine, Posed, pose_affinely
+from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
 from optloc.proof.scope import is_run, unsupported
 from optloc.solvers.certify.branch_and_bound import METHOD, budgets, certify_stage, gaps_below, sentence
 from optloc.solvers.certify.position_cost import agrees
@@ -91,7 +91,7 @@ class _Room:
         Measurements.
     found : tuple of array
         Fields of `optloc.compute.range_start.Answer`, without position and covariance.
-    costs : Posed
+    costs : PositionCosts
         With the whitened measurements; empty without a proof.
     asked, answered : Asked, Answered
         Of the proofs.
@@ -109,7 +109,7 @@ class _Room:
 
     z: Array
     found: tuple[Array, ...]
-    costs: Posed
+    costs: PositionCosts
     asked: Asked
     answered: Answered
     centre: Array
@@ -299,7 +299,7 @@ class Single:
             planes=np.empty((n, 0, 3)),
             surface=np.empty((n, 0)),
         )
-        costs = Posed(kinds, data, K, np.empty((n, K.shape[1])), np.full(n, np.inf))
+        costs = PositionCosts(kinds, data, K, np.empty((n, K.shape[1])), np.full(n, np.inf))
         centre = np.broadcast_to(self.centre, (*shape, d))
         kept = {
             "layout": self.direct.layout,
@@ -363,7 +363,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     ready = None if bare.batch_shape else direct(bare)
     if ready is None or (proves and (unsupported(bare) or is_run(bare))):
         return None
-    affine = pose_affinely(bare) if proves else None
+    affine = affine_costs(bare) if proves else None
     if proves and affine is None:
         return None
     weight, d = bare.weight, problem.dimension

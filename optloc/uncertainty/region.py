@@ -20,7 +20,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.box import reaches_infinity
 from optloc.proof.cover import cost_of_point, cover_everywhere, cover_near, room
-from optloc.proof.pose import pose_costs
+from optloc.proof.position_costs import position_costs
 from optloc.proof.scope import crowded, unsupported
 from optloc.proof.search_space import Chart as Axes
 from optloc.proof.search_space import Cost, cost_of, empty_box
@@ -212,7 +212,7 @@ def _cover(surface: Surface, threshold: float, boxes: int | None) -> tuple[Cells
     why = unsupported(surface.problem) or crowded(surface.problem)
     if why:
         return None, False, why
-    costs = pose_costs(surface.problem)
+    costs = position_costs(surface.problem)
     cost, x = _present(costs.kinds, costs.data[0], costs.K[0], costs.w[0]), np.array(surface.position)
     box, d = empty_box(cost.K.shape[0], cost.K.shape[1]), len(x)
     level = cost_of_point(cost, box, x) + threshold - surface.least

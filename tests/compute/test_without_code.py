@@ -130,3 +130,27 @@ def test_who_looks_on_does_not_wait(command, looked_at, way):
         os.close(kept)
         os.close(terminal)
     assert done.stdout.split()[-1] == str(way)
+
+
+# The fix of a run of moving stations, whose proof takes sparse rows.
+RUN = """
+import numpy as np
+import optloc
+from optloc.compute import jit
+
+rng = np.random.default_rng(1)
+places = rng.uniform(-1e4, 1e4, (6, 3)) + 10.0 * np.arange(6)[:, None, None] * rng.uniform(-100.0, 100.0, (6, 3))
+rows = optloc.measured("range", a=np.tile(np.arange(6), 6), epoch=np.repeat(np.arange(6), 6), sigma=1.0)
+problem = optloc.simulate(optloc.assemble(optloc.Stations(places, tuple("ABCDEF")), rows), [2e3, 3e3, 4e3], 1)
+print(optloc.solve(problem).status.label, len(jit._DONE))
+"""
+
+
+def test_runs_are_fixed_without_a_compiler(tmp_path):
+    given = {**os.environ, "PYTHONPATH": str(Path(optloc.__file__).parents[1]), "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", RUN]
+    done = subprocess.run(command, env=given | {"OPTLOC_COMPILE": "never"}, capture_output=True, text=True, check=True)
+    assert not done.stderr
+    status, compiled = done.stdout.split()
+    assert status in ("ok", "unproven")
+    assert compiled == "0"

@@ -6,7 +6,7 @@ import numpy as np
 import pymap3d
 
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATE, RATIO
-from optloc.proof.pose import pose_costs
+from optloc.proof.position_costs import position_costs
 
 
 def node_values(problem, kinds, data, x):
@@ -38,7 +38,7 @@ def node_values(problem, kinds, data, x):
 
 
 def cost_of(problem, x):
-    """Return the posed cost (M,) of one problem at positions x (M, d)."""
-    one = pose_costs(problem.flat())
+    """Return the cost (M,) of one problem at positions x (M, d)."""
+    one = position_costs(problem.flat())
     phi = node_values(problem, one.kinds, np.broadcast_to(one.data[:1], (len(x), *one.data.shape[1:])), x)
     return ((phi @ one.K[0].T - one.w[:1]) ** 2).sum(-1)

@@ -170,10 +170,10 @@ def test_where_infinity_is_near_the_gap_of_the_region_is_tried(why, margin, monk
     """Proofs of one gap at a time fail from 9 on: only where infinity is the reason one between 9 and none is tried."""
     problem, real, tried = CASES["tdoa-3d"].problem, branch_and_bound.prove, []
 
-    def failing(pose, asked):
+    def failing(costs, asked):
         gap = asked.gaps[:, 0]
         tried.append(float(gap[0]))
-        answer = real(pose, asked)
+        answer = real(costs, asked)
         return answer._replace(verdict=np.where(gap >= 9.0, why, answer.verdict), gap=gap)
 
     monkeypatch.setattr(branch_and_bound, "prove", failing)

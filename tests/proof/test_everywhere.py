@@ -14,7 +14,7 @@ from optloc.proof.convex_boxes import set_minimum
 from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE, prove
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
-from optloc.proof.pose import Posed
+from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import cost_of, empty_box
 
 # Of directions, radians.
@@ -231,7 +231,7 @@ def shown(problems, minima, gaps, budget):
         np.zeros((n, 0, 3)),
         np.zeros((n, 0)),
     )
-    return prove_all(Posed(kinds, data, K, w, np.full(n, np.inf)), asked)
+    return prove_all(PositionCosts(kinds, data, K, w, np.full(n, np.inf)), asked)
 
 
 def check_what_is_shown(problem, minima, answer, budget):

@@ -79,7 +79,7 @@ def test_who_ran_out_of_few_boxes_goes_on(monkeypatch):
     """A proof that used its few boxes up may have shown less than it would have with more."""
     budgets = []
 
-    def proved(pose, asked):
+    def proved(costs, asked):
         budgets.append(asked.budget.copy())
         out = batch.empty_answer(len(asked.x), 2)
         out.boxes[:] = np.minimum(asked.budget, [7, 25, 90][: len(asked.x)] if len(budgets) == 1 else 1000)
@@ -90,9 +90,11 @@ def test_who_ran_out_of_few_boxes_goes_on(monkeypatch):
     monkeypatch.setattr(batch, "usable", lambda kernel, count: True)
     n = 3
     asked = batch.Asked(*(np.zeros((n, 2)) for _ in batch.Asked._fields))._replace(budget=np.array([3000, 3000, 60]))
-    pose = batch.Posed(np.zeros(1, np.int64), np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), np.zeros((n, 1)), np.zeros(n))
+    costs = batch.PositionCosts(
+        np.zeros(1, np.int64), np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), np.zeros((n, 1)), np.zeros(n)
+    )
     monkeypatch.setattr(batch, "FIRST_BOXES", 75)
-    answer = batch._prove_few(pose, asked)
+    answer = batch._prove_few(costs, asked)
     assert budgets[0].tolist() == [25, 25, 25]
     assert budgets[1].tolist() == [3000, 60]  # the second and the third, each with all of its own
     assert answer.boxes.tolist() == [7, 1000, 60]

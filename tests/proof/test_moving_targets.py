@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 
 from optloc import Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
 from optloc.compute.jit import enabled
-from optloc.proof.runs.posed import pose_courses
 from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import (
     has_no_minimum,
     hessian_of_state,
@@ -75,7 +75,7 @@ def boxes(rng: np.random.Generator, count: int):
         x = np.zeros(made.layout.size)
         x[: len(truth)] = truth
         problem = simulate(made, truth=x, seed=number).flat()
-        course = pose_courses(problem).courses[0][0]
+        course = course_costs(problem).courses[0][0]
         off = 10.0 ** rng.uniform(0.0, 4.5)
         origin = truth[:4] + off * np.array([1.0, 1.0, 0.01, 0.01]) * rng.normal(size=4)
         turn = np.diag([1.0, 1.0, 0.01, 0.01]) @ rng.normal(size=(4, 4))
@@ -242,7 +242,7 @@ def test_clocks_and_what_is_known_of_the_state_count(seed):
         made = spoiled(rng, made)
         problem = simulate(made, truth=np.concatenate([truth, np.zeros(made.layout.size - 4)]), seed=number)
         fix = solve(problem)
-        # a claim is made only where the posed cost is that of the fix
+        # a claim is made only where the cost is that of the fix
         claims.append(fix.certificate.proof == "region" if fix.answered else None)
     assert claims.count(True) >= 3
 

@@ -8,7 +8,7 @@ from proof.sampling import bounded, changes, curved, differences, numbers, remai
 from optloc.proof.nodes.angles import ALONE
 from optloc.proof.nodes.node import AZIMUTH, RANGE, RATIO
 from optloc.proof.nodes.ratio import MEASURED
-from optloc.proof.pose import mark_alone
+from optloc.proof.position_costs import mark_alone
 
 pytestmark = pytest.mark.usefixtures("form")
 

@@ -14,10 +14,10 @@ from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.batch import costs_at
 from optloc.proof.box import cube
 from optloc.proof.curvature import C00, entry
-from optloc.proof.pose import pose_costs
-from optloc.proof.runs.posed import pose_runs
+from optloc.proof.position_costs import position_costs
 from optloc.proof.runs.prove import costs_of_runs
 from optloc.proof.runs.rows import blur_of, least_length, residual_at
+from optloc.proof.runs.run_costs import run_costs
 from optloc.proof.runs.search import Space, floor_of, set_curves, set_nodes, sum_at, tables_of
 from optloc.proof.search_space import chart_on
 from optloc.proof.surface import SLIP
@@ -111,8 +111,8 @@ def test_a_run_costs_what_its_dense_rows_cost():
     rng = np.random.default_rng(SEED)
     for problem, x in runs_of(rng):
         places = (x + rng.normal(0.0, 1e3, (5, len(x))))[None]
-        own, blur = costs_of_runs(pose_runs(problem), places)
-        np.testing.assert_allclose(own, costs_at(pose_costs(problem), places)[0], rtol=1e-9)
+        own, blur = costs_of_runs(run_costs(problem), places)
+        np.testing.assert_allclose(own, costs_at(position_costs(problem), places)[0], rtol=1e-9)
         assert (blur < 1e-6 * (1.0 + np.sqrt(own))).all()
 
 
@@ -122,26 +122,28 @@ def test_rows_have_weights_of_their_own():
     weight = rng.uniform(0.2, 1.0, problem.count) * (np.arange(problem.count) > 0)  # the first row is absent
     problem = problem.with_rows(weight=weight).flat()
     x = rng.uniform(-3e4, 3e4, (1, 1, 3))
-    assert np.isclose(costs_of_runs(pose_runs(problem), x)[0], costs_at(pose_costs(problem), x)[0], rtol=1e-9).all()
+    assert np.isclose(costs_of_runs(run_costs(problem), x)[0], costs_at(position_costs(problem), x)[0], rtol=1e-9).all()
 
 
 def test_few_rows_cost_nowhere_more_than_all():
     rng = np.random.default_rng(SEED + 1)
     for problem, x in runs_of(rng):
-        run = pose_runs(problem).runs[0]
+        run = run_costs(problem).runs[0]
         look = run.look
         for _ in range(20):
             at = x + rng.normal(0.0, 10.0 ** rng.uniform(1.0, 5.0), len(x))
-            pose = pose_costs(problem)._replace(kinds=look.kinds, data=look.data[None], K=look.K[None], w=look.w[None])
-            all_rows = costs_of_runs(pose_runs(problem), at[None, None])[0][0, 0]
-            assert costs_at(pose, at[None, None])[0][0, 0] <= all_rows * (1.0 + 1e-9)
+            costs = position_costs(problem)._replace(
+                kinds=look.kinds, data=look.data[None], K=look.K[None], w=look.w[None]
+            )
+            all_rows = costs_of_runs(run_costs(problem), at[None, None])[0][0, 0]
+            assert costs_at(costs, at[None, None])[0][0, 0] <= all_rows * (1.0 + 1e-9)
 
 
 @pytest.mark.usefixtures("form")
 def test_no_point_of_a_box_costs_less_than_its_bound(seed):
     rng, good = np.random.default_rng([SEED, seed, 2]), 0
     for problem, x in runs_of(rng):
-        run = pose_runs(problem).runs[0]
+        run = run_costs(problem).runs[0]
         for space, tables in spaces(problem, run, x):
             floor, box, sheet = floor_of(space, run.cost), tables.box, tables.sheet
             for _ in range(many(60, 4)):
@@ -167,7 +169,7 @@ def test_no_point_of_a_box_costs_less_than_its_bound(seed):
 def test_no_point_of_a_box_has_a_hessian_beyond_its_bounds(seed):
     rng, good = np.random.default_rng([SEED, seed, 3]), 0
     for problem, x in runs_of(rng):
-        run = pose_runs(problem).runs[0]
+        run = run_costs(problem).runs[0]
         for space, tables in spaces(problem, run, x):
             floor, free = floor_of(space, run.cost), 2 if len(space.chart.surface) else len(x)
 

@@ -11,7 +11,7 @@ from optloc import assemble, solve
 from optloc.compute.jit import enabled
 from optloc.proof.batch import Asked, prove_all
 from optloc.proof.near import UNIQUE, VALUE
-from optloc.proof.pose import pose_costs
+from optloc.proof.position_costs import position_costs
 
 EQUAL = 1e-6
 # Formulas of their own exist for all cells but that of satellites, which is in geodetic coordinates.
@@ -47,7 +47,7 @@ def counted(count: int) -> int:
 def verdicts(problem, item, x, kappa: float, budget: int = 300):
     """Return the verdicts (n,) on positions x (n, d) of trials `item`, without any repair."""
     n, d = x.shape
-    pose = pose_costs(problem.flat())
+    costs = position_costs(problem.flat())
     cost = np.array([Trial(problem, i).cost(at) for i, at in zip(item, x, strict=True)])
     nowhere = np.full((n, 2, d), np.nan)
     reach = 1e5 * np.stack([-np.ones((n, d)), np.ones((n, d))], axis=1)
@@ -64,7 +64,7 @@ def verdicts(problem, item, x, kappa: float, budget: int = 300):
         np.zeros((n, 0, 3)),
         np.zeros((n, 0)),
     )
-    return prove_all(pose.take(item), asked).verdict
+    return prove_all(costs.take(item), asked).verdict
 
 
 def stationary_points(trial: Trial, truth, rng, count: int):

@@ -7,7 +7,7 @@ from proof.sampling import many
 
 from optloc.proof.atlas import atlas_of, home_of, infinity, set_centre
 from optloc.proof.box import cube
-from optloc.proof.pose import pose_costs
+from optloc.proof.position_costs import position_costs
 from optloc.proof.search_space import chart_at, cost_of, empty_box
 from optloc.proof.squares import bend_of, clip_to_squares, squares_of
 
@@ -21,10 +21,10 @@ NAMES = (
 def scenes(name, count, seed):
     """Return costs, tables of a box at the truth, squared rows, an atlas, and the truths."""
     problem, truth = BY_NAME[name].drawn(count, seed=seed)
-    posed = pose_costs(problem.flat())
+    costs = position_costs(problem.flat())
     for i in range(count):
-        K, data = posed.K[i if len(posed.K) > 1 else 0], posed.data[i if len(posed.data) > 1 else 0]
-        cost, box = cost_of(posed.kinds, data, K, posed.w[i]), empty_box(*K.shape)
+        K, data = costs.K[i if len(costs.K) > 1 else 0], costs.data[i if len(costs.data) > 1 else 0]
+        cost, box = cost_of(costs.kinds, data, K, costs.w[i]), empty_box(*K.shape)
         chart_at(cost, truth[i], box)
         middle, radius = cube(cost.kinds, cost.data, truth[i])
         yield cost, box, squares_of(cost, box, middle, radius), atlas_of(middle, radius, 3, 0), truth[i]

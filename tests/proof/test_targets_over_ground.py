@@ -28,8 +28,8 @@ from optloc.proof.runs.ground import (
     state_off,
     state_on,
 )
-from optloc.proof.runs.posed import pose_courses
 from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import has_no_minimum, hessian_of_state, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import Axes, cost_of_state, put, set_bends, set_box, table_of
 from optloc.proof.scope import unsupported
@@ -112,7 +112,7 @@ def test_states_on_the_surface_keep_height_and_direction(seed):
     rng = np.random.default_rng([2, seed])
     for _ in range(30):
         problem, x = drawn(rng, ("range",))
-        ground = pose_courses(problem.flat()).courses[0][0].ground
+        ground = course_costs(problem.flat()).courses[0][0].ground
         ground = ground._replace(axes=axes_at(ground.data, x[:3]))
         assert np.array_equal(ground.axes, np.eye(3))  # the frame's, as the region is in them
         back = state_off(ground, state_on(ground, x[:6]))
@@ -184,7 +184,7 @@ def boxes(rng: np.random.Generator, count: int):
     for number in range(count):
         made, truth = drawn(rng, KINDS[number % len(KINDS)])
         problem = simulate(made, truth=truth, seed=number).flat()
-        course = pose_courses(problem).courses[0][0]
+        course = course_costs(problem).courses[0][0]
         off = 10.0 ** rng.uniform(0.0, 4.5)
         turn = np.diag([1.0, 1.0, 0.01, 0.01]) @ rng.normal(size=(4, 4))
         origin = state_on(course.ground, truth[:6]) + off * np.array([1.0, 1.0, 0.01, 0.01]) * rng.normal(size=4)
@@ -243,7 +243,7 @@ def test_hessians_are_those_of_the_cost(seed):
     rng = np.random.default_rng([7, seed])
     for number in range(10):
         made, truth = drawn(rng, KINDS[number % 4])
-        course = pose_courses(simulate(made, truth=truth, seed=number).flat()).courses[0][0]
+        course = course_costs(simulate(made, truth=truth, seed=number).flat()).courses[0][0]
         state = state_on(course.ground, truth[:6]) + rng.normal(size=4) * [3e3, 3e3, 20.0, 20.0]
         scale = np.array([20.0, 20.0, 0.2, 0.2])
         moves = np.diag(scale)
@@ -287,7 +287,7 @@ EXACT = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-7, "max_nfev": 300}
 
 def minima(problem, rng: np.random.Generator, near: Array, starts: int) -> list[tuple[float, Array]]:
     """Return the minima within the limits that SciPy finds, costs and states (4,) on the surface."""
-    ground, found = pose_courses(problem.flat()).courses[0][0].ground, []
+    ground, found = course_costs(problem.flat()).courses[0][0].ground, []
     most = np.array([REACH, REACH, FAST, FAST])
     draws = rng.uniform(-1.0, 1.0, (starts, 4)) * most * rng.choice([0.2, 1.0], (starts, 1))
     for state in [near, *draws]:

@@ -25,7 +25,6 @@ from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STA
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
 from optloc.proof.runs.ground import Ground, axes_at, corners_on, over_ground, state_off, state_on
-from optloc.proof.runs.posed import Courses, Run, Runs
 from optloc.proof.runs.rows import (
     blur_of,
     digits_of,
@@ -33,6 +32,7 @@ from optloc.proof.runs.rows import (
     is_convex_by,
     residual_at,
 )
+from optloc.proof.runs.run_costs import Courses, Run, Runs
 from optloc.proof.runs.search import (
     CAPACITY,
     Space,
@@ -332,7 +332,7 @@ def _beside(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables, co
     return Space(False, atlas, chart, room[0, :known], room[1, :known])
 
 
-def prove_runs(posed: Runs, asked: Asked) -> Answered:
+def prove_runs(costs: Runs, asked: Asked) -> Answered:
     """Return the outcome of the proofs of n fixes of n long problems, see `optloc.proof.batch.prove_all`.
 
     Plain Python would take a second for ten boxes: without machine code none is looked at.
@@ -346,7 +346,7 @@ def prove_runs(posed: Runs, asked: Asked) -> Answered:
         beside = Known(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
         for corners in (asked.region[i], asked.fallback[i]):
             verdict[i], boxes[i], bound[i] = prove_run(
-                posed.runs[i],
+                costs.runs[i],
                 asked.x[i],
                 beside,
                 asked.gaps[i, 0],
@@ -367,15 +367,15 @@ def prove_runs(posed: Runs, asked: Asked) -> Answered:
     return without_rivals(verdict, boxes, bound, whole, asked, found)
 
 
-def runs_lack_code(posed: Runs | Courses, count: int) -> bool:
+def runs_lack_code(costs: Runs | Courses, count: int) -> bool:
     """Return whether proofs of so many long problems were left because there is no machine code of them yet."""
-    return enabled() and not usable(prove_run if isinstance(posed, Runs) else prove_course, count)
+    return enabled() and not usable(prove_run if isinstance(costs, Runs) else prove_course, count)
 
 
-def costs_of_runs(posed: Runs, x: Array) -> tuple[Array, Array]:
-    """Return posed costs (n, P) at positions x (n, P, d) and the rounding of their residuals, see `costs_at`."""
+def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
+    """Return costs (n, P) at positions x (n, P, d) and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *x.shape[:2]))
-    for i, run in enumerate(posed.runs):
+    for i, run in enumerate(costs.runs):
         tables = tables_of(run)
         for p, place in enumerate(plainly(x[i])):
             out[0, i, p] = cost_of_place(run, place, tables)
@@ -387,7 +387,7 @@ def costs_of_runs(posed: Runs, x: Array) -> tuple[Array, Array]:
 # Targets that move.
 
 
-def prove_courses(posed: Courses, asked: Asked) -> Answered:
+def prove_courses(costs: Courses, asked: Asked) -> Answered:
     """Return the outcome of the proofs of n fixes of n problems of a moving target; x holds velocities as well.
 
     Without machine code none is looked at, as of `prove_runs`.
@@ -397,7 +397,7 @@ def prove_courses(posed: Courses, asked: Asked) -> Answered:
     found = np.full((n, size), np.nan)
 
     def prove(i: int) -> None:
-        (whole, few), ground = _on_surface(posed.courses[i], asked.x[i])
+        (whole, few), ground = _on_surface(costs.courses[i], asked.x[i])
         state, others, corners = asked.x[i], asked.others[i, : asked.known[i]], asked.region[i]
         if over_ground(ground):
             state, others, corners = state_on(ground, state), state_on(ground, others), corners_on(ground, corners)
@@ -425,10 +425,10 @@ def _on_surface(courses: tuple[Course, Course], state: Array) -> tuple[tuple[Cou
     return (whole, few), whole.ground
 
 
-def costs_of_courses(posed: Courses, states: Array) -> tuple[Array, Array]:
-    """Return posed costs (n, P) of states (n, P, 2 d) and the rounding of their residuals, see `costs_at`."""
+def costs_of_courses(costs: Courses, states: Array) -> tuple[Array, Array]:
+    """Return costs (n, P) of states (n, P, 2 d) and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *states.shape[:2]))
-    for i, (whole, _) in enumerate(posed.courses):
+    for i, (whole, _) in enumerate(costs.courses):
         for p, state in enumerate(plainly(states[i])):
             out[:, i, p] = cost_of_state(whole, state)
     return out[0], out[1]

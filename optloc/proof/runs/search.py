@@ -33,7 +33,6 @@ from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, is
 from optloc.proof.near import Aim, lay_or_halve
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
-from optloc.proof.runs.posed import Run
 from optloc.proof.runs.rows import (
     Sheet,
     blur_of,
@@ -44,6 +43,7 @@ from optloc.proof.runs.rows import (
     sheet_of,
     sum_up_rows,
 )
+from optloc.proof.runs.run_costs import Run
 from optloc.proof.search_space import (
     LINES,
     Box,

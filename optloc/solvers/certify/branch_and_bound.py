@@ -156,7 +156,7 @@ class Work:
         The verdict of the pool.
     proven : Claims
         What is claimed of each.
-    costs : Posed, Runs or Courses
+    costs : PositionCosts, Runs or Courses
         Their costs over the position, equalities apart.
     ignored : array (N, h, d)
         Minima that the Earth hides; NaN in empty slots.

@@ -13,9 +13,9 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, costs_at, lacks_code, prove_all
 from optloc.proof.nodes.level import height_numbers
-from optloc.proof.pose import Posed, pose_costs
-from optloc.proof.runs.posed import Courses, Runs, pose_courses, pose_runs
+from optloc.proof.position_costs import PositionCosts, position_costs
 from optloc.proof.runs.prove import costs_of_courses, costs_of_runs, prove_courses, prove_runs, runs_lack_code
+from optloc.proof.runs.run_costs import Courses, Runs, course_costs, run_costs
 from optloc.proof.scope import held_height, is_run
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 from optloc.solvers.starts.position import spread_of
@@ -23,14 +23,14 @@ from optloc.solvers.starts.position import spread_of
 # Costs over the target's state: its position, with dense rows or sparse ones where there are many, or where it moves
 # its position and velocity.
 
-Costs = Posed | Runs | Courses
+Costs = PositionCosts | Runs | Courses
 
 
 def eliminate_nuisance(problem: Problem) -> Costs:
     """Return the costs of a flat batch of problems over the target's state, all other unknowns at their best values."""
     if problem.motions[0].order > 0:
-        return pose_courses(problem)
-    return pose_runs(problem) if is_run(problem) else pose_costs(problem)
+        return course_costs(problem)
+    return run_costs(problem) if is_run(problem) else position_costs(problem)
 
 
 def prove(costs: Costs, asked: Asked) -> Answered:
@@ -42,7 +42,7 @@ def prove(costs: Costs, asked: Asked) -> Answered:
 
 def lacks(costs: Costs, count: int) -> bool:
     """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
-    return lacks_code(count) if isinstance(costs, Posed) else runs_lack_code(costs, count)
+    return lacks_code(count) if isinstance(costs, PositionCosts) else runs_lack_code(costs, count)
 
 
 def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
@@ -220,7 +220,7 @@ def agrees(problem: Problem, fix: Fix, costs: Costs) -> Array:
         N problems within the scope of the proof.
     fix : Fix
         Their fixes.
-    costs : Posed, Runs or Courses
+    costs : PositionCosts, Runs or Courses
         Their costs over the position, equalities apart.
     """
     places = _places(problem, fix)

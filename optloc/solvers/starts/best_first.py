@@ -9,8 +9,8 @@ from optloc.compute.jit import enabled
 from optloc.linear.constraints import is_exact
 from optloc.problem.problem import Problem
 from optloc.proof.best_first import Places, find_minima
-from optloc.proof.pose import pose_costs
-from optloc.proof.runs.posed import pose_few
+from optloc.proof.position_costs import position_costs
+from optloc.proof.runs.run_costs import few_costs
 from optloc.proof.scope import is_run
 from optloc.solvers.certify.position_cost import surfaces_of
 from optloc.solvers.policy import LISTED_GAP
@@ -44,9 +44,9 @@ def best_first_starts(problem: Problem) -> Array:
     places = Places(x, np.broadcast_to(region, (size, 2, d)), planes, surface)
     budget = _BUDGET if enabled() else _SLOW_BUDGET
     if not is_run(problem):
-        return find_minima(pose_costs(problem), places, LISTED_GAP, budget, _MOST)[0]
+        return find_minima(position_costs(problem), places, LISTED_GAP, budget, _MOST)[0]
     # Few rows of a run are enough to begin with: the rest decides between their minima.
-    looks = [pose_few(problem.take(np.array([i]))) for i in range(size)]
+    looks = [few_costs(problem.take(np.array([i]))) for i in range(size)]
     each = [find_minima(look, _place(places, i), LISTED_GAP, _RUN_BUDGET, _MOST)[0] for i, look in enumerate(looks)]
     return np.concatenate(each)
 

@@ -21,7 +21,7 @@ from optloc.proof.atlas import Atlas, atlas_of, position, set_centre
 from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, RATE, SLOPE0
-from optloc.proof.pose import Posed, pose_costs
+from optloc.proof.position_costs import PositionCosts, position_costs
 from optloc.proof.scope import is_run, unsupported
 
 # Boxes for each problem, by its dimension; centres that are kept, the cheapest of them. In space 600 boxes missed the
@@ -60,7 +60,7 @@ def moving_starts(problem: Problem) -> Array:
     problem : Problem
         N problems of which `moves_at_once` holds.
     """
-    costs, d = pose_costs(held(problem)), problem.dimension
+    costs, d = position_costs(held(problem)), problem.dimension
     out = np.full((problem.batch_shape[0], _MOST, d), np.nan)
     for i in range(len(out)):
         found = _search(costs.take(slice(i, i + 1)), d)
@@ -68,7 +68,7 @@ def moving_starts(problem: Problem) -> Array:
     return out
 
 
-def _search(costs: Posed, d: int) -> Array:
+def _search(costs: PositionCosts, d: int) -> Array:
     """Return the cheapest centres (q, d) of boxes that are far apart."""
     kinds, data, K, w = costs.kinds, costs.data[0], costs.K[0], costs.w[0]
     with plain():

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from optloc.base.types import Array
+from optloc.compute.jit import plain, usable
 from optloc.linear.normal import prior_parts, weighed
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.proof.batch import plainly
 from optloc.proof.nodes.level import height_numbers
-from optloc.proof.pose import (
+from optloc.proof.position_costs import (
     Columns,
     Others,
-    Posed,
+    PositionCosts,
     add_linear,
     columns_of,
     counts_from_measured,
@@ -68,7 +70,7 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """The posed costs of a flat batch of long problems, as `optloc.proof.pose.Posed` holds those of short ones.
+    """The costs of a flat batch of long problems; `PositionCosts` are the costs of short ones.
 
     Parameters
     ----------
@@ -90,23 +92,30 @@ class Runs:
         return float(_DENSE * max(1.0, len(self.runs[0].cost.kinds) / _LONG) ** 0.25)
 
     def take(self, items: Array | slice) -> Runs:
-        """Return the posed costs of some of the problems."""
+        """Return the costs of some of the problems."""
         numbers = np.arange(len(self.runs))[items]
         return Runs(tuple(self.runs[i] for i in numbers), self.level[items])
 
 
-def pose_runs(problem: Problem) -> Runs:
-    """Return the costs of a flat batch of N long problems over the position, see `optloc.proof.pose.pose_costs`."""
-    problem = weighed(problem)
-    posed = [_pose(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
-    return Runs(tuple(run for run, _ in posed), np.array([level for _, level in posed]))
+def run_costs(problem: Problem) -> Runs:
+    """Return the costs of a flat batch of N long problems over the position."""
+    problem, count = weighed(problem), problem.batch_shape[0]
+    with _quickest(count):
+        costs = [_run_cost(problem.take(np.array([i]))) for i in range(count)]
+    return Runs(tuple(run for run, _ in costs), np.array([level for _, level in costs]))
 
 
-def pose_few(problem: Problem) -> Posed:
+def _quickest(count: int) -> AbstractContextManager[None]:
+    """Return a context with plain kernels, unless machine code for so many runs is at hand or worth its compilation."""
+    return nullcontext() if usable(cost_of, count) else plain()
+
+
+def few_costs(problem: Problem) -> PositionCosts:
     """Return the cost of few rows of one long problem, a batch of one."""
-    run, level = _pose(weighed(problem))
+    with _quickest(1):
+        run, level = _run_cost(weighed(problem))
     look = run.look
-    return Posed(look.kinds, look.data[None], look.K[None], look.w[None], np.array([level]))
+    return PositionCosts(look.kinds, look.data[None], look.K[None], look.w[None], np.array([level]))
 
 
 def _read(problem: Problem) -> tuple[Others, Array, Array, Columns]:
@@ -119,7 +128,7 @@ def _read(problem: Problem) -> tuple[Others, Array, Array, Columns]:
     return others.with_stations(problem, made), known, usable, made
 
 
-def _pose(problem: Problem) -> tuple[Run, float]:
+def _run_cost(problem: Problem) -> tuple[Run, float]:
     """Return one problem of a batch of one as a run, and its level of turns."""
     others, known, usable, made = _read(problem)
     priors = position_prior(problem, made)
@@ -144,7 +153,7 @@ def _pose(problem: Problem) -> tuple[Run, float]:
 
 @dataclass(frozen=True, slots=True)
 class Courses:
-    """The posed costs of a flat batch of problems of a moving target, as `Runs` holds those of one that stays.
+    """The costs of a flat batch of problems of a moving target, as `Runs` holds those of one that stays.
 
     Parameters
     ----------
@@ -163,19 +172,19 @@ class Courses:
         return float(_DENSE)
 
     def take(self, items: Array | slice) -> Courses:
-        """Return the posed costs of some of the problems."""
+        """Return the costs of some of the problems."""
         numbers = np.arange(len(self.courses))[items]
         return Courses(tuple(self.courses[i] for i in numbers), self.level[items])
 
 
-def pose_courses(problem: Problem) -> Courses:
+def course_costs(problem: Problem) -> Courses:
     """Return the costs of a flat batch of N problems over position and velocity, all else at its best values."""
     problem = weighed(problem)
-    posed = [_pose_course(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
-    return Courses(tuple(courses for courses, _ in posed), np.array([level for _, level in posed]))
+    costs = [_course_cost(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
+    return Courses(tuple(courses for courses, _ in costs), np.array([level for _, level in costs]))
 
 
-def _pose_course(problem: Problem) -> tuple[tuple[Course, Course], float]:
+def _course_cost(problem: Problem) -> tuple[tuple[Course, Course], float]:
     """Return one problem of a batch of one as courses of all rows and of few, and its level of turns."""
     others, known, usable, made = _read(problem)
     since = problem.times - problem.origin

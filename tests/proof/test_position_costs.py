@@ -10,7 +10,7 @@ from proof.plain import cost_of
 from optloc import Motion, Prior, Stations, assemble, measured, simulate, with_bias
 from optloc.base.types import Bias
 from optloc.compute.sums import equations_at
-from optloc.proof.pose import pose_costs
+from optloc.proof.position_costs import position_costs
 from optloc.proof.scope import unsupported
 
 PLACES = 12
@@ -97,7 +97,7 @@ def test_clocks_with_priors_and_emission_times():
 def test_offsets_of_angles_with_priors():
     problem = with_bias(CASES["angles-3d"].problem, "north", per="kind", kind="azimuth", sigma=0.01)
     agree(problem)
-    level = pose_costs(problem.flat()).level
+    level = position_costs(problem.flat()).level
     assert np.all(level > 1e4)
     assert np.all(np.isfinite(level))
 
@@ -150,20 +150,20 @@ def test_a_batch_is_posed_as_its_problems_are():
     rng = np.random.default_rng(8)
     z = tdoa(3).z + rng.normal(0.0, 5.0, (4, tdoa(3).count))
     batch = tdoa(3).with_rows(z=z)
-    one = pose_costs(batch)
+    one = position_costs(batch)
     assert len(one.K) == len(one.data) == 1
     assert one.w.shape[0] == 4
     for i in range(4):
-        single = pose_costs(batch.take(np.array([i])))
+        single = position_costs(batch.take(np.array([i])))
         np.testing.assert_allclose(one.w[i], single.w[0], rtol=1e-13)
     places = assemble(
         STATIONS[3] + rng.normal(0, 9.0, (4, 1, 7, 3)),
         measured("tdoa", z, a=pairs(3)[0], b=pairs(3)[1], arrival_sigma=5.0),
     )
-    one = pose_costs(places.flat())
+    one = position_costs(places.flat())
     assert len(one.data) == 4
     for i in range(4):
-        np.testing.assert_allclose(one.data[i], pose_costs(places.flat().take(np.array([i]))).data[0])
+        np.testing.assert_allclose(one.data[i], position_costs(places.flat().take(np.array([i]))).data[0])
 
 
 def test_many_rows_over_few_ranges_are_compressed():
@@ -173,7 +173,7 @@ def test_many_rows_over_few_ranges_are_compressed():
     )
     problem = simulate(problem, TARGET[3], 5)
     agree(problem)
-    assert pose_costs(problem.flat()).K.shape[-2:] == (8, 7)
+    assert position_costs(problem.flat()).K.shape[-2:] == (8, 7)
 
 
 def uncertain(problem, variance):

@@ -273,7 +273,7 @@ def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Arra
     return out
 
 
-class Posed(NamedTuple):
+class PositionCosts(NamedTuple):
     """The maximum-likelihood costs of a flat batch of N problems over the position; B is N, or 1 where all share.
 
     Every other unknown has the value that is best for the position.
@@ -303,8 +303,8 @@ class Posed(NamedTuple):
         """Return with how many nodes the time of a box grows as their square."""
         return float(len(self.kinds))
 
-    def take(self, items: Array | slice) -> Posed:
-        """Return the posed costs of some of the problems; the same where these are all of them, in order."""
+    def take(self, items: Array | slice) -> PositionCosts:
+        """Return the costs of some of the problems; the same where these are all of them, in order."""
         if not isinstance(items, slice) and np.array_equal(items, np.arange(len(self.w))):
             return self
 
@@ -314,7 +314,7 @@ class Posed(NamedTuple):
         return self._replace(data=own(self.data), K=own(self.K), w=self.w[items], level=self.level[items])
 
 
-def pose_costs(problem: Problem) -> Posed:
+def position_costs(problem: Problem) -> PositionCosts:
     """Return the costs of a flat batch of problems over the position.
 
     Unknown emission times and offsets without a prior are projected out; offsets, drifts and isotropic station errors
@@ -328,7 +328,7 @@ def pose_costs(problem: Problem) -> Posed:
     """
     kinds, numbers, K, w, level = _rows_of(problem)
     K, w = compress(K, w)
-    return Posed(kinds, data=mark_alone(kinds, numbers, K, w), K=K, w=w, level=level)
+    return PositionCosts(kinds, data=mark_alone(kinds, numbers, K, w), K=K, w=w, level=level)
 
 
 def _rows_of(problem: Problem) -> tuple[Array, Array, Array, Array, Array]:
@@ -350,12 +350,12 @@ def _rows_of(problem: Problem) -> tuple[Array, Array, Array, Array, Array]:
 
 
 class Affine(NamedTuple):
-    """The costs of all problems that differ in their measurements z alone: of ``base + slope z``, see `Posed`.
+    """The costs of all problems that differ in their measurements z alone: of ``base + slope z``, see `PositionCosts`.
 
     Parameters
     ----------
     kinds, data, K : int array (J,), array (1, J, width), array (1, q, J)
-        As of `Posed`.
+        As of `PositionCosts`.
     base, slope : array (p,), (p, m)
         Whitened measurements of z = 0, and what they gain with each measurement.
     basis : array (p, J), optional
@@ -378,7 +378,7 @@ class Affine(NamedTuple):
             w[:] = _fold(self.basis, self.slope @ z + self.base)
 
 
-def pose_affinely(problem: Problem) -> Affine | None:
+def affine_costs(problem: Problem) -> Affine | None:
     """Return how the cost of a problem depends on its measurements, or None where not in a straight line.
 
     Parameters
