@@ -106,7 +106,7 @@ def run_costs(problem: Problem) -> Runs:
 
 
 def _quickest(count: int) -> AbstractContextManager[None]:
-    """Return a context with plain kernels, unless machine code for so many runs is at hand or worth its compilation."""
+    """Return a context with plain kernels, unless machine code is at hand or worth its compilation."""
     return nullcontext() if usable(cost_of, count) else plain()
 
 
