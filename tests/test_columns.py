@@ -47,8 +47,8 @@ def read(folder, text, name="t.csv", **told):
     return understood(path, Told(**{"sigma": "10 cm", **told}))
 
 
-def fixed(plan):
-    fix = solve(plan.read().problem)
+def fixed(made):
+    fix = solve(made.read().problem)
     return np.linalg.norm(fix.position.reshape(-1, 3) - TAG, axis=-1).max()
 
 
@@ -163,8 +163,8 @@ def test_stations_may_be_called_like_columns(pair, names, tmp_path):
     far = dict(zip(names, FAR.values(), strict=True))
     first, *rest = names
     lines = "".join(f"{name},{first},{(far[name] - far[first]) / C:.9f}\n" for name in rest)
-    plan = read(tmp_path, f"{','.join(pair)},tdoa_ns\n{lines}", stations=sites(tmp_path, names), sigma="0.1 ns")
-    assert fixed(plan) < 1e-5
+    made = read(tmp_path, f"{','.join(pair)},tdoa_ns\n{lines}", stations=sites(tmp_path, names), sigma="0.1 ns")
+    assert fixed(made) < 1e-5
     ranges = "".join(f"{name},{r:.9f}\n" for name, r in far.items())
     assert fixed(read(tmp_path, f"anchor,range_m\n{ranges}", stations=sites(tmp_path, names))) < 1e-5
 
@@ -224,9 +224,9 @@ def test_a_role_that_is_named_is_used_or_refused(columns, words, tmp_path):
         f"{n},{r / C * 1e-9:.15f},{r},30,N1\n" for n, r in FAR.items()
     )
     if words is None:
-        plan = read(tmp_path, text, columns=columns)
-        assert plan.uses["when_s"] == "toa"
-        assert fixed(plan) < 1e-5
+        made = read(tmp_path, text, columns=columns)
+        assert made.uses["when_s"] == "toa"
+        assert fixed(made) < 1e-5
         return
     with pytest.raises(InvalidProblem, match=words):
         read(tmp_path, text, columns=columns)
@@ -270,9 +270,9 @@ def test_a_measurement_is_not_left_out_without_a_message(column, tmp_path):
     told = {"what": "range"}
     with pytest.raises(InvalidProblem, match=rf"'{column}': it may hold a measurement .* --ignore {column} leaves"):
         read(tmp_path, text, **told)
-    plan = read(tmp_path, text, ignore=(column,), **told)
-    assert column not in plan.uses
-    assert fixed(plan) < 1e-5
+    made = read(tmp_path, text, ignore=(column,), **told)
+    assert column not in made.uses
+    assert fixed(made) < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -280,9 +280,9 @@ def test_a_measurement_is_not_left_out_without_a_message(column, tmp_path):
 )
 def test_other_columns_are_named_in_one_line(columns, tmp_path):
     text = rows("anchor,range_m," + ",".join(columns), "{n},{r:.9f},30.5,1")
-    plan = read(tmp_path, text, what="range")
-    assert dict(plan.about)["not used"] == ", ".join(columns)
-    assert fixed(plan) < 1e-5
+    made = read(tmp_path, text, what="range")
+    assert dict(made.about)["not used"] == ", ".join(columns)
+    assert fixed(made) < 1e-5
 
 
 @pytest.mark.parametrize("column", ["dist_corr_m", "far [cm]", "range_raw", "twr2", "angle_deg", "level_dB"])
@@ -402,9 +402,9 @@ def test_a_window_needs_the_unit_of_the_times_not_their_name(name, unit, told, t
 )
 def test_a_window_puts_arrivals_together_by_their_gaps(head, size, tmp_path):
     lines = "".join(f"{n},{(0.5 * k + 1e-9 * r / C) / size!r}\n" for k in range(3) for n, r in FAR.items())
-    plan = read(tmp_path, f"{head}\n{lines}", window="1 ms")
-    assert plan.read().problem.epochs == 3
-    assert fixed(plan) < 1e-3
+    made = read(tmp_path, f"{head}\n{lines}", window="1 ms")
+    assert made.read().problem.epochs == 3
+    assert fixed(made) < 1e-3
 
 
 @pytest.mark.parametrize("epochs", [1, 3])
@@ -442,9 +442,9 @@ def test_wrong_units_of_times_are_refused(told, words, tmp_path):
 )
 def test_the_sign_is_told_as_it_is(head, sign, further, tmp_path):
     lines = "".join(f"{n},N1,{further(r, FAR['N1']):.9f}\n" for n, r in FAR.items() if n != "N1")
-    plan = read(tmp_path, f"{head}\n{lines}", sigma="0.1 dB" if "dB" in head else "1 cm")
-    assert dict(plan.about)["sign"] == f"positive where the {sign} is farther"
-    problem = plan.read().problem
+    made = read(tmp_path, f"{head}\n{lines}", sigma="0.1 dB" if "dB" in head else "1 cm")
+    assert dict(made.about)["sign"] == f"positive where the {sign} is farther"
+    problem = made.read().problem
     where = problem.stations.position.reshape(-1, 3)
     one = problem.rows[0]
     r = np.linalg.norm(TAG - where, axis=-1)
@@ -476,19 +476,19 @@ NESTED = {
 
 @pytest.mark.parametrize("name", NESTED)
 def test_lists_are_found_at_any_depth(name, tmp_path):
-    plan = read(tmp_path, json.dumps(NESTED[name]), "t.json", what="range")
-    assert plan.read().problem.count == len(FAR)
-    assert fixed(plan) < 1e-6
+    made = read(tmp_path, json.dumps(NESTED[name]), "t.json", what="range")
+    assert made.read().problem.count == len(FAR)
+    assert fixed(made) < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["json", "python", "parquet", "objects"])
 def test_lists_in_cells_are_rows(kind, tmp_path):
     frame = pd.DataFrame({"t_s": [0.0, 1.0], "anchor": [list(FAR)] * 2, "range_m": [list(FAR.values())] * 2})
     if kind == "parquet":
-        plan = read(tmp_path, frame, "t.parquet")
+        made = read(tmp_path, frame, "t.parquet")
     elif kind == "objects":
         objects = [[{"anchor": n, "range_m": r} for n, r in FAR.items()]] * 2
-        plan = read(tmp_path, pd.DataFrame({"t_s": [0.0, 1.0], "readings": objects}), "t.parquet")
+        made = read(tmp_path, pd.DataFrame({"t_s": [0.0, 1.0], "readings": objects}), "t.parquet")
     else:
         spell = json.dumps if kind == "json" else str
         path = tmp_path / "t.csv"
@@ -497,9 +497,9 @@ def test_lists_in_cells_are_rows(kind, tmp_path):
             table.writerow(frame.columns)
             for row in frame.itertuples(index=False):
                 table.writerow([row[0], spell(row[1]), spell(row[2])])
-        plan = read(tmp_path, path.read_text())
-    assert plan.read().problem.epochs == 2
-    assert fixed(plan) < 1e-6
+        made = read(tmp_path, path.read_text())
+    assert made.read().problem.epochs == 2
+    assert fixed(made) < 1e-6
 
 
 def test_stations_of_a_document_may_have_lists_of_coordinates(tmp_path):

@@ -152,9 +152,9 @@ def test_stations_of_a_table_may_have_headings(tmp_path):
         rows.append(f"S{k},{lat},{lon},{course}")
     path.write_text("\n".join(lines) + "\n")
     sites.write_text("\n".join(rows) + "\n")
-    plan = understood(path, Told(sigma="1 deg", stations=sites))
-    assert off(solve(plan.read().problem)) < 0.1
-    assert "bearings are taken from the headings of the stations" in plan.notes[0]
+    made = understood(path, Told(sigma="1 deg", stations=sites))
+    assert off(solve(made.read().problem)) < 0.1
+    assert "bearings are taken from the headings of the stations" in made.notes[0]
     sites.write_text("\n".join(rows).replace(",65.0", ",") + "\n")
     with pytest.raises(InvalidProblem, match="station 'S2' has no heading"):
         understood(path, Told(sigma="1 deg", stations=sites))

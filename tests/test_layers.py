@@ -169,6 +169,23 @@ def test_a_module_name_stands_for_one_thing():
     assert len([name for name, count in names.items() if count > 1]) <= RECURRING
 
 
+# Words with one meaning, and the module that may define them: the plan of the engine, and the function that returns a
+# problem of optimisation.
+RESERVED = {"Plan": "optloc.engine", "pose": "optloc.pose"}
+
+
+def test_reserved_words_are_defined_in_one_place():
+    kinds = (ast.ClassDef, ast.FunctionDef)
+    found = [
+        (module, node.name)
+        for module, path in modules(ROOT).items()
+        for node in ast.walk(parsed(path))
+        if isinstance(node, kinds) and node.name.strip("_") in RESERVED
+    ]
+    wrong = [(module, name) for module, name in found if not module.startswith(RESERVED[name.strip("_")])]
+    assert not wrong
+
+
 def test_formulations_know_nothing_of_optloc():
     foreign = [arrow for arrow in arrows(ROOT) if arrow[0].split(".")[0] == "formulations"]
     assert not [arrow for arrow in foreign if arrow[2].split(".")[0] not in GROUND]

@@ -124,7 +124,7 @@ CENTIMETRES = [502, 668, 783, 638]
 
 
 def wide(folder, columns, values=None, **told):
-    """Return the plan of a table with these columns, the first of which are those of known stations."""
+    """Return the problem of a table with these columns, the first of which are those of known stations."""
     stations = folder / "anchors.csv"
     stations.write_text(told.pop("places", STATIONS))
     values = values or [*CENTIMETRES, *[310] * (len(columns) - 4)]
@@ -156,22 +156,22 @@ def test_a_receiver_that_is_no_station_is_refused(case, tmp_path):
     assert f"column {column!r}" in said
     assert f"there is no station {name!r}" in said
     assert "--ignore" in said
-    plan = wide(tmp_path, columns, **unit, ignore=(column,))
-    assert len(plan.sections[0].columns["z"]) == 12
+    made = wide(tmp_path, columns, **unit, ignore=(column,))
+    assert len(made.sections[0].columns["z"]) == 12
 
 
 @pytest.mark.parametrize(
     "column", ["rssi_A1", "temperature", "battery_V", "note", "x_m", "dist_sigma", "dist_A1_quality", "lat"]
 )
 def test_columns_of_other_things_are_no_receivers(column, tmp_path):
-    plan = wide(tmp_path, [*(f"dist_A{i}_cm" for i in range(1, 5)), column])
-    assert len(plan.sections[0].columns["z"]) == 12
+    made = wide(tmp_path, [*(f"dist_A{i}_cm" for i in range(1, 5)), column])
+    assert len(made.sections[0].columns["z"]) == 12
 
 
 def test_a_column_without_numbers_holds_no_readings(tmp_path):
     for cell in ("", "lost"):
-        plan = wide(tmp_path, [f"A{i}" for i in range(1, 6)], [*CENTIMETRES, cell], unit="cm")
-        assert len(plan.sections[0].columns["z"]) == 12
+        made = wide(tmp_path, [f"A{i}" for i in range(1, 6)], [*CENTIMETRES, cell], unit="cm")
+        assert len(made.sections[0].columns["z"]) == 12
 
 
 def test_words_as_names_are_refused_by_their_spelling(tmp_path):

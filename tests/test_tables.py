@@ -50,7 +50,7 @@ def table(folder, text, name="t.csv"):
     return path
 
 
-def plan(folder, text, name="t.csv", **told):
+def table_problem(folder, text, name="t.csv", **told):
     return understood(table(folder, text, name), Told(**{"sigma": "10 cm", "stations": anchors(folder), **told}))
 
 
@@ -175,7 +175,7 @@ NESTED = {"columns": {"station": "at_anchor"}}
     ],
 )  # fmt: skip
 def test_ranges_in_every_dress_are_the_same_fix(text, told, tmp_path):
-    found = plan(tmp_path, text, "t.json" if text.startswith("[") else "t.csv", **told)
+    found = table_problem(tmp_path, text, "t.json" if text.startswith("[") else "t.csv", **told)
     fix = solve(found.read().problem)
     assert np.linalg.norm(fix.position.reshape(-1, 3) - TAG, axis=-1).max() < 1e-6
 
@@ -183,10 +183,10 @@ def test_ranges_in_every_dress_are_the_same_fix(text, told, tmp_path):
 def test_columns_of_two_units_are_one(tmp_path):
     d = ranges()
     text = "A1_cm,A2_m,A3_mm,A4_km\n" + f"{d['A1'] * 1e2!r},{d['A2']!r},{d['A3'] * 1e3!r},{d['A4'] / 1e3!r}\n"
-    loaded = plan(tmp_path, text, what="range").read()
+    loaded = table_problem(tmp_path, text, what="range").read()
     np.testing.assert_allclose(loaded.problem.rows[0].z, [d[f"A{i}"] for i in range(1, 5)], rtol=1e-12)
     with pytest.raises(InvalidProblem, match="some columns are in ns, others in cm"):
-        plan(tmp_path, "A1_cm,A2_ns\n1,2\n", what="range")
+        table_problem(tmp_path, "A1_cm,A2_ns\n1,2\n", what="range")
 
 
 def test_names_of_columns_hold_names_of_stations():
@@ -226,7 +226,7 @@ def test_differences_have_a_sign_that_is_known(header, row, told, tmp_path):
     d = differences()
     chosen = [n for n in d if row == "long" or n in header]
     lines = [f"{n},A2,{d[n]:.9f}" for n in d] if row == "long" else [",".join(f"{d[n]:.9f}" for n in chosen)]
-    loaded = plan(tmp_path, "\n".join([header, *lines]), **{"sigma": "1 ns", **told}).read()
+    loaded = table_problem(tmp_path, "\n".join([header, *lines]), **{"sigma": "1 ns", **told}).read()
     names = loaded.problem.stations.names
     rows = loaded.problem.rows[0]
     found = {names[a]: z for a, b, z in zip(rows.a, rows.b, rows.z, strict=True) if names[b] == "A2"}
@@ -234,7 +234,7 @@ def test_differences_have_a_sign_that_is_known(header, row, told, tmp_path):
     assert found == pytest.approx({n: d[n] * 1e-9 * SPEED_OF_LIGHT for n in chosen}, abs=1e-6)
     if "positive" in told:
         with pytest.raises(InvalidProblem, match="say --positive a-farther"):
-            plan(tmp_path, "\n".join([header, *lines]), sigma="1 ns")
+            table_problem(tmp_path, "\n".join([header, *lines]), sigma="1 ns")
 
 
 def test_dates_and_numbers_of_an_instant_are_the_same_arrivals(tmp_path):
@@ -245,18 +245,18 @@ def test_dates_and_numbers_of_an_instant_are_the_same_arrivals(tmp_path):
     bare = dates.replace("+02:00", "")
     told = {"stations": stations, "sigma": "1 ns"}
     z = [
-        plan(tmp_path, "msg,rx,toa_s\n" + text, **told, zone=zone).read().problem.rows[0].z
+        table_problem(tmp_path, "msg,rx,toa_s\n" + text, **told, zone=zone).read().problem.rows[0].z
         for text, zone in ((numbers, None), (dates, None), (bare, "Europe/Berlin"))
     ]
     np.testing.assert_allclose(z[0], [7919e-12 * i * SPEED_OF_LIGHT for i in range(6)], rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(z[1], z[0])
     np.testing.assert_array_equal(z[2], z[0])
     with pytest.raises(InvalidProblem, match=r"'toa_s': the dates name no time zone; say --zone UTC"):
-        plan(tmp_path, "msg,rx,toa_s\n" + bare, **told)
+        table_problem(tmp_path, "msg,rx,toa_s\n" + bare, **told)
     with pytest.raises(InvalidProblem, match=r"row 1, .* names no time zone, but others do"):
-        plan(tmp_path, "msg,rx,toa_s\n" + dates.replace("+02:00", "", 1), **told)
+        table_problem(tmp_path, "msg,rx,toa_s\n" + dates.replace("+02:00", "", 1), **told)
     with pytest.raises(InvalidProblem, match="no time zone 'Mars'"):
-        plan(tmp_path, "msg,rx,toa_s\n" + bare, **told, zone="Mars")
+        table_problem(tmp_path, "msg,rx,toa_s\n" + bare, **told, zone="Mars")
 
 
 # Numbers that may be none, and readings that are there twice.
@@ -267,25 +267,25 @@ def test_a_number_that_may_mean_nothing_is_asked_for(mark, good, tmp_path):
     rows = "".join(f"{k},{good + 0.1 * k},{mark if k == 2 else 4.0 + 0.1 * k},{5.0 + 0.01 * k}\n" for k in range(4))
     text = "epoch,dist_A1_m,dist_A2_m,dist_A3_m\n" + rows
     with pytest.raises(InvalidProblem, match=rf"row 3, .*'dist_A2_m': {mark} occurs once, .* --missing {mark}, or"):
-        plan(tmp_path, text)
-    found = plan(tmp_path, text, missing=mark)
+        table_problem(tmp_path, text)
+    found = table_problem(tmp_path, text, missing=mark)
     assert found.read().problem.count == 11
     assert f"1 cell with {mark}: no reading" in found.notes
-    assert plan(tmp_path, text, missing="none").read().problem.count == 12
+    assert table_problem(tmp_path, text, missing="none").read().problem.count == 12
 
 
 def test_a_zero_of_the_first_arrival_is_a_reading(tmp_path):
     told = {"stations": rx(tmp_path), "sigma": "1 ns", "what": "arrivals"}
     text = "msg,Lake_ns,Mill_ns,Tower_ns\n1,0,100.5,200\n2,70,0,30\n"
-    assert plan(tmp_path, text, **told).read().problem.count == 6
+    assert table_problem(tmp_path, text, **told).read().problem.count == 6
     with pytest.raises(InvalidProblem, match=r"0 occurs 4 times, first here"):
-        plan(tmp_path, text + "3,0,900,0\n".replace("70", "71"), **told)
+        table_problem(tmp_path, text + "3,0,900,0\n".replace("70", "71"), **told)
 
 
 @pytest.mark.parametrize("word", ["", "NaN", "n/a", "-", "NULL"])
 def test_words_for_nothing_are_no_readings(word, tmp_path):
     text = f"epoch,dist_A1_m,dist_A2_m\n1,3.2,{word}\n2,3.3,4.4\n"
-    found = plan(tmp_path, text)
+    found = table_problem(tmp_path, text)
     assert found.read().problem.count == 3
     assert "1 cell without a number: no reading" in found.notes
 
@@ -293,11 +293,13 @@ def test_words_for_nothing_are_no_readings(word, tmp_path):
 def test_repeats_are_refused_with_their_count_or_averaged(tmp_path):
     text = "frame,anchor,range_m\n1,A1,3.0\n1,A2,4.0\n1,A1,3.2\n1,A1,3.4\n"
     with pytest.raises(InvalidProblem, match=r"row 3: station 'A1' has a second .* in row 1; 2 such repeats in all"):
-        plan(tmp_path, text)
-    found = plan(tmp_path, text, average=True)
+        table_problem(tmp_path, text)
+    found = table_problem(tmp_path, text, average=True)
     np.testing.assert_allclose(found.read().problem.rows[0].z, [3.2, 4.0])
     assert "2 repeated readings were averaged" in found.notes[0]
-    around = plan(tmp_path, "anchor,bearing_deg\nA1,359\nA1,3\nA2,10\n", average=True, sigma="1 deg").sections[0]
+    around = table_problem(tmp_path, "anchor,bearing_deg\nA1,359\nA1,3\nA2,10\n", average=True, sigma="1 deg").sections[
+        0
+    ]
     np.testing.assert_allclose([float(z) for z in around.columns["z"]], [1.0, 10.0], atol=1e-9)
 
 
@@ -329,11 +331,11 @@ def test_repeats_are_refused_with_their_count_or_averaged(tmp_path):
 )
 def test_what_is_ambiguous_is_one_sentence(text, told, words, tmp_path):
     with pytest.raises(InvalidProblem, match=words):
-        plan(tmp_path, text, **told)
+        table_problem(tmp_path, text, **told)
 
 
 def test_angles_beyond_a_turn_are_degrees(tmp_path):
-    found = plan(tmp_path, "anchor,bearing\nA1,30\nA2,1.5\n", sigma="1 deg")
+    found = table_problem(tmp_path, "anchor,bearing\nA1,30\nA2,1.5\n", sigma="1 deg")
     assert found.sections[0].unit == "deg"
     assert "beyond a turn in radians" in found.notes[0]
 
@@ -351,17 +353,17 @@ def test_several_kinds_in_one_table(tmp_path):
 def test_readings_within_a_window_or_of_a_target_that_stays(tmp_path):
     rows = "".join(f"{0.01 * i:.2f},{n},{d:.6f}\n" for i, (n, d) in enumerate(ranges().items()))
     text = "t_s,anchor,range_m\n" + rows + rows.replace("0.0", "1.0")
-    assert "--window '0.1 s' those of 0.1 s" in plan(tmp_path, text).notes[0]
-    assert plan(tmp_path, text, window="0.2 s").read().problem.epochs == 2
-    assert plan(tmp_path, text, still=True).read().problem.epochs == 1
+    assert "--window '0.1 s' those of 0.1 s" in table_problem(tmp_path, text).notes[0]
+    assert table_problem(tmp_path, text, window="0.2 s").read().problem.epochs == 2
+    assert table_problem(tmp_path, text, still=True).read().problem.epochs == 1
     heard = "rx,toa_us\nLake,5\nMill,7\nTower,9\nLake,900005\nMill,900011\n"
     told = {"stations": rx(tmp_path), "sigma": "1 us", "window": "1 ms"}
-    assert plan(tmp_path, heard, **told).read().problem.epochs == 2
+    assert table_problem(tmp_path, heard, **told).read().problem.epochs == 2
 
 
 def test_depths_grow_downwards_and_axes_may_have_their_units(tmp_path):
     stations = table(tmp_path, "buoy;node;x_km;y_m;depth_m\n1;A;0.1;20;5\n2;B;1;30;-2\n", "sea.csv")
-    found = plan(tmp_path, "node,range_m\nA,10\nB,20\n", stations=stations, columns={"name": "node"}).read()
+    found = table_problem(tmp_path, "node,range_m\nA,10\nB,20\n", stations=stations, columns={"name": "node"}).read()
     np.testing.assert_allclose(found.problem.stations.position[0], [[100, 20, -5], [1000, 30, 2]])
 
 
@@ -481,10 +483,10 @@ def test_without_out_a_table_is_only_looked_at(tmp_path):
 def test_digits_that_are_lost_are_told(tmp_path):
     told = {"stations": rx(tmp_path), "sigma": "1 ns"}
     with pytest.raises(InvalidProblem, match=r"row 1, column 'toa_ns': the arrival 1.79E\+18 has lost its digits"):
-        plan(tmp_path, "msg,rx,toa_ns\n1,Lake,1.79E+18\n1,Mill,1.79E+18\n", **told)
+        table_problem(tmp_path, "msg,rx,toa_ns\n1,Lake,1.79E+18\n1,Mill,1.79E+18\n", **told)
     seconds = "1790000000.250000123456"
     rows = f'[{{"rx": "Lake", "toa_s": {seconds}}}, {{"rx": "Mill", "toa_s": 1790000000.25}}]'
-    found = plan(tmp_path, rows, "t.json", **told).sections[0]
+    found = table_problem(tmp_path, rows, "t.json", **told).sections[0]
     assert [float(z) for z in found.columns["z"]] == [1.23456e-7, 0.0]
     import pandas as pd
 
@@ -495,8 +497,8 @@ def test_digits_that_are_lost_are_told(tmp_path):
 def test_a_column_like_those_of_receivers_that_names_none_is_refused(tmp_path):
     text = "t_s,A1_m,A2_m,A9_m,note\n1,3,4,5,x\n"
     with pytest.raises(InvalidProblem, match=r"column 'A9_m': there is no station 'A9'; did you mean 'A4'"):
-        plan(tmp_path, text, what="range")
-    assert len(plan(tmp_path, text, what="range", ignore=("A9_m",)).sections[0].columns["z"]) == 2
+        table_problem(tmp_path, text, what="range")
+    assert len(table_problem(tmp_path, text, what="range", ignore=("A9_m",)).sections[0].columns["z"]) == 2
 
 
 def test_differences_share_the_errors_of_their_stations_as_in_one_call(tmp_path):
@@ -504,7 +506,7 @@ def test_differences_share_the_errors_of_their_stations_as_in_one_call(tmp_path)
     pairs = [("A1", "A2"), ("A1", "A3"), ("A2", "A3"), ("A1", "A4"), ("B-1", "A4"), ("A1", "B-1")]
     values = {pair: far[pair[0]] - far[pair[1]] for pair in pairs}
     text = "station,reference,tdoa [m]\n" + "".join(f"{a},{b},{value:.6f}\n" for (a, b), value in values.items())
-    read = solve(plan(tmp_path, text, positive="a-farther").read().problem)
+    read = solve(table_problem(tmp_path, text, positive="a-farther").read().problem)
     told = locate(ANCHORS, tdoa=values, unit="m", sigma=0.1)
     assert np.allclose(read.position, told.position, atol=1e-4)
     assert np.allclose(read.cov, told.cov, rtol=1e-3)

@@ -190,14 +190,14 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
 
     told, console = Told(**given), Screen(quiet=quiet or as_json)
     if out is None:
-        plan = understood(file, told)
-        _tell(plan, console)
-        plan.read()
+        table_problem = understood(file, told)
+        _tell(table_problem, console)
+        table_problem.read()
         say_next(console, f"Nothing is written: --out names the problem file, and optloc fix {file} fixes it as it is.")
         if as_json:
-            write_text(Path("-"), dumps(plan.as_read))
+            write_text(Path("-"), dumps(table_problem.as_read))
         return 0
-    found = written(file, out, told, tell=lambda plan: _tell(plan, console))
+    found = written(file, out, told, tell=lambda table_problem: _tell(table_problem, console))
     if as_json:
         write_text(Path("-"), dumps(_json(found)))
     elif found.loaded is None:
@@ -219,15 +219,15 @@ def say_next(console: Console, line: str) -> None:
     say(console, line)
 
 
-def _tell(plan: TableProblem, console: Console) -> None:
+def _tell(table_problem: TableProblem, console: Console) -> None:
     """Print what a table is understood to be, and what was assumed."""
     from optloc.cli.output import say, say_all
 
-    say(console, f"{plan.source.name} is understood as")
-    width = max(len(word) for word, _ in plan.about)
-    for word, text in plan.about:
+    say(console, f"{table_problem.source.name} is understood as")
+    width = max(len(word) for word, _ in table_problem.about)
+    for word, text in table_problem.about:
         say(console, f"  {word:<{width}}  {text}")
-    say_all(console, plan.notes)
+    say_all(console, table_problem.notes)
 
 
 def _json(found: Converted) -> dict[str, Any]:
@@ -287,6 +287,6 @@ def read_problem(
     from optloc.cli.output import Screen
     from optloc.files.convert import understood
 
-    plan = understood(file, told)
-    _tell(plan, Screen(quiet=quiet, stderr=on_error))
-    return plan.read(more or {})
+    table_problem = understood(file, told)
+    _tell(table_problem, Screen(quiet=quiet, stderr=on_error))
+    return table_problem.read(more or {})

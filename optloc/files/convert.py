@@ -76,7 +76,7 @@ def convert(
     told : Told, optional
         What the table does not say itself.
     tell : callable, optional
-        Is given the plan of a table of readings before it is written.
+        Is given the problem of a table before it is written.
     **options
         The same, one by one: the fields of `Told`.
 
@@ -99,12 +99,12 @@ def convert(
         return _write_stations(source, out, told.columns, told.frame)
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the problem file must end in .toml", str(out), "let the name behind --out end in it")
-    plan = understood(source, told)
-    tell(plan)
-    claim(*plan.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
+    table_problem = understood(source, told)
+    tell(table_problem)
+    claim(*table_problem.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
     # Read before it is there: what cannot be read is not written.
-    loaded = plan.read()
-    return Converted(plan.write(out), loaded, plan.notes, plan.as_read)
+    loaded = table_problem.read()
+    return Converted(table_problem.write(out), loaded, table_problem.notes, table_problem.as_read)
 
 
 def _check_told(told: Told) -> None:
@@ -142,13 +142,13 @@ def understood(source: Path, told: Told) -> TableProblem:
         For what is wrong, and for what may mean two things: naming the option that says which.
     """
     _check_told(told)
-    plan = gnss(source, told) if is_gnss(source) else _of_table(source, told)
-    azimuths = any(section.kind == "azimuth" for section in plan.sections)
+    table_problem = gnss(source, told) if is_gnss(source) else _of_table(source, told)
+    azimuths = any(section.kind == "azimuth" for section in table_problem.sections)
     if told.declination is not None and not azimuths:
         raise InvalidProblem("the table has no bearings", "--declination", "leave it out")
-    if told.turned and AT_RECEPTION != plan.lines:
+    if told.turned and AT_RECEPTION != table_problem.lines:
         raise InvalidProblem("the table has no satellites", "--turned", "leave it out")
-    return plan
+    return table_problem
 
 
 def _of_table(source: Path, told: Told) -> TableProblem:
