@@ -39,7 +39,8 @@ def texts(path: Path) -> list[str]:
     """Return the docstrings, comments and longer strings of a module, or the paragraphs of a page."""
     source = path.read_text(encoding="utf-8")
     if path.suffix == ".md":
-        return re.sub(r"```.*?```", "", source, flags=re.DOTALL).split("\n\n")
+        prose = re.sub(r"```.*?```|^\|.*$", "", source, flags=re.DOTALL | re.MULTILINE)  # without code and tables
+        return prose.split("\n\n")
     nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant)]
     found = [node.value for node in nodes if isinstance(node.value, str) and node.value.count(" ") >= SPACES]
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)

@@ -180,9 +180,9 @@ def test_reserved_words_are_defined_in_one_place():
         (module, node.name)
         for module, path in modules(ROOT).items()
         for node in ast.walk(parsed(path))
-        if isinstance(node, kinds) and node.name.strip("_") in RESERVED
+        if isinstance(node, kinds) and node.name in RESERVED
     ]
-    wrong = [(module, name) for module, name in found if not module.startswith(RESERVED[name.strip("_")])]
+    wrong = [(module, name) for module, name in found if not module.startswith(RESERVED[name])]
     assert not wrong
 
 
