@@ -7,7 +7,9 @@ docstrings and line numbers are not part of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from hashlib import sha256
 from types import CodeType, FunctionType, ModuleType
@@ -89,6 +91,9 @@ def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tu
     seen.add(function)
     yield _text(function.__code__, function.__doc__), None
     yield _text(function.__defaults__), None
+    for word in sorted(_words(function.__annotations__)):
+        if is_record(found := function.__globals__.get(word)):
+            yield f"takes {_text(found)}", None
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     named = dict(zip(function.__code__.co_freevars, cells, strict=True))
     names = sorted(_names(function.__code__))
@@ -112,6 +117,23 @@ def _value(name: str, value: Any, names: list[str], seen: set[FunctionType]) -> 
         yield f"{name} = {_text(value)}", None
 
 
+def _words(annotations: Mapping[str, Any]) -> set[str]:
+    """Return the names in annotations, which are strings."""
+    return set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, annotations.values()))))
+
+
+def is_record(value: Any) -> bool:
+    """Return whether a value is a class of named tuples: machine code knows their fields by their places."""
+    return isinstance(value, type) and hasattr(value, "_fields")
+
+
+def _record(kind: Any) -> str:
+    """Return the text of a class of named tuples: its name, its fields, and the named tuples among them."""
+    space = vars(sys.modules[kind.__module__])
+    inner = [space[word] for word in sorted(_words(kind.__annotations__)) if is_record(space.get(word))]
+    return f"{kind.__module__}.{kind.__qualname__}{kind._fields} of {list(map(_record, inner))}"
+
+
 def _is_library(module: str) -> bool:
     return module.partition(".")[0] in _LIBRARIES
 
@@ -132,14 +154,16 @@ def _text(value: Any, documentation: str | None = None) -> str:
         constants = value.co_consts[value.co_consts[:1] in ((documentation,), (None,)) :]
         return _text((value.co_code, value.co_names, value.co_varnames, value.co_argcount, constants))
     if isinstance(value, tuple):
-        fields = getattr(value, "_fields", ())
-        return f"{type(value).__name__}{fields}({', '.join(map(_text, value))})"
+        kind = _text(type(value)) if is_record(type(value)) else "tuple"
+        return f"{kind}({', '.join(map(_text, value))})"
     if isinstance(value, frozenset):
         return f"frozenset({', '.join(sorted(map(_text, value)))})"
     if isinstance(value, np.ndarray):
         return f"array {value.dtype} {value.shape} {value.tobytes().hex()}"
+    if is_record(value):
+        return _record(value)
     if isinstance(value, type):
-        return f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
+        return f"{value.__module__}.{value.__qualname__}"
     if isinstance(value, ModuleType):
         return value.__name__
     return f"{type(value).__name__} {value!r}"

@@ -122,6 +122,15 @@ def _entries() -> tuple[Any, Any]:
     return Impl, Callee
 
 
+def _fields(kind: Any) -> tuple[Any, ...]:
+    """Return the fields of a type of numba, and of the types in it; () of one without."""
+    from numba.core import types
+
+    if not isinstance(kind, types.BaseTuple):
+        return ()
+    return getattr(kind, "fields", ()), tuple(_fields(inner) for inner in kind)
+
+
 @cache
 def _cache_type() -> Any:
     """Return numba's cache of a function, told where it lies and by which name; damaged entries are as good as none."""
@@ -137,6 +146,10 @@ def _cache_type() -> Any:
             self._name = name_of(function)
             self._installed = None if callee else installed()
 
+        def _index_key(self, sig: Any, codegen: Any) -> Any:
+            # numba tells named tuples apart by their class and the types of their fields, not by the fields.
+            return *super()._index_key(sig, codegen), tuple(map(_fields, getattr(sig, "args", sig)))
+
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             try:
                 found = self._from_installed(sig, target_context)
@@ -150,15 +163,22 @@ def _cache_type() -> Any:
                 return None
             place, made = self._installed
             target_context.refresh()
-            sig, _, code = self._index_key(sig, target_context.codegen())
+            sig, _, *code = self._index_key(sig, target_context.codegen())
             file = numba.IndexDataCacheFile(str(place), self._impl.filename_base, "")
-            data = file.load((sig, (made.triple, made.processor, made.features), code))
+            data = file.load((sig, (made.triple, made.processor, made.features), *code))
             return None if data is None else self._impl.rebuild(target_context, data)
 
         def save_overload(self, sig: Any, data: Any) -> None:
+            place, base = Path(self._cache_path), self._impl.filename_base
             try:
-                super().save_overload(sig, data)
-                _leave_last(Path(self._cache_path), self._name, self._impl.filename_base)
+                try:
+                    super().save_overload(sig, data)
+                except OSError:
+                    raise
+                except Exception:  # noqa: BLE001  # the index is damaged, or names a class that no longer exists
+                    (place / f"{base}.nbi").unlink()
+                    super().save_overload(sig, data)
+                _leave_last(place, self._name, base)
             except OSError as error:  # a full disk: the code serves this process
                 _LOG.warning("machine code of %s cannot be kept on disk: %s", self._name, error)
 

@@ -22,7 +22,6 @@ from typing import Literal
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.compute.kept import folder
-from optloc.compute.manifest import digest_of
 
 # Seconds in which a solver ends on programs of two unknowns, which take milliseconds; and to begin a process.
 _PATIENCE, _START = 5.0, 60.0
@@ -158,10 +157,10 @@ def faults_of(kinds: Mapping[str, str]) -> dict[str, str]:
 def _key(kinds: tuple[tuple[str, str], ...]) -> str:
     """Return what the outcome depends on, as a digest: names, versions, and the programs of the trial."""
     here = Path(__file__).parent
-    programs = list((here.parents[1] / "formulations").glob("*.py"))
+    programs = [path.read_text(encoding="utf-8") for path in sorted((here.parents[1] / "formulations").glob("*.py"))]
     libraries = [version_of(name) for name in ("casadi", "cvxpy", "numpy")]
     versions = [entry.version for entry in installed().values()]
-    text = json.dumps([kinds, versions, libraries, digest_of(programs, here.parents[1]), sys.version])
+    text = json.dumps([kinds, versions, libraries, programs, sys.version])
     return sha256(text.encode()).hexdigest()[:16]
 
 

@@ -8,13 +8,14 @@ from collections import defaultdict
 from functools import cache
 from statistics import mean, median
 from types import FunctionType
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import optloc
 from optloc.cli.compile import PARTS
-from optloc.compute import digests
+from optloc.compute import digests, kept
 from optloc.compute.jit import _KERNELS, compiled, enabled, inlined, named, replace, with_constants
 from optloc.proof.nodes.dispatch import NODES, text_of
 
@@ -179,6 +180,52 @@ def test_a_constant_renews_what_reads_it(values, level):
     before = digests_of()
     replace({level: written(SAME["a comment"], **values)})
     assert [old == new for old, new in zip(before, digests_of(), strict=True)] == [False, False, False, True]
+
+
+class Inner(NamedTuple):
+    low: float
+    high: float
+
+
+class Outer(NamedTuple):
+    inner: Inner
+    x: float
+
+
+def turned():
+    """Return a class like `Inner`, but for the order of its fields."""
+
+    class Other(NamedTuple):
+        high: float
+        low: float
+
+    Other.__qualname__ = Inner.__qualname__
+    return Other
+
+
+def test_the_places_of_fields_count_though_the_code_names_them_alone(monkeypatch):
+    """A field is read by its place: with the fields in another order, old machine code would read another."""
+
+    def kernel(outer: "Outer") -> float:
+        return outer.inner.low
+
+    def digest():
+        digests._own.cache_clear()
+        return digests.digest_of(digests.Compilable(kernel, taken_in=False))
+
+    before = digest()
+    assert digest() == before
+    monkeypatch.setitem(globals(), "Inner", turned())
+    assert digest() != before
+
+
+@pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
+def test_named_tuples_with_other_fields_have_other_keys():
+    from numba import typeof
+
+    one, other = (typeof((Outer(kind(1.0, 2.0), 3.0), 4)) for kind in (Inner, turned()))
+    assert kept._fields(one) != kept._fields(other)
+    assert kept._fields(typeof(1.0)) == ()
 
 
 def test_a_callee_that_is_taken_in_makes_other_code():

@@ -1,6 +1,7 @@
 """Machine code on disk is that of the sources that are there: also where only what a kernel calls was edited."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -69,6 +70,19 @@ def test_an_edited_callee_renews_its_callers_and_damage_is_made_good(tmp_path):
         assert asked_here == (answer, compiled, place)
     assert len(list(callees.glob("callee.level-*.nbi"))) == 2
     assert not list(place.glob("*level*"))
+
+
+def test_a_damaged_index_is_made_again(tmp_path):
+    """As one that names a class under the name of a module that it no longer has."""
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "callee.py").write_text(CALLEE.format(step=1))
+    more = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "OPTLOC_CALLEES": str(tmp_path / "callees")}
+    _, _, place = asked(tmp_path, **more)
+    index = next(place.glob("caller.answer-*.nbi"))
+    version = pickle.dumps(pickle.load(index.open("rb")))
+    index.write_bytes(version + b"cno_such_module\nNoSuchClass\n.")
+    assert asked(tmp_path, **more)[:2] == (2, 1)
+    assert asked(tmp_path, **more)[:2] == (2, 0)
 
 
 def test_users_keep_no_callees(tmp_path):
