@@ -1,4 +1,4 @@
-"""How numba is asked to compile kernels: its options, and its pipeline for functions that only kernels call.
+"""The options of numba for kernels, and its pipeline for functions that only kernels call.
 
 A kernel takes in what it calls. To optimise and translate a callee alone, and once more in each caller, took half of
 the time of a compilation. So callees stop before these steps.

@@ -147,7 +147,7 @@ def _cache_type() -> Any:
             self._installed = None if callee else installed()
 
         def _index_key(self, sig: Any, codegen: Any) -> Any:
-            # numba tells named tuples apart by their class and the types of their fields, not by the fields.
+            # For numba two named tuples differ by class and types of fields, not by the names of the fields.
             return *super()._index_key(sig, codegen), tuple(map(_fields, getattr(sig, "args", sig)))
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:

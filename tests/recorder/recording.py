@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_info
 import formulations
 import optloc
 from optloc import Fix, Problem, solve
-from recorder.plan import Scene
+from recorder.scope import Scene
 
 FORMAT = 1
 # Packages that compute parts of a fix.
