@@ -9,8 +9,8 @@ from cases import CASES
 from recorder.__main__ import main
 from recorder.comparison import KINDS, Tolerance, compare
 from recorder.listing import listing
-from recorder.scope import REFINEMENTS, VARIANTS, own_words, scenes, shipped_methods
 from recorder.recording import Recording, plain, read, record, solved
+from recorder.scope import REFINEMENTS, VARIANTS, own_words, scenes, shipped_methods
 
 from optloc import METHODS
 

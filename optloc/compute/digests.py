@@ -141,7 +141,7 @@ def _is_library(module: str) -> bool:
 def _names(code: CodeType) -> set[str]:
     """Return the names of globals and attributes in a function, and in functions inside it.
 
-    An attribute with the name of a kernel counts as a call: bytecode would distinguish them in a hundred times the time.
+    An attribute with the name of a kernel counts as a call: bytecode, read for the difference, takes too long.
     """
     inner = [_names(part) for part in code.co_consts if isinstance(part, CodeType)]
     return set(code.co_names).union(*inner)

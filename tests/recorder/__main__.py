@@ -12,8 +12,8 @@ from cases import CASES
 
 from recorder.comparison import KINDS, Tolerance, compare
 from recorder.listing import listing
-from recorder.scope import VARIANTS, scenes, shipped_methods
 from recorder.recording import Record, read, record
+from recorder.scope import VARIANTS, scenes, shipped_methods
 
 # CPU seconds of a fix that is worth a look: on one core, all fixes but a few of all cases take less.
 SLOW = 2.0
