@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from optloc.base.types import Array, Status
-from optloc.linear.constraints import TOLERANCE, Face, exact, faces, violation
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_held, violation
+from optloc.linear.normal import marginal
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
 from optloc.problem.fix import tail_probability
@@ -200,6 +202,10 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (beyond, 4)):
         array[needy] = np.concatenate([found[place] for found in on_faces], axis=1)
     beyond = np.where(_fits(pool, beyond), beyond, np.inf)
+    if not pool.loss:
+        inside = np.where(kept.code == Status.OK, kept.cost, np.inf).min(1)
+        falling = _falls(problem, sides, inside, x, cost, face)
+        cost, code = np.where(falling, np.inf, cost), np.where(falling, np.int8(Status.INFEASIBLE), code)
     return replace(
         kept,
         hidden=_first_told(kept.hidden, _name_hidden(problem, x, beyond)),
@@ -279,6 +285,32 @@ def _on_face(
     refused = np.full(shape, np.inf)
     refused[row, slot] = np.where(inside | (status != Status.OK), np.inf, found)
     return x, cost, code, np.full(shape, number), refused
+
+
+def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
+    """Return which minima along a face (N, size) are minima of all that is admitted, (N,).
+
+    They meet every constraint, no station that hears them is behind the Earth, and the cost grows inwards from the
+    face: the conditions of Karush, Kuhn and Tucker.
+    """
+    good = (violation(problem, x) <= TOLERANCE) & ~is_hidden(problem, x)
+    if len(face) > len(exact(problem)):
+        good &= is_held(problem, face, x, marginal(equations_at(problem, x))[1])
+    return np.asarray(good)
+
+
+def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: Array, face: Array) -> Array:
+    """Return from which minima on faces (N, q) the cost falls inwards, if a minimum of all that is admitted costs less.
+
+    `inside` (N,) is the least cost of a minimum on no face. The least of all minima is one of all that is admitted. A
+    descent may have missed it: then the best that was found stays.
+    """
+    held = np.zeros(cost.shape, dtype=bool)
+    for number in range(1, len(sides)):
+        item, slot = np.nonzero(np.isfinite(cost) & (face == number))
+        held[item, slot] = is_minimum(problem.take(item), sides[number], x[item, slot])
+    least = np.minimum(np.where(held, cost, np.inf).min(1), inside)
+    return np.asarray(~held & (cost >= least[:, None]))
 
 
 # What the Earth hides is told, not dropped.

@@ -16,22 +16,17 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import Axes, overwrite, take
 from optloc.base.types import Array, Status
-from optloc.compute.sums import equations_at
 from optloc.linear.constraints import (
-    TOLERANCE,
     Face,
     exact,
     face_names,
     faces,
     is_corner,
     is_exact,
-    is_held,
     on_face,
     restore,
-    violation,
     violation_names,
 )
-from optloc.linear.normal import marginal
 from optloc.problem.claims import GLOBAL, REGION, Claims, untried
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
@@ -61,7 +56,7 @@ from optloc.solvers.certify.position_cost import (
     state_columns,
     surfaces_of,
 )
-from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.inequalities import is_minimum
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, in_parts, offer, pack, where
@@ -322,17 +317,31 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
     wanted = np.where(gain >= margin, 0.0, np.where(gain < 0.0, np.ceil(above), margin))
     proven = untried(len(seeds))
     proven.write(np.arange(len(seeds)), unknown(LEFT.format(names)))
-    for gap in np.unique(wanted[alone.answered]):
-        items = np.flatnonzero(alone.answered & (wanted == gap))
-        part = on.take(items)
-        done = certified_freely(part, take(pool, items), None, float(gap), effort)
-        done = _within_limits(part, done, limits, float(gap), effort)
-        pool = pool.merge(items, done)
-        assert done.proven is not None
-        tried = done.proven.tried
-        proven.write(items[tried], take(done.proven, tried))
+
+    def prove(asked: Array) -> None:
+        nonlocal pool
+        for gap in np.unique(wanted[asked]):
+            items = np.flatnonzero(asked & (wanted == gap))
+            part = on.take(items)
+            done = certified_freely(part, take(pool, items), None, float(gap), effort)
+            done = _within_limits(part, done, limits, float(gap), effort)
+            pool = pool.merge(items, done)
+            assert done.proven is not None
+            tried = done.proven.tried
+            proven.write(items[tried], take(done.proven, tried))
+
+    prove(alone.answered)
     alone = judge(on, replace(pool, proven=None))
     gain = _gain(alone.cost, fix.cost)
+    # An unfinished proof falls back to the gap of `ambiguous`. It counts from the least minimum. One that is not admitted
+    # may cost less than the fix.
+    enough = np.ceil(AMBIGUOUS_GAP - gain)
+    short = alone.answered & (gain < 0.0) & (wanted > enough) & (proven.margin + gain < AMBIGUOUS_GAP)
+    if short.any():
+        wanted = np.where(short, enough, wanted)
+        prove(short)
+        alone = judge(on, replace(pool, proven=None))
+        gain = _gain(alone.cost, fix.cost)
     sure, gap = _is_sure(proven, limits), proven.margin
     least, rest = np.where(sure, gain, -np.inf), np.where(sure, gain + gap, -np.inf)
     return Along(*_minima(alone), least, rest, proven.boxes, proven.reason)
@@ -375,12 +384,7 @@ def _is_admitted(problem: Problem, face: Face, along: Along) -> Array:
     """Return which minima along a face (n, q) are minima of all that is admitted."""
     out = np.isfinite(along.cost)
     item, slot = np.nonzero(out)
-    part, x = problem.take(item), along.x[item, slot]
-    good = (violation(part, x) <= TOLERANCE) & ~is_hidden(part, x)
-    if len(face) > len(exact(problem)):
-        _, vector, _ = marginal(equations_at(part, x))
-        good &= is_held(part, face, x, vector)
-    out[item, slot] = good
+    out[item, slot] = is_minimum(problem.take(item), face, along.x[item, slot])
     return out
 
 
