@@ -288,9 +288,9 @@ def _on_face(
 
 
 def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
-    """Return which minima along a face (N, size) are minima of all that is admitted, (N,).
+    """Return a flag (N,) for each minimum along a face (N, size) that is a minimum of all admitted positions.
 
-    They meet every constraint, no station that hears them is behind the Earth, and the cost grows inwards from the
+    It meets every constraint, the Earth hides it from no station with a row of it, and the cost grows inwards from the
     face: the conditions of Karush, Kuhn and Tucker.
     """
     good = (violation(problem, x) <= TOLERANCE) & ~is_hidden(problem, x)
@@ -300,7 +300,7 @@ def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
 
 
 def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: Array, face: Array) -> Array:
-    """Return from which minima on faces (N, q) the cost falls inwards, if a minimum of all that is admitted costs less.
+    """Return a flag for each minimum on a face (N, q) from which the cost falls inwards, unless it is the least found.
 
     `inside` (N,) is the least cost of a minimum on no face. The least of all minima is one of all that is admitted. A
     descent may have missed it: then the best that was found stays.

@@ -333,8 +333,8 @@ def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: f
     prove(alone.answered)
     alone = judge(on, replace(pool, proven=None))
     gain = _gain(alone.cost, fix.cost)
-    # An unfinished proof falls back to the gap of `ambiguous`. It counts from the least minimum. One that is not admitted
-    # may cost less than the fix.
+    # An unfinished proof falls back to the gap of `ambiguous`. It counts from the least minimum, which may cost less
+    # than the fix if it is not admitted.
     enough = np.ceil(AMBIGUOUS_GAP - gain)
     short = alone.answered & (gain < 0.0) & (wanted > enough) & (proven.margin + gain < AMBIGUOUS_GAP)
     if short.any():
