@@ -230,7 +230,7 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
         The kernels that Python calls of which there is no machine code even now; empty if all went well.
     """
     names = [name for name, part in PARTS.items() if part.missing()]
-    known, done, lock = {}, set(), Lock()
+    known, done, lock = dict[str, set[str]](), set[str](), Lock()
 
     def follow(name: str) -> None:
         for line in _started(name, shared):

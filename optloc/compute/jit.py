@@ -260,8 +260,8 @@ def replace(functions: Mapping[Callable[..., Any], Callable[..., Any]]) -> None:
     for kernel, function in functions.items():
         assert isinstance(kernel, _Kernel)
         kernel.function = function
-    for kernel in callers(cast(Iterable[_Kernel], functions), _KERNELS):
-        cast(_Kernel, kernel).renew()
+    for caller in callers(cast(Iterable[_Kernel], functions), _KERNELS):
+        cast(_Kernel, caller).renew()
 
 
 def compiled(function: _Function) -> _Function:

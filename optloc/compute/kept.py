@@ -126,7 +126,8 @@ def _fields(kind: Any) -> tuple[Any, ...]:
     """Return the fields of a type of numba, and of the types in it; () of one without."""
     from numba.core import types
 
-    if not isinstance(kind, types.BaseTuple):
+    numba: Any = types  # half typed
+    if not isinstance(kind, numba.BaseTuple):
         return ()
     return getattr(kind, "fields", ()), tuple(_fields(inner) for inner in kind)
 

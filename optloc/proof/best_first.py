@@ -406,8 +406,8 @@ def _search(costs: PositionCosts, place: Places, gap: float, budget: int, most: 
     """Return the minima (most, d) of one cost, and the boxes that it took; places without their first axis."""
     cost = present_in(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = cube(cost.kinds, cost.data, place.x)
-    found, costs = np.zeros((most, len(place.x))), np.full(most, inf)
-    aim = Aim(place.planes, place.surface, gap, _AWAY * radius, found, costs)
+    found, least = np.zeros((most, len(place.x))), np.full(most, inf)
+    aim = Aim(place.planes, place.surface, gap, _AWAY * radius, found, least)
     box, near = empty_box(*cost.K.shape), empty_box(*cost.K.shape)
     if len(place.surface):
         _, boxes = _search_sides(cost, box, near, place.x, aim, budget)
@@ -415,8 +415,8 @@ def _search(costs: PositionCosts, place: Places, gap: float, budget: int, most: 
         _, boxes = _search_everywhere(cost, box, near, place.x, aim, budget)
     else:
         _, boxes = _search_region(cost, box, near, place.x, aim, place.region, budget)
-    order = np.argsort(costs)
+    order = np.argsort(least)
     points = np.full(found.shape, np.nan)
-    good = order[costs[order] < costs.min() + gap]
+    good = order[least[order] < least.min() + gap]
     points[: len(good)] = found[good]
     return points, boxes
