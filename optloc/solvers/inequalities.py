@@ -294,7 +294,7 @@ def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
     face: the conditions of Karush, Kuhn and Tucker.
     """
     good = (violation(problem, x) <= TOLERANCE) & ~is_hidden(problem, x)
-    if len(face) > len(exact(problem)):
+    if len(x) and len(face) > len(exact(problem)):
         good &= is_held(problem, face, x, marginal(equations_at(problem, x))[1])
     return np.asarray(good)
 
