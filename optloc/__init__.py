@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from optloc.linear import constraints
     from optloc.linear.evaluate import predict
     from optloc.linear.gauss_newton import gauss_newton
+    from optloc.linear.least_squares_ranges import reduce
     from optloc.linear.normal import Linear, Normal, linearise, normal
     from optloc.linear.simulate import simulate
     from optloc.linear.walks import wander
@@ -74,7 +75,6 @@ if TYPE_CHECKING:
     from optloc.solvers.prepared import Prepared, prepare
     from optloc.solvers.robust.stage import rejected
     from optloc.solvers.running import Running
-    from optloc.solvers.starts.least_squares_ranges import reduce
     from optloc.solvers.suspects.stage import suspects
     from optloc.uncertainty.arc import Arc, trace_arc
     from optloc.uncertainty.posterior import Mixture, Samples, mixture, samples
@@ -237,7 +237,7 @@ _HOMES = {
     "solvers.prepared": "Prepared prepare",
     "solvers.robust.stage": "rejected",
     "solvers.running": "Running",
-    "solvers.starts.least_squares_ranges": "reduce",
+    "linear.least_squares_ranges": "reduce",
     "solvers.suspects.stage": "suspects",
     "uncertainty.arc": "Arc trace_arc",
     "uncertainty.posterior": "Mixture Samples mixture samples",

@@ -15,7 +15,8 @@ from often import few
 
 from optloc import Status, assemble, certify, measured, prepare, simulate, solve
 from optloc.base import linalg
-from optloc.solvers import METHODS, SOLVERS, range_fixes, single
+from optloc.engine import plan
+from optloc.solvers import METHODS, SOLVERS, single
 from optloc.solvers.certify import admitted
 
 STATIONS = np.array([[0.0, 0.0], [1000.0, 0.0], [0.0, 1000.0], [1000.0, 1100.0], [500.0, -300.0]])
@@ -88,7 +89,7 @@ def watched(monkeypatch, decide):
 
         return guarded
 
-    for kept in (range_fixes._KEPT, single._KEPT):  # what was made before would not fail again
+    for kept in (plan._KEPT, single._KEPT):  # what was made before would not fail again
         kept.clear()
     with monkeypatch.context() as patch:
         for module, name, value in list(functions()):

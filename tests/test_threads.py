@@ -19,8 +19,9 @@ from optloc import Fix, InvalidProblem, Problem, assemble, measured, simulate, s
 from optloc.base.cache import Cache
 from optloc.base.threads import flow, mapped, thread_count
 from optloc.compute import tables, trace
+from optloc.engine import plan
 from optloc.linear import evaluate
-from optloc.solvers import ipopt, range_fixes
+from optloc.solvers import ipopt
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
@@ -248,7 +249,7 @@ def solved_in_threads(problems: list[Problem], methods: tuple[str, ...], solves:
     count = len(problems)
     tasks = [(i % count, methods[(i + i // count) % len(methods)]) for i in range(solves)]
     alone = {task: solve(problems[task[0]], task[1]) for task in set(tasks)}
-    for cache in (evaluate._LINKS, tables._KEPT, trace._TRACED, range_fixes._KEPT, ipopt._PROGRAMS):
+    for cache in (evaluate._LINKS, tables._KEPT, trace._TRACED, plan._KEPT, ipopt._PROGRAMS):
         cache.clear()
 
     def again(task: tuple[int, str]) -> None:

@@ -375,3 +375,24 @@ def error_ellipse(covariance: Array, probability: float = 0.95) -> tuple[Array, 
     scale = np.sqrt(2.0 * gammaincinv(covariance.shape[-1] / 2, probability))
     axes = scale * np.sqrt(np.maximum(values, 0.0))
     return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
+
+
+def project_out(unknowns: Array, values: Array) -> Array:
+    """Return values (..., q, p) less their projection onto the span of unknowns (..., q, n)."""
+    if not unknowns.shape[-1]:
+        return values
+    basis = span_of(unknowns)
+    # Twice: what rounding leaves of the first projection is as large as the values, and they may be large.
+    once = values - basis @ (np.swapaxes(basis, -1, -2) @ values)
+    return np.asarray(once - basis @ (np.swapaxes(basis, -1, -2) @ once))
+
+
+def span_of(unknowns: Array) -> Array:
+    """Return orthonormal columns (..., q, n) of the span of unknowns (..., q, n); zeros where some are dependent.
+
+    Columns are scaled to one length first; what then is shorter than 1e-12 counts as dependent.
+    """
+    length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
+    u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
+    # The rounding of a column that is a sum of others is some thousandth of that; what is dependent changes nothing.
+    return np.asarray(u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :])

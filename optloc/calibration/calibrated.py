@@ -27,7 +27,7 @@ from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, toge
 from optloc.calibration.network import Network
 from optloc.calibration.outliers import PRICE, outliers
 from optloc.calibration.rounds import laid
-from optloc.compute.range_shape import STRAIGHT
+from optloc.engine.shape import STRAIGHT
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 

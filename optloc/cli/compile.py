@@ -54,7 +54,7 @@ _FEW, _MANY = 40, 500
 
 
 def _problem_of(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
-    rows = {"b": np.zeros(5, dtype=int)} if kind in ("tdoa", "fdoa") else {}
+    rows = {"b": np.zeros(5, dtype=int)} if kind in ("tdoa", "fdoa", "groa") else {}
     return assemble(stations, measured(kind, a=np.arange(1, 6), sigma=1.0, **rows), **more)
 
 
@@ -68,6 +68,12 @@ def _fix_ranges() -> None:
     problem = _drawn("tdoa", _FEW)
     solve(problem, "gtrs+lsr")
     prepare(_problem_of("tdoa"), "gtrs+lsr")(problem.z[0])
+
+
+def _fix_tapes() -> None:
+    problem = _drawn("groa", _FEW)
+    solve(problem, "gtrs+lsr")
+    prepare(_problem_of("groa"), "gtrs+lsr")(problem.z[0])
 
 
 def _filter() -> None:
@@ -163,11 +169,10 @@ PARTS: Mapping[str, Part] = {
     "fixes": Part(
         "fixes, refinements and filters",
         "optloc.compute",
-        (_fix_ranges, _refine, _filter),
+        (_fix_ranges, _fix_tapes, _refine, _filter),
         (
             "optloc.compute.filter.absorb",
-            "optloc.compute.range_fixes.fixes",
-            "optloc.compute.range_fixes.fixes_four",
+            *(f"optloc.engine.fixes.fixes_{mark}" for mark in ("ranges", "few_ranges", "tapes", "one_by_tapes")),
             "optloc.compute.refine.refine_block",
             "optloc.compute.refine.refine_runs",
             "optloc.compute.equations.normal_block",

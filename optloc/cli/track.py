@@ -34,12 +34,12 @@ from optloc.cli.output import (
 from optloc.files import Loaded
 from optloc.files.readings import Told
 from optloc.files.writer import GrowingTable
+from optloc.linear.least_squares_ranges import reduce
 from optloc.problem.epochs import cut
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.report.formats.marks import Results
-from optloc.solvers.starts.least_squares_ranges import reduce
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
 from optloc.track.run import Entry, Rules, tracked
 from optloc.track.several_targets import alone

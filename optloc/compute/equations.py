@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.threads import mapped, thread_count
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.compute.lanes import Room, add_group, add_prior, arrange, blocks, clear, gather, load, measure, memory
+from optloc.compute.lanes import Cells, add_group, add_prior, arrange, blocks, clear, gather, load, measure, memory
 from optloc.compute.pack import AT, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
 from optloc.compute.tables import FIRST, GROUP_EPOCH, Tables
 from optloc.linear.normal import Normal
@@ -97,7 +97,7 @@ def _epochs(
     c: Numbers,
     m: Array,
     r: Array,
-    room: Room,
+    room: Cells,
     begin: int,
     used: int,
     priors: bool,

@@ -14,7 +14,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, put
-from optloc.compute.lanes import Room, arrange, gather, load, memory
+from optloc.compute.lanes import Cells, arrange, gather, load, memory
 from optloc.compute.pack import Packed
 
 # Halvings of a step that raises the cost, and the rise that is rounding: as in `optloc.track.updates`.
@@ -134,7 +134,7 @@ def _equations(
     packed: Packed,
     m: Array,
     r: Array,
-    room: Room,
+    room: Cells,
     root: Array,
     y: Array,
     x: Array,

@@ -16,7 +16,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.threads import held_by_forks
 from optloc.base.types import Array
 from optloc.compute.compilation import options
-from optloc.compute.digests import Compilable, callers
+from optloc.compute.digests import Compilable, callers, closure
 from optloc.compute.kept import begin_child, folder, is_kept, kept, locked, name_of
 from optloc.compute.progress import Reporter
 
@@ -302,7 +302,13 @@ def put_rows(values: Array, out: Array) -> None:
             out[i, k] = values[i, k]
 
 
-def with_constants(kernel: _Function, mark: str, **constants: Any) -> _Function:
+def with_constants(
+    kernel: _Function,
+    mark: str,
+    replaced: Mapping[Callable[..., Any], Callable[..., Any]] | None = None,
+    /,
+    **constants: Any,
+) -> _Function:
     """Return a kernel with other values of module constants, in it and in all kernels that it calls.
 
     Machine code knows constants when it is made, so others take machine code of their own; the source is one.
@@ -313,12 +319,15 @@ def with_constants(kernel: _Function, mark: str, **constants: Any) -> _Function:
         As `compiled` returns it.
     mark : str
         Tells the names of its machine code from those of the kernels as they are.
+    replaced : dict, optional
+        Kernels that are called in the place of others.
     constants : object
         New values by name; kernels that use none of them, nor call one that does, stay as they are.
     """
-    made: dict[_Kernel, _Kernel] = {}
+    made, others = dict[_Kernel, _Kernel](), replaced or {}
 
     def copy(one: _Kernel) -> _Kernel:
+        one = cast(_Kernel, others.get(one, one))
         if one in made:
             return made[one]
         old, changed = one.function, dict[str, Any]()
@@ -335,4 +344,8 @@ def with_constants(kernel: _Function, mark: str, **constants: Any) -> _Function:
         return made[one]
 
     assert isinstance(kernel, _Kernel)
-    return cast(_Function, copy(kernel))
+    out = copy(kernel)
+    for one in {*made, *others}:
+        if one in _KERNELS and not closure(cast(_Kernel, one)).isdisjoint(cast(Iterable[_Kernel], others)):
+            _KERNELS.remove(cast(_Kernel, one))  # a pattern, of which there will be no machine code
+    return cast(_Function, out)

@@ -50,7 +50,7 @@ A few lanes share the choice of an operation over several rows; twice the most l
 """
 
 
-class Room(NamedTuple):
+class Cells(NamedTuple):
     """First cell of each part, for p unknowns of which n are shared and l local."""
 
     own: int  # sources, whitening matrices and priors that each problem has to itself
@@ -77,6 +77,7 @@ class Room(NamedTuple):
 
 STATE = 10
 """Cells that a refinement keeps of every problem."""
+_EPSILON = float(np.finfo(float).eps)
 
 # Lanes of a block: as many as keep the cells that are used again and again (2**18 doubles, 2 MB) in the cache, and all
 # of them in bounds (64 MB). 64 lanes share the cost of choosing an operation; eight fill a vector register.
@@ -84,7 +85,7 @@ _LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
 
 
 @compiled
-def arrange(t: Tables, c: Numbers, size: int) -> Room:
+def arrange(t: Tables, c: Numbers, size: int) -> Cells:
     """Return where things stand for problems of p = `size` unknowns."""
     n, local, largest = t.shared, t.local, 0
     for i in range(t.groups, c.place.shape[0]):
@@ -107,7 +108,7 @@ def arrange(t: Tables, c: Numbers, size: int) -> Room:
     local_scale = own_local + local * local
     half = local_scale + local
     state = half + (n + 1) * local
-    return Room(
+    return Cells(
         own,
         observed,
         present,
@@ -144,6 +145,19 @@ def load(
 
 
 @compiled
+def blur_of(sigma: Array, size: Array, m: Array, room: Cells, lane: int, item: int) -> float:
+    """Return the rounding error of the whitened residuals: arrival times that count from long ago are coarse."""
+    row, squares = item if sigma.shape[0] > 1 else 0, 0.0
+    for i in range(sigma.shape[1]):
+        if not room.absent or m[room.present + i, lane] != 0.0:
+            ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
+            squares += ratio * ratio
+    # Four roundings, as in `optloc.solvers.refine`.
+    coarse = 4.0 * _EPSILON * np.sqrt(squares)
+    return coarse if np.isfinite(coarse) else 0.0
+
+
+@compiled
 def _fill(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
     row = item if source.shape[0] > 1 else 0
     for i in range(source.shape[1]):
@@ -162,7 +176,7 @@ def blocks(packed: Packed, size: int, count: int) -> int:
 
 
 @compiled
-def memory(t: Tables, room: Room, lanes: int) -> tuple[Array, Array]:
+def memory(t: Tables, room: Cells, lanes: int) -> tuple[Array, Array]:
     """Return cells and registers for a number of lanes."""
     return np.zeros((room.cells, lanes)), np.zeros((t.registers, max(LENGTH, lanes)))
 
@@ -220,7 +234,7 @@ def _rare(operation: int, r: Array, to: int, u: int, v: int, count: int) -> None
 
 
 @compiled
-def measure(t: Tables, common: Array, m: Array, r: Array, room: Room, packet: int, x: int, lanes: int) -> None:
+def measure(t: Tables, common: Array, m: Array, r: Array, room: Cells, packet: int, x: int, lanes: int) -> None:
     """Write derivatives and residuals of a packet: columns of the row's group, then the residual.
 
     Parameters
@@ -233,7 +247,7 @@ def measure(t: Tables, common: Array, m: Array, r: Array, room: Room, packet: in
         Memory; the rows of the packet are written to `room.rows`.
     r : array (registers, LENGTH)
         Registers.
-    room : Room
+    room : Cells
         Where things stand.
     packet : int
         Which rows.
@@ -361,7 +375,7 @@ def _mask(m: Array, value: int, present: int, lanes: int) -> None:
 
 
 @compiled
-def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, priors: bool, lanes: int) -> None:
+def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool, lanes: int) -> None:
     """Write the normal equations at `room.trial` into `room.after`.
 
     Parameters
@@ -374,7 +388,7 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, priors: bool, 
         Memory.
     r : array (registers, LENGTH)
         Registers.
-    room : Room
+    room : Cells
         Where things stand.
     priors : bool
         Whether Gaussian priors are added.
@@ -401,7 +415,7 @@ def clear(m: Array, first: int, count: int, lanes: int) -> None:
 
 
 @compiled
-def add_group(t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, lanes: int) -> None:
+def add_group(t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, lanes: int) -> None:
     """Add the whitened rows of a group to the equations in `room.after`."""
     line = t.group + group
     begin, size = t.table[line, GROUP_COLUMN], t.table[line, GROUP_ROWS]
@@ -412,7 +426,7 @@ def add_group(t: Tables, common: Array, place: Array, m: Array, room: Room, grou
 
 @compiled
 def whiten_group(
-    t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, residual: bool, lanes: int
+    t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, residual: bool, lanes: int
 ) -> int:
     """Whiten the rows of a group, or their residuals alone, and return the cell of the first."""
     line = t.group + group
@@ -491,7 +505,7 @@ def _square(
 
 @compiled
 def add_prior(
-    common: Array, place: int, size: int, m: Array, room: Room, x: int, start: int, last: int, lanes: int
+    common: Array, place: int, size: int, m: Array, room: Cells, x: int, start: int, last: int, lanes: int
 ) -> None:
     """Add a Gaussian prior of the `size` unknowns at cell x on, whose first column is `start`."""
     error, pull, to = room.error, room.error + size, room.after

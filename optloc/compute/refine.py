@@ -16,11 +16,12 @@ from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.equations import chunks, normal_at
 from optloc.compute.jit import compiled
 from optloc.compute.lanes import (
-    Room,
+    Cells,
     add_group,
     add_prior,
     arrange,
     blocks,
+    blur_of,
     clear,
     gather,
     load,
@@ -36,7 +37,6 @@ from optloc.linear.normal import OPEN, Normal
 _OK, LIMIT, _STALLED, NUMERICAL = (
     int(status) for status in (Status.OK, Status.MAX_ITERATIONS, Status.STALLED, Status.NUMERICAL)
 )
-_EPSILON = float(np.finfo(float).eps)
 
 
 class Rules(NamedTuple):
@@ -139,7 +139,7 @@ def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: in
 
 
 @compiled
-def begin(c: Numbers, m: Array, room: Room, tag: Array, used: int, item: Array, x: Array) -> None:
+def begin(c: Numbers, m: Array, room: Cells, tag: Array, used: int, item: Array, x: Array) -> None:
     """Bring the starts of empty lanes into them."""
     for b in range(used):
         if tag[FRESH, b] == EMPTY:
@@ -149,20 +149,7 @@ def begin(c: Numbers, m: Array, room: Room, tag: Array, used: int, item: Array, 
             for i in range(x.shape[1]):
                 m[room.trial + i, b] = x[start, i]
             m[room.state + DAMPING, b], m[room.state + GROWTH, b] = FIRST_DAMPING, FIRST_GROWTH
-            m[room.state + BLUR, b] = _blur(c.sigma, c.size, m, room, b, item[start])
-
-
-@compiled
-def _blur(sigma: Array, size: Array, m: Array, room: Room, lane: int, item: int) -> float:
-    """Return the rounding error of the whitened residuals: arrival times that count from long ago are coarse."""
-    row, squares = item if sigma.shape[0] > 1 else 0, 0.0
-    for i in range(sigma.shape[1]):
-        if not room.absent or m[room.present + i, lane] != 0.0:
-            ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
-            squares += ratio * ratio
-    # Four roundings, as in `optloc.solvers.refine`.
-    coarse = 4.0 * _EPSILON * np.sqrt(squares)
-    return coarse if np.isfinite(coarse) else 0.0
+            m[room.state + BLUR, b] = blur_of(c.sigma, c.size, m, room, b, item[start])
 
 
 @compiled
@@ -176,7 +163,7 @@ def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
 
 
 @compiled
-def _judge(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int) -> None:
+def _judge(m: Array, room: Cells, size: int, tag: Array, rules: Rules, used: int) -> None:
     """Take the places tried that are better, and set damping and status."""
     line = size + 1
     better, cost = room.state + BETTER, line * line - 1
@@ -197,7 +184,7 @@ def _judge(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int)
 
 
 @compiled
-def judge_trial(m: Array, room: Room, now: int, after: int, rules: Rules, b: int) -> int:
+def judge_trial(m: Array, room: Cells, now: int, after: int, rules: Rules, b: int) -> int:
     """Return the status of a lane after a step; say whether it is better and set the damping."""
     state = room.state
     better, small, stuck, m[state + DAMPING, b], m[state + GROWTH, b] = judge_lane(
@@ -218,7 +205,7 @@ def judge_trial(m: Array, room: Room, now: int, after: int, rules: Rules, b: int
 
 
 @compiled
-def _finish(m: Array, room: Room, tag: Array, lane: int, out: Answers) -> None:
+def _finish(m: Array, room: Cells, tag: Array, lane: int, out: Answers) -> None:
     """Write the answer of a lane."""
     start, size = tag[START, lane], out.x.shape[1]
     last = room.now + size * (size + 1)
@@ -232,7 +219,7 @@ def _finish(m: Array, room: Room, tag: Array, lane: int, out: Answers) -> None:
 
 
 @compiled
-def _advance(m: Array, room: Room, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
+def _advance(m: Array, room: Cells, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
     """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
     size, damping, gain = n + local, room.state + DAMPING, room.state + GAIN
     vector = room.now + size * (size + 1)
@@ -282,7 +269,7 @@ def refine_runs(packed: Packed, item: Array, first: int, last: int, rules: Rules
 
 
 @compiled
-def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) -> None:
+def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, lanes: int) -> None:
     """Write the cost at `room.trial`."""
     cost, last = room.state + TRIED, t.shared + t.local
     total = room.after + (last + 1) ** 2 - 1
@@ -303,7 +290,7 @@ def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) ->
 
 
 @compiled
-def _priors(t: Tables, c: Numbers, m: Array, room: Room, x: int, local: bool, epoch: int, lanes: int) -> None:
+def _priors(t: Tables, c: Numbers, m: Array, room: Cells, x: int, local: bool, epoch: int, lanes: int) -> None:
     """Add the priors of the shared unknowns, or of those of an epoch, to the equations in `room.after`."""
     for i in range(t.groups, c.place.shape[0]):
         if (c.place[i, PRIOR_LOCAL] == 1) == local:
@@ -313,7 +300,7 @@ def _priors(t: Tables, c: Numbers, m: Array, room: Room, x: int, local: bool, ep
 
 
 @compiled
-def _judge_run(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int) -> None:
+def _judge_run(m: Array, room: Cells, size: int, tag: Array, rules: Rules, used: int) -> None:
     """Take the places tried that are better, and set damping and status."""
     better, cost, tried = room.state + BETTER, room.state + COST, room.state + TRIED
     for b in range(used):
@@ -332,7 +319,7 @@ def _judge_run(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: 
 
 
 @compiled
-def _finish_run(m: Array, room: Room, tag: Array, lane: int, out: Answers) -> None:
+def _finish_run(m: Array, room: Cells, tag: Array, lane: int, out: Answers) -> None:
     """Write the answer of a lane."""
     start = tag[START, lane]
     out.cost[start], out.iterations[start] = m[room.state + COST, lane], tag[STEPS, lane]
@@ -342,7 +329,7 @@ def _finish_run(m: Array, room: Room, tag: Array, lane: int, out: Answers) -> No
 
 
 @compiled
-def _advance_run(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Array, damped: bool, used: int) -> None:
+def _advance_run(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, tag: Array, damped: bool, used: int) -> None:
     """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
     n, damping, gain = t.shared, room.state + DAMPING, room.state + GAIN
     vector = room.now + (n + t.local) * (n + t.local + 1)
@@ -366,7 +353,7 @@ def _advance_run(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Arr
 
 
 @compiled
-def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Array, summing: bool, lanes: int) -> None:
+def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, tag: Array, summing: bool, lanes: int) -> None:
     """Go through the epochs at `room.best`: sum up the shared system (in `room.now` undamped), or step their own."""
     n, local, last = t.shared, t.local, t.shared + t.local
     group, packet, line = 0, 0, last + 1
@@ -402,7 +389,7 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Array, sum
 
 
 @compiled
-def _own(m: Array, room: Room, tag: Array, n: int, local: int, epoch: int, lanes: int) -> None:
+def _own(m: Array, room: Cells, tag: Array, n: int, local: int, epoch: int, lanes: int) -> None:
     """Write the step of the unknowns of an epoch."""
     complete(m, room, n, local, lanes)
     vector, at = room.after + (n + local) * (n + local + 1) + n, n + epoch * local
@@ -414,7 +401,7 @@ def _own(m: Array, room: Room, tag: Array, n: int, local: int, epoch: int, lanes
 
 
 @compiled
-def _add(m: Array, room: Room, n: int, line: int, lanes: int) -> None:
+def _add(m: Array, room: Cells, n: int, line: int, lanes: int) -> None:
     """Add the damped sums of all epochs to what their unknowns cost them."""
     for i in range(n):
         for j in range(i + 1):

@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
-from optloc.compute.lanes import Room
+from optloc.compute.lanes import Cells
 
 # Scaled systems in the memory of a block of lanes.
 
@@ -98,14 +98,14 @@ def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -
 
 
 @compiled
-def step(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
+def step(m: Array, room: Cells, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
     """Write the damped step from `room.now` into `room.step`, zero where cell `ok` becomes 0.0.
 
     Parameters
     ----------
     m : array (cells, B)
         Memory.
-    room : Room
+    room : Cells
         Where things stand.
     n, local : int
         Numbers of shared and of local unknowns.
@@ -142,7 +142,7 @@ def step(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes:
 
 @compiled
 def factor_local(
-    m: Array, room: Room, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
+    m: Array, room: Cells, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
 ) -> None:
     """Factor the damped system of the local unknowns of equations at cell `source`; prepare what couples it."""
     line, half = n + local + 1, room.half
@@ -167,7 +167,7 @@ def factor_local(
 
 
 @compiled
-def eliminate(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+def eliminate(m: Array, room: Cells, n: int, local: int, lanes: int) -> None:
     """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
     half = room.half
     for a in range(local):
@@ -182,7 +182,7 @@ def eliminate(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
 
 
 @compiled
-def complete(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+def complete(m: Array, room: Cells, n: int, local: int, lanes: int) -> None:
     """Write the step of the local unknowns behind that of the shared ones; their system is factored."""
     own = room.step + n
     for a in range(local):
@@ -257,6 +257,50 @@ def solve_plain(lower: Array, inverse: Array, right: Array) -> None:
         for j in range(i + 1, n):
             for lane in range(LANES):
                 right[i, lane] -= lower[j, i, lane] * right[j, lane]
+
+
+# Share of its diagonal that a pivot must keep: an unknown that no row feels is left as it is.
+_FELT = 1e-13
+
+
+@compiled
+def eliminate_last(A: Array, right: Array, cost: Array, diagonal: Array, keep: int) -> None:
+    """Take the last unknowns from normal equations, the others at whatever values: what is left is about those.
+
+    Parameters
+    ----------
+    A : array (n, n, W)
+        Information below the diagonal. Overwritten: of the first `keep` unknowns the information that is left; row i of
+        an unknown that is taken holds ``-d x_i / d x_j`` for j < i.
+    right : array (n, W)
+        Right side; overwritten.
+    cost : array (W,)
+        Cost, which becomes the least over the unknowns that are taken.
+    diagonal : array (n, W)
+        Scratch.
+    keep : int
+        Unknowns that stay.
+    """
+    n = len(right)
+    for k in range(keep, n):
+        for lane in range(LANES):
+            diagonal[k, lane] = A[k, k, lane]
+    for k in range(n - 1, keep - 1, -1):
+        for lane in range(LANES):
+            felt = A[k, k, lane] > _FELT * diagonal[k, lane]
+            A[k, k, lane] = 1.0 / A[k, k, lane] if felt else 0.0
+            cost[lane] -= A[k, k, lane] * right[k, lane] * right[k, lane]
+        # from the last column down: what is overwritten is no longer needed
+        for i in range(k - 1, -1, -1):
+            share = diagonal[k]
+            for lane in range(LANES):
+                share[lane] = A[k, k, lane] * A[k, i, lane]
+                right[i, lane] -= share[lane] * right[k, lane]
+            for j in range(i + 1):
+                for lane in range(LANES):
+                    A[i, j, lane] -= share[lane] * A[k, j, lane]
+            for lane in range(LANES):
+                A[k, i, lane] = share[lane]
 
 
 # Linear algebra of symmetric 3x3 matrices and of small positive definite systems, as scalar code.

@@ -227,3 +227,10 @@ def variances(noise: Noise, count: int) -> Array:
     for block in noise.blocks:
         out[..., block.row] = np.diagonal(block.covariance, axis1=-2, axis2=-1)
     return out
+
+
+def whiten_rows(noise: tuple[Whitener, ...], values: Array) -> Array:
+    """Return whitened values (..., q, p) of values (..., m, p) of all rows, block under block."""
+    parts = [whitener.apply(values) for whitener in noise]
+    shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*shape, *part.shape[-2:])) for part in parts], axis=-2)

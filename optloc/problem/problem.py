@@ -119,6 +119,11 @@ class Problem:
         return _join([block.z for block in self.rows])
 
     @property
+    def correction(self) -> Array:
+        """Return the known amounts by which the measurements of all rows exceed the model, (..., m)."""
+        return _join([block.correction for block in self.rows])
+
+    @property
     def observed(self) -> Array:
         """Return the measurements of all rows less their known corrections, (..., m): what h(x) is compared with."""
         return _join([block.z - block.correction for block in self.rows])

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optloc.base.linalg import project_out
 from optloc.base.types import Array
 from optloc.linear.evaluate import block_links, columns
 from optloc.linear.normal import prior_parts, weighed
 from optloc.models import MODELS, Model
-from optloc.problem.noise import Whitener, variances, whiten
+from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.dispatch import NODES, code_of, named, width
 from optloc.proof.nodes.level import linear_numbers
@@ -150,38 +151,10 @@ def add_linear(made: Columns, rows: Array, origin: Array | None = None) -> list[
 # Least squares over a position alone: what else is unknown, and enters linearly, takes its best value.
 
 
-def whiten_rows(noise: tuple[Whitener, ...], values: Array) -> Array:
-    """Return whitened values (..., q, p) of values (..., m, p) of all rows, block under block."""
-    parts = [whitener.apply(values) for whitener in noise]
-    shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
-    return np.concatenate([np.broadcast_to(part, (*shape, *part.shape[-2:])) for part in parts], axis=-2)
-
-
 def roots(precision: Array) -> Array:
     """Return L' (..., n, n) with L L' a symmetric positive semidefinite precision."""
     values, vectors = np.linalg.eigh(precision)
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2))
-
-
-def project_out(unknowns: Array, values: Array) -> Array:
-    """Return values (..., q, p) less their projection onto the span of unknowns (..., q, n)."""
-    if not unknowns.shape[-1]:
-        return values
-    basis = span_of(unknowns)
-    # Twice: what rounding leaves of the first projection is as large as the values, and they may be large.
-    once = values - basis @ (np.swapaxes(basis, -1, -2) @ values)
-    return np.asarray(once - basis @ (np.swapaxes(basis, -1, -2) @ once))
-
-
-def span_of(unknowns: Array) -> Array:
-    """Return orthonormal columns (..., q, n) of the span of unknowns (..., q, n); zeros where some are dependent.
-
-    Columns are scaled to one length first; what then is shorter than 1e-12 counts as dependent.
-    """
-    length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
-    u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
-    # The rounding of a column that is a sum of others is some thousandth of that; what is dependent changes nothing.
-    return np.asarray(u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :])
 
 
 def compress(K: Array, w: Array) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
+from optloc.linear.vectors import vectors
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -15,7 +16,6 @@ from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, Entry, Formul
 from optloc.solvers.outside import given
 from optloc.solvers.pool import PART, begin, in_parts, where
 from optloc.solvers.single import at_once
-from optloc.solvers.starts.position import vectors
 from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
 
 __all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Method", "given", "solve", "vectors"]

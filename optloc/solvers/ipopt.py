@@ -18,6 +18,7 @@ from optloc.compute.sums import equations_at
 from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
 from optloc.linear.normal import decrement, prior_parts, step, weighed
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
+from optloc.linear.vectors import complete
 from optloc.linear.walks import chain_at, places, walks
 from optloc.problem.fix import Stage
 from optloc.problem.noise import whiten
@@ -26,7 +27,7 @@ from optloc.solvers.inequalities import without_broken
 from optloc.solvers.pool import Pool, begin, offer
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.block_averages import average_blocks
-from optloc.solvers.starts.position import complete, registrable, spread_of
+from optloc.solvers.starts.position import registrable, spread_of
 from optloc.solvers.starts.registration import BLOCKS, group_alike
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle

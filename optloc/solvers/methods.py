@@ -23,9 +23,9 @@ from optloc.solvers.certify.admitted import certified, value_certified
 from optloc.solvers.certify.branch_and_bound import claims_before, tried_before
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
+from optloc.solvers.planned import Quick
 from optloc.solvers.policy import LISTED_GAP
 from optloc.solvers.pool import Pool, offer, pack, where
-from optloc.solvers.range_fixes import Quick, at_hand
 from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
@@ -242,7 +242,7 @@ class Method:
             name = "+".join(words)
             if shortcut(self):
                 return [_named(name, replace(short, alone=True))]
-            if at_hand(count) and self.words[: len(words)] == words:
+            if self.words[: len(words)] == words:
                 return [_named(name, short), *map(_stage, self.words[len(words) :])]
         return [_stage(word) for word in self.words]
 

@@ -11,12 +11,13 @@ import numpy as np
 
 from optloc.base.errors import NUMERICAL, InvalidProblem
 from optloc.base.types import Array
+from optloc.engine.plan import Plan, plan_of
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve, solve_in_stages
 from optloc.solvers.methods import Method, shortcut
-from optloc.solvers.range_fixes import Direct, at_hand, direct, settle_directly
+from optloc.solvers.planned import settle_directly
 from optloc.solvers.single import Single, is_few, single
 from optloc.solvers.verdict.judge import verdict
 
@@ -31,21 +32,21 @@ class Prepared:
         What it was prepared from; its own measurements do not matter.
     method : str
         As of `optloc.solve`.
-    direct : Direct, optional
-        What fixes its measurements directly; None where they take the stages of the method.
-    place : array (B, stations, d)
-        Positions of all stations, metres.
+    plan : Plan, optional
+        What fixes its measurements; None where they take the stages of the method.
     shape : tuple of int
         Batch axes that the problem has without its measurements.
+    count : int
+        Rows.
     short : Single, optional
         What fixes few sets of measurements past all batches, where there is such a way.
     """
 
     problem: Problem
     method: str
-    direct: Direct | None
-    place: Array
+    plan: Plan | None
     shape: tuple[int, ...]
+    count: int
     short: Single | None
 
     def __call__(self, z: Any) -> Fix:
@@ -83,20 +84,16 @@ class Prepared:
                 if fix is not None:
                     return fix
         # nothing is ready: the stages of the method do it as ever
-        if self.direct is None or not at_hand(prod(shape)):
+        if self.plan is None or not self.plan.at_hand(prod(shape)):
             wide = np.broadcast_to(values, (*shape, values.shape[-1]))
             return solve_in_stages(self.problem.with_rows(z=wide), Method.parse(self.method))
-        flat = np.broadcast_to(values, (*shape, values.shape[-1])).reshape(-1, values.shape[-1])
-        place = self.place
-        if len(place) > 1:
-            wide = np.broadcast_to(place.reshape(*self.shape, *place.shape[1:]), (*shape, *place.shape[1:]))
-            place = wide.reshape(-1, *place.shape[1:])
+        flat = self._flat(values, shape)
         try:
-            pool = settle_directly(self.direct, flat, place, lambda items: self._flat(values, shape).take(items))
-            fix = verdict(self._flat(values, shape), pool)
+            pool = settle_directly(self.plan, self.plan.rows(flat), flat.z, self.plan.places(flat), flat.take)
+            fix = verdict(flat, pool)
         except NUMERICAL:
             # one of them fails: which one is told where all take the stages
-            return solve(self._flat(values, shape), self.method).reshape(shape)
+            return solve(flat, self.method).reshape(shape)
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:
@@ -107,7 +104,9 @@ class Prepared:
 
     def _batch(self, z: Array) -> tuple[int, ...]:
         """Return the batch axes of the answer."""
-        count = self.problem.count
+        count = self.count
+        if z.shape == (count,):
+            return self.shape
         if z.ndim == 0 or z.shape[-1] != count:
             raise InvalidProblem(
                 f"z has shape {z.shape}, and the problem has {count} rows",
@@ -151,10 +150,8 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     # without measurements, so that nothing prepared can depend on them
     bare = problem.with_rows(z=np.zeros(problem.count))
-    ready = short = None
+    plan = short = None
     with suppress(*NUMERICAL):  # the stages tell which of its fixes fails
-        ready = direct(bare) if shortcut(parsed) and not separable(bare) else None
+        plan = plan_of(bare) if shortcut(parsed) and not separable(bare) else None
         short = single(bare, parsed)
-    position = problem.stations.position
-    place = position.reshape(-1, *position.shape[-2:])
-    return Prepared(bare, method, ready, place, bare.batch_shape, short)
+    return Prepared(bare, method, plan, bare.batch_shape, bare.count, short)

@@ -12,6 +12,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.compute.sums import summed
 from optloc.linear.normal import Normal, covariance, eliminated, with_priors
+from optloc.linear.vectors import complete
 from optloc.linear.walks import walks
 from optloc.problem.epochs import cut, joined, tied, window
 from optloc.problem.fix import Fix
@@ -20,7 +21,6 @@ from optloc.problem.problem import Problem
 from optloc.solvers.pool import begin
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
-from optloc.solvers.starts.position import complete
 from optloc.solvers.verdict.judge import verdict
 
 # One standard deviation: the sums then err by thousandths of it.

@@ -22,6 +22,9 @@ from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.compute.jit import usable
+from optloc.engine.memory import Answer
+from optloc.engine.plan import LIMIT, TOLERANCE, Plan, is_planned, key_of, plan_of
+from optloc.engine.shape import STRAIGHT
 from optloc.problem.chart import Chart, quantile
 from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable
@@ -35,17 +38,8 @@ from optloc.solvers.certify.branch_and_bound import METHOD, budgets, certify_sta
 from optloc.solvers.certify.position_cost import agrees
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.methods import Method
+from optloc.solvers.planned import direct_stages
 from optloc.solvers.policy import COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
-from optloc.solvers.range_fixes import (
-    LIMIT,
-    TOLERANCE,
-    Direct,
-    direct,
-    direct_stages,
-    is_direct,
-    kernel_for,
-    key_of,
-)
 from optloc.solvers.verdict.findings import (
     BENT_SENTENCE,
     NO_PROOF,
@@ -90,7 +84,7 @@ class _Room:
     z : array (n, m)
         Measurements.
     found : tuple of array
-        Fields of `optloc.compute.range_start.Answer`, without position and covariance.
+        Fields of `optloc.engine.memory.Answer`, without position and covariance.
     costs : PositionCosts
         With the whitened measurements; empty without a proof.
     asked, answered : Asked, Answered
@@ -127,11 +121,11 @@ class Single:
     ----------
     problem : Problem
         What it was made of; its own measurements do not matter.
-    direct : Direct
+    plan : Plan
         What fixes it.
-    model : Model
-        The maps of `direct`, as machine code takes them.
-    station : array (1, s, d)
+    rows : named tuple
+        Rows of the plan.
+    place : array (1, s, d)
         Stations that take part, metres.
     map : Affine, optional
         Of the costs of the proof; None for methods without one.
@@ -149,9 +143,9 @@ class Single:
     """
 
     problem: Problem
-    direct: Direct
-    model: Any
-    station: Array
+    plan: Plan
+    rows: Any
+    place: Array
     map: Affine | None
     absent: Array | None
     centre: Array
@@ -166,31 +160,28 @@ class Single:
 
         None where only the long way knows what to say of one of them.
         """
-        from optloc.compute.range_start import Answer
-
-        began, shape = perf_counter(), z.shape[:-1]
+        began, shape, plan = perf_counter(), z.shape[:-1], self.plan
         n = prod(shape)
-        kernel = kernel_for(n, often=self.often)
+        kernel = plan.kernel(n, often=self.often)
         if not usable(kernel, n) or (self.map is not None and lacks_code(n)):
             return None
-        room = self._room(shape)
+        room, size, shared = self._room(shape), plan.size, plan.shared
         room.z[:] = z
         if self.absent is not None:
             room.z[:, self.absent] = 0.0
-        d = self.station.shape[-1]
-        x, covariance = np.empty((n, self.direct.layout.size)), np.empty((n, d, d))
-        answer = Answer(x, covariance, *room.found)
-        steps = kernel(self.model, room.z, self.station, TOLERANCE, LIMIT, False, answer)
+        answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *room.found)
+        steps = kernel(plan.model, self.rows, room.z, self.place, TOLERANCE, LIMIT, False, answer)
         costs = answer.cost.tolist()
         for cost, settled, rival in zip(costs, answer.settled.tolist(), answer.rival_cost.tolist(), strict=True):
             if not settled or rival < np.inf or not cost <= self.doubt:
                 return None
+        x = answer.x
         if room.many is not None and is_hidden(room.many, x).any():  # the stages say what lies behind the Earth
             return None
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
         if self.map is not None:
-            if not self._proves(self.map, x[:, :d], costs, room):
+            if not self._proves(self.map, x[:, : self.place.shape[-1]], costs, room):
                 return None
             stages = (*stages, certify_stage(f"{n} global", fixed))
         fix = self._judge(shape, answer, costs, stages, room)
@@ -233,13 +224,15 @@ class Single:
         marks, kinds = [], []
         for cost, bent, least in zip(costs, answer.kappa.tolist(), answer.infinity.tolist(), strict=True):
             more = least - cost
+            if bent[0] > STRAIGHT and more != more:  # nobody has looked at infinity  # noqa: PLR0124
+                return None
             marks.append(marks_of(cost > self.refuted, more, self.region, np.inf, bent[0], self.map is not None))
             kinds.append(chart_kind(*bent))
         told = _told(tuple(marks), tuple(kinds), shape)
         if told is None:
             return None
         x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
-        cost, claims = answer.cost.reshape(shape).copy(), room.claims
+        cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.place.shape[-1]
         if self.map is not None:
             bound, boxes = room.answered.bound.reshape(shape).copy(), room.answered.boxes.reshape(shape).copy()
             claims = Claims(
@@ -255,7 +248,7 @@ class Single:
             cost=cost,
             stages=stages,
             marks=told.marks,
-            chart=Chart(told.kind, x[..., : covariance.shape[-1]], covariance, room.centre),
+            chart=Chart(told.kind, x[..., :d], covariance[..., :d, :d], room.centre),
             infinity=answer.infinity.reshape(shape) - cost,
             **room.kept,
         )
@@ -272,7 +265,7 @@ class Single:
         return rooms[shape]
 
     def _make_room(self, shape: tuple[int, ...]) -> _Room:
-        n, size, d, m = max(1, *shape, 1), self.direct.layout.size, self.station.shape[-1], self.problem.count
+        n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.place.shape[-1], self.problem.count
         found = (
             np.empty(n),
             np.empty(n, dtype=np.bool_),
@@ -302,12 +295,12 @@ class Single:
         costs = PositionCosts(kinds, data, K, np.empty((n, K.shape[1])), np.full(n, np.inf))
         centre = np.broadcast_to(self.centre, (*shape, d))
         kept = {
-            "layout": self.direct.layout,
-            "frame": self.direct.frame,
+            "layout": self.plan.layout,
+            "frame": self.plan.frame,
             "alternatives": Alternatives(np.empty((*shape, 0, size)), np.empty((*shape, 0))),
             # views that nobody can write into
-            "dof": np.broadcast_to(np.int32(self.direct.dof), shape),
-            "weights": np.broadcast_to(self.direct.weight, (*shape, m)),
+            "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
+            "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
             "active": np.broadcast_to(_NOTHING, shape),  # constraints that hold fixes: none
             "reach": np.broadcast_to(centre_and_spread(self.problem.stations.places)[1].reshape(()), shape),
         }
@@ -354,14 +347,12 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     often : bool
         As of `Single`.
     """
-    from optloc.compute.range_start import Model
-
     proves = _WORDS.get(method.words)
     if proves is None or (method.then is not None and not proves) or separable(problem):
         return None
     bare = _alone(problem)
-    ready = None if bare.batch_shape else direct(bare)
-    if ready is None or (proves and (unsupported(bare) or is_run(bare))):
+    plan = None if bare.batch_shape else plan_of(bare)
+    if plan is None or (proves and (unsupported(bare) or is_run(bare))):
         return None
     affine = affine_costs(bare) if proves else None
     if proves and affine is None:
@@ -369,14 +360,14 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     weight, d = bare.weight, problem.dimension
     return Single(
         bare,
-        ready,
-        Model(*ready.maps),  # type: ignore[arg-type]
-        np.require(bare.stations.position[:, ready.station], dtype=float, requirements=["C", "W"]),
+        plan,
+        plan.rows(bare),
+        np.require(plan.places(bare), dtype=float, requirements=["C", "W"]),
         affine,
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),
-        largest(ready.dof, DOUBT),
-        largest(ready.dof, REFUTED),
+        largest(plan.dof, DOUBT),
+        largest(plan.dof, REFUTED),
         quantile(COVERED, d),
         often,
     )
@@ -387,11 +378,10 @@ def _alone(problem: Problem) -> Problem:
     bare = problem.with_rows(z=np.zeros(problem.count))
     if not bare.batch_shape or prod(bare.batch_shape) > 1:
         return bare
-    # what has a direct way has batch axes of its stations alone, of which only the places matter
-    place = bare.stations.position
-    return replace(
-        bare, stations=replace(bare.stations, position=place.reshape(place.shape[-3:]), velocity=None, axes=None)
-    )
+    # what has a plan has batch axes of its stations alone
+    place, rates = bare.stations.position, bare.stations.velocity
+    rates = None if rates is None else rates.reshape(rates.shape[-3:])
+    return replace(bare, stations=replace(bare.stations, position=place.reshape(place.shape[-3:]), velocity=rates))
 
 
 # What fixes one problem is made in two milliseconds and takes some 50 kB.
@@ -404,10 +394,12 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
     What does not depend on the measurements is kept for the next problem of the same structure.
     """
     shape, place = problem.batch_shape, problem.stations.position
-    if not is_few(shape) or place.size != prod(place.shape[-3:]) or not is_direct(problem):
+    if not is_few(shape) or place.size != prod(place.shape[-3:]) or not is_planned(problem):
         return None
     with suppress(*NUMERICAL):  # the stages tell which of them fails
-        ready = _KEPT.find((method, place.tobytes(), *key_of(problem)), lambda: single(problem, method))
+        rates = problem.stations.velocity
+        numbers = (place.tobytes(), None if rates is None else rates.tobytes())
+        ready = _KEPT.find((method, *numbers, *key_of(problem)), lambda: single(problem, method))
         if ready is not None:
             z = problem.z
             return ready(z if z.shape[:-1] == shape else np.broadcast_to(z, (*shape, z.shape[-1])))

@@ -17,6 +17,7 @@ from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.normal import decrement, step
+from optloc.linear.vectors import hold_still, vectors
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
@@ -29,13 +30,11 @@ from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.position import (
     along_the_valley,
-    hold_still,
     mirror,
     one_position,
     registrable,
     spread_of,
     subarray_starts,
-    vectors,
 )
 from optloc.solvers.starts.registration import step_beside
 from optloc.solvers.starts.several_positions import from_pieces
@@ -117,7 +116,7 @@ def gtrs_lsr(problem: Problem, pool: Pool | None) -> Pool:
     return lsr_with_mirror(problem, gtrs(problem, pool))
 
 
-def lsr_with_mirror(problem: Problem, start: Pool, descend: Callable[[Problem, Array], Array] | None = None) -> Pool:
+def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
     """Return starts and their mirror images, refined.
 
     The image in the plane (or line) that fits the stations best is where flat networks have their second minimum; one
@@ -129,9 +128,6 @@ def lsr_with_mirror(problem: Problem, start: Pool, descend: Callable[[Problem, A
         N problems.
     start : Pool
         Starts.
-    descend : callable, optional
-        Moves positions (N, 2 q, d), starts and then images, to the minima that refinement leads to, more quickly; NaN
-        where it leads to none, or an image to the minimum of its start.
     """
     if not one_position(problem):
         return lsr(problem, start)
@@ -139,10 +135,6 @@ def lsr_with_mirror(problem: Problem, start: Pool, descend: Callable[[Problem, A
     position = start.x[..., slot.start : slot.start + slot.size]
     image = mirror(problem, position)
     x = np.concatenate([start.x, vectors(problem, image)], axis=1)
-    if descend is not None:
-        q, ahead = start.x.shape[1], vectors(problem, descend(problem, np.concatenate([position, image], axis=1)))
-        # starts that lead nowhere are the refinement's to judge
-        x = np.where(np.isnan(ahead) & (np.arange(2 * q) < q)[:, None], x, ahead)
     x = pack(x)
     both = replace(offer(problem, x, start, "", perf_counter()), stages=start.stages)
     # where an image runs to infinity its cost is one of many there, and not the least: nobody has looked

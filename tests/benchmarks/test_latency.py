@@ -14,10 +14,10 @@ from monte_carlo.tables import write
 
 from optloc import Motion, assemble, measured, prepare, solve
 from optloc.compute.jit import enabled
-from optloc.compute.range_fixes import few_fixes
-from optloc.compute.range_start import Answer
+from optloc.engine.fixes import fix_few_ranges
+from optloc.engine.memory import Answer
+from optloc.engine.plan import LIMIT, TOLERANCE
 from optloc.proof.batch import prove_here
-from optloc.solvers.range_fixes import LIMIT, TOLERANCE
 from optloc.track import State, polynomial, predicted
 from optloc.track.track import scan_at, take_scan
 from optloc.track.updates import filter_of
@@ -85,7 +85,7 @@ def kernels(place):
 
     def work(i):
         room.z[0] = z[i]
-        few_fixes(short.model, room.z, short.station, TOLERANCE, LIMIT, False, answer)
+        fix_few_ranges(short.plan.model, short.rows, room.z, short.place, TOLERANCE, LIMIT, False, answer)
         short.map.write(z[i], room.costs.w[0])
         room.asked.x[0] = x[0]
         prove_here(room.costs, room.asked, room.answered)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from proof.sampling import many
 
+from optloc.base.linalg import project_out
 from optloc.compute.jit import plain
 from optloc.proof.box import bound_nodes, rounding
 from optloc.proof.nodes.node import PHI, RANGE
-from optloc.proof.position_costs import project_out
 from optloc.proof.search_space import chart_on, cost_of, empty_box, place
 
 _NEAREST, _FARTHEST = -3.0, 4.0  # tenth powers of standard deviations from the fix to the places that are looked at

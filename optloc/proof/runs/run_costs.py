@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optloc.base.linalg import project_out, span_of
 from optloc.base.types import Array
 from optloc.compute.jit import plain, usable
 from optloc.linear.normal import prior_parts, weighed
@@ -24,9 +25,7 @@ from optloc.proof.position_costs import (
     counts_from_measured,
     mark_nodes,
     position_prior,
-    project_out,
     roots,
-    span_of,
     turned_level,
 )
 from optloc.proof.runs.ground import STRAIGHT, Ground

@@ -27,6 +27,7 @@ from optloc.linear.constraints import (
     restore,
     violation_names,
 )
+from optloc.linear.vectors import vectors
 from optloc.problem.claims import GLOBAL, REGION, Claims, untried
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
@@ -62,7 +63,6 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, in_parts, offer, pack, where
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
-from optloc.solvers.starts.position import vectors
 from optloc.solvers.verdict.judge import failed, fill, judge, verdict
 from optloc.solvers.verdict.minima import settle
 

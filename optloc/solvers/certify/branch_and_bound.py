@@ -13,6 +13,7 @@ from optloc.base.records import change, overwrite, present, take
 from optloc.base.types import Array, Certificate
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
+from optloc.linear.vectors import vectors
 from optloc.problem.chart import quantile
 from optloc.problem.claims import GLOBAL, PROOFS, REGION, UNKNOWN, Claims, claim, untried
 from optloc.problem.fix import Fix, Stage
@@ -40,7 +41,6 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, TriedBefore, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
-from optloc.solvers.starts.position import vectors
 from optloc.solvers.verdict.judge import judge, standing
 
 # What a proof lets a certificate say, in sentences.

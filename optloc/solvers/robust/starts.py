@@ -12,6 +12,7 @@ from optloc.linear.constraints import exact
 from optloc.linear.courses import elapsed
 from optloc.linear.normal import depends_on_place, weighed
 from optloc.linear.redundancy import degrees_of_freedom
+from optloc.linear.vectors import vectors
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import independent, variances
 from optloc.problem.problem import Problem
@@ -19,7 +20,7 @@ from optloc.solvers.pool import Pool, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
-from optloc.solvers.starts.position import one_position, registrable, rows_of_stations, vectors
+from optloc.solvers.starts.position import one_position, registrable, rows_of_stations
 from optloc.solvers.starts.registration import mirror_courses, split_epochs
 from optloc.solvers.verdict.judge import judge, standing
 

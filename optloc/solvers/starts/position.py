@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -11,12 +10,10 @@ from formulations.range_height import Ellipsoid, ellipsoid, locate, locate_by_ra
 from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Band
-from optloc.linear.evaluate import block_links, columns, predict
+from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.models import MODELS, Model
 from optloc.models.primitives import WGS84_A, WGS84_F
-from optloc.problem.layout import emission_name
 from optloc.problem.problem import Problem
-from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
 from optloc.solvers.starts.squared_range import Pick, candidates, every
 
 # Where other minima are looked for beside a badly determined fix. With these places the Monte Carlo of cases in
@@ -129,86 +126,6 @@ def rows_of_stations(problem: Problem) -> Array:
         taken = MODELS[rows.kind].stations
         parts.append(((rows.a == every) & (taken > 0)) | ((rows.b == every) & (taken > 1)))
     return np.concatenate(parts, axis=1)
-
-
-def vectors(problem: Problem, position: Array | None) -> Array:
-    """Return full parameter vectors (N, q, size) with given positions and every other unknown at its prior mean.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems.
-    position : array (N, q, d or more), optional
-        Of the only target, with what of its state follows; None: vectors (N, size) without any state.
-    """
-    layout = problem.layout
-    x = np.zeros(((problem.batch_shape[0],) if position is None else position.shape[:-1]) + (layout.size,))
-    means = [(prior.name, prior.mean) for prior in problem.priors]
-    means += [(bias.name, np.ravel(bias.mean)) for bias in problem.biases if bias.sigma is not None]
-    for name, mean in means:
-        slot, shared = layout.find(name)
-        if shared:
-            each = mean if mean.ndim == 1 or position is None else mean[:, None]
-            x[..., slot.start : slot.start + slot.size] = each
-    if position is not None:
-        slot, _ = layout.find("position")
-        x[..., slot.start : slot.start + position.shape[-1]] = position
-        x = _fit_emission_times(problem, x) if problem.emitting else x
-    return x
-
-
-def complete(problem: Problem, shared: Array) -> Array:
-    """Return full parameter vectors (N, q, size) of shared unknowns (N, q, n): local ones as fit them, or zero."""
-    x = np.zeros((*shared.shape[:-1], problem.layout.size))
-    x[..., : shared.shape[-1]] = shared
-    x[np.isnan(shared).any(-1)] = np.nan
-    return _fit_emission_times(problem, x) if problem.emitting else x
-
-
-def _fit_emission_times(problem: Problem, x: Array) -> Array:
-    """Return vectors (N, q, size) with the emission times that fit their positions: the mean of what is left over."""
-    size, q = x.shape[:2]
-    part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, x.shape[-1]).copy()
-    usable = np.asarray(np.isfinite(out).all(-1))
-    left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
-    present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
-    # an emission enters each of its rows with factor one: the mean of the rest fits it; one nobody hears stays zero
-    for links, start in zip(block_links(problem), problem.starts, strict=True):
-        own = np.isin(links.adds.column, emissions) & links.model.emission
-        column, rows = links.adds.column[own], start + links.adds.row[own]
-        heard, total = np.zeros(out.shape), np.zeros(out.shape)
-        np.add.at(heard, (..., column), present[:, rows])  # type: ignore[arg-type]
-        np.add.at(total, (..., column), np.where(present[:, rows], left[:, rows], 0.0))  # type: ignore[arg-type]
-        out += np.where(usable[:, None], total / np.maximum(heard, 1.0), 0.0)
-    return out.reshape(size, q, -1)
-
-
-def emission_columns(problem: Problem) -> Array:
-    """Return the columns of all emission times in the full parameter vector."""
-    names = [emission_name(target, len(problem.motions)) for target in problem.emitting]
-    return np.concatenate([columns(problem.layout, name, np.arange(problem.epochs)).ravel() for name in names])
-
-
-def hold_still(problem: Problem) -> Problem:
-    """Return the problem of the position alone: one static target, nothing else unknown but emission times."""
-    motions = tuple(replace(motion, order=0) for motion in problem.motions)
-    return replace(without_biases(problem), motions=motions)
-
-
-def without_biases(problem: Problem) -> Problem:
-    """Return a flat batch of problems without biases and priors: what is unknown of them is known as its prior mean.
-
-    Offsets, drifts and scales without a prior are taken for zero, rotations always are.
-    """
-    x, rows = vectors(problem, None), []
-    for links, block in zip(block_links(problem), problem.rows, strict=True):
-        gain, added = links.gains.total(x, block.count), links.adds.total(x, block.count)
-        # a row says z = (1 + gain) h(x) + added + correction: solved for h(x)
-        z = (block.z - block.correction - added) / (1.0 + gain)
-        # rows that no bias touches stay as they are, to the last bit
-        known = replace(block, z=z, correction=np.zeros(block.count))
-        rows.append(known if gain.any() or added.any() else block)
-    return replace(problem, rows=tuple(rows), biases=(), priors=())
 
 
 # The size of a problem: numbers of order one are what solvers need.

@@ -14,8 +14,10 @@ from optloc.base.types import Array, Bias, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.courses import elapsed
 from optloc.linear.evaluate import block_links
+from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.linear.normal import covariance, prior_parts
 from optloc.linear.redundancy import degrees_of_freedom
+from optloc.linear.vectors import complete, vectors
 from optloc.linear.walks import places, state_of, walks
 from optloc.problem.clocks import greville, rate_name
 from optloc.problem.epochs import by_epoch, untied
@@ -23,8 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.refine import refine
 from optloc.solvers.starts.block_averages import average_blocks
-from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
-from optloc.solvers.starts.position import complete, distance_of, spread_of, vectors
+from optloc.solvers.starts.position import distance_of, spread_of
 
 BLOCKS = 30
 """Blocks that a run is averaged over: far more rows than unknowns, at a cost that does not grow with the run. Fewer and

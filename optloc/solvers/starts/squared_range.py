@@ -13,16 +13,14 @@ from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
-from optloc.models import MODELS, LiftedRow, Point, lifted_row
+from optloc.engine.lifts import Entry, Known, azimuths_beside, enter, pair_elevation
+from optloc.linear.least_squares_ranges import Ranges
+from optloc.models import MODELS, Point
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
-from optloc.solvers.starts.least_squares_ranges import Ranges
 
 Factor = Callable[[Array | None], Array]
 """Maps points (N, d), or None, to the error of a row per unit of error of its measurement, (N, m)."""
-
-Row = tuple[Array, Array, Factor]
-"""Coefficients (N or 1, m, d + 1), right sides (N or 1, m), and factor of the rows of one kind."""
 
 # Scaled distance, and factor, below which a row is weighed as if it were there: an answer on a station, or on the line
 # of a bearing's singularity, must not give one row all the weight. A thousandth of the network is nearer than any start
@@ -294,26 +292,41 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
     if model.ranges is not None or model.lifted is None:
         return None
     a, b = (_point(problem, rows, index, to) for index in (rows.a, rows.b))
-    m = rows.z - rows.correction
-    azimuth, paired = _azimuth_beside(problem, rows) if rows.kind == "elevation" else (None, None)
-    # without ranges the paired form is the only linear one; with some, only where every elevation has its azimuth
-    if azimuth is not None and (found is None or bool(np.all(paired))):
-        made: Row | None = _pair_elevation(m, azimuth, a)
+    m, paired = rows.z - rows.correction, None
+    beside = azimuths_beside(problem, rows) if rows.kind == "elevation" else None
+    if beside is not None:
+        # an absent elevation is taken for present: it needs no azimuth
+        paired = (problem.weight[..., beside] > 0.0) | (rows.weight == 0.0)
+        # without ranges the paired form is the only linear one; with some, only where every elevation has its azimuth
+        paired = paired if found is None or bool(np.all(paired)) else None
+    if paired is not None:
+        entry: Entry | None = pair_elevation(m, problem.observed[..., beside], a)
     else:
-        lifted = lifted_row(model, m, a, b)
-        assert lifted is not None
-        made, paired = _substitute(lifted, rows, a, b, found, to), None
-    if made is None:
+        known = None if found is None else _known(found, rows, to)
+        entry = enter(model, m, a, b, known)
+    if entry is None:
         return None
-    row, right, factor = made
     size = problem.batch_shape[0]
-    row, right = np.broadcast_to(row, (size, *row.shape[-2:])), np.broadcast_to(right, (size, right.shape[-1]))
+    row, right = _wide([*entry.x, entry.last], size, rows.count), _wide([entry.right], size, rows.count)[..., 0]
     weight = np.broadcast_to(rows.weight, right.shape)
     present = (weight > 0.0) & (True if paired is None else paired)
+    if ((np.isnan(row).any(-1) | np.isnan(right)) & present & np.isfinite(m)).any():
+        return None  # a range stays unknown
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
     # a row of weight w counts as one of variance sigma^2 / w; absent ones have zero coefficients
     sigma = sigma / np.sqrt(np.where(present, weight, 1.0))
+
+    def factor(point: Array | None) -> Array:
+        if point is None:
+            return np.ones(1)
+        return np.asarray(entry.factor(Point(tuple(point[:, None, c] for c in range(point.shape[-1])))))
+
     return Lifted(np.where(present[..., None], row, 0.0), np.where(present, right, 0.0), sigma, factor)
+
+
+def _wide(parts: list[Any], size: int, count: int) -> Array:
+    """Return numbers side by side, (N, m, parts)."""
+    return np.stack([np.broadcast_to(part, (size, count)) for part in parts], axis=-1)
 
 
 def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point:
@@ -329,82 +342,17 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
     return Point(components, None, tuple(tuple(axes[..., i, c] for c in d) for i in d))
 
 
-def _azimuth_beside(problem: Problem, rows: Rows) -> tuple[Array | None, Array | None]:
-    """Return the azimuth beside each elevation (same station, target and epoch), (..., m), and where it is present.
-
-    None if any has no such row. An absent elevation is taken for present: it needs no azimuth.
-    """
-    for other in problem.rows:
-        if other.kind != "azimuth":
-            continue
-        keys = list(zip(other.a.tolist(), other.epoch.tolist(), other.target.tolist(), strict=True))
-        wanted = list(zip(rows.a.tolist(), rows.epoch.tolist(), rows.target.tolist(), strict=True))
-        pick = [keys.index(key) for key in wanted if key in keys]
-        if len(pick) == len(wanted):
-            there = (other.weight[..., pick] > 0.0) | (rows.weight == 0.0)
-            return np.asarray(other.z[..., pick] - other.correction[..., pick]), np.asarray(there)
-    return None, None
-
-
-def _pair_elevation(m: Array, azimuth: Array, a: Point) -> Row:
-    """Return [sin E cos A, sin E sin A, -cos E] . (x - s) = 0 in the station's axes; its error is range times n_E."""
-    # the normal of the cone of elevation m in the measured azimuth: at right angles to the line of sight
-    local = (np.sin(m) * np.cos(azimuth), np.sin(m) * np.sin(azimuth), -np.cos(m))
-    basis = a.axes or tuple(tuple(float(i == j) for j in range(3)) for i in range(3))
-    normal = [sum(local[i] * basis[i][c] for i in range(3)) for c in range(3)]
-    place = np.stack(np.broadcast_arrays(*a.position), axis=-1)
-    row = np.stack(np.broadcast_arrays(*normal), axis=-1)
-
-    def factor(point: Array | None) -> Array:
-        return np.ones(1) if point is None else np.asarray(np.linalg.norm(point[:, None] - place, axis=-1))
-
-    return np.concatenate([row, np.zeros((*row.shape[:-1], 1))], axis=-1), (row * place).sum(-1), factor
-
-
-def _substitute(lifted: LiftedRow, rows: Rows, a: Point, b: Point, found: Ranges | None, to: Coordinates) -> Row | None:
-    """Return a lifted row with its ranges replaced by c + sign t, or None where a range stays unknown."""
-    d = len(a.position)
-
-    def factor(point: Array | None) -> Array:
-        if point is None:
-            return np.ones(1)
-        return np.asarray(lifted.factor(Point(tuple(point[:, None, c] for c in range(d))), a, b))
-
-    shape = np.broadcast_shapes(*(np.shape(v) for v in (*a.position, lifted.ra, lifted.rb, lifted.constant)))
-    # a gain ratio has no term in x: only its ranges tell of the place
-    x = [np.broadcast_to(v, shape) for v in (lifted.x or (0.0,) * d)]
-    last, constant = np.zeros(shape), np.broadcast_to(lifted.constant, shape)
-    terms = [(c, index) for c, index in ((lifted.ra, rows.a), (lifted.rb, rows.b)) if np.any(c != 0.0)]
-    if terms and found is None:
-        return _squared_ratio(lifted, a, b, factor) if lifted.x is None else None
-    for coefficient, index in terms:
-        assert found is not None
-        node = [_node(found, int(s), int(e)) for s, e in zip(index, rows.epoch, strict=True)]
-        if min(node) < 0:
-            return None
+def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[Known, Known]:
+    """Return the ranges of both ends of rows, scaled; NaN where one stays unknown."""
+    both = []
+    for index in (rows.a, rows.b):
+        node = np.array([_node(found, int(s), int(e)) for s, e in zip(index, rows.epoch, strict=True)])
+        offset = np.where(node >= 0, found.offset[:, node], np.nan) / to.scale[:, None]
         # on the paraboloid ranges are known (sign 0), and the last coordinate is no range
-        last = last + coefficient * found.sign[:, node] * to.on_cone
-        constant = constant + coefficient * found.offset[:, node] / to.scale[:, None]
-    return np.stack([*x, last], axis=-1), -constant, factor
+        both.append(Known(offset, found.sign[:, node] * to.on_cone))
+    return both[0], both[1]
 
 
 def _node(found: Ranges, station: int, epoch: int) -> int:
     at = np.flatnonzero((found.station == station) & ((found.epoch == epoch) | (found.epoch.max(initial=0) == 0)))
     return int(at[0]) if len(at) and found.inside[:, at[0]].all() else -1
-
-
-def _squared_ratio(lifted: LiftedRow, a: Point, b: Point, factor: Factor) -> Row:
-    """Square ``ra r_a + rb r_b = 0``: linear in (x, |x|^2)."""
-    # ra r_a = -rb r_b, so p r_a^2 = q r_b^2: exact, as both sides are positive; p = q is a plane
-    p, q = np.asarray(lifted.ra) ** 2, np.asarray(lifted.rb) ** 2
-    at_a, at_b = (sum(v * v for v in point.position) for point in (a, b))
-    x = [-2.0 * (p * u - q * v) for u, v in zip(a.position, b.position, strict=True)]
-
-    def squared_factor(point: Array | None) -> Array:
-        if point is None:
-            return np.ones(1)
-        r_b = np.sqrt(sum((point[:, None, c] - v) ** 2 for c, v in enumerate(b.position)))
-        # d(p r_a^2 - q r_b^2) = (sqrt p r_a + sqrt q r_b) d(...), and both terms are equal at the place
-        return np.asarray(2.0 * np.sqrt(q) * r_b * np.abs(factor(point)))
-
-    return np.stack(np.broadcast_arrays(*x, p - q), axis=-1), np.asarray(q * at_b - p * at_a), squared_factor

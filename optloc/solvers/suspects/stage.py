@@ -16,6 +16,7 @@ from optloc.adequacy.noise_level import SEVERAL, CommonLevel, common_level_at
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
+from optloc.linear.vectors import complete
 from optloc.problem.arrivals import Arrivals, as_arrivals, restore_order, shared_places
 from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
@@ -28,7 +29,6 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED
 from optloc.solvers.pool import Pool, begin, in_parts, offer
 from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
-from optloc.solvers.starts.position import complete
 from optloc.solvers.suspects.subsets import (
     Finding,
     Rest,

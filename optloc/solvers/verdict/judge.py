@@ -12,6 +12,7 @@ from optloc.base.records import overwrite, present, take
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
+from optloc.linear.least_squares_ranges import ranges
 from optloc.models import MODELS
 from optloc.models.layers import Layers
 from optloc.problem.claims import Claims, alike, choose, claim
@@ -19,7 +20,6 @@ from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
 from optloc.solvers.pool import Curvature, Pool
-from optloc.solvers.starts.least_squares_ranges import ranges
 from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.conclusion import conclude
 from optloc.solvers.verdict.findings import (

@@ -9,12 +9,10 @@ from scipy.optimize import least_squares
 from optloc import Status, assemble, measured, solve
 from optloc.base.types import Array
 from optloc.compute.jit import enabled
+from optloc.engine.plan import plan_of
 from optloc.problem.chart import basis
 from optloc.solvers import policy
-from optloc.solvers.range_fixes import _descend, direct, fix_directly
-from optloc.solvers.refine import refine
-from optloc.solvers.stages import gtrs, gtrs_lsr
-from optloc.solvers.starts.position import mirror
+from optloc.solvers.stages import gtrs_lsr
 from optloc.solvers.verdict.judge import verdict
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
@@ -57,7 +55,8 @@ class Scene:
         return J.T @ J
 
     def answer(self):
-        return fix_directly(direct(self.problem), self.z, self.place)[0]
+        plan = plan_of(self.problem)
+        return plan.run(plan.rows(self.problem), self.z, self.place)[0]
 
 
 def scene(kind, place, truth, seed):
@@ -220,36 +219,9 @@ def test_the_stages_find_the_same_rivals():
     assert np.array_equal(few.code, other.code[:10])
 
 
-@pytest.mark.parametrize("kind", ["tdoa", "range"])
-@pytest.mark.parametrize("rivalled", [True, False])
-def test_few_descend_to_where_the_refinement_of_all_kinds_ends(kind, rivalled):
-    made = flat(kind, 6, 100, 40) if rivalled else around(kind, 3, 6, (3.0, 3.7), 40)
-    problem = made.problem
-    start = gtrs(problem, None).x[:, :1]
-    x = np.concatenate([start, mirror(problem, start)], axis=1)
-    found = _descend(direct(problem), problem, x)
-    first, second = (refine(problem, x[:, i], limit=100) for i in (0, 1))
-    ended = first.status == Status.OK
-    assert ended.mean() > 0.9
-    assert np.array_equal(np.isfinite(found[:, 0]).all(-1), ended)
-    # runs to infinity end where rounding says so
-    near = ended & (second.status == Status.OK) & (np.sqrt((second.x**2).sum(-1)) < 1e5)
-    led = np.isfinite(found[:, 1]).all(-1)
-    assert (near & (led == rivalled)).sum() > 5
-    for i in np.flatnonzero(near):
-        A = made.information(i, first.x[i])
-        apart = found[i, 0] - first.x[i]
-        assert apart @ A @ apart < 1e-6
-        if led[i]:
-            assert made.cost(i, found[i, 1]) == pytest.approx(second.cost[i], rel=1e-9, abs=1e-6)
-        else:  # given up where it leads back to its start only
-            back = second.x[i] - first.x[i]
-            assert back @ A @ back < policy.SAME_PLACE
-
-
 def test_thresholds_are_those_of_the_policy():
     from optloc.adequacy.shape import BENT
-    from optloc.compute.range_mirror import LISTED, SAME
-    from optloc.compute.range_shape import STRAIGHT
+    from optloc.engine.images import LISTED, SAME
+    from optloc.engine.shape import STRAIGHT
 
     assert (LISTED, SAME, STRAIGHT) == (policy.LISTED_GAP, policy.SAME_PLACE, BENT)

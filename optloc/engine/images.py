@@ -5,19 +5,23 @@ A refinement is given up where it cannot lead to a rival of the fix: see `watch`
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.compute.jit import compiled
-from optloc.compute.range_refine import decide, equations, propose, ranges
-from optloc.compute.range_start import (
+from optloc.compute.systems import LANES, factor_plain, principal_axes, solve_plain
+from optloc.engine.evaluator import bend, bow_of, equations, note_nearest
+from optloc.engine.memory import (
     ALIVE,
     AXES,
     CENTRE,
     COST,
     DAMPING,
     DIAGONAL,
+    EIGEN,
     FIX,
     FIX_COST,
     FIX_H,
@@ -26,24 +30,20 @@ from optloc.compute.range_start import (
     GROWTH,
     H_TRIAL,
     HEIGHT,
-    HIGH,
     INVERSE,
-    LOOP,
     LOW,
     LOWER,
     MOVE,
     NORMAL,
-    ROW,
     SHARE,
     SPARE,
     STEPS,
     G,
     H,
-    Model,
     Room,
     X,
 )
-from optloc.compute.systems import LANES, factor_plain, principal_axes, solve_plain
+from optloc.engine.refine import decide, propose
 
 LISTED = 25.0
 """Cost above that of the fix up to which a rival counts (`optloc.solvers.policy.LISTED_GAP`)."""
@@ -72,8 +72,8 @@ _WEAK = 1e-11
 def find_plane(room: Room) -> None:
     """Write the direction in which the stations spread least to row NORMAL."""
     s, d = room.place.shape[:2]
-    matrix, normal, least, spare = room.matrix, room.vector[NORMAL], room.scalar[LOW], room.scalar[SPARE]
-    work, axes = matrix[H_TRIAL], matrix[AXES]
+    normal, least, spare = room.vector[NORMAL], room.scalar[LOW], room.scalar[SPARE]
+    work, axes = room.axes[EIGEN], room.axes[AXES]
     for i in range(d):
         for j in range(i + 1):
             for lane in range(LANES):
@@ -98,13 +98,14 @@ def find_plane(room: Room) -> None:
 def keep_fix(room: Room) -> None:
     """Keep position and information of the fix, and its height above the stations' plane."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
-    d = vector.shape[1]
     for lane in range(LANES):
         scalar[HEIGHT, lane] = 0.0
-    for i in range(d):
+    for i in range(room.d):
+        for lane in range(LANES):
+            scalar[HEIGHT, lane] += (vector[X, i, lane] - vector[CENTRE, i, lane]) * vector[NORMAL, i, lane]
+    for i in range(vector.shape[1]):
         for lane in range(LANES):
             vector[FIX, i, lane] = vector[X, i, lane]
-            scalar[HEIGHT, lane] += (vector[X, i, lane] - vector[CENTRE, i, lane]) * vector[NORMAL, i, lane]
         for j in range(i + 1):
             for lane in range(LANES):
                 matrix[FIX_H, i, j, lane] = matrix[H, i, j, lane]
@@ -115,6 +116,7 @@ def reflect(room: Room) -> None:
     """Start the refinement of the mirror images of kept fixes; those that are not good have none."""
     vector, scalar = room.vector, room.scalar
     for i in range(vector.shape[1]):
+        # the other unknowns begin where they are: their share of the normal is zero
         for lane in range(LANES):
             vector[X, i, lane] = vector[FIX, i, lane] - 2.0 * scalar[HEIGHT, lane] * vector[NORMAL, i, lane]
     for lane in range(LANES):
@@ -123,33 +125,32 @@ def reflect(room: Room) -> None:
 
 
 @compiled
-def follow(model: Model, u: Array, room: Room, tolerance: float, fewest: int, every: bool) -> None:
-    """Refine the positions of lanes that are alive, until fewer of them are left than are worth a block.
+def follow(rows: Any, room: Room, tolerance: float, fewest: int, every: bool) -> None:
+    """Refine the unknowns of lanes that are alive, until fewer of them are left than are worth a block.
 
     Parameters
     ----------
-    model : Model
-        What all problems share.
-    u : array (q, W)
-        Whitened rows.
+    rows : named tuple
+        Of the evaluator.
     room : Room
-        Positions, damping, steps, and what `keep_fix` wrote in. Lanes that arrived somewhere stay good and are no
-        longer alive; those that are given up are not good.
+        Unknowns, damping, steps, and what `keep_fix` wrote in. Lanes that arrived somewhere stay good and are no longer
+        alive; those that are given up are not good.
     tolerance : float
-        As of `optloc.compute.range_refine.refine`.
+        As of `optloc.engine.refine.refine`.
     fewest : int
         Lanes for which it goes on.
     every : bool
         As of `watch`.
     """
     scalar, nearest = room.scalar, room.scalar[SHARE]
-    _evaluate(model, u, room, False)
+    equations(rows, room, 0)
     _note_nearest(room, nearest, True)
+    bow = bow_of(rows, room)
     while True:
         propose(room.vector, room.matrix, scalar)
-        if watch(model, room, nearest, every) < fewest:
+        if watch(bow, room, nearest, every) < fewest:
             return
-        _evaluate(model, u, room, True)
+        equations(rows, room, 1)
         going = decide(room.vector, room.matrix, scalar, tolerance)
         _note_nearest(room, nearest, False)
         if not going:
@@ -157,52 +158,27 @@ def follow(model: Model, u: Array, room: Room, tolerance: float, fewest: int, ev
 
 
 @compiled
-def _evaluate(model: Model, u: Array, room: Room, trial: bool) -> None:
-    vector, matrix, scalar, shift = room.vector, room.matrix, room.scalar, 1 if trial else 0
-    # rows of what is tried stand behind those of what is kept
-    equations(
-        model.K,
-        u,
-        room.place,
-        room.r,
-        room.unit,
-        vector[X + shift],
-        vector[ROW],
-        scalar[SPARE],
-        scalar[LOOP],
-        matrix[H + shift],
-        vector[G + shift],
-        scalar[COST + shift],
-    )
-
-
-@compiled
 def _note_nearest(room: Room, nearest: Array, every: bool) -> None:
     """Write the range to the nearest station, where the last step was kept."""
     kept, least = room.scalar[SPARE], room.scalar[LOW]
-    for lane in range(LANES):
-        least[lane] = np.inf
-    for i in range(len(room.r)):
-        for lane in range(LANES):
-            least[lane] = min(least[lane], room.r[i, lane])
+    note_nearest(room, least)
     for lane in range(LANES):
         nearest[lane] = least[lane] if every or kept[lane] != 0.0 else nearest[lane]
 
 
 @compiled
-def watch(model: Model, room: Room, nearest: Array, every: bool) -> float:
+def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
     """Give up refinements that lead to no rival, and return how many lanes are alive.
 
     Two reasons end one. Within a ball of radius D about it nothing costs as little as a rival: over a step of length
-    D a range is off its linear prediction by 0 to ``D^2 / 2 r``, so that all residuals together are by no more than
-    ``norm(K) sqrt(s) D^2 / 2 r`` (half of it where a common error of all ranges is nothing), and the linear
-    prediction itself is nowhere better than its least. Or the refinement is back at the fix: within three standard
+    D all residuals together are off their linear prediction by no more than ``bow D^2 / r``, and that itself is nowhere
+    better than its least. Or the refinement is back at the fix: within three standard
     deviations of it, where the cost has risen as the curvature of the fix says.
 
     Parameters
     ----------
-    model : Model
-        What all problems share.
+    bow : float
+        Of `optloc.engine.evaluator.bow_of`.
     room : Room
         Proposed steps, and what `keep_fix` wrote in; ALIVE and GOOD are written.
     nearest : array (W,)
@@ -212,7 +188,6 @@ def watch(model: Model, room: Room, nearest: Array, every: bool) -> float:
     """
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, spare, trace = vector.shape[1], scalar[SPARE], scalar[LOW]
-    bow = model.norm * np.sqrt(len(room.r)) * (0.25 if model.level else 0.5)
     for lane in range(LANES):
         trace[lane], spare[lane] = 0.0, 0.0
     for i in range(d):
@@ -240,7 +215,7 @@ def watch(model: Model, room: Room, nearest: Array, every: bool) -> float:
 
 
 @compiled
-def confirm(model: Model, u: Array, room: Room) -> float:
+def confirm(rows: Any, room: Room) -> float:
     """Leave good only the lanes that arrived at a rival, and return how many did.
 
     Where a damped refinement ends is no minimum yet: the undamped step must be short there, too, and the curvature of
@@ -263,7 +238,7 @@ def confirm(model: Model, u: Array, room: Room) -> float:
     for lane in range(LANES):
         scalar[GOOD, lane] = scalar[GOOD, lane] if spare[lane] >= SAME else 0.0
     _require_rest(vector, matrix, scalar)
-    _bend(model, u, room)
+    bend(rows, room)
     _require_positive(vector, matrix, scalar[GOOD], matrix[H_TRIAL])
     found = 0.0
     for lane in range(LANES):
@@ -300,39 +275,3 @@ def _require_positive(vector: Array, matrix: Array, good: Array, curvature: Arra
     for i in range(d):
         for lane in range(LANES):
             good[lane] = good[lane] if 0.0 < inverse[i, lane] * diagonal[i, lane] < 1.0 / _WEAK else 0.0
-
-
-@compiled
-def _bend(model: Model, u: Array, room: Room) -> None:
-    """Write half the second derivatives of the cost to H_TRIAL: the information, less what bent fronts do to it."""
-    vector, matrix, scalar = room.vector, room.matrix, room.scalar
-    s, d = room.place.shape[:2]
-    left, pull = scalar[SPARE], scalar[HIGH]
-    out, residual = matrix[H_TRIAL], room.rows[:, 0]  # there are no more whitened rows than stations
-    ranges(room.place, vector[X], room.r, room.unit, left)
-    for k in range(len(model.K)):
-        for lane in range(LANES):
-            residual[k, lane] = u[k, lane]
-        for i in range(s):
-            part = model.K[k, i]
-            if part != 0.0:
-                for lane in range(LANES):
-                    residual[k, lane] -= part * room.r[i, lane]
-    for i in range(d):
-        for j in range(i + 1):
-            for lane in range(LANES):
-                out[i, j, lane] = matrix[H, i, j, lane]
-    for k in range(s):
-        for lane in range(LANES):
-            pull[lane] = 0.0
-        for m in range(len(model.K)):
-            part = model.K[m, k]
-            if part != 0.0:
-                for lane in range(LANES):
-                    pull[lane] += part * residual[m, lane]
-        for i in range(d):
-            for j in range(i + 1):
-                own = 1.0 if i == j else 0.0
-                for lane in range(LANES):
-                    across = own - room.unit[k, i, lane] * room.unit[k, j, lane]
-                    out[i, j, lane] -= pull[lane] * across / room.r[k, lane]

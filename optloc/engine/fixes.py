@@ -1,4 +1,4 @@
-"""Fixes from ranges in one compiled call: start, refinement, covariance, and what tells how far each is to be trusted.
+"""Fixes in one compiled call: start, refinement, covariance, and what tells how far each is to be trusted.
 
 Problems go through in blocks of lanes. Some things few problems need: more steps, a mirror image that leads on, another
 look at the shape. Those that do are collected and go through again in full blocks, so that no block waits for one of
@@ -7,16 +7,27 @@ its lanes.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
-from optloc.compute.gtrs import minimise
-from optloc.compute.jit import compiled, with_constants
-from optloc.compute.range_mirror import LISTED, confirm, find_plane, follow, keep_fix, reflect
-from optloc.compute.range_refine import equations, ranges, refine
-from optloc.compute.range_shape import STRAIGHT, find_even, measure_infinity, measure_shape, see_far
-from optloc.compute.range_start import (
+from optloc.compute.jit import compiled
+from optloc.compute.systems import LANES, factor_plain, solve_plain
+from optloc.engine import ranges, tapes
+from optloc.engine.evaluator import (
+    count_lifted,
+    count_unknowns,
+    equations,
+    evaluated_by,
+    finish,
+    keep,
+    load,
+    measure_infinity,
+)
+from optloc.engine.images import LISTED, confirm, find_plane, follow, keep_fix, reflect
+from optloc.engine.memory import (
     ALIVE,
     BEYOND,
     BLUR,
@@ -24,36 +35,32 @@ from optloc.compute.range_start import (
     COST,
     DAMPING,
     DIAGONAL,
+    EIGEN,
     FIX_COST,
     FIX_GOOD,
     GOOD,
     GROWTH,
     H_TRIAL,
     INVERSE,
-    LOOP,
     LOWER,
     MOVE,
     NORMAL,
     ORIGIN,
     ROW,
-    SCALE,
     SOLVABLE,
     SPARE,
     SPREAD,
     STEPS,
     Answer,
-    G,
     H,
     Model,
     Room,
     X,
     make_room,
-    read,
-    square,
-    stand,
-    weigh,
 )
-from optloc.compute.systems import LANES, factor_plain, solve_plain
+from optloc.engine.refine import refine
+from optloc.engine.shape import STRAIGHT, find_even, measure_shape
+from optloc.engine.start import begin, read, stand
 
 # Steps after which the problems of a block that still move wait for each other: fixes near their stations take two to
 # five.
@@ -67,19 +74,23 @@ _WORTH = LANES // 2
 
 
 @compiled
-def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, given: bool, answer: Answer) -> int:
-    """Fix N positions from ranges, each from measurements alone, and return the most steps that one took.
+def fixes(
+    model: Model, rows: Any, z: Array, station: Array, tolerance: float, most: int, given: bool, answer: Answer
+) -> int:
+    """Fix N positions, each from measurements alone, and return the most steps that one took.
 
     Parameters
     ----------
     model : Model
-        What all problems share.
+        How measurements become a start.
+    rows : named tuple
+        Of the evaluator.
     z : array (N, m)
         Measurements, metres.
     station : array (N or 1, s, d)
         Stations, metres: those that take part, all of which have rows. Their mean is the centre of the chart.
     tolerance, most : float, int
-        Tolerance and limit of `optloc.compute.range_refine.refine`.
+        Tolerance and limit of `optloc.engine.refine.refine`.
     given : bool
         Whether starts stand in the answer's positions: those that the start here does not find, mostly because another
         position fits the squared ranges as well. Every mirror image of them is refined.
@@ -87,41 +98,43 @@ def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, g
         Written.
     """
     count = len(z)
-    room = make_room(model, station.shape[1], station.shape[2])
+    s, d, size = station.shape[1], station.shape[2], answer.x.shape[1]
+    own = keep(model, rows, s, d, size)
+    room = make_room(model, own, s, d, count_unknowns(rows, d, size), count_lifted(rows))
     late, hidden, look = np.empty(count, np.int64), np.empty(count, np.int64), np.zeros(count, np.bool_)
     course = np.empty((3, count))
     waiting, images, steps = 0, 0, 0
     for first in range(0, count, LANES):
         size = _take(room.item, None, first, count)
-        _see(model, z, station, room, first == 0)
+        _see(model, rows, z, station, room, first == 0)
         if given:
             _resume(answer.x, room)
         else:
-            _begin(model, room)
+            begin(model, rows, room)
         # what is no full block has nothing to wait for
         limit = min(_FEW, most) if size == LANES else most
-        steps = max(steps, _refine(model, z, room, size, tolerance, limit, answer))
+        steps = max(steps, _refine(rows, z, room, size, tolerance, limit, answer))
         for lane in range(size):
             if room.scalar[ALIVE, lane] != 0.0 and most > limit:
                 late[waiting] = room.item[lane]
                 waiting += 1
-        images = _examine(model, z, room, size, tolerance, given, answer, look, hidden, images, course)
+        images = _examine(rows, z, room, size, tolerance, given, answer, look, hidden, images, course)
     for first in range(0, waiting, LANES):
         size = _take(room.item, late, first, waiting)
-        _see(model, z, station, room, False)
+        _see(model, rows, z, station, room, False)
         _resume(answer.x, room)
-        steps = max(steps, _FEW + _refine(model, z, room, size, tolerance, most - _FEW, answer))
-        images = _examine(model, z, room, size, tolerance, given, answer, look, hidden, images, course)
-    _pursue(model, z, station, room, tolerance, given, answer, look, hidden, images, course)
+        steps = max(steps, _FEW + _refine(rows, z, room, size, tolerance, most - _FEW, answer))
+        images = _examine(rows, z, room, size, tolerance, given, answer, look, hidden, images, course)
+    _pursue(model, rows, z, station, room, tolerance, given, answer, look, hidden, images, course)
     waiting = 0
     for i in range(count):
         late[waiting] = i
         waiting += 1 if look[i] else 0
     for first in range(0, waiting, LANES):
         size = _take(room.item, late, first, waiting)
-        _see(model, z, station, room, False)
+        _see(model, rows, z, station, room, False)
         _resume(answer.x, room)
-        _look_again(model, z, room, size, answer, look)
+        _look_again(rows, z, room, size, answer, look)
     return steps
 
 
@@ -136,13 +149,11 @@ def _take(item: Array, order: Array | None, first: int, count: int) -> int:
 
 
 @compiled
-def _see(model: Model, z: Array, station: Array, room: Room, begins: bool) -> None:
+def _see(model: Model, rows: Any, z: Array, station: Array, room: Room, begins: bool) -> None:
     """Take measurements and stations of a block; stations that all problems share are taken when a call begins."""
-    scalar, vector = room.scalar, room.vector
-    s, q, e = station.shape[1], len(model.K), len(model.start)
+    scalar, vector, anew = room.scalar, room.vector, len(station) > 1 or begins
     read(z, room.item, model.row, model.anchor, model.linear, room.seen, room.value, scalar[BLUR], scalar[GOOD])
-    _loops(room.value[s + q + e :], scalar[LOOP])
-    if len(station) > 1 or begins:
+    if anew:
         stand(
             station,
             room.item,
@@ -154,51 +165,25 @@ def _see(model: Model, z: Array, station: Array, room: Room, begins: bool) -> No
             scalar[SPARE],
         )
         find_plane(room)
-        if model.level:
-            see_far(model, room)
+    load(rows, z, room, anew)
 
 
 @compiled
-def _begin(model: Model, room: Room) -> None:
-    """Find starts: squared ranges weighed as equal first, then by the ranges of that answer."""
-    scalar, s = room.scalar, len(room.place)
-    square(
-        room.value[:s],
-        model.sign,
-        model.reference,
-        room.place,
-        scalar[SPREAD],
-        scalar[SCALE],
-        room.squared,
-        scalar[SPARE],
-    )
-    # near to maximum likelihood, and no guess
-    for turn in range(2):
-        weigh(room.squared, room.place, room.y, scalar[SCALE], model.white, turn == 0, room.rows, scalar[SPARE])
-        minimise(room.rows, model.reference >= 0, room.y, scalar[SOLVABLE], room.work)
-        _accept(room.y, scalar[SOLVABLE], scalar[GOOD], scalar[SCALE], room.vector[X])
-
-
-@compiled
-def _refine(model: Model, z: Array, room: Room, size: int, tolerance: float, limit: int, answer: Answer) -> int:
-    """Refine the positions of a block and write them; return the most steps that one took."""
-    s, scalar = len(room.place), room.scalar
-    u = room.value[s : s + len(model.K)]
-    refine(model.K, u, room.place, room.r, room.unit, room.vector, room.matrix, scalar, tolerance, limit)
-    _write_fixes(model, z, room, size, answer)
+def _refine(rows: Any, z: Array, room: Room, size: int, tolerance: float, limit: int, answer: Answer) -> int:
+    """Refine the unknowns of a block and write them; return the most steps that one took."""
+    refine(rows, room, tolerance, limit)
+    _write_fixes(rows, z, room, size, answer)
     steps = 0
     for lane in range(size):
-        steps = max(steps, int(scalar[STEPS, lane]))
+        steps = max(steps, int(room.scalar[STEPS, lane]))
     return steps
 
 
 @compiled
-def _write_fixes(model: Model, z: Array, room: Room, size: int, answer: Answer) -> None:
-    """Write positions, covariances and costs of the first lanes, and to FIX_GOOD which are settled."""
+def _write_fixes(rows: Any, z: Array, room: Room, size: int, answer: Answer) -> None:
+    """Write unknowns, covariances and costs of the first lanes, and to FIX_GOOD which are settled."""
     scalar = room.scalar
-    _invert(room.vector, room.matrix, scalar)
-    if len(model.start):
-        _emit(model, z, room)
+    _invert(room)
     for lane in range(LANES):
         good = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
         scalar[FIX_GOOD, lane] = 1.0 if good else 0.0
@@ -208,15 +193,16 @@ def _write_fixes(model: Model, z: Array, room: Room, size: int, answer: Answer) 
         i = room.item[lane]
         settled[i] = scalar[FIX_GOOD, lane] != 0.0
         cost[i] = scalar[COST, lane]
-        for j in range(len(found)):
-            for k in range(len(found)):
+        for j in range(covariance.shape[1]):
+            for k in range(covariance.shape[1]):
                 covariance[i, j, k] = found[max(j, k), min(j, k), lane]
-    _place(room.vector, room.sent, room.item, answer.x, scalar[ALIVE], False, size)
+    _place(room.vector, room.item, answer.x, scalar[ALIVE], False, size)
+    finish(rows, z, room, size, scalar[ALIVE], False, answer.x)
 
 
 @compiled
-def _place(vector: Array, sent: Array, item: Array, x: Array, mark: Array, marked: bool, size: int) -> None:
-    """Write positions and emission times of the first lanes to their problems, or of those that are marked."""
+def _place(vector: Array, item: Array, x: Array, mark: Array, marked: bool, size: int) -> None:
+    """Write the unknowns that are refined of the first lanes to their problems, or of those that are marked."""
     d = vector.shape[1]
     for lane in range(size):
         if marked and mark[lane] == 0.0:
@@ -224,13 +210,11 @@ def _place(vector: Array, sent: Array, item: Array, x: Array, mark: Array, marke
         i = item[lane]
         for j in range(d):
             x[i, j] = vector[X, j, lane] + vector[ORIGIN, j, lane]
-        for j in range(len(sent)):
-            x[i, d + j] = sent[j, lane]
 
 
 @compiled
 def _examine(
-    model: Model,
+    rows: Any,
     z: Array,
     room: Room,
     size: int,
@@ -246,11 +230,11 @@ def _examine(
 
     Fixes whose shape needs a closer look are marked, mirror images on their way wait; returns how many wait by now.
     """
-    s, scalar = len(room.place), room.scalar
-    u, settled = room.value[s : s + len(model.K)], scalar[FIX_GOOD]
+    scalar = room.scalar
+    settled = scalar[FIX_GOOD]
     kappa, even, closer, turned = room.vector[ROW, 0], room.vector[ROW, 1], 0, False
-    measure_shape(model, u, room, False, False, kappa)
-    find_even(room.matrix, even)
+    measure_shape(rows, room, False, False, kappa)
+    find_even(room.axes[EIGEN], even)
     shape, rival, infinity, item = answer.kappa, answer.rival_cost, answer.infinity, room.item
     for lane in range(size):
         i, good = item[lane], settled[lane] != 0.0
@@ -260,8 +244,8 @@ def _examine(
         closer += 1 if look[i] else 0
         turned = turned or even[lane] != 0.0
     if closer >= _WORTH or (closer and size < LANES):
-        _measure_closely(model, u, room, size, answer, look, turned)
-    measure_infinity(model, u, room)
+        _measure_closely(rows, room, size, answer, look, turned)
+    measure_infinity(rows, room)
     left = 0.0
     for lane in range(size):
         if settled[lane] != 0.0:
@@ -273,16 +257,16 @@ def _examine(
         return images
     keep_fix(room)
     reflect(room)
-    follow(model, u, room, tolerance, _WORTH if size == LANES else 1, given)
-    return _end_images(model, z, room, size, answer, look, hidden, images, course)
+    follow(rows, room, tolerance, _WORTH if size == LANES else 1, given)
+    return _end_images(rows, z, room, size, answer, look, hidden, images, course)
 
 
 @compiled
-def _measure_closely(model: Model, u: Array, room: Room, size: int, answer: Answer, look: Array, turned: bool) -> None:
+def _measure_closely(rows: Any, room: Room, size: int, answer: Answer, look: Array, turned: bool) -> None:
     """Measure the shape in metres along turned axes as well, if asked, and in inverse range where it is poor there."""
     kappa, item, settled, shape, far = room.vector[ROW, 0], room.item, answer.settled, answer.kappa, 0
     if turned:
-        measure_shape(model, u, room, False, True, kappa)
+        measure_shape(rows, room, False, True, kappa)
     for lane in range(size):
         i = item[lane]
         if settled[i]:
@@ -290,7 +274,7 @@ def _measure_closely(model: Model, u: Array, room: Room, size: int, answer: Answ
             shape[i, 0] = kappa[lane] if turned else shape[i, 0]
             far += 1 if shape[i, 0] > STRAIGHT else 0
     if far:
-        measure_shape(model, u, room, True, True, kappa)
+        measure_shape(rows, room, True, True, kappa)
         for lane in range(size):
             i = item[lane]
             if settled[i] and shape[i, 0] > STRAIGHT:
@@ -300,6 +284,7 @@ def _measure_closely(model: Model, u: Array, room: Room, size: int, answer: Answ
 @compiled
 def _pursue(
     model: Model,
+    rows: Any,
     z: Array,
     station: Array,
     room: Room,
@@ -312,16 +297,15 @@ def _pursue(
     course: Array,
 ) -> None:
     """Refine the mirror images that are on their way, again and again in full blocks, until none is."""
-    s, scalar, item, cost = station.shape[1], room.scalar, room.item, answer.cost
+    scalar, item, cost = room.scalar, room.item, answer.cost
     while images:
         waiting = images
         images = 0
         for first in range(0, waiting, LANES):
             size = _take(room.item, hidden, first, waiting)
-            _see(model, z, station, room, False)
-            u = room.value[s : s + len(model.K)]
+            _see(model, rows, z, station, room, False)
             _resume(answer.x, room)
-            _evaluate_fix(model, u, room)
+            equations(rows, room, 0)
             keep_fix(room)
             _resume(answer.rival, room)
             for lane in range(LANES):
@@ -329,14 +313,14 @@ def _pursue(
                 scalar[FIX_COST, lane], scalar[GOOD, lane], scalar[ALIVE, lane] = cost[i], 1.0, 1.0
                 scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
                 scalar[STEPS, lane] = course[2, i]
-            follow(model, u, room, tolerance, _WORTH if size == LANES else 1, given)
+            follow(rows, room, tolerance, _WORTH if size == LANES else 1, given)
             # those that wait on stand before the blocks that are still to come
-            images = _end_images(model, z, room, size, answer, look, hidden, images, course)
+            images = _end_images(rows, z, room, size, answer, look, hidden, images, course)
 
 
 @compiled
 def _end_images(
-    model: Model,
+    rows: Any,
     z: Array,
     room: Room,
     size: int,
@@ -347,7 +331,7 @@ def _end_images(
     course: Array,
 ) -> int:
     """Write the rivals that mirror images arrived at, put those on their way to wait, and return how many do."""
-    s, scalar, item = len(room.place), room.scalar, room.item
+    scalar, item = room.scalar, room.item
     before = images
     for lane in range(size):
         if scalar[ALIVE, lane] != 0.0:
@@ -357,12 +341,11 @@ def _end_images(
             course[0, i], course[1, i] = scalar[DAMPING, lane], scalar[GROWTH, lane]
             course[2, i] = scalar[STEPS, lane]
     if images > before:
-        _place(room.vector, room.sent, item, answer.rival, scalar[ALIVE], True, size)
-    if confirm(model, room.value[s : s + len(model.K)], room) == 0.0:
+        _place(room.vector, item, answer.rival, scalar[ALIVE], True, size)
+    if confirm(rows, room) == 0.0:
         return images
-    if len(model.start):
-        _emit(model, z, room)
-    _place(room.vector, room.sent, item, answer.rival, scalar[GOOD], True, size)
+    _place(room.vector, item, answer.rival, scalar[GOOD], True, size)
+    finish(rows, z, room, size, scalar[GOOD], True, answer.rival)
     rival, cost = answer.rival_cost, answer.cost
     for lane in range(size):
         if scalar[GOOD, lane] != 0.0:
@@ -401,58 +384,13 @@ def _exchange(x: Array, cost: Array, rival: Array, rival_cost: Array, i: int) ->
 
 
 @compiled
-def _look_again(model: Model, z: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
+def _look_again(rows: Any, z: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
     """Write covariance and shape of fixes in row X anew."""
-    s, scalar = len(room.place), room.scalar
-    u = room.value[s : s + len(model.K)]
-    _evaluate_fix(model, u, room)
+    equations(rows, room, 0)
     for lane in range(LANES):
-        scalar[ALIVE, lane] = 0.0
-    _write_fixes(model, z, room, size, answer)
-    _measure_closely(model, u, room, size, answer, look, True)
-
-
-@compiled
-def _evaluate_fix(model: Model, u: Array, room: Room) -> None:
-    """Find information and cost at row X."""
-    vector, scalar = room.vector, room.scalar
-    equations(
-        model.K,
-        u,
-        room.place,
-        room.r,
-        room.unit,
-        vector[X],
-        vector[ROW],
-        scalar[SPARE],
-        scalar[LOOP],
-        room.matrix[H],
-        vector[G],
-        scalar[COST],
-    )
-
-
-@compiled
-def _loops(loops: Array, cost: Array) -> None:
-    """Write the cost of the loops."""
-    count = len(loops)
-    for lane in range(LANES):
-        cost[lane] = 0.0
-    for i in range(count):
-        for lane in range(LANES):
-            cost[lane] += loops[i, lane] * loops[i, lane]
-
-
-@compiled
-def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> None:
-    """Take positions from squared-range answers; those that are not settled, or behind the stations, are not good."""
-    d = len(x)
-    for lane in range(LANES):
-        good[lane] = good[lane] * settled[lane] if y[d, lane] >= 0.0 else 0.0
-    for j in range(d):
-        for lane in range(LANES):
-            y[j, lane] = y[j, lane] if good[lane] != 0.0 else 0.0
-            x[j, lane] = y[j, lane] * scale[lane]
+        room.scalar[ALIVE, lane] = 0.0
+    _write_fixes(rows, z, room, size, answer)
+    _measure_closely(rows, room, size, answer, look, True)
 
 
 @compiled
@@ -465,32 +403,10 @@ def _resume(x: Array, room: Room) -> None:
 
 
 @compiled
-def _emit(model: Model, z: Array, room: Room) -> None:
-    """Find the emission times at row X: less the ranges' share, plus the measurement that they count from."""
-    first = len(room.place) + len(model.K)
-    ranges(room.place, room.vector[X], room.r, room.unit, room.scalar[SPARE])
-    item, r, value, sent, travel, start, row = (
-        room.item,
-        room.r,
-        room.value,
-        room.sent,
-        model.travel,
-        model.start,
-        model.row,
-    )
-    for j in range(len(start)):
-        at = start[j]
-        for lane in range(LANES):
-            sent[j, lane] = value[first + j, lane] + (z[item[lane], at] - row[0, at] if at >= 0 else 0.0)
-        for k in range(len(r)):
-            for lane in range(LANES):
-                sent[j, lane] -= travel[j, k] * r[k, lane]
-
-
-@compiled
-def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
+def _invert(room: Room) -> None:
     """Write the lower half of the covariance over H_TRIAL, and whether it is regular and the fix near to SOLVABLE."""
-    d = vector.shape[1]
+    vector, matrix, scalar = room.vector, room.matrix, room.scalar
+    p = vector.shape[1]
     diagonal, inverse, move, fine, away = (
         vector[DIAGONAL],
         vector[INVERSE],
@@ -500,27 +416,31 @@ def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
     )
     for lane in range(LANES):
         away[lane] = 0.0
-    for i in range(d):
+    for i in range(room.d):
         for lane in range(LANES):
-            diagonal[i, lane] = matrix[H, i, i, lane]
             apart = (vector[X, i, lane] - vector[CENTRE, i, lane]) / scalar[SPREAD, lane]
             away[lane] += apart * apart
+    for i in range(p):
+        for lane in range(LANES):
+            diagonal[i, lane] = matrix[H, i, i, lane]
     for lane in range(LANES):
         # Far away the cost hardly depends on the distance: verdicts there need the stages of the long way.
         fine[lane] = 1.0 if away[lane] <= _FAR * _FAR else 0.0
     factor_plain(matrix[H], diagonal, matrix[LOWER], inverse)
-    for j in range(d):
-        for i in range(d):
+    for j in range(p):
+        for i in range(p):
             for lane in range(LANES):
                 move[i, lane] = 1.0 if i == j else 0.0
         solve_plain(matrix[LOWER], inverse, move)
         for lane in range(LANES):
             fine[lane] = fine[lane] if 0.0 < inverse[j, lane] * diagonal[j, lane] < 1.0 / _WEAK else 0.0
-        for i in range(j, d):
+        for i in range(j, p):
             for lane in range(LANES):
                 matrix[H_TRIAL, i, j, lane] = move[i, lane]
 
 
+fix_ranges = evaluated_by(fixes, ranges, "ranges")
+fix_tapes = evaluated_by(fixes, tapes, "tapes")
 # A block works out all of its lanes, whatever stands in them: one problem takes 55 us in 64 lanes, 30 in 8, 25 in 4.
-few_fixes = with_constants(fixes, "four", LANES=4, _WORTH=2)
-"""The same as `fixes` in blocks of four: for so few problems that most of the 64 lanes would be empty."""
+fix_few_ranges = evaluated_by(fixes, ranges, "few_ranges", LANES=4, _WORTH=2)
+fix_one_by_tapes = evaluated_by(fixes, tapes, "one_by_tapes", LANES=1, _WORTH=1)

@@ -1,0 +1,131 @@
+"""What the steps of the engine ask of the rows of a problem: one interface, for which `evaluated_by` puts in one form.
+
+There are two: `optloc.engine.ranges` for rows that are sums of ranges and nothing else unknown, `optloc.engine.tapes`
+for rows of every kind. Each has kernels of these names. Machine code is made for each form, so that nothing is chosen
+while it runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, TypeVar
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, with_constants
+from optloc.engine.memory import Model, Room
+
+_Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
+
+
+@compiled
+def count_unknowns(rows: Any, d: int, size: int) -> int:
+    """Return how many unknowns are refined together: of positions of d coordinates, and parameter vectors of a size."""
+    raise NotImplementedError
+
+
+@compiled
+def count_lifted(rows: Any) -> int:
+    """Return the number of linear rows of other kinds than ranges in a start."""
+    raise NotImplementedError
+
+
+@compiled
+def keep(model: Model, rows: Any, stations: int, d: int, size: int) -> Any:
+    """Return the memory that an evaluator keeps for a block."""
+    raise NotImplementedError
+
+
+@compiled
+def load(rows: Any, z: Array, room: Room, anew: bool) -> None:
+    """Take measurements (N, m) of a block, whose stations are new ones or not."""
+    raise NotImplementedError
+
+
+@compiled
+def minimise_start(model: Model, rows: Any, room: Room, first: bool) -> None:
+    """Write the minimiser of the weighed squared-range rows to `room.y`, and to SOLVABLE whether it is one."""
+    raise NotImplementedError
+
+
+@compiled
+def complete(rows: Any, room: Room) -> None:
+    """Write the unknowns beside the position to row X where a refinement begins."""
+    raise NotImplementedError
+
+
+@compiled
+def equations(rows: Any, room: Room, shift: int) -> None:
+    """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
+    raise NotImplementedError
+
+
+@compiled
+def costs(rows: Any, room: Room) -> None:
+    """Write to COST_TRIAL the cost at TRIAL, the least over the unknowns beside the position."""
+    raise NotImplementedError
+
+
+@compiled
+def bow_of(rows: Any, room: Room) -> float:
+    """Return how much the rows may bend: all residuals together by this times D^2 / r over a step D at range r."""
+    raise NotImplementedError
+
+
+@compiled
+def note_nearest(room: Room, least: Array) -> None:
+    """Write the range to the nearest station (W,) where the equations were written last."""
+    raise NotImplementedError
+
+
+@compiled
+def bend(rows: Any, room: Room) -> None:
+    """Write half the second derivatives of the cost at row X to H_TRIAL."""
+    raise NotImplementedError
+
+
+@compiled
+def measure_infinity(rows: Any, room: Room) -> None:
+    """Write to BEYOND what infinity costs, see `optloc.engine.memory.Answer.infinity`."""
+    raise NotImplementedError
+
+
+@compiled
+def finish(rows: Any, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+    """Write the unknowns that are not refined of the first lanes, or of those that are marked, to x (N, size)."""
+    raise NotImplementedError
+
+
+_INTERFACE = (
+    count_unknowns,
+    count_lifted,
+    keep,
+    load,
+    minimise_start,
+    complete,
+    equations,
+    costs,
+    bow_of,
+    note_nearest,
+    bend,
+    measure_infinity,
+    finish,
+)
+
+
+def evaluated_by(kernel: _Kernel, rows: ModuleType, mark: str, **constants: Any) -> _Kernel:
+    """Return a kernel whose rows are evaluated by the kernels of a module, with other values of some constants.
+
+    Parameters
+    ----------
+    kernel : callable
+        Calls kernels of this module, at whatever depth.
+    rows : module
+        Has one of each name.
+    mark : str
+        Tells names of machine code from those of other forms.
+    constants : object
+        As of `optloc.compute.jit.with_constants`.
+    """
+    own = {kernel: getattr(rows, kernel.__name__) for kernel in _INTERFACE}
+    return with_constants(kernel, mark, own, **constants)

@@ -1,0 +1,406 @@
+"""Plans: a problem structure as arrays, made once and kept; measurements and station positions are arguments of a run.
+
+A plan serves one target at rest, whatever its rows measure and whatever else is unknown beside its position, as long as
+the problems of a batch share all but measurements, positions and velocities of stations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.cache import Cache
+from optloc.base.frames import Frame
+from optloc.base.linalg import project_out
+from optloc.base.threads import mapped
+from optloc.base.types import Array
+from optloc.compute.jit import enabled, ready, usable
+from optloc.compute.pack import pack
+from optloc.engine.fixes import fix_few_ranges, fix_one_by_tapes, fix_ranges, fix_tapes
+from optloc.engine.lifts import Lifts, lift
+from optloc.engine.memory import Answer, Model
+from optloc.engine.ranges import RangeRows
+from optloc.engine.tapes import TapeRows
+from optloc.linear.evaluate import block_links
+from optloc.linear.least_squares_ranges import Ranges, ranges
+from optloc.linear.normal import depends_on_place, weighed
+from optloc.linear.redundancy import degrees_of_freedom
+from optloc.linear.vectors import hold_still, vectors
+from optloc.linear.walks import walks
+from optloc.models import MODELS
+from optloc.problem.layout import Layout
+from optloc.problem.noise import variances, whiten, whiten_rows
+from optloc.problem.problem import Problem
+
+# Rows, and epochs with emission times, up to which dense maps pay: their cost grows with the square.
+MOST = 64
+# Unknowns up to which systems are solved side by side in lanes.
+_UNKNOWNS = 40
+# Share of the largest weight below which a combination of rows is rounding: four digits above it.
+_NOTHING = 1e-12
+# Share of a combination of ranges that their common part may have left by rounding: differences have none of it.
+_LEVEL = 1e-9
+
+TOLERANCE, LIMIT = 1e-7, 100
+"""Of the refinement of the method "lsr"."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What turns measurements of one structure into fixes: all but the measurements and the stations.
+
+    Parameters
+    ----------
+    layout : Layout
+        Unknowns; the position is the first.
+    frame : Frame
+        Of the positions.
+    weight : array (m,)
+        Row weights.
+    dof : int
+        Degrees of freedom.
+    node : int array (2, s)
+        Epoch and station of each place that takes part; the epoch is 0 where stations stay.
+    model : Model
+        How measurements become a start.
+    rows : callable
+        Maps problems without batch axes, or a flat batch, to the rows as an evaluator takes them.
+    ranged : bool
+        Whether all rows are sums of ranges, and nothing else is unknown but emission times.
+    size, shared : int
+        Numbers of all unknowns, and of those that all epochs share.
+    """
+
+    layout: Layout
+    frame: Frame
+    weight: Array
+    dof: int
+    node: Array
+    model: Model
+    rows: Callable[[Problem], Any]
+    ranged: bool
+    size: int
+    shared: int
+
+    def places(self, problem: Problem) -> Array:
+        """Return the places (N or 1, s, d) that take part, metres, of problems of this structure."""
+        position = problem.stations.position
+        flat = position.reshape(-1, *position.shape[-3:])
+        every = np.arange(flat.shape[2])
+        # Usually all stations take part, and their positions need no copy.
+        if flat.shape[1] == 1 and np.array_equal(self.node[1], every):
+            return flat[:, 0]
+        return flat[:, self.node[0], self.node[1]]
+
+    def kernel(self, count: int, *, often: bool = False) -> Callable[..., int]:
+        """Return the machine code for so many problems: narrow blocks for few, unless only the wide ones are loaded.
+
+        Parameters
+        ----------
+        count : int
+            Problems of one call.
+        often : bool
+            Whether such a call comes again and again, and is worth loading what serves it best.
+        """
+        few, many, most = _BY_RANGES if self.ranged else _BY_TAPES
+        narrow = count <= most and (ready(few) or ((often or not ready(many)) and usable(few, count)))
+        return few if narrow else many
+
+    def at_hand(self, count: int) -> bool:
+        """Return whether so many problems may be run: machine code is there, or they may wait for it."""
+        return usable(self.kernel(count, often=True), count)
+
+    def run(
+        self, rows: Any, z: Array, place: Array, threads: int | None = None, start: Array | None = None
+    ) -> tuple[Answer, int]:
+        """Return what is found of N problems, and the most steps that a fix took.
+
+        Parameters
+        ----------
+        rows : named tuple
+            Of `rows`.
+        z : array (N, m)
+            Measurements.
+        place : array (N or 1, s, d)
+            Of `places`.
+        threads : int, optional
+            At most so many; as many as `optloc.base.threads.thread_count` says if absent.
+        start : array (N, size), optional
+            Where refinements begin; starts are found where none are given.
+        """
+        kernel, count = self.kernel(len(z)), len(z)
+        answer, given = blank_answer(count, self.size, self.shared), start is not None
+        if start is not None:
+            answer = answer._replace(x=np.array(start))
+
+        def work(first: int) -> int:
+            part = slice(first, min(first + _CHUNK, count))
+            own = _owned(place[part] if len(place) > 1 else place)
+            some = Answer(*(array[part] for array in answer))
+            return int(kernel(self.model, rows_at(rows, part), _owned(z[part]), own, TOLERANCE, LIMIT, given, some))
+
+        return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
+
+
+# Problems that a thread takes at a time: some milliseconds, against which handing them out is nothing. From 1 000 to
+# 16 000 no difference was measured.
+_CHUNK = 4096
+# Narrow and wide blocks, and problems up to which narrow ones are quicker. Of ranges, one of four lanes takes 25 us,
+# two 45, four as long as one of 64. Of tapes, blocks are of one lane: sines and arc tangents take each by itself.
+_BY_RANGES = (fix_few_ranges, fix_ranges, 8)
+_BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
+
+
+def blank_answer(count: int, size: int, shared: int) -> Answer:
+    """Return arrays for what is found of so many problems, of so many unknowns."""
+    return Answer(
+        np.empty((count, size)),
+        np.empty((count, shared, shared)),
+        np.empty(count),
+        np.empty(count, dtype=np.bool_),
+        np.empty((count, size)),
+        np.empty(count),
+        np.empty((count, 2)),
+        np.empty(count),
+    )
+
+
+def _owned(values: Array) -> Array:
+    """Return values as the one type of array for which there is machine code: float, C order, writable."""
+    return np.require(values, dtype=float, requirements=["C", "W"])
+
+
+def rows_at(rows: Any, part: slice | Array) -> Any:
+    """Return the rows of some problems: of tapes, what each has to itself."""
+    if not isinstance(rows, TapeRows):
+        return rows
+    c = rows.numbers
+    own = {name: getattr(c, name) for name in ("source", "white", "prior", "sigma")}
+    cut = {name: array[part] for name, array in own.items() if len(array) > 1}
+    return rows._replace(numbers=c._replace(**cut)) if cut else rows
+
+
+# Which structures have a plan.
+
+# The plan of 64 rows takes 100 kB, that of six rows 2 kB.
+_KEPT = Cache["Plan | None"](256)
+
+
+def plan_of(problem: Problem) -> Plan | None:
+    """Return the plan of problems, or None where there is none; kept for the next problems of the same structure.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of problems; their measurements are not looked at.
+    """
+    if not (is_planned(problem) and enabled()):
+        return None
+    return _KEPT.find(key_of(problem), lambda: _make(problem))
+
+
+def key_of(problem: Problem) -> tuple[Hashable, ...]:
+    """Return a key of all that the plan of a problem is made of."""
+    # Not structure, yet what a plan is made of: they are part of the key by their bytes.
+    numbers = [array for r in problem.rows for array in (r.weight, r.correction)]
+    numbers += [block.covariance for block in problem.noise.blocks]
+    numbers += [covariance for _, _, covariance in problem.stations.errors]
+    if problem.biases or problem.priors:
+        numbers += [array for bias in problem.biases for array in (bias.mean, bias.sigma) if array is not None]
+        numbers += [array for prior in problem.priors for array in (prior.mean, prior.covariance)]
+    if problem.stations.axes is not None:
+        numbers.append(problem.stations.axes)
+    return (problem.structure, *(array.tobytes() for array in numbers))
+
+
+def is_planned(problem: Problem) -> bool:
+    """Return whether the structure, and what the batch shares, are such that a plan exists and pays."""
+    stations, motion = problem.stations, problem.motions[0]
+    shared = [(array, 1) for r in problem.rows for array in (r.weight, r.correction)]
+    shared += [(block.covariance, 3) for block in problem.noise.blocks]
+    shared += [(covariance, 3) for _, _, covariance in stations.errors]
+    if problem.biases or problem.priors:
+        shared += [(array, 1) for bias in problem.biases for array in (bias.mean, bias.sigma) if array is not None]
+        shared += [(prior.mean, 1) for prior in problem.priors] + [(prior.covariance, 2) for prior in problem.priors]
+    if stations.axes is not None:
+        shared.append((stations.axes, 4))
+    return (
+        not problem.constraints
+        and len(problem.motions) == 1
+        and (motion.order, motion.span, motion.known) == (0, "run", None)
+        and all(bool((r.target == 0).all()) for r in problem.rows)
+        and 0 < problem.count <= MOST
+        and problem.epochs <= MOST
+        and all(array.ndim == core for array, core in shared)
+        and (_is_ranged(problem) or _is_taped(problem))
+        and not depends_on_place(problem)
+    )
+
+
+def _is_ranged(problem: Problem) -> bool:
+    """Return whether all rows are sums of ranges to stations that stay, and nothing else is unknown."""
+    stations = problem.stations
+    return (
+        not (problem.biases or problem.priors or stations.estimated)
+        and stations.position.shape[-3] == 1
+        and all(MODELS[rows.kind].ranges is not None for rows in problem.rows)
+    )
+
+
+def _is_taped(problem: Problem) -> bool:
+    """Return whether rows have tapes, and unknowns of epochs are few."""
+    layout = problem.layout
+    several = layout.n_local > 0 and problem.epochs > 1
+    return problem.medium is None and not several and layout.size <= _UNKNOWNS and not walks(problem)
+
+
+# How a plan is made.
+
+
+def _make(problem: Problem) -> Plan | None:
+    one = _bare(problem)
+    dof = int(degrees_of_freedom(one.flat())[0])
+    if dof < 0 or problem.layout.find("position")[0].start:
+        return None
+    found = ranges(weighed(_probe(hold_still(one.flat()))))
+    ranged = _is_ranged(problem)
+    # Stations that no row links would have ranges that nothing relates.
+    if ranged and (found is None or len(found.groups[0]) != 1):
+        return None
+    heard = np.zeros(0, dtype=np.int64) if found is None else np.flatnonzero(found.inside[0])
+    node = _nodes(one, found, heard)
+    white = np.eye(node.shape[1])
+    if found is not None:
+        white[: len(heard), : len(heard)] = linalg.whitening(found.covariance[0, heard[:, None], heard])
+    # The compiled core takes triangular matrices only: a covariance that is singular has none.
+    if np.triu(white, 1).any():
+        return None
+    model = _model(one, found, heard, white)
+    make: Callable[[Problem], Any]
+    if ranged:
+        turned, made = _range_rows(weighed(one), node[1])
+        model, make = model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made
+    else:
+        places = {(int(station), int(epoch)): i for i, (epoch, station) in enumerate(node.T)}
+        lifts = lift(hold_still(one.flat()).take(np.zeros(1, dtype=int)), found, places, model.reference >= 0)
+        make = partial(_tape_rows, one.correction, vectors(one.flat(), None)[0], lifts)
+        if make(one) is None or not (len(heard) or len(lifts.sigma)):
+            return None
+    layout = problem.layout
+    return Plan(layout, problem.frame, one.weight, dof, node, model, make, ranged, layout.size, layout.n_shared)
+
+
+def _bare(problem: Problem) -> Problem:
+    """Return one of some problems, without measurements."""
+    stations = problem.stations
+    place = stations.position.reshape(-1, *stations.position.shape[-3:])[0]
+    rates = stations.velocity
+    rates = None if rates is None else rates.reshape(-1, *rates.shape[-3:])[0]
+    return replace(
+        problem.with_rows(z=np.zeros(problem.count)), stations=replace(stations, position=place, velocity=rates)
+    )
+
+
+def _probe(problem: Problem) -> Problem:
+    """Return one problem for each row, whose measurement is one and all others zero."""
+    # What is linear is known by its images of the unit vectors.
+    parts = np.split(np.eye(problem.count), problem.starts[1:], axis=1)
+    rows = tuple(replace(r, z=part, correction=np.zeros(r.count)) for r, part in zip(problem.rows, parts, strict=True))
+    return replace(problem, rows=rows, stations=replace(problem.stations, velocity=None, axes=None))
+
+
+def _nodes(one: Problem, found: Ranges | None, heard: Array) -> Array:
+    """Return epoch and station (2, s) of the places that take part: first those whose ranges are known."""
+    moving = one.stations.position.shape[-3] > 1
+    first = [] if found is None else list(zip(found.epoch[heard].tolist(), found.station[heard].tolist(), strict=True))
+    others = {
+        (int(rows.epoch[i]) if moving else 0, int(end[i]))
+        for rows in one.rows
+        for end in (rows.a, rows.b)[: MODELS[rows.kind].stations]
+        for i in np.flatnonzero(rows.weight > 0.0)
+    }
+    return np.array([*first, *sorted(others - {*first})], dtype=np.int64).reshape(-1, 2).T
+
+
+def _model(one: Problem, found: Ranges | None, heard: Array, white: Array) -> Model:
+    """Return how measurements of one problem become a start."""
+    count, s, flat = one.count, len(white), one.flat()
+    added, gain = np.zeros(count), np.zeros(count)
+    base = vectors(flat, None)
+    for links, rows, start in zip(block_links(one), one.rows, one.starts, strict=True):
+        part = slice(start, start + rows.count)
+        gain[part], added[part] = links.gains.total(base, rows.count)[0], links.adds.total(base, rows.count)[0]
+    present = one.weight > 0.0
+    precision = np.where(present, 1.0 / np.where(present, variances(weighed(one).noise, count), 1.0), 0.0)
+    linear, sign, ranged, reference = np.zeros((s, count)), np.zeros(s), np.zeros(s), -1
+    if found is not None:
+        linear[: len(heard)] = found.offset[:, heard].T
+        sign[: len(heard)], ranged[: len(heard)] = found.sign[0, heard], 1.0
+        reference = int(np.searchsorted(heard, found.reference[0])) if found.free.all() else -1
+    row = np.stack([one.correction + added, precision, 1.0 / (1.0 + gain)])
+    return Model(row, _anchors(one)[0], linear, sign, ranged, reference, white)
+
+
+def _anchors(one: Problem) -> tuple[Array, Array]:
+    """Return the row that each row with an emission time is counted from (m,), and that of each epoch (k,); or -1."""
+    anchor, start = np.full(one.count, -1), np.full(one.epochs if one.layout.n_local else 0, -1)
+    for rows, first in zip(one.rows, one.starts, strict=True):
+        if MODELS[rows.kind].emission:
+            for i in np.flatnonzero(rows.weight > 0.0):
+                epoch = int(rows.epoch[i])
+                start[epoch] = first + i if start[epoch] < 0 else start[epoch]
+                anchor[first + i] = start[epoch]
+    return anchor, start
+
+
+def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
+    """Return the maps to whitened rows, emission times and loops; and the rows over the ranges to stations (s,)."""
+    design, emitted = _design(one, station)
+    alone = whiten_rows(whiten(one.noise, one.weight), np.eye(one.count))
+    times = alone @ emitted
+    # Emission times projected out: what is left of the rows depends on ranges alone.
+    bare = project_out(times, alone)
+    basis, upper = np.linalg.qr(bare @ design, mode="complete")
+    inside = min(upper.shape)
+    turned = basis.T @ bare
+    loops = turned[inside:]
+    # Combinations of rows that no range moves: their cost is the misfit of loops.
+    loops = loops[np.abs(loops).max(-1, initial=0.0) > _NOTHING * np.abs(alone).max()]
+    emission = np.linalg.pinv(times) @ alone
+    share = upper[:inside]
+    norm = float(np.linalg.norm(share, 2)) if share.size else 0.0
+    return np.concatenate([turned[:inside], emission, loops]), RangeRows(
+        one.correction,
+        np.array(share, order="C"),
+        np.array(emission @ design, order="C"),
+        _anchors(one)[1],
+        norm,
+        bool(np.abs(share.sum(-1)).max(initial=0.0) <= _LEVEL * norm),
+    )
+
+
+def _design(one: Problem, station: Array) -> tuple[Array, Array]:
+    """Return the rows over ranges (m, s) and emission times (m, k)."""
+    design, emitted = np.zeros((one.count, len(station))), np.zeros((one.count, len(_anchors(one)[1])))
+    place = {int(s): i for i, s in enumerate(station)}
+    for rows, first in zip(one.rows, one.starts, strict=True):
+        model = MODELS[rows.kind]
+        for i in np.flatnonzero(rows.weight > 0.0):
+            for coefficient, end in zip(model.ranges or (), (int(rows.a[i]), int(rows.b[i])), strict=False):
+                if coefficient:
+                    design[first + i, place[end]] += coefficient
+            if model.emission:
+                emitted[first + i, int(rows.epoch[i])] = 1.0
+    return design, emitted
+
+
+def _tape_rows(correction: Array, base: Array, lifts: Lifts, problem: Problem) -> TapeRows | None:
+    """Return the rows of problems as tapes, or None where they have none."""
+    bare = problem.with_rows(z=np.zeros(problem.count))
+    found = pack(bare, whiten(weighed(bare).noise, bare.weight))
+    return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts)

@@ -1,0 +1,538 @@
+"""Rows that are sums of ranges, and nothing else unknown but emission times: a linear map of the ranges, and loops."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.gtrs import minimise
+from optloc.compute.jit import compiled
+from optloc.compute.systems import LANES, principal_axes
+from optloc.engine.memory import (
+    AXES,
+    BEYOND,
+    COST,
+    COST_TRIAL,
+    DIAGONAL,
+    EIGEN,
+    FIX_COST,
+    H_TRIAL,
+    HIGH,
+    INVERSE,
+    LOOP,
+    LOW,
+    MOVE,
+    ROW,
+    SHARE,
+    SOLVABLE,
+    SPARE,
+    TRIAL,
+    G,
+    H,
+    Model,
+    Room,
+    X,
+)
+
+
+class RangeRows(NamedTuple):
+    """Whitened rows over ranges r: the cost is ``|u - K r|^2`` and that of the loops, which depend on no range.
+
+    Parameters
+    ----------
+    correction : array (m,)
+        Known amount by which each measurement exceeds the model, metres.
+    K : array (q, s)
+        Whitened rows, 1/metres. In `Model.linear` the maps to u stand behind those to ranges, then those to emission
+        times for zero ranges, then those to loops.
+    travel : array (e, s)
+        How the ranges reduce the emission times.
+    start : int64 array (e,)
+        Row that each emission time counts from, -1 where there is none.
+    norm : float
+        Greatest singular value of K.
+    level : bool
+        Whether K takes no notice of what all ranges have in common: then the cost has limits at infinity.
+    """
+
+    correction: Array
+    K: Array
+    travel: Array
+    start: Array
+    norm: float
+    level: bool
+
+
+class RangeRoom(NamedTuple):
+    """What is kept for a block of problems of s stations.
+
+    Parameters
+    ----------
+    r, unit : array (s, W), (s, d, W)
+        Ranges, and unit vectors from the stations.
+    residual : array (q, W)
+        Whitened residuals.
+    sent : array (e, W)
+        Emission times.
+    flat : array (q, d, W)
+        How the whitened rows fall with the direction of a remote emitter, along principal axes.
+    stiff : array (d, W)
+        Eigenvalues of that map's square.
+    """
+
+    r: Array
+    unit: Array
+    residual: Array
+    sent: Array
+    flat: Array
+    stiff: Array
+
+
+@compiled
+def count_unknowns(rows: RangeRows, d: int, size: int) -> int:
+    """Return the number of coordinates: emission times follow from the position."""
+    return d
+
+
+@compiled
+def count_lifted(rows: RangeRows) -> int:
+    """Return the number of rows of other kinds: none."""
+    return 0
+
+
+@compiled
+def keep(model: Model, rows: RangeRows, stations: int, d: int, size: int) -> RangeRoom:
+    """Return the memory for a block of problems."""
+    q = len(rows.K)
+    return RangeRoom(
+        np.zeros((stations, LANES)),
+        np.zeros((stations, d, LANES)),
+        np.zeros((q, LANES)),
+        np.zeros((len(rows.start), LANES)),
+        np.zeros((q, d, LANES)),
+        np.zeros((d, LANES)),
+    )
+
+
+@compiled
+def load(rows: RangeRows, z: Array, room: Room, anew: bool) -> None:
+    """Write the cost of the loops; of new stations what they say of infinity."""
+    first, loop = len(room.place) + len(rows.K) + len(rows.start), room.scalar[LOOP]
+    for lane in range(LANES):
+        loop[lane] = 0.0
+    for i in range(first, len(room.value)):
+        for lane in range(LANES):
+            loop[lane] += room.value[i, lane] * room.value[i, lane]
+    if anew and rows.level:
+        _see_far(rows, room)
+
+
+@compiled
+def minimise_start(model: Model, rows: RangeRows, room: Room, first: bool) -> None:
+    """Write the minimiser of the weighed squared-range rows."""
+    minimise(room.rows, model.reference >= 0, room.y, room.scalar[SOLVABLE], room.work)
+
+
+@compiled
+def complete(rows: RangeRows, room: Room) -> None:
+    """Do nothing: the position is all that is refined."""
+
+
+@compiled
+def equations(rows: RangeRows, room: Room, shift: int) -> None:
+    """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
+    s, vector, scalar = len(room.place), room.vector, room.scalar
+    _equations(
+        rows.K,
+        room.value[s : s + len(rows.K)],
+        room.place,
+        room.own.r,
+        room.own.unit,
+        vector[X + shift],
+        vector[ROW],
+        scalar[SPARE],
+        scalar[LOOP],
+        room.matrix[H + shift],
+        vector[G + shift],
+        scalar[COST + shift],
+    )
+
+
+@compiled
+def costs(rows: RangeRows, room: Room) -> None:
+    """Write the cost at TRIAL to COST_TRIAL: a third of the work of `equations`."""
+    s, scalar = len(room.place), room.scalar
+    u, trial = room.value[s : s + len(rows.K)], room.vector[TRIAL]
+    _costs(rows.K, u, room.place, trial, room.own.r, scalar[SPARE], scalar[LOOP], scalar[COST_TRIAL])
+
+
+@compiled
+def bow_of(rows: RangeRows, room: Room) -> float:
+    """Return how much all residuals bend over a step D at range r, times r / D^2.
+
+    A range is off its linear prediction by 0 to ``D^2 / 2 r``: all residuals together by no more than
+    ``norm(K) sqrt(s) D^2 / 2 r``, and by half of it where a common error of all ranges is nothing.
+    """
+    return float(rows.norm * np.sqrt(len(room.own.r)) * (0.25 if rows.level else 0.5))
+
+
+@compiled
+def note_nearest(room: Room, least: Array) -> None:
+    """Write the range to the nearest station (W,)."""
+    r = room.own.r
+    for lane in range(LANES):
+        least[lane] = np.inf
+    for i in range(len(r)):
+        for lane in range(LANES):
+            least[lane] = min(least[lane], r[i, lane])
+
+
+@compiled
+def finish(rows: RangeRows, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+    """Write the emission times at row X: less the ranges' share, plus the measurement that they count from."""
+    item, r, sent, start, d = room.item, room.own.r, room.own.sent, rows.start, room.d
+    if not len(start):
+        return
+    first = len(room.place) + len(rows.K)
+    ranges(room.place, room.vector[X], r, room.own.unit, room.scalar[SPARE])
+    for j in range(len(start)):
+        at = start[j]
+        for lane in range(LANES):
+            since = z[item[lane], at] - rows.correction[at] if at >= 0 else 0.0
+            sent[j, lane] = room.value[first + j, lane] + since
+        for k in range(len(r)):
+            for lane in range(LANES):
+                sent[j, lane] -= rows.travel[j, k] * r[k, lane]
+    for lane in range(size):
+        if not marked or mark[lane] != 0.0:
+            for j in range(len(start)):
+                x[item[lane], d + j] = sent[j, lane]
+
+
+@compiled
+def _equations(
+    K: Array,
+    u: Array,
+    place: Array,
+    r: Array,
+    unit: Array,
+    x: Array,
+    row: Array,
+    left: Array,
+    loop: Array,
+    information: Array,
+    right: Array,
+    cost: Array,
+) -> None:
+    """Find information (lower half), right-hand side and cost at positions x (d, W); `row` and `left` are scratch."""
+    d = len(x)
+    ranges(place, x, r, unit, left)
+    for lane in range(LANES):
+        cost[lane] = loop[lane]
+    for i in range(d):
+        for lane in range(LANES):
+            right[i, lane] = 0.0
+        for j in range(i + 1):
+            for lane in range(LANES):
+                information[i, j, lane] = 0.0
+    for k in range(len(K)):
+        _row(K[k], u[k], r, unit, row, left)
+        for lane in range(LANES):
+            cost[lane] += left[lane] * left[lane]
+        for i in range(d):
+            for lane in range(LANES):
+                right[i, lane] += row[i, lane] * left[lane]
+            for j in range(i + 1):
+                for lane in range(LANES):
+                    information[i, j, lane] += row[i, lane] * row[j, lane]
+
+
+@compiled
+def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Array) -> None:
+    """Find one whitened row (d, W) of the Jacobian and its residual (W,): what is seen less shares of the ranges."""
+    s, d = unit.shape[:2]
+    for lane in range(LANES):
+        left[lane] = seen[lane]
+    for j in range(d):
+        for lane in range(LANES):
+            row[j, lane] = 0.0
+    for i in range(s):
+        part = share[i]
+        # Pairs of stations: of a row over all ranges two entries are not zero.
+        if part != 0.0:
+            for lane in range(LANES):
+                left[lane] -= part * r[i, lane]
+            for j in range(d):
+                for lane in range(LANES):
+                    row[j, lane] += part * unit[i, j, lane]
+
+
+@compiled
+def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
+    """Find ranges (s, W) and unit vectors (s, d, W) from the stations at positions x (d, W)."""
+    s, d = place.shape[:2]
+    for i in range(s):
+        for lane in range(LANES):
+            spare[lane] = 0.0
+        for j in range(d):
+            for lane in range(LANES):
+                apart = x[j, lane] - place[i, j, lane]
+                unit[i, j, lane] = apart
+                spare[lane] += apart * apart
+        for lane in range(LANES):
+            r[i, lane] = np.sqrt(spare[lane])
+            spare[lane] = 1.0 / r[i, lane]
+        for j in range(d):
+            for lane in range(LANES):
+                unit[i, j, lane] *= spare[lane]
+
+
+@compiled
+def _costs(K: Array, u: Array, place: Array, x: Array, r: Array, left: Array, loop: Array, cost: Array) -> None:
+    """Find the cost alone at positions x (d, W): a third of the work of `equations`; `r` and `left` are scratch."""
+    s, d = place.shape[:2]
+    for i in range(s):
+        for lane in range(LANES):
+            r[i, lane] = 0.0
+        for j in range(d):
+            for lane in range(LANES):
+                apart = x[j, lane] - place[i, j, lane]
+                r[i, lane] += apart * apart
+        for lane in range(LANES):
+            r[i, lane] = np.sqrt(r[i, lane])
+    for lane in range(LANES):
+        cost[lane] = loop[lane]
+    for k in range(len(K)):
+        for lane in range(LANES):
+            left[lane] = u[k, lane]
+        for i in range(s):
+            part = K[k, i]
+            if part != 0.0:
+                for lane in range(LANES):
+                    left[lane] -= part * r[i, lane]
+        for lane in range(LANES):
+            cost[lane] += left[lane] * left[lane]
+
+
+@compiled
+def bend(rows: RangeRows, room: Room) -> None:
+    """Write half the second derivatives of the cost to H_TRIAL: the information, less what bent fronts do to it."""
+    vector, matrix, scalar, K = room.vector, room.matrix, room.scalar, rows.K
+    s, d = room.place.shape[:2]
+    left, pull = scalar[SPARE], scalar[HIGH]
+    out, residual, r, unit = matrix[H_TRIAL], room.own.residual, room.own.r, room.own.unit
+    ranges(room.place, vector[X], r, unit, left)
+    for k in range(len(K)):
+        for lane in range(LANES):
+            residual[k, lane] = room.value[s + k, lane]
+        for i in range(s):
+            part = K[k, i]
+            if part != 0.0:
+                for lane in range(LANES):
+                    residual[k, lane] -= part * r[i, lane]
+    for i in range(d):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                out[i, j, lane] = matrix[H, i, j, lane]
+    for k in range(s):
+        for lane in range(LANES):
+            pull[lane] = 0.0
+        for m in range(len(K)):
+            part = K[m, k]
+            if part != 0.0:
+                for lane in range(LANES):
+                    pull[lane] += part * residual[m, lane]
+        for i in range(d):
+            for j in range(i + 1):
+                own = 1.0 if i == j else 0.0
+                for lane in range(LANES):
+                    across = own - unit[k, i, lane] * unit[k, j, lane]
+                    out[i, j, lane] -= pull[lane] * across / r[k, lane]
+
+
+# What infinity costs.
+
+BEYOND_DOUBT = 16.0
+"""Cost above that of a fix from which on infinity is far outside every region that is reported."""
+
+# Newton's steps on the secular equation: three to six from the start that is taken here.
+_STEPS = 20
+# Share by which the direction may differ from unit length: the cost hangs on its square.
+_UNIT = 1e-12
+
+
+@compiled
+def _see_far(rows: RangeRows, room: Room) -> None:
+    """Write the map from directions to whitened rows, turned to its principal axes, and its squared singular values."""
+    s, d = room.place.shape[:2]
+    flat = room.own.flat
+    for k in range(len(flat)):
+        for j in range(d):
+            for lane in range(LANES):
+                flat[k, j, lane] = 0.0
+            for i in range(s):
+                part = rows.K[k, i]
+                if part != 0.0:
+                    for lane in range(LANES):
+                        flat[k, j, lane] += part * room.place[i, j, lane]
+    _turn_to_axes(room)
+
+
+@compiled
+def _turn_to_axes(room: Room) -> None:
+    """Turn the map to the principal axes of its square."""
+    flat, stiff, row = room.own.flat, room.own.stiff, room.vector[MOVE]
+    work, axes, d = room.axes[EIGEN], room.axes[AXES], room.d
+    for i in range(d):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                work[i, j, lane] = 0.0
+            for k in range(len(flat)):
+                for lane in range(LANES):
+                    work[i, j, lane] += flat[k, i, lane] * flat[k, j, lane]
+    principal_axes(work, axes, room.scalar[SPARE])
+    for j in range(d):
+        for lane in range(LANES):
+            stiff[j, lane] = work[j, j, lane]
+    for k in range(len(flat)):
+        for j in range(d):
+            for lane in range(LANES):
+                row[j, lane] = flat[k, j, lane]
+        for j in range(d):
+            for lane in range(LANES):
+                flat[k, j, lane] = 0.0
+            for i in range(d):
+                for lane in range(LANES):
+                    flat[k, j, lane] += row[i, lane] * axes[i, j, lane]
+
+
+@compiled
+def measure_infinity(rows: RangeRows, room: Room) -> None:
+    """Write the least cost at infinity to BEYOND: exact where it is within `BEYOND_DOUBT` of FIX_COST, else a bound.
+
+    Parameters
+    ----------
+    rows : RangeRows
+        Of all problems.
+    room : Room
+        LOOP, FIX_COST and what `_see_far` wrote in; rows of scratch are overwritten.
+    """
+    scalar, vector = room.scalar, room.vector
+    out = scalar[BEYOND]
+    if not rows.level:
+        for lane in range(LANES):
+            out[lane] = np.inf
+        return
+    s = len(room.place)
+    u = room.value[s : s + len(rows.K)]
+    total, least, more, todo = scalar[HIGH], scalar[LOW], scalar[SHARE], scalar[COST_TRIAL]
+    g, gap = vector[TRIAL], vector[DIAGONAL]
+    d = len(g)
+    _begin(u, room, g, gap, total, least, more)
+    for _ in range(_STEPS):
+        if not _step(scalar, g, gap, total, least, more, out, todo):
+            break
+    left = 0.0
+    for lane in range(LANES):
+        todo[lane] = 0.0 if out[lane] > scalar[FIX_COST, lane] + BEYOND_DOUBT else 1.0
+        left += todo[lane]
+    if left > 0.0:
+        y = vector[INVERSE]
+        for j in range(d):
+            for lane in range(LANES):
+                # a direction of no pull along an axis of no stiffness stays zero: what length is missing comes below
+                y[j, lane] = g[j, lane] / (gap[j, lane] + more[lane]) if g[j, lane] != 0.0 else 0.0
+        _lengthen(y, gap, scalar[SPARE])
+        _weigh(u, room, y, scalar[SPARE], scalar[HIGH])
+        for lane in range(LANES):
+            out[lane] = scalar[HIGH, lane] if todo[lane] != 0.0 else out[lane]
+
+
+@compiled
+def _begin(u: Array, room: Room, g: Array, gap: Array, total: Array, least: Array, more: Array) -> None:
+    """Write g, gaps of the eigenvalues, the cost without ranges, the least eigenvalue, and the first multiplier.
+
+    Multipliers are counted from minus the least eigenvalue: there nothing cancels. The first is as large as the longest
+    part of the direction allows: the direction is not shorter than one, and Newton's steps come from that side.
+    """
+    q, d = len(u), len(g)
+    for lane in range(LANES):
+        total[lane], least[lane], more[lane] = room.scalar[LOOP, lane], np.inf, 0.0
+    for j in range(d):
+        for lane in range(LANES):
+            least[lane] = min(least[lane], room.own.stiff[j, lane])
+            g[j, lane] = 0.0
+    for k in range(q):
+        for lane in range(LANES):
+            total[lane] += u[k, lane] * u[k, lane]
+        for j in range(d):
+            for lane in range(LANES):
+                g[j, lane] -= room.own.flat[k, j, lane] * u[k, lane]
+    for j in range(d):
+        for lane in range(LANES):
+            gap[j, lane] = room.own.stiff[j, lane] - least[lane]
+            more[lane] = max(more[lane], abs(g[j, lane]) - gap[j, lane])
+
+
+@compiled
+def _step(
+    scalar: Array, g: Array, gap: Array, total: Array, least: Array, more: Array, low: Array, todo: Array
+) -> bool:
+    """Write the lower bounds at the multipliers, and move those that could matter; return whether one moved."""
+    d, square, cube = len(g), scalar[SPARE], todo
+    for lane in range(LANES):
+        low[lane], square[lane], cube[lane] = total[lane] + least[lane] - more[lane], 0.0, 0.0
+    for j in range(d):
+        for lane in range(LANES):
+            away = gap[j, lane] + more[lane]
+            part = g[j, lane] / away if g[j, lane] != 0.0 else 0.0
+            low[lane] -= g[j, lane] * part
+            square[lane] += part * part
+            cube[lane] += part * part / away if g[j, lane] != 0.0 else 0.0
+    moving = 0.0
+    for lane in range(LANES):
+        length = np.sqrt(square[lane])
+        # a direction that is too short even here lies between two of the same cost: the hard case, and the bound holds
+        left = length > 1.0 + _UNIT and low[lane] <= scalar[FIX_COST, lane] + BEYOND_DOUBT
+        # Newton's step for 1 / length = 1, which is all but straight
+        more[lane] += square[lane] * (length - 1.0) / cube[lane] if left else 0.0
+        moving += 1.0 if left else 0.0
+    return moving > 0.0
+
+
+@compiled
+def _lengthen(y: Array, gap: Array, spare: Array) -> None:
+    """Make directions unit vectors: too short ones by a part along the axis of the least eigenvalue."""
+    d = len(y)
+    for lane in range(LANES):
+        spare[lane] = 0.0
+    for j in range(d):
+        for lane in range(LANES):
+            spare[lane] += y[j, lane] * y[j, lane]
+    for j in range(d):
+        for lane in range(LANES):
+            if gap[j, lane] == 0.0 and spare[lane] < 1.0:
+                own = y[j, lane] * y[j, lane]
+                size = np.sqrt(max(1.0 - spare[lane] + own, 0.0))
+                y[j, lane] = size if y[j, lane] >= 0.0 else -size
+                spare[lane] = 1.0
+    for j in range(d):
+        for lane in range(LANES):
+            y[j, lane] /= np.sqrt(spare[lane])
+
+
+@compiled
+def _weigh(u: Array, room: Room, y: Array, left: Array, cost: Array) -> None:
+    """Write the cost of remote emitters in directions y (d, W): from residuals, which cancel less than the bound."""
+    for lane in range(LANES):
+        cost[lane] = room.scalar[LOOP, lane]
+    for k in range(len(u)):
+        for lane in range(LANES):
+            left[lane] = u[k, lane]
+        for j in range(len(y)):
+            for lane in range(LANES):
+                left[lane] += room.own.flat[k, j, lane] * y[j, lane]
+        for lane in range(LANES):
+            cost[lane] += left[lane] * left[lane]

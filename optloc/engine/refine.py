@@ -1,0 +1,142 @@
+"""Damped Gauss-Newton of many problems side by side: the rules of `optloc.solvers.refine`, lane by lane."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.linalg import PIVOT
+from optloc.base.types import Array
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
+from optloc.compute.jit import compiled
+from optloc.compute.systems import LANES, factor_plain, solve_plain
+from optloc.engine.evaluator import equations
+from optloc.engine.memory import (
+    ALIVE,
+    BLUR,
+    COST,
+    COST_TRIAL,
+    DAMPING,
+    DIAGONAL,
+    G_TRIAL,
+    GAIN,
+    GOOD,
+    GROWTH,
+    H_TRIAL,
+    INVERSE,
+    LOWER,
+    MOVE,
+    SOLVABLE,
+    SPARE,
+    STEPS,
+    TRIAL,
+    G,
+    H,
+    Room,
+    X,
+)
+
+
+@compiled
+def refine(rows: Any, room: Room, tolerance: float, limit: int) -> None:
+    """Refine the unknowns of the lanes that are good; those that do not finish in time stay alive.
+
+    Parameters
+    ----------
+    rows : named tuple
+        Of the evaluator.
+    room : Room
+        Unknowns in row X, rounding error and which lanes are good in; unknowns, right sides, information (lower half),
+        costs, steps, which are alive and which good out.
+    tolerance : float
+        A fix is finished when its next step is shorter than this many of its own standard deviations.
+    limit : int
+        Steps tried at most.
+
+    Notes
+    -----
+    Levenberg's method with Marquardt's scaling; the damping follows H. B. Nielsen, "Damping parameter in Marquardt's
+    method", IMM-REP-1999-05, Technical University of Denmark.
+    """
+    vector, matrix, scalar = room.vector, room.matrix, room.scalar
+    equations(rows, room, 0)
+    for lane in range(LANES):
+        # A start that is NaN or infinite is not good, and takes no step.
+        scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
+        scalar[ALIVE, lane] = scalar[GOOD, lane]
+        scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
+    # All lanes step until none is alive: a lane that is finished takes no more steps that count.
+    for _ in range(limit):
+        propose(vector, matrix, scalar)
+        equations(rows, room, 1)
+        if not decide(vector, matrix, scalar, tolerance):
+            break
+
+
+@compiled
+def propose(vector: Array, matrix: Array, scalar: Array) -> None:
+    """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
+    d = vector.shape[1]
+    diagonal, inverse, move, right, damping = (
+        vector[DIAGONAL],
+        vector[INVERSE],
+        vector[MOVE],
+        vector[G],
+        scalar[DAMPING],
+    )
+    gain, solvable, information = scalar[GAIN], scalar[SOLVABLE], matrix[H]
+    for lane in range(LANES):
+        gain[lane], solvable[lane] = 0.0, 1.0
+    for i in range(d):
+        for lane in range(LANES):
+            diagonal[i, lane] = information[i, i, lane] * (1.0 + damping[lane])
+            move[i, lane] = right[i, lane]
+    factor_plain(information, diagonal, matrix[LOWER], inverse)
+    solve_plain(matrix[LOWER], inverse, move)
+    x, trial = vector[X], vector[TRIAL]
+    for i in range(d):
+        for lane in range(LANES):
+            gain[lane] += move[i, lane] * right[i, lane]
+            trial[i, lane] = x[i, lane] + move[i, lane]
+            # One over the share of its diagonal that a pivot keeps: at least one, infinite or negative where there is
+            # no pivot.
+            share = inverse[i, lane] * diagonal[i, lane]
+            solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / PIVOT else 0.0
+
+
+@compiled
+def decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
+    """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
+    d = vector.shape[1]
+    # Lanes that are finished go through the rule too, and are left as they are: their step counts as unsolvable.
+    kept, alive = scalar[SPARE], scalar[ALIVE]
+    for lane in range(LANES):
+        better, small, stuck, scalar[DAMPING, lane], scalar[GROWTH, lane] = judge_lane(
+            scalar[COST, lane],
+            scalar[COST_TRIAL, lane],
+            scalar[GAIN, lane],
+            alive[lane] * scalar[SOLVABLE, lane] != 0.0,
+            scalar[BLUR, lane],
+            scalar[DAMPING, lane],
+            scalar[GROWTH, lane],
+            tolerance,
+            True,
+        )
+        scalar[COST, lane] = scalar[COST_TRIAL, lane] if better else scalar[COST, lane]
+        scalar[STEPS, lane] += alive[lane]
+        scalar[GOOD, lane] = 0.0 if stuck and alive[lane] != 0.0 else scalar[GOOD, lane]
+        alive[lane] = 0.0 if small or stuck else alive[lane]
+        kept[lane] = 1.0 if better else 0.0
+    for i in range(d):
+        for lane in range(LANES):
+            # Selections instead of branches: lanes that keep and lanes that refuse go through one instruction.
+            vector[X, i, lane] = vector[TRIAL, i, lane] if kept[lane] != 0.0 else vector[X, i, lane]
+            vector[G, i, lane] = vector[G_TRIAL, i, lane] if kept[lane] != 0.0 else vector[G, i, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                matrix[H, i, j, lane] = matrix[H_TRIAL, i, j, lane] if kept[lane] != 0.0 else matrix[H, i, j, lane]
+    left = 0.0
+    for lane in range(LANES):
+        left += alive[lane]
+    return left > 0.0

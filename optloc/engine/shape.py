@@ -1,0 +1,251 @@
+"""The shape of the likelihood about fixes: how far it is Gaussian, and in which chart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.systems import LANES, eliminate_last, principal_axes
+from optloc.engine.evaluator import costs
+from optloc.engine.memory import (
+    AXES,
+    BASE,
+    CENTRE,
+    COST,
+    COST_TRIAL,
+    DIAGONAL,
+    EIGEN,
+    HIGH,
+    LOW,
+    MARGIN,
+    MOVE,
+    ROW,
+    SHARE,
+    SPARE,
+    TRIAL,
+    G,
+    H,
+    Room,
+    X,
+)
+
+STRAIGHT = 0.3
+"""Greatest kappa of a Gaussian that covers: the cost at three sigma lies between 6.67 and 12.15 instead of 9."""
+
+# Where costs are compared, in standard deviations: far enough to see skewness, near enough to hold 99 %.
+_REACH = 3.0
+# Share of the quadratic cost below which a rise counts as none: its logarithm is 20, far beyond any threshold.
+_NONE = 1e-9
+# Share by which eigenvalues may differ and still be equal: the axes between them are then any axes.
+_EQUAL = 0.05
+# Least inverse range, in that of the fix: a step ends a million times as far away, where fronts are flat.
+_HORIZON = 1e-6
+
+
+@compiled
+def measure_shape(rows: Any, room: Room, inverse: bool, turned: bool, out: Array) -> None:
+    """Find kappa of fixes in row X, with their information and costs.
+
+    Parameters
+    ----------
+    rows : named tuple
+        Of the evaluator.
+    room : Room
+        Unknowns, information and costs; rows of scratch are overwritten.
+    inverse : bool
+        In inverse range about the mean of the stations that take part, instead of in metres.
+    turned : bool
+        Whether axes between equal eigenvalues are turned by 45 degrees as well.
+    out : array (W,)
+        Written: kappa; infinite at the centre of the chart.
+    """
+    vector, scalar, d = room.vector, room.scalar, room.d
+    high, low, spare = scalar[HIGH], scalar[LOW], scalar[SPARE]
+    if vector.shape[1] > d:
+        _leave_position(room)
+    if inverse:
+        _span(vector, room.axes[BASE], spare)
+    _axes(room, inverse, spare)
+    for lane in range(LANES):
+        high[lane], low[lane] = 1.0, 1.0
+    for k in range(d):
+        for side in range(2):
+            size = _REACH if side == 0 else -_REACH
+            for i in range(d):
+                for lane in range(LANES):
+                    vector[MOVE, i, lane] = size * room.axes[AXES, i, k, lane]
+            _probe(rows, room, inverse)
+            _note(scalar, high, low)
+    if turned:
+        _turn(rows, room, inverse)
+    for lane in range(LANES):
+        out[lane] = np.log(max(high[lane], 1.0 / max(low[lane], _NONE)))
+
+
+@compiled
+def _leave_position(room: Room) -> None:
+    """Eliminate the unknowns beside the position: its information, and how they follow it, are written to MARGIN."""
+    p, left, right = room.vector.shape[1], room.matrix[MARGIN], room.vector[MOVE]
+    for i in range(p):
+        for lane in range(LANES):
+            right[i, lane] = room.vector[G, i, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                left[i, j, lane] = room.matrix[H, i, j, lane]
+    eliminate_last(left, right, room.scalar[SPARE], room.vector[DIAGONAL], room.d)
+
+
+@compiled
+def find_even(eigen: Array, out: Array) -> None:
+    """Write 1.0 where two eigenvalues, on a diagonal (d, d, W), are equal within the share that counts, else 0.0."""
+    for lane in range(LANES):
+        out[lane] = 0.0
+    for i in range(1, len(eigen)):
+        for j in range(i):
+            for lane in range(LANES):
+                out[lane] = max(out[lane], _even(eigen, i, j, lane))
+
+
+@compiled
+def _even(eigen: Array, i: int, j: int, lane: int) -> float:
+    first, second = eigen[i, i, lane], eigen[j, j, lane]
+    return 1.0 if abs(first - second) <= _EQUAL * max(first, second) else 0.0
+
+
+@compiled
+def _turn(rows: Any, room: Room, inverse: bool) -> None:
+    """Go along the diagonals between axes of equal eigenvalues, and note them where they are equal."""
+    vector, axes, scalar = room.vector, room.axes, room.scalar
+    d, share = room.d, scalar[SHARE]
+    even = room.vector[ROW, 0]
+    for j in range(1, d):
+        for k in range(j):
+            found = 0.0
+            for lane in range(LANES):
+                even[lane] = _even(axes[EIGEN], j, k, lane)
+                found += even[lane]
+            if found == 0.0:
+                continue
+            for side in range(4):
+                first = (_REACH if side < 2 else -_REACH) * np.sqrt(0.5)
+                second = first if side in (0, 3) else -first
+                for i in range(d):
+                    for lane in range(LANES):
+                        along = first * axes[AXES, i, j, lane]
+                        vector[MOVE, i, lane] = along + second * axes[AXES, i, k, lane]
+                _probe(rows, room, inverse)
+                for lane in range(LANES):
+                    # a quadratic rise stands for what is not asked
+                    rise = scalar[COST, lane] + 1.0 / share[lane]
+                    scalar[COST_TRIAL, lane] = scalar[COST_TRIAL, lane] if even[lane] != 0.0 else rise
+                _note(scalar, scalar[HIGH], scalar[LOW])
+
+
+@compiled
+def _span(vector: Array, base: Array, r: Array) -> None:
+    """Write the derivatives of positions by (p, w) at the fix, ``[r B, -r u0]``, to the columns of a base (d, d, W).
+
+    B as in T. Duff et al., "Building an orthonormal basis, revisited", J. Computer Graphics Techniques 6 (2017).
+    """
+    d = len(base)
+    for lane in range(LANES):
+        r[lane] = 0.0
+    for i in range(d):
+        for lane in range(LANES):
+            base[i, d - 1, lane] = vector[CENTRE, i, lane] - vector[X, i, lane]
+            r[lane] += base[i, d - 1, lane] * base[i, d - 1, lane]
+    for lane in range(LANES):
+        r[lane] = np.sqrt(r[lane])
+        if d == 2:
+            base[0, 0, lane], base[1, 0, lane] = base[1, 1, lane], -base[0, 1, lane]
+        else:
+            x, y, z = -base[0, 2, lane] / r[lane], -base[1, 2, lane] / r[lane], -base[2, 2, lane] / r[lane]
+            sign = 1.0 if z >= 0.0 else -1.0
+            a = -1.0 / (sign + z)
+            base[0, 0, lane] = r[lane] * (1.0 + sign * a * x * x)
+            base[1, 0, lane] = r[lane] * sign * a * x * y
+            base[2, 0, lane] = -r[lane] * sign * x
+            base[0, 1, lane] = r[lane] * a * x * y
+            base[1, 1, lane] = r[lane] * (sign + a * y * y)
+            base[2, 1, lane] = -r[lane] * y
+
+
+@compiled
+def _axes(room: Room, inverse: bool, spare: Array) -> None:
+    """Write the principal axes of the position's information, or of it in the chart, one sigma long, to AXES."""
+    d, base, work, axes = room.d, room.axes[BASE], room.axes[EIGEN], room.axes[AXES]
+    source = room.matrix[MARGIN if room.vector.shape[1] > d else H]
+    for i in range(d):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                work[i, j, lane] = 0.0 if inverse else source[i, j, lane]
+    if inverse:
+        for k in range(d):
+            for i in range(d):
+                for lane in range(LANES):
+                    spare[lane] = 0.0
+                for m in range(d):
+                    row, column = max(k, m), min(k, m)
+                    for lane in range(LANES):
+                        spare[lane] += source[row, column, lane] * base[m, i, lane]
+                for j in range(i + 1):
+                    for lane in range(LANES):
+                        work[i, j, lane] += base[k, j, lane] * spare[lane]
+    principal_axes(work, axes, spare)
+    for k in range(d):
+        for lane in range(LANES):
+            spare[lane] = 1.0 / np.sqrt(work[k, k, lane])
+        for i in range(d):
+            for lane in range(LANES):
+                axes[i, k, lane] *= spare[lane]
+
+
+@compiled
+def _probe(rows: Any, room: Room, inverse: bool) -> None:
+    """Find the cost a step MOVE away, and one over the rise of a quadratic one; a step past the horizon ends there."""
+    vector, scalar, base = room.vector, room.scalar, room.axes[BASE]
+    d, move, trial, share, w = room.d, vector[MOVE], vector[TRIAL], scalar[SHARE], scalar[SPARE]
+    if inverse:
+        for lane in range(LANES):
+            down = move[d - 1, lane]
+            cut = (_HORIZON - 1.0) / down if 1.0 + down < _HORIZON else 1.0
+            share[lane] = 1.0 / (_REACH * _REACH * cut * cut)
+            w[lane] = 1.0 / (1.0 + cut * down)
+            for j in range(d - 1):
+                move[j, lane] *= cut
+        for i in range(d):
+            for lane in range(LANES):
+                trial[i, lane] = -base[i, d - 1, lane]
+            for j in range(d - 1):
+                for lane in range(LANES):
+                    trial[i, lane] += base[i, j, lane] * move[j, lane]
+            for lane in range(LANES):
+                trial[i, lane] = vector[CENTRE, i, lane] + w[lane] * trial[i, lane]
+    else:
+        for lane in range(LANES):
+            share[lane] = 1.0 / (_REACH * _REACH)
+        for i in range(d):
+            for lane in range(LANES):
+                trial[i, lane] = vector[X, i, lane] + move[i, lane]
+    for k in range(d, vector.shape[1]):
+        for lane in range(LANES):
+            trial[k, lane] = vector[X, k, lane]
+        for j in range(k):
+            for lane in range(LANES):
+                trial[k, lane] -= room.matrix[MARGIN, k, j, lane] * (trial[j, lane] - vector[X, j, lane])
+    costs(rows, room)
+
+
+@compiled
+def _note(scalar: Array, high: Array, low: Array) -> None:
+    """Keep the greatest and the least rise of the cost, relative to that of a quadratic one."""
+    for lane in range(LANES):
+        rise = (scalar[COST_TRIAL, lane] - scalar[COST, lane]) * scalar[SHARE, lane]
+        # what is no number is far from quadratic, and comparisons with it fail
+        number, lower = rise < np.inf, rise < low[lane]
+        rise = rise if number else np.inf
+        high[lane] = max(high[lane], rise)
+        low[lane] = rise if lower else low[lane]

@@ -1,0 +1,317 @@
+"""Rows of every kind as tapes of h(x) and its derivatives, with whatever else is unknown beside the position."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.gtrs import minimise
+from optloc.compute.jit import compiled
+from optloc.compute.lanes import Cells, arrange, blur_of, gather, memory, run
+from optloc.compute.lanes import load as load_lane
+from optloc.compute.pack import Numbers
+from optloc.compute.systems import LANES, eliminate_last, factor_plain, solve_plain
+from optloc.compute.tables import Tables
+from optloc.engine.lifts import CODE, CONSTANT, INPUT, NUMBER, OFFSET, ROW, SEEN, STATION, Lifts
+from optloc.engine.memory import (
+    BEYOND,
+    BLUR,
+    COST,
+    COST_TRIAL,
+    DIAGONAL,
+    H_TRIAL,
+    MOVE,
+    ORIGIN,
+    REST,
+    SCALE,
+    SOLVABLE,
+    SPARE,
+    TRIAL,
+    G,
+    H,
+    Model,
+    Room,
+    X,
+)
+from optloc.engine.start import NEAR
+
+
+class TapeRows(NamedTuple):
+    """Rows of N problems as tapes.
+
+    Parameters
+    ----------
+    tables : Tables
+        Indices.
+    numbers : Numbers
+        What the problems share, and what each has to itself but for its measurements.
+    correction : array (m,)
+        Known amount by which each measurement exceeds the model.
+    base : array (p,)
+        Where the unknowns beside the position begin.
+    lifts : Lifts
+        Rows that are linear beside squared ranges.
+    """
+
+    tables: Tables
+    numbers: Numbers
+    correction: Array
+    base: Array
+    lifts: Lifts
+
+
+class TapeRoom(NamedTuple):
+    """What is kept for a block: where things stand in the memory of lanes, that memory, and registers."""
+
+    at: Cells
+    m: Array
+    r: Array
+
+
+@compiled
+def count_unknowns(rows: TapeRows, d: int, size: int) -> int:
+    """Return the number of all unknowns."""
+    return size
+
+
+@compiled
+def count_lifted(rows: TapeRows) -> int:
+    """Return the number of linear rows beside squared ranges."""
+    return len(rows.lifts.sigma)
+
+
+@compiled
+def keep(model: Model, rows: TapeRows, stations: int, d: int, size: int) -> TapeRoom:
+    """Return the memory for a block of problems."""
+    at = arrange(rows.tables, rows.numbers, size)
+    m, r = memory(rows.tables, at, LANES)
+    if rows.lifts.registers > len(r):
+        r = np.zeros((rows.lifts.registers, r.shape[1]))
+    return TapeRoom(at, m, r)
+
+
+@compiled
+def load(rows: TapeRows, z: Array, room: Room, anew: bool) -> None:
+    """Bring the numbers of a block into its lanes."""
+    c, at, m = rows.numbers, room.own.at, room.own.m
+    for lane in range(LANES):
+        i = room.item[lane]
+        load_lane(m, lane, i, c.source, c.white, c.prior, c.observed, c.present)
+        for j in range(z.shape[1]):
+            m[at.observed + j, lane] = z[i, j] - rows.correction[j]
+        room.scalar[BLUR, lane] = blur_of(c.sigma, c.size, m, at, lane, i)
+
+
+@compiled
+def minimise_start(model: Model, rows: TapeRows, room: Room, first: bool) -> None:
+    """Write the minimiser of the weighed squared-range rows, and of linear ones beside them."""
+    _lift(rows.lifts, room, first)
+    if rows.lifts.flat:
+        _minimise_flat(room)
+    else:
+        minimise(room.rows, model.reference >= 0, room.y, room.scalar[SOLVABLE], room.work)
+
+
+@compiled
+def _lift(lifts: Lifts, room: Room, first: bool) -> None:
+    """Write the linear rows behind those of ranges, weighed by the error that they have at the last answer."""
+    s, r, scale, spare = len(room.place), room.own.r, room.scalar[SCALE], room.scalar[SPARE]
+    together = max(1, r.shape[1] // LANES)
+    for lane in range(LANES):
+        spare[lane] = 1.0 / scale[lane]
+    for b in range(len(lifts.block) - 1):
+        last, begin = lifts.block[b + 1, ROW], lifts.block[b, INPUT]
+        for row in range(lifts.block[b, ROW], last, together):
+            end = min(row + together, last)
+            for one in range(row, end):
+                _enter(lifts, room, r, one, begin, (one - row) * LANES, spare)
+            for k in range(lifts.block[b, CONSTANT], lifts.block[b + 1, CONSTANT]):
+                for i in range((end - row) * LANES):
+                    r[lifts.constant[k], i] = lifts.value[k]
+            run(lifts.code, lifts.block[b, CODE], lifts.block[b + 1, CODE], r, (end - row) * LANES)
+            for one in range(row, end):
+                _weigh(lifts.output[b], lifts.sigma[one], r, (one - row) * LANES, first, room.rows[s + one])
+
+
+@compiled
+def _enter(lifts: Lifts, room: Room, r: Array, row: int, begin: int, low: int, inverse: Array) -> None:
+    """Write the inputs of a row into their registers; `inverse` is one over the scale."""
+    for i in range(lifts.first[row + 1] - lifts.first[row]):
+        to, line = lifts.input[begin + i], lifts.first[row] + i
+        what, which = lifts.source[line, 0], lifts.source[line, 1]
+        for lane in range(LANES):
+            if what == NUMBER:
+                value = lifts.number[which]
+            elif what == SEEN:
+                value = room.seen[which, lane]
+            elif what == STATION:
+                value = room.place[which // room.d, which % room.d, lane] * inverse[lane]
+            elif what == OFFSET:
+                value = room.value[which, lane] * inverse[lane]
+            else:
+                value = room.y[which, lane]
+            r[to, low + lane] = value
+
+
+@compiled
+def _weigh(output: Array, sigma: float, r: Array, low: int, first: bool, out: Array) -> None:
+    """Write a row (d + 2, W) over the error that it has, or over that of a place one scale away."""
+    last = len(output) - 1
+    for j in range(last):
+        for lane in range(LANES):
+            factor = 1.0 if first else max(abs(r[output[last], low + lane]), NEAR)
+            out[j, lane] = r[output[j], low + lane] / (factor * sigma)
+
+
+@compiled
+def _minimise_flat(room: Room) -> None:
+    """Write the least-squares position: no row has the last coordinate, and the quadric would only invent one."""
+    rows, y, d, vector, work = room.rows, room.y, room.d, room.vector, room.axes[0]
+    diagonal, inverse, solvable = vector[DIAGONAL][:d], vector[MOVE][:d], room.scalar[SOLVABLE]
+    for i in range(d):
+        for lane in range(LANES):
+            y[i, lane], diagonal[i, lane] = 0.0, 0.0
+        for j in range(i + 1):
+            for lane in range(LANES):
+                work[i, j, lane] = 0.0
+    for k in range(len(rows)):
+        for i in range(d):
+            for lane in range(LANES):
+                y[i, lane] += rows[k, i, lane] * rows[k, d + 1, lane]
+            for j in range(i + 1):
+                for lane in range(LANES):
+                    work[i, j, lane] += rows[k, i, lane] * rows[k, j, lane]
+    for lane in range(LANES):
+        y[d, lane], solvable[lane] = 0.0, 1.0
+    for i in range(d):
+        for lane in range(LANES):
+            diagonal[i, lane] = work[i, i, lane]
+    factor_plain(work, diagonal, room.axes[1], inverse)
+    solve_plain(room.axes[1], inverse, y[:d])
+    for i in range(d):
+        for lane in range(LANES):
+            share = inverse[i, lane] * diagonal[i, lane]
+            solvable[lane] = solvable[lane] if 0.0 < share < _MOST else 0.0
+
+
+# One over the share of its diagonal that a pivot must keep: below it three digits of a start are left.
+_MOST = 1e13
+
+
+@compiled
+def complete(rows: TapeRows, room: Room) -> None:
+    """Write the unknowns beside the position that fit it best: exact where rows are linear in them."""
+    vector, d, p = room.vector, room.d, room.vector.shape[1]
+    if p == d:
+        return
+    for k in range(d, p):
+        for lane in range(LANES):
+            vector[X, k, lane] = rows.base[k]
+    equations(rows, room, 0)
+    _copy(room, 0)
+    left, right = room.matrix[REST], vector[MOVE]
+    eliminate_last(left, right, room.scalar[SPARE], vector[DIAGONAL], d)
+    for k in range(d, p):
+        for lane in range(LANES):
+            vector[TRIAL, k, lane] = left[k, k, lane] * right[k, lane]
+        for j in range(d, k):
+            for lane in range(LANES):
+                vector[TRIAL, k, lane] -= left[k, j, lane] * vector[TRIAL, j, lane]
+    for k in range(d, p):
+        for lane in range(LANES):
+            vector[X, k, lane] += vector[TRIAL, k, lane]
+
+
+@compiled
+def _copy(room: Room, shift: int) -> None:
+    """Copy information and right side at row X, or at TRIAL with shift 1, to REST and MOVE."""
+    p, left = room.vector.shape[1], room.matrix[REST]
+    for i in range(p):
+        for lane in range(LANES):
+            room.vector[MOVE, i, lane] = room.vector[G + shift, i, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                left[i, j, lane] = room.matrix[H + shift, i, j, lane]
+
+
+@compiled
+def equations(rows: TapeRows, room: Room, shift: int) -> None:
+    """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
+    m = _evaluate(rows, room, shift)
+    p, last = room.vector.shape[1], room.own.at.after
+    matrix, vector = room.matrix[H + shift], room.vector[G + shift]
+    for i in range(p):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                matrix[i, j, lane] = m[last + i * (p + 1) + j, lane]
+        for lane in range(LANES):
+            vector[i, lane] = m[last + p * (p + 1) + i, lane]
+    for lane in range(LANES):
+        room.scalar[COST + shift, lane] = m[last + p * (p + 2), lane]
+
+
+@compiled
+def _evaluate(rows: TapeRows, room: Room, shift: int) -> Array:
+    """Write the equations at row X, or at TRIAL with shift 1, into the memory of the lanes, which is returned."""
+    own, x, origin = room.own, room.vector[X + shift], room.vector[ORIGIN]
+    for i in range(room.vector.shape[1]):
+        for lane in range(LANES):
+            own.m[own.at.trial + i, lane] = x[i, lane] + origin[i, lane]
+    gather(rows.tables, rows.numbers, own.m, own.r, own.at, True, LANES)
+    return own.m
+
+
+@compiled
+def costs(rows: TapeRows, room: Room) -> None:
+    """Write the cost at TRIAL, the least over the unknowns beside the position, to COST_TRIAL."""
+    p, d, at = room.vector.shape[1], room.d, room.own.at.after
+    m = _evaluate(rows, room, 1)
+    for lane in range(LANES):
+        room.scalar[COST_TRIAL, lane] = m[at + p * (p + 2), lane]
+    if p == d:
+        return
+    left, right = room.matrix[REST], room.vector[MOVE]
+    for i in range(p):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                left[i, j, lane] = m[at + i * (p + 1) + j, lane]
+        for lane in range(LANES):
+            right[i, lane] = m[at + p * (p + 1) + i, lane]
+    eliminate_last(left, right, room.scalar[COST_TRIAL], room.vector[DIAGONAL], d)
+
+
+@compiled
+def bow_of(rows: TapeRows, room: Room) -> float:
+    """Return infinity: nobody says how much rows of any kind bend."""
+    return np.inf
+
+
+@compiled
+def note_nearest(room: Room, least: Array) -> None:
+    """Write that no station is near."""
+    for lane in range(LANES):
+        least[lane] = np.inf
+
+
+@compiled
+def bend(rows: TapeRows, room: Room) -> None:
+    """Write the information to H_TRIAL: tapes have first derivatives only."""
+    p = room.vector.shape[1]
+    for i in range(p):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                room.matrix[H_TRIAL, i, j, lane] = room.matrix[H, i, j, lane]
+
+
+@compiled
+def measure_infinity(rows: TapeRows, room: Room) -> None:
+    """Write that nobody has looked."""
+    for lane in range(LANES):
+        room.scalar[BEYOND, lane] = np.nan
+
+
+@compiled
+def finish(rows: TapeRows, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+    """Do nothing: all unknowns are refined."""

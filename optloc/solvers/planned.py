@@ -1,0 +1,173 @@
+"""Fixes by plans; what is not plainly good takes the stages of the long way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.base.records import take
+from optloc.base.types import Array, Status
+from optloc.compute.sums import equations_at
+from optloc.engine.plan import Plan, plan_of, rows_at
+from optloc.problem.fix import Stage
+from optloc.problem.problem import Problem
+from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.policy import equal_cost
+from optloc.solvers.pool import Curvature, Pool, in_parts
+from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
+from optloc.solvers.verdict.minima import likelihood_of, measure_curvature
+
+if TYPE_CHECKING:
+    from optloc.engine.memory import Answer
+
+
+@dataclass(frozen=True, slots=True)
+class Quick:
+    """The stages "gtrs" and "lsr" as one, by a plan where there is one.
+
+    Parameters
+    ----------
+    alone : bool
+        Whether nothing follows: then the mirror image of the start is refined on the way of the stages, too. What
+        follows otherwise looks for other minima by itself.
+    """
+
+    alone: bool = False
+
+    def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
+        """Return the settled pools of a flat batch of problems."""
+        count, start = problem.batch_shape[0], pool
+        plan = plan_of(problem) if pool is None else None
+        refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
+        if plan is None or not plan.at_hand(count):
+
+            def work(some: Problem, part: slice) -> Pool:
+                return refinement(some, gtrs(some, None if start is None else take(start, part)))
+
+            return in_parts(problem, work)
+        z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
+        z = z if z.ndim == 2 and len(z) == count else np.broadcast_to(z, (count, problem.count))
+        return settle_directly(plan, plan.rows(problem), z, plan.places(problem), problem.take, refinement)
+
+
+def settle_directly(
+    plan: Plan,
+    rows: Any,
+    z: Array,
+    place: Array,
+    problems_at: Callable[[Array], Problem],
+    refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror,
+    threads: int | None = None,
+) -> Pool:
+    """Return the settled pools of measurements: by a plan where the answer is plain, else by other means.
+
+    Parameters
+    ----------
+    plan : Plan
+        Of the problems.
+    rows : named tuple
+        Of the plan.
+    z : array (N, m)
+        Measurements.
+    place : array (N or 1, s, d)
+        Of the stations that take part.
+    problems_at : callable
+        Maps the numbers of problems whose answer is not plain to the problems.
+    refinement : callable
+        What takes the starts of those that are not plain by any means.
+    threads : int, optional
+        At most so many; as many as `optloc.base.threads.thread_count` says if absent.
+    """
+    began = perf_counter()
+    answer, steps = plan.run(rows, z, place, threads)
+    left = np.flatnonzero(~_is_final(plan, answer, problems_at))
+    if not len(left):
+        return _pool(plan, _preferred(answer, problems_at), steps, began)
+    # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
+    some = problems_at(left)
+    start = in_parts(some, lambda part, _: gtrs(part, None))
+    own = place[left] if len(place) > 1 else place
+    more, again = plan.run(rows_at(rows, left), z[left], own, threads, start.x[:, 0])
+    for whole, part in zip(answer, more, strict=True):
+        whole[left] = part
+    pool = _pool(plan, _preferred(answer, problems_at), max(steps, again), began)
+    lost = np.flatnonzero(~_is_final(plan, more, some.take))
+    if not len(lost):
+        return pool
+    start = take(start, lost)
+    return pool.merge(left[lost], in_parts(some.take(lost), lambda part, which: refinement(part, take(start, which))))
+
+
+def _is_final(plan: Plan, answer: Answer, problems_at: Callable[[Array], Problem]) -> Array:
+    """Return which fixes (N,) need no other means: settled ones.
+
+    On Earth those which it hides from a station are not final: what lies before it competes, and is told.
+    """
+    if not plan.frame.geodetic:
+        return answer.settled
+    out, items = np.array(answer.settled), np.flatnonzero(answer.settled)
+    out[items] = ~is_hidden(problems_at(items), answer.x[items])
+    return out
+
+
+def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answer:
+    """Return the answer with the likelier by its place of two minima that cost the same, as the verdict has it."""
+    tied = np.flatnonzero(answer.settled & (np.abs(answer.rival_cost - answer.cost) <= equal_cost(answer.cost)))
+    if not len(tied):
+        return answer
+    some = problems_at(tied)
+    (first, second), (other, another) = likelihood_of(some, answer.x[tied]), likelihood_of(some, answer.rival[tied])
+    changed = (other > first) | ((other == first) & (another > second))
+    items, some = tied[changed], some.take(np.flatnonzero(changed))
+    if not len(items):
+        return answer
+    x, rival, cost, rival_cost, covariance, kappa = (
+        np.array(values)
+        for values in (answer.x, answer.rival, answer.cost, answer.rival_cost, answer.covariance, answer.kappa)
+    )
+    x[items], rival[items] = rival[items], x[items]
+    cost[items], rival_cost[items] = rival_cost[items], cost[items]
+    at = x[items]
+    covariance[items] = measure_curvature(some, equations_at(some, at), at, np.zeros(len(at), dtype=int)).covariance
+    kappa[items] = np.nan  # the verdict looks at its shape
+    return answer._replace(x=x, rival=rival, cost=cost, rival_cost=rival_cost, covariance=covariance, kappa=kappa)
+
+
+def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
+    """Return the pool of fixes that were found directly, with a second slot where some have a rival."""
+    count, seconds = len(answer.cost), perf_counter() - began
+    rivalled = np.isfinite(answer.rival_cost) & answer.settled
+    x, cost = answer.x[:, None], answer.cost[:, None]
+    code = np.broadcast_to(np.int8(Status.OK), (count, 1))
+    if rivalled.any():
+        rival = np.where(rivalled[:, None], answer.rival, np.nan)
+        x = np.concatenate([x, rival[:, None]], axis=1)
+        cost = np.stack([answer.cost, np.where(rivalled, answer.rival_cost, np.inf)], axis=1)
+        # an empty slot is one that nobody has refined
+        second = np.where(rivalled, np.int8(Status.OK), np.int8(Status.UNAVAILABLE))
+        code = np.concatenate([code, second[:, None]], axis=1)
+    return Pool(
+        x,
+        cost,
+        code,
+        np.broadcast_to(0, cost.shape),
+        np.broadcast_to(plan.weight, (count, len(plan.weight))),
+        np.broadcast_to(np.int32(plan.dof), count),
+        direct_stages(count, steps, seconds),
+        refined=True,
+        curvature=Curvature(answer.covariance, kappa=answer.kappa),
+        plain=answer.settled & ~rivalled,
+        infinity=answer.infinity,
+    )
+
+
+_STARTED = Stage("gtrs", "1 candidates at most", 0.0)
+
+
+def direct_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
+    """Return the stages that so many fixes went through at once, and the most steps that one took."""
+    return _STARTED, Stage("lsr", f"{count} candidates, {steps} steps at most", seconds)
