@@ -23,8 +23,10 @@ from optloc import (
     station_array,
     with_bias,
 )
+from optloc.base.types import Band
 from optloc.compute.jit import enabled
 from optloc.engine.plan import plan_of
+from optloc.linear.constraints import box, height
 from optloc.solvers.pool import in_parts
 from optloc.solvers.stages import gtrs_lsr
 from optloc.solvers.verdict.judge import verdict
@@ -48,7 +50,11 @@ def assert_same(fix, other, apart=1e-6):
     assert np.array_equal(fix.code, other.code)
     assert [without_numbers(reason) for reason in fix.reason] == [without_numbers(reason) for reason in other.reason]
     assert list(fix.certificate) == list(other.certificate)
-    assert list(fix.active) == list(other.active)
+    for mine, theirs in zip(fix.active, other.active, strict=True):
+        assert [held.name for held in mine] == [held.name for held in theirs]
+        assert np.allclose(
+            [held.multiplier for held in mine], [held.multiplier for held in theirs], rtol=1e-5, atol=1e-6
+        )
     assert np.array_equal(fix.dof, other.dof)
     assert np.array_equal(fix.weights, other.weights)
     assert fix.layout == other.layout
@@ -143,6 +149,7 @@ def test_equals_the_stages(name):
 
 
 TAPED = ["groa", "tdoa+azimuth", "angles", "bistatic", "toa+azimuth", "prior", "bias", "errors", "height"]
+TAPED += ["exact height", "plane", "line", "above ground", "box", "angles at a height", "bias in a plane"]
 
 
 def taped(name):
@@ -172,8 +179,21 @@ def taped(name):
         stations = replace(base, covariance=np.tile(9.0 * np.eye(3), (base.count, 1, 1)))
     if name == "height":
         more["frame"] = ENU
+    if name in ("exact height", "above ground", "angles at a height"):
+        more["frame"] = ENU
+        level = ENU.to_geodetic(truth)[2]
+        more["constraints"] = height(0.0) if name == "above ground" else height(exactly=level)
+    if name == "angles at a height":
+        rows = tuple(measured(kind, a=np.arange(s), sigma=0.005) for kind in ("azimuth", "elevation"))
+    if name == "box":
+        more["constraints"] = box([-1e5, -1e5, 0.0], [1e5, 1e5, 2e4])
+    if name.endswith(("plane", "line")):
+        held = Band("plane", np.array(truth[2]), np.array(truth[2]), np.eye(3)[2], "z")
+        across = np.array([1.0, 2.0, 0.0])
+        other = Band("plane", np.array(across @ truth), np.array(across @ truth), across, "line")
+        more["constraints"] = (held, other) if name == "line" else (held,)
     problem = assemble(stations, *rows, **more)
-    if name == "bias":
+    if name.startswith("bias"):
         problem = with_bias(problem, "clock", members=tuple(problem.stations.names[1:4]), sigma=5.0)
     return problem, np.append(truth, np.zeros(problem.layout.size - 3))
 

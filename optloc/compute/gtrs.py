@@ -14,7 +14,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, factor_plain, solve_plain
+from optloc.compute.systems import LANES, factor_plain, principal_axes, solve_plain
 
 # Newton's steps: with range differences and ranges of five and six stations all lanes settled in three or four; what
 # has not settled after three times as many needs the other tool.
@@ -94,6 +94,115 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     for i in range(n):
         for lane in range(LANES):
             settled[lane] = settled[lane] if abs(y[i, lane]) < np.inf else 0.0
+
+
+# Share of the largest eigenvalue of B'B below which a direction is open, with a margin of four digits to rounding; and
+# curvature of the quadric along it below which it meets the line once.
+_OPEN, _STRAIGHT = 1e-11, 1e-12
+
+
+@compiled
+def meet(rows: Array, on_cone: bool, y: Array, other: Array, settled: Array, two: Array, work: Array) -> None:
+    """Find where lines of minimisers meet the quadric: of problems whose rows leave one direction open.
+
+    Stations in a plane leave the direction across it open, and as few rows as coordinates one direction in any case.
+    All points along it cost the same, so that both points on the quadric are minimisers.
+
+    Parameters
+    ----------
+    rows, on_cone : array (q, n + 1, W), bool
+        As of `minimise`.
+    y, other : array (n, W)
+        Written where a lane is not settled: one point, and the second one.
+    settled, two : float array (W,)
+        Lanes that are not settled are looked at; written: 1.0 where there is a point, and where there is a second one.
+    work : array (at least ``scratch(n)``, W)
+        Scratch.
+    """
+    n = len(y)
+    A, axes = work[: n * n].reshape(n, n, LANES), work[n * n : 2 * n * n].reshape(n, n, LANES)
+    rest = work[2 * n * n :]
+    b, along, base, spare = rest[:n], rest[n : 2 * n], rest[2 * n : 3 * n], rest[3 * n]
+    left = 0.0
+    for lane in range(LANES):
+        two[lane] = 0.0
+        left += 1.0 - settled[lane]
+    if left == 0.0:
+        return
+    _normal(rows, A, b, spare)
+    principal_axes(A, axes, spare)
+    for lane in range(LANES):
+        if settled[lane] == 0.0:
+            _meet_lane(A, axes, b, along, base, on_cone, y, other, settled, two, lane)
+
+
+@compiled
+def _open_axis(A: Array, lane: int) -> int:
+    """Return the axis of the only eigenvalue, on the diagonal of A, that is nothing; -1 where there is not one."""
+    n, first, most, second = len(A), 0, 0.0, np.inf
+    for k in range(n):
+        most = max(most, A[k, k, lane])
+        first = k if A[k, k, lane] < A[first, first, lane] else first
+    for k in range(n):
+        second = second if k == first else min(second, A[k, k, lane])
+    return first if A[first, first, lane] < _OPEN * most < second else -1
+
+
+@compiled
+def _meet_lane(
+    A: Array,
+    axes: Array,
+    b: Array,
+    along: Array,
+    base: Array,
+    on_cone: bool,
+    y: Array,
+    other: Array,
+    settled: Array,
+    two: Array,
+    lane: int,
+) -> None:
+    """Do so for one lane: eigenvalues on the diagonal of A, eigenvectors in the columns of axes."""
+    n, first = len(y), _open_axis(A, lane)
+    if first < 0:
+        return
+    for i in range(n):
+        along[i, lane], base[i, lane] = axes[i, first, lane], 0.0
+    for k in range(n):
+        if k != first:
+            part = 0.0
+            for i in range(n):
+                part += axes[i, k, lane] * b[i, lane]
+            for i in range(n):
+                base[i, lane] += axes[i, k, lane] * part / A[k, k, lane]
+    square, cross, value = 0.0, 0.0, 0.0
+    for i in range(n - 1):
+        square += along[i, lane] * along[i, lane]
+        cross += along[i, lane] * base[i, lane]
+        value += base[i, lane] * base[i, lane]
+    u, v = along[n - 1, lane], base[n - 1, lane]
+    if on_cone:
+        square, cross, value = square - u * u, cross - u * v, value - v * v
+    else:
+        cross, value = cross - 0.5 * u, value - v
+    inside = cross * cross - square * value
+    if not inside >= 0.0:
+        return
+    # the larger root first, and the other one from their product: nothing cancels
+    sum_of = -(cross + (np.sqrt(inside) if cross >= 0.0 else -np.sqrt(inside)))
+    roots = (value / sum_of if sum_of != 0.0 else 0.0, sum_of / square if abs(square) > _STRAIGHT else np.nan)
+    for t in roots:
+        last = v + t * u
+        # behind the apex there is nothing
+        if not (last >= 0.0 and abs(t) < np.inf):
+            continue
+        for i in range(n):
+            if settled[lane] == 0.0:
+                y[i, lane] = base[i, lane] + t * along[i, lane]
+            else:
+                other[i, lane] = base[i, lane] + t * along[i, lane]
+        two[lane] = settled[lane]
+        settled[lane] = 1.0
 
 
 @compiled

@@ -16,10 +16,10 @@ from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES, factor_plain, solve_plain
 from optloc.engine import ranges, tapes
+from optloc.engine.admission import admit, evaluate, find_multipliers, hold_covariance, restore
 from optloc.engine.evaluator import (
     count_lifted,
     count_unknowns,
-    equations,
     evaluated_by,
     finish,
     keep,
@@ -36,6 +36,7 @@ from optloc.engine.memory import (
     DAMPING,
     DIAGONAL,
     EIGEN,
+    FIX,
     FIX_COST,
     FIX_GOOD,
     GOOD,
@@ -47,6 +48,7 @@ from optloc.engine.memory import (
     NORMAL,
     ORIGIN,
     ROW,
+    SECOND,
     SOLVABLE,
     SPARE,
     SPREAD,
@@ -69,6 +71,10 @@ _FEW = 6
 _WEAK = 1e-11
 # A fourfold margin to the spreads of the stations from which on a fix is doubted.
 _FAR = 2.5e3
+# Share of costs that rounding, and the tolerance of a refinement, leave (`optloc.solvers.policy.equal_cost`).
+_TIED = 1e-6
+# Difference of logarithms of distances that is rounding, as of `optloc.solvers.verdict.minima.likelihood_of`.
+_SAME_DISTANCE = 1e-6
 # Lanes of a block from which on it goes on as it is: collecting problems anew costs a start and half a step.
 _WORTH = LANES // 2
 
@@ -108,23 +114,23 @@ def fixes(
         size = _take(room.item, None, first, count)
         _see(model, rows, z, station, room, first == 0)
         if given:
-            _resume(answer.x, room)
+            _resume(model, answer.x, room)
         else:
             begin(model, rows, room)
         # what is no full block has nothing to wait for
         limit = min(_FEW, most) if size == LANES else most
-        steps = max(steps, _refine(rows, z, room, size, tolerance, limit, answer))
+        steps = max(steps, _refine(model, rows, z, room, size, tolerance, limit, answer))
         for lane in range(size):
             if room.scalar[ALIVE, lane] != 0.0 and most > limit:
                 late[waiting] = room.item[lane]
                 waiting += 1
-        images = _examine(rows, z, room, size, tolerance, given, answer, look, hidden, images, course)
+        images = _examine(model, rows, z, room, size, tolerance, given, answer, look, hidden, images, course)
     for first in range(0, waiting, LANES):
         size = _take(room.item, late, first, waiting)
         _see(model, rows, z, station, room, False)
-        _resume(answer.x, room)
-        steps = max(steps, _FEW + _refine(rows, z, room, size, tolerance, most - _FEW, answer))
-        images = _examine(rows, z, room, size, tolerance, given, answer, look, hidden, images, course)
+        _resume(model, answer.x, room)
+        steps = max(steps, _FEW + _refine(model, rows, z, room, size, tolerance, most - _FEW, answer))
+        images = _examine(model, rows, z, room, size, tolerance, given, answer, look, hidden, images, course)
     _pursue(model, rows, z, station, room, tolerance, given, answer, look, hidden, images, course)
     waiting = 0
     for i in range(count):
@@ -133,8 +139,8 @@ def fixes(
     for first in range(0, waiting, LANES):
         size = _take(room.item, late, first, waiting)
         _see(model, rows, z, station, room, False)
-        _resume(answer.x, room)
-        _look_again(rows, z, room, size, answer, look)
+        _resume(model, answer.x, room)
+        _look_again(model, rows, z, room, size, answer, look)
     return steps
 
 
@@ -152,6 +158,11 @@ def _take(item: Array, order: Array | None, first: int, count: int) -> int:
 def _see(model: Model, rows: Any, z: Array, station: Array, room: Room, begins: bool) -> None:
     """Take measurements and stations of a block; stations that all problems share are taken when a call begins."""
     scalar, vector, anew = room.scalar, room.vector, len(station) > 1 or begins
+    level = model.admission.level
+    for k in range(len(room.level)):
+        for lane in range(LANES):
+            at = room.item[lane] if len(level) > 1 else 0
+            room.level[k, 0, lane], room.level[k, 1, lane] = level[at, k, 0], level[at, k, 1]
     read(z, room.item, model.row, model.anchor, model.linear, room.seen, room.value, scalar[BLUR], scalar[GOOD])
     if anew:
         stand(
@@ -169,10 +180,12 @@ def _see(model: Model, rows: Any, z: Array, station: Array, room: Room, begins: 
 
 
 @compiled
-def _refine(rows: Any, z: Array, room: Room, size: int, tolerance: float, limit: int, answer: Answer) -> int:
+def _refine(
+    model: Model, rows: Any, z: Array, room: Room, size: int, tolerance: float, limit: int, answer: Answer
+) -> int:
     """Refine the unknowns of a block and write them; return the most steps that one took."""
-    refine(rows, room, tolerance, limit)
-    _write_fixes(rows, z, room, size, answer)
+    refine(model, rows, room, tolerance, limit)
+    _write_fixes(model, rows, z, room, size, answer)
     steps = 0
     for lane in range(size):
         steps = max(steps, int(room.scalar[STEPS, lane]))
@@ -180,10 +193,13 @@ def _refine(rows: Any, z: Array, room: Room, size: int, tolerance: float, limit:
 
 
 @compiled
-def _write_fixes(rows: Any, z: Array, room: Room, size: int, answer: Answer) -> None:
+def _write_fixes(model: Model, rows: Any, z: Array, room: Room, size: int, answer: Answer) -> None:
     """Write unknowns, covariances and costs of the first lanes, and to FIX_GOOD which are settled."""
     scalar = room.scalar
     _invert(room)
+    hold_covariance(model, room)
+    find_multipliers(model, room)
+    admit(model, room, scalar[SOLVABLE])
     for lane in range(LANES):
         good = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
         scalar[FIX_GOOD, lane] = 1.0 if good else 0.0
@@ -193,6 +209,8 @@ def _write_fixes(rows: Any, z: Array, room: Room, size: int, answer: Answer) -> 
         i = room.item[lane]
         settled[i] = scalar[FIX_GOOD, lane] != 0.0
         cost[i] = scalar[COST, lane]
+        for k in range(len(room.part)):
+            answer.multiplier[i, k] = room.part[k, lane]
         for j in range(covariance.shape[1]):
             for k in range(covariance.shape[1]):
                 covariance[i, j, k] = found[max(j, k), min(j, k), lane]
@@ -214,6 +232,7 @@ def _place(vector: Array, item: Array, x: Array, mark: Array, marked: bool, size
 
 @compiled
 def _examine(
+    model: Model,
     rows: Any,
     z: Array,
     room: Room,
@@ -233,7 +252,7 @@ def _examine(
     scalar = room.scalar
     settled = scalar[FIX_GOOD]
     kappa, even, closer, turned = room.vector[ROW, 0], room.vector[ROW, 1], 0, False
-    measure_shape(rows, room, False, False, kappa)
+    measure_shape(model, rows, room, False, False, kappa)
     find_even(room.axes[EIGEN], even)
     shape, rival, infinity, item = answer.kappa, answer.rival_cost, answer.infinity, room.item
     for lane in range(size):
@@ -244,8 +263,12 @@ def _examine(
         closer += 1 if look[i] else 0
         turned = turned or even[lane] != 0.0
     if closer >= _WORTH or (closer and size < LANES):
-        _measure_closely(rows, room, size, answer, look, turned)
-    measure_infinity(rows, room)
+        _measure_closely(model, rows, room, size, answer, look, turned)
+    if len(model.admission.output):  # bounds limit, or bar, the way there
+        for lane in range(LANES):
+            scalar[BEYOND, lane] = np.nan
+    else:
+        measure_infinity(rows, room)
     left = 0.0
     for lane in range(size):
         if settled[lane] != 0.0:
@@ -256,25 +279,29 @@ def _examine(
     if left == 0.0:
         return images
     keep_fix(room)
-    reflect(room)
-    follow(rows, room, tolerance, _WORTH if size == LANES else 1, given)
-    return _end_images(rows, z, room, size, answer, look, hidden, images, course)
+    reflect(model, room)
+    follow(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
+    return _end_images(model, rows, z, room, size, answer, look, hidden, images, course)
 
 
 @compiled
-def _measure_closely(rows: Any, room: Room, size: int, answer: Answer, look: Array, turned: bool) -> None:
+def _measure_closely(model: Model, rows: Any, room: Room, size: int, answer: Answer, look: Array, turned: bool) -> None:
     """Measure the shape in metres along turned axes as well, if asked, and in inverse range where it is poor there."""
     kappa, item, settled, shape, far = room.vector[ROW, 0], room.item, answer.settled, answer.kappa, 0
     if turned:
-        measure_shape(rows, room, False, True, kappa)
+        measure_shape(model, rows, room, False, True, kappa)
     for lane in range(size):
         i = item[lane]
         if settled[i]:
             look[i] = False
             shape[i, 0] = kappa[lane] if turned else shape[i, 0]
             far += 1 if shape[i, 0] > STRAIGHT else 0
-    if far:
-        measure_shape(rows, room, True, True, kappa)
+    if far and model.admission.exact:  # the chart knows of no surface
+        for lane in range(size):
+            if settled[item[lane]]:
+                shape[item[lane], 1] = np.inf
+    elif far:
+        measure_shape(model, rows, room, True, True, kappa)
         for lane in range(size):
             i = item[lane]
             if settled[i] and shape[i, 0] > STRAIGHT:
@@ -304,22 +331,23 @@ def _pursue(
         for first in range(0, waiting, LANES):
             size = _take(room.item, hidden, first, waiting)
             _see(model, rows, z, station, room, False)
-            _resume(answer.x, room)
-            equations(rows, room, 0)
+            _resume(model, answer.x, room)
+            evaluate(model, rows, room, 0)
             keep_fix(room)
-            _resume(answer.rival, room)
+            _resume(model, answer.rival, room)
             for lane in range(LANES):
                 i = item[lane]
                 scalar[FIX_COST, lane], scalar[GOOD, lane], scalar[ALIVE, lane] = cost[i], 1.0, 1.0
                 scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
                 scalar[STEPS, lane] = course[2, i]
-            follow(rows, room, tolerance, _WORTH if size == LANES else 1, given)
+            follow(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
             # those that wait on stand before the blocks that are still to come
-            images = _end_images(rows, z, room, size, answer, look, hidden, images, course)
+            images = _end_images(model, rows, z, room, size, answer, look, hidden, images, course)
 
 
 @compiled
 def _end_images(
+    model: Model,
     rows: Any,
     z: Array,
     room: Room,
@@ -342,7 +370,7 @@ def _end_images(
             course[2, i] = scalar[STEPS, lane]
     if images > before:
         _place(room.vector, item, answer.rival, scalar[ALIVE], True, size)
-    if confirm(rows, room) == 0.0:
+    if confirm(model, rows, room) == 0.0:
         return images
     _place(room.vector, item, answer.rival, scalar[GOOD], True, size)
     finish(rows, z, room, size, scalar[GOOD], True, answer.rival)
@@ -351,7 +379,9 @@ def _end_images(
         if scalar[GOOD, lane] != 0.0:
             i = item[lane]
             rival[i] = scalar[COST, lane]
-            if rival[i] < cost[i]:
+            # of two that cost the same the likelier by its place, whatever rounding says
+            tied = abs(rival[i] - cost[i]) <= _TIED * (1.0 + cost[i])
+            if _is_likelier(room, lane) if tied else rival[i] < cost[i]:
                 _exchange(answer.x, cost, answer.rival, rival, i)
                 look[i] = True
                 if rival[i] == np.inf:
@@ -361,6 +391,23 @@ def _end_images(
                     hidden[images] = i
                     images += 1
     return images
+
+
+@compiled
+def _is_likelier(room: Room, lane: int) -> bool:
+    """Return whether row X is the likelier of two minima of one cost: nearer to the stations than FIX, or upper.
+
+    Distances that differ in the seventh digit of their logarithm differ by rounding.
+    """
+    vector, last = room.vector, room.d - 1
+    near, far = 0.0, 0.0
+    for j in range(room.d):
+        near += (vector[X, j, lane] - vector[CENTRE, j, lane]) ** 2
+        far += (vector[FIX, j, lane] - vector[CENTRE, j, lane]) ** 2
+    ahead = 0.5 * np.log(far / near)
+    if abs(ahead) > _SAME_DISTANCE:
+        return bool(ahead > 0.0)
+    return bool(vector[X, last, lane] > vector[FIX, last, lane])
 
 
 @compiled
@@ -384,22 +431,25 @@ def _exchange(x: Array, cost: Array, rival: Array, rival_cost: Array, i: int) ->
 
 
 @compiled
-def _look_again(rows: Any, z: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
+def _look_again(model: Model, rows: Any, z: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
     """Write covariance and shape of fixes in row X anew."""
-    equations(rows, room, 0)
+    evaluate(model, rows, room, 0)
     for lane in range(LANES):
         room.scalar[ALIVE, lane] = 0.0
-    _write_fixes(rows, z, room, size, answer)
-    _measure_closely(rows, room, size, answer, look, True)
+    _write_fixes(model, rows, z, room, size, answer)
+    _measure_closely(model, rows, room, size, answer, look, True)
 
 
 @compiled
-def _resume(x: Array, room: Room) -> None:
+def _resume(model: Model, x: Array, room: Room) -> None:
     """Go on from the positions reached so far."""
     item, vector = room.item, room.vector
     for j in range(vector.shape[1]):
         for lane in range(LANES):
             vector[X, j, lane] = x[item[lane], j] - vector[ORIGIN, j, lane]
+    for lane in range(LANES):
+        room.scalar[SECOND, lane] = 0.0
+    restore(model, room, 0)
 
 
 @compiled

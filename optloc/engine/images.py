@@ -13,7 +13,8 @@ from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES, factor_plain, principal_axes, solve_plain
-from optloc.engine.evaluator import bend, bow_of, equations, note_nearest
+from optloc.engine.admission import admit, coarsen, evaluate, hold, restore
+from optloc.engine.evaluator import bend, bow_of, note_nearest
 from optloc.engine.memory import (
     ALIVE,
     AXES,
@@ -35,11 +36,14 @@ from optloc.engine.memory import (
     LOWER,
     MOVE,
     NORMAL,
+    OTHER,
+    SECOND,
     SHARE,
     SPARE,
     STEPS,
     G,
     H,
+    Model,
     Room,
     X,
 )
@@ -112,24 +116,28 @@ def keep_fix(room: Room) -> None:
 
 
 @compiled
-def reflect(room: Room) -> None:
-    """Start the refinement of the mirror images of kept fixes; those that are not good have none."""
-    vector, scalar = room.vector, room.scalar
+def reflect(model: Model, room: Room) -> None:
+    """Start the refinement of mirror images of kept fixes, or of second starts; what is not good has none."""
+    vector, scalar, d = room.vector, room.scalar, room.d
     for i in range(vector.shape[1]):
         # the other unknowns begin where they are: their share of the normal is zero
         for lane in range(LANES):
-            vector[X, i, lane] = vector[FIX, i, lane] - 2.0 * scalar[HEIGHT, lane] * vector[NORMAL, i, lane]
+            image = vector[FIX, i, lane] - 2.0 * scalar[HEIGHT, lane] * vector[NORMAL, i, lane]
+            vector[X, i, lane] = vector[OTHER, i, lane] if i < d and scalar[SECOND, lane] != 0.0 else image
     for lane in range(LANES):
         scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
         scalar[ALIVE, lane] = scalar[GOOD, lane]
+    restore(model, room, 0)
 
 
 @compiled
-def follow(rows: Any, room: Room, tolerance: float, fewest: int, every: bool) -> None:
+def follow(model: Model, rows: Any, room: Room, tolerance: float, fewest: int, every: bool) -> None:
     """Refine the unknowns of lanes that are alive, until fewer of them are left than are worth a block.
 
     Parameters
     ----------
+    model : Model
+        Says what holds fixes.
     rows : named tuple
         Of the evaluator.
     room : Room
@@ -142,16 +150,17 @@ def follow(rows: Any, room: Room, tolerance: float, fewest: int, every: bool) ->
     every : bool
         As of `watch`.
     """
-    scalar, nearest = room.scalar, room.scalar[SHARE]
-    equations(rows, room, 0)
+    nearest = room.scalar[SHARE]
+    evaluate(model, rows, room, 0)
+    coarsen(model, room)
     _note_nearest(room, nearest, True)
     bow = bow_of(rows, room)
     while True:
-        propose(room.vector, room.matrix, scalar)
+        propose(model, room)
         if watch(bow, room, nearest, every) < fewest:
             return
-        equations(rows, room, 1)
-        going = decide(room.vector, room.matrix, scalar, tolerance)
+        evaluate(model, rows, room, 1)
+        going = decide(room, tolerance)
         _note_nearest(room, nearest, False)
         if not going:
             return
@@ -215,7 +224,7 @@ def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
 
 
 @compiled
-def confirm(rows: Any, room: Room) -> float:
+def confirm(model: Model, rows: Any, room: Room) -> float:
     """Leave good only the lanes that arrived at a rival, and return how many did.
 
     Where a damped refinement ends is no minimum yet: the undamped step must be short there, too, and the curvature of
@@ -237,8 +246,9 @@ def confirm(rows: Any, room: Room) -> float:
                 spare[lane] += matrix[FIX_H, max(i, j), min(i, j), lane] * apart
     for lane in range(LANES):
         scalar[GOOD, lane] = scalar[GOOD, lane] if spare[lane] >= SAME else 0.0
-    _require_rest(vector, matrix, scalar)
+    _require_rest(model, room)
     bend(rows, room)
+    admit(model, room, scalar[GOOD])
     _require_positive(vector, matrix, scalar[GOOD], matrix[H_TRIAL])
     found = 0.0
     for lane in range(LANES):
@@ -247,14 +257,16 @@ def confirm(rows: Any, room: Room) -> float:
 
 
 @compiled
-def _require_rest(vector: Array, matrix: Array, scalar: Array) -> None:
+def _require_rest(model: Model, room: Room) -> None:
     """Keep the lanes whose undamped step is short."""
+    vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, move, length = vector.shape[1], vector[MOVE], scalar[SPARE]
     _require_positive(vector, matrix, scalar[GOOD], matrix[H])
     for i in range(d):
         for lane in range(LANES):
             move[i, lane] = vector[G, i, lane]
     solve_plain(matrix[LOWER], vector[INVERSE], move)
+    hold(model, room)
     for lane in range(LANES):
         length[lane] = 0.0
     for i in range(d):

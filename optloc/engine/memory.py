@@ -15,8 +15,9 @@ ROUNDING = 4.0 * 2.220446049250313e-16
 """Share of a measurement that is rounding: four of a double lie between it and its residual."""
 
 # Rows of `Room.vector`: where a refinement stands and what it tries, each followed by the same of a trial; FIX and
-# NORMAL are the fix whose mirror image is refined, and the direction in which the stations spread least.
-X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE, FIX, NORMAL = range(12)
+# NORMAL are the fix whose mirror image is refined, and the direction in which the stations spread least; OTHER is a
+# second start, where SECOND says so.
+X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE, FIX, NORMAL, OTHER = range(13)
 # Rows of `Room.matrix`: information and factor; FIX_H is the information at the fix, MARGIN what is left of it without
 # the unknowns beside the position, and REST the same at a trial.
 H, H_TRIAL, LOWER, FIX_H, MARGIN, REST = range(6)
@@ -24,7 +25,52 @@ H, H_TRIAL, LOWER, FIX_H, MARGIN, REST = range(6)
 BASE, AXES, EIGEN = range(3)
 # Rows of `Room.scalar`.
 COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
-FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND = range(14, 21)
+FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND = range(14, 22)
+
+
+class Admission(NamedTuple):
+    """Quantities of a position that are held or bounded, as tapes, and the Earth, which hides positions.
+
+    Parameters
+    ----------
+    exact : int
+        So many of the first quantities are held.
+    code : int64 array (n, 4)
+        Operations of all tapes, see `optloc.compute.trace.Tape`.
+    block : int64 array (k + 1, 3)
+        Where operations, constants and inputs of each begin.
+    constant : int64 array (c,), value : array (c,)
+        Registers of constants, and what they hold.
+    input : int64 array (i, 2)
+        Registers of inputs, and which coordinate each is.
+    output : int64 array (k, 1 + d)
+        Registers of value and derivatives; -1 for a derivative of zero.
+    level : array (N or 1, k, 2)
+        Lower and upper bounds.
+    registers : int
+        How many.
+    earth : bool
+        Whether there is one: then an Earth-centred position is ``turn x + origin``.
+    turn, origin : array (3, 3), (3,)
+        See there.
+    heard, seen : array (s,)
+        1.0 for the places that a row is of, and for those that an angle is of.
+    """
+
+    exact: int
+    code: Array
+    block: Array
+    constant: Array
+    value: Array
+    input: Array
+    output: Array
+    level: Array
+    registers: int
+    earth: bool
+    turn: Array
+    origin: Array
+    heard: Array
+    seen: Array
 
 
 class Model(NamedTuple):
@@ -47,6 +93,8 @@ class Model(NamedTuple):
         Station whose range is t; -1 where the ranges are determined.
     white : array (s, s)
         Lower triangular whitening matrix of c.
+    admission : Admission
+        Which positions are admitted.
     """
 
     row: Array
@@ -56,6 +104,7 @@ class Model(NamedTuple):
     ranged: Array
     reference: int
     white: Array
+    admission: Admission
 
 
 class Answer(NamedTuple):
@@ -67,6 +116,8 @@ class Answer(NamedTuple):
         Parameter vectors, the position first.
     covariance : array (N, n, n)
         Of the first n unknowns.
+    multiplier : array (N, c)
+        Of what is held: the gradient of the cost and its gradients times these add up to nothing.
     cost : array (N,)
         Weighted sums of squared residuals.
     settled : bool array (N,)
@@ -85,6 +136,7 @@ class Answer(NamedTuple):
 
     x: Array
     covariance: Array
+    multiplier: Array
     cost: Array
     settled: Array
     rival: Array
@@ -110,10 +162,18 @@ class Room(NamedTuple):
         Stations from the origin, metres.
     squared, rows : array (s, d + 2, W), (s + l, d + 2, W)
         Squared-range rows as they are; and weighed, behind them the l linear rows of other kinds.
-    y, work : array (d + 1, W), (n, W)
-        Squared-range answers, and scratch of `optloc.compute.gtrs.minimise`.
-    vector, matrix, axes, scalar : array (12, p, W), (6, p, p, W), (3, d, d, W), (21, W)
+    y, second, work : array (d + 1, W), (d + 1, W), (n, W)
+        Squared-range answers, second ones, and scratch of `optloc.compute.gtrs.minimise`.
+    vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (22, W)
         See the names of their rows. Positions count from the origin, row ORIGIN.
+    face, push : array (2, c, d, W), (c, p, W)
+        Gradients of what is held at rows X and TRIAL, and their products with an inverse.
+    small, part, pivot, diagonal : array (2, c, c, W), (c, W), (c, W), (c, W)
+        Products of these with each other, and scratch.
+    level, quantity : array (k, 2, W), (k, W)
+        Bounds, and what they bound.
+    registers, spot : array (r, W), (2, 3)
+        Scratch.
     own : named tuple
         What the evaluator of the rows keeps.
     """
@@ -126,11 +186,22 @@ class Room(NamedTuple):
     squared: Array
     rows: Array
     y: Array
+    second: Array
     work: Array
     vector: Array
     matrix: Array
     axes: Array
     scalar: Array
+    face: Array
+    push: Array
+    small: Array
+    part: Array
+    pivot: Array
+    diagonal: Array
+    level: Array
+    quantity: Array
+    registers: Array
+    spot: Array
     own: Any
 
 
@@ -138,6 +209,7 @@ class Room(NamedTuple):
 def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, others: int) -> Room:
     """Return the memory of a block of problems: of so many unknowns, with so many linear rows of other kinds."""
     s, p, m = stations, unknowns, model.row.shape[1]
+    c, k = model.admission.exact, len(model.admission.output)
     return Room(
         d,
         np.empty(LANES, np.int64),
@@ -147,10 +219,21 @@ def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, othe
         np.zeros((s, d + 2, LANES)),
         np.zeros((s + others, d + 2, LANES)),
         np.zeros((d + 1, LANES)),
+        np.zeros((d + 1, LANES)),
         np.zeros((scratch(d + 1), LANES)),
-        np.zeros((12, p, LANES)),
+        np.zeros((13, p, LANES)),
         np.zeros((6, p, p, LANES)),
         np.zeros((3, d, d, LANES)),
-        np.zeros((21, LANES)),
+        np.zeros((22, LANES)),
+        np.zeros((2, c, d, LANES)),
+        np.zeros((c, p, LANES)),
+        np.zeros((2, c, c, LANES)),
+        np.zeros((c, LANES)),
+        np.zeros((c, LANES)),
+        np.zeros((c, LANES)),
+        np.zeros((k, 2, LANES)),
+        np.zeros((k, LANES)),
+        np.zeros((model.admission.registers, LANES)),
+        np.zeros((2, 3)),
         own,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,14 +18,16 @@ from optloc.base.cache import Cache
 from optloc.base.frames import Frame
 from optloc.base.linalg import project_out
 from optloc.base.threads import mapped
-from optloc.base.types import Array
+from optloc.base.types import Array, Band
 from optloc.compute.jit import enabled, ready, usable
 from optloc.compute.pack import pack
+from optloc.engine.admission import admission_of, levels_of
 from optloc.engine.fixes import fix_few_ranges, fix_one_by_tapes, fix_ranges, fix_tapes
 from optloc.engine.lifts import Lifts, lift
-from optloc.engine.memory import Answer, Model
+from optloc.engine.memory import Admission, Answer, Model
 from optloc.engine.ranges import RangeRows
 from optloc.engine.tapes import TapeRows
+from optloc.linear.constraints import exact, face_names, is_exact
 from optloc.linear.evaluate import block_links
 from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.linear.normal import depends_on_place, weighed
@@ -74,6 +76,8 @@ class Plan:
         Whether all rows are sums of ranges, and nothing else is unknown but emission times.
     size, shared : int
         Numbers of all unknowns, and of those that all epochs share.
+    held : tuple of str
+        Names of the constraints that hold fixes.
     """
 
     layout: Layout
@@ -86,14 +90,20 @@ class Plan:
     ranged: bool
     size: int
     shared: int
+    held: tuple[str, ...]
 
-    def places(self, problem: Problem) -> Array:
-        """Return the places (N or 1, s, d) that take part, metres, of problems of this structure."""
+    def load(self, problem: Problem) -> Load:
+        """Return what problems of this structure have to themselves: one without batch axes, or a flat batch."""
+        model, admission = self.model, self.model.admission
+        if len(admission.output):
+            model = model._replace(admission=admission._replace(level=levels_of(problem)))
+        return Load(model, self.rows(problem), self._places(problem))
+
+    def _places(self, problem: Problem) -> Array:
         position = problem.stations.position
         flat = position.reshape(-1, *position.shape[-3:])
-        every = np.arange(flat.shape[2])
         # Usually all stations take part, and their positions need no copy.
-        if flat.shape[1] == 1 and np.array_equal(self.node[1], every):
+        if flat.shape[1] == 1 and np.array_equal(self.node[1], np.arange(flat.shape[2])):
             return flat[:, 0]
         return flat[:, self.node[0], self.node[1]]
 
@@ -115,36 +125,62 @@ class Plan:
         """Return whether so many problems may be run: machine code is there, or they may wait for it."""
         return usable(self.kernel(count, often=True), count)
 
-    def run(
-        self, rows: Any, z: Array, place: Array, threads: int | None = None, start: Array | None = None
-    ) -> tuple[Answer, int]:
+    def run(self, load: Load, z: Array, threads: int | None = None, start: Array | None = None) -> tuple[Answer, int]:
         """Return what is found of N problems, and the most steps that a fix took.
 
         Parameters
         ----------
-        rows : named tuple
-            Of `rows`.
+        load : Load
+            Of the problems.
         z : array (N, m)
             Measurements.
-        place : array (N or 1, s, d)
-            Of `places`.
         threads : int, optional
             At most so many; as many as `optloc.base.threads.thread_count` says if absent.
         start : array (N, size), optional
             Where refinements begin; starts are found where none are given.
         """
         kernel, count = self.kernel(len(z)), len(z)
-        answer, given = blank_answer(count, self.size, self.shared), start is not None
+        answer, given = blank_answer(count, self.size, self.shared, len(self.held)), start is not None
         if start is not None:
             answer = answer._replace(x=np.array(start))
 
         def work(first: int) -> int:
             part = slice(first, min(first + _CHUNK, count))
-            own = _owned(place[part] if len(place) > 1 else place)
-            some = Answer(*(array[part] for array in answer))
-            return int(kernel(self.model, rows_at(rows, part), _owned(z[part]), own, TOLERANCE, LIMIT, given, some))
+            own, some = load.take(part), Answer(*(array[part] for array in answer))
+            return int(kernel(own.model, own.rows, _owned(z[part]), _owned(own.place), TOLERANCE, LIMIT, given, some))
 
         return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
+
+
+class Load(NamedTuple):
+    """What N problems of one structure have to themselves, but for their measurements.
+
+    Parameters
+    ----------
+    model : Model
+        With the levels of constraints.
+    rows : named tuple
+        Of the evaluator.
+    place : array (N or 1, s, d)
+        Places that take part, metres.
+    """
+
+    model: Model
+    rows: Any
+    place: Array
+
+    def take(self, part: slice | Array) -> Load:
+        """Return the load of some of the problems."""
+        model, rows, place = self
+        level = model.admission.level
+        if len(level) > 1:
+            model = model._replace(admission=model.admission._replace(level=level[part]))
+        if isinstance(rows, TapeRows):
+            c = rows.numbers
+            own = {name: getattr(c, name) for name in ("source", "white", "prior", "sigma")}
+            cut = {name: array[part] for name, array in own.items() if len(array) > 1}
+            rows = rows._replace(numbers=c._replace(**cut)) if cut else rows
+        return Load(model, rows, place[part] if len(place) > 1 else place)
 
 
 # Problems that a thread takes at a time: some milliseconds, against which handing them out is nothing. From 1 000 to
@@ -156,11 +192,12 @@ _BY_RANGES = (fix_few_ranges, fix_ranges, 8)
 _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
-def blank_answer(count: int, size: int, shared: int) -> Answer:
-    """Return arrays for what is found of so many problems, of so many unknowns."""
+def blank_answer(count: int, size: int, shared: int, held: int) -> Answer:
+    """Return arrays for what is found of so many problems, of so many unknowns and surfaces that hold them."""
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),
+        np.empty((count, held)),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
         np.empty((count, size)),
@@ -173,16 +210,6 @@ def blank_answer(count: int, size: int, shared: int) -> Answer:
 def _owned(values: Array) -> Array:
     """Return values as the one type of array for which there is machine code: float, C order, writable."""
     return np.require(values, dtype=float, requirements=["C", "W"])
-
-
-def rows_at(rows: Any, part: slice | Array) -> Any:
-    """Return the rows of some problems: of tapes, what each has to itself."""
-    if not isinstance(rows, TapeRows):
-        return rows
-    c = rows.numbers
-    own = {name: getattr(c, name) for name in ("source", "white", "prior", "sigma")}
-    cut = {name: array[part] for name, array in own.items() if len(array) > 1}
-    return rows._replace(numbers=c._replace(**cut)) if cut else rows
 
 
 # Which structures have a plan.
@@ -215,7 +242,9 @@ def key_of(problem: Problem) -> tuple[Hashable, ...]:
         numbers += [array for prior in problem.priors for array in (prior.mean, prior.covariance)]
     if problem.stations.axes is not None:
         numbers.append(problem.stations.axes)
-    return (problem.structure, *(array.tobytes() for array in numbers))
+    numbers += [band.coefficients for band in problem.constraints if isinstance(band, Band)]
+    held = (tuple(map(is_exact, problem.constraints)),) if problem.constraints else ()
+    return (problem.structure, *(array.tobytes() for array in numbers), *held)
 
 
 def is_planned(problem: Problem) -> bool:
@@ -230,9 +259,9 @@ def is_planned(problem: Problem) -> bool:
     if stations.axes is not None:
         shared.append((stations.axes, 4))
     return (
-        not problem.constraints
-        and len(problem.motions) == 1
-        and (motion.order, motion.span, motion.known) == (0, "run", None)
+        len(problem.motions) == 1
+        and (motion.order, motion.span) == (0, "run")
+        and motion.known is None
         and all(bool((r.target == 0).all()) for r in problem.rows)
         and 0 < problem.count <= MOST
         and problem.epochs <= MOST
@@ -280,7 +309,10 @@ def _make(problem: Problem) -> Plan | None:
     # The compiled core takes triangular matrices only: a covariance that is singular has none.
     if np.triu(white, 1).any():
         return None
-    model = _model(one, found, heard, white)
+    admission = admission_of(one, node)
+    if admission is None:
+        return None
+    model = _model(one, found, heard, white, admission)
     make: Callable[[Problem], Any]
     if ranged:
         turned, made = _range_rows(weighed(one), node[1])
@@ -292,7 +324,8 @@ def _make(problem: Problem) -> Plan | None:
         if make(one) is None or not (len(heard) or len(lifts.sigma)):
             return None
     layout = problem.layout
-    return Plan(layout, problem.frame, one.weight, dof, node, model, make, ranged, layout.size, layout.n_shared)
+    held, sizes = face_names(one, exact(one)), (layout.size, layout.n_shared)
+    return Plan(layout, problem.frame, one.weight, dof, node, model, make, ranged, *sizes, held)
 
 
 def _bare(problem: Problem) -> Problem:
@@ -327,7 +360,7 @@ def _nodes(one: Problem, found: Ranges | None, heard: Array) -> Array:
     return np.array([*first, *sorted(others - {*first})], dtype=np.int64).reshape(-1, 2).T
 
 
-def _model(one: Problem, found: Ranges | None, heard: Array, white: Array) -> Model:
+def _model(one: Problem, found: Ranges | None, heard: Array, white: Array, admission: Admission) -> Model:
     """Return how measurements of one problem become a start."""
     count, s, flat = one.count, len(white), one.flat()
     added, gain = np.zeros(count), np.zeros(count)
@@ -343,7 +376,7 @@ def _model(one: Problem, found: Ranges | None, heard: Array, white: Array) -> Mo
         sign[: len(heard)], ranged[: len(heard)] = found.sign[0, heard], 1.0
         reference = int(np.searchsorted(heard, found.reference[0])) if found.free.all() else -1
     row = np.stack([one.correction + added, precision, 1.0 / (1.0 + gain)])
-    return Model(row, _anchors(one)[0], linear, sign, ranged, reference, white)
+    return Model(row, _anchors(one)[0], linear, sign, ranged, reference, white, admission)
 
 
 def _anchors(one: Problem) -> tuple[Array, Array]:

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from optloc.base.linalg import PIVOT
-from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES, factor_plain, solve_plain
-from optloc.engine.evaluator import equations
+from optloc.engine.admission import coarsen, evaluate, hold, restore
 from optloc.engine.memory import (
     ALIVE,
     BLUR,
@@ -33,17 +32,20 @@ from optloc.engine.memory import (
     TRIAL,
     G,
     H,
+    Model,
     Room,
     X,
 )
 
 
 @compiled
-def refine(rows: Any, room: Room, tolerance: float, limit: int) -> None:
+def refine(model: Model, rows: Any, room: Room, tolerance: float, limit: int) -> None:
     """Refine the unknowns of the lanes that are good; those that do not finish in time stay alive.
 
     Parameters
     ----------
+    model : Model
+        Says what holds fixes.
     rows : named tuple
         Of the evaluator.
     room : Room
@@ -59,8 +61,9 @@ def refine(rows: Any, room: Room, tolerance: float, limit: int) -> None:
     Levenberg's method with Marquardt's scaling; the damping follows H. B. Nielsen, "Damping parameter in Marquardt's
     method", IMM-REP-1999-05, Technical University of Denmark.
     """
-    vector, matrix, scalar = room.vector, room.matrix, room.scalar
-    equations(rows, room, 0)
+    scalar = room.scalar
+    evaluate(model, rows, room, 0)
+    coarsen(model, room)
     for lane in range(LANES):
         # A start that is NaN or infinite is not good, and takes no step.
         scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
@@ -68,15 +71,16 @@ def refine(rows: Any, room: Room, tolerance: float, limit: int) -> None:
         scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
     # All lanes step until none is alive: a lane that is finished takes no more steps that count.
     for _ in range(limit):
-        propose(vector, matrix, scalar)
-        equations(rows, room, 1)
-        if not decide(vector, matrix, scalar, tolerance):
+        propose(model, room)
+        evaluate(model, rows, room, 1)
+        if not decide(room, tolerance):
             break
 
 
 @compiled
-def propose(vector: Array, matrix: Array, scalar: Array) -> None:
+def propose(model: Model, room: Room) -> None:
     """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
+    vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d = vector.shape[1]
     diagonal, inverse, move, right, damping = (
         vector[DIAGONAL],
@@ -94,6 +98,7 @@ def propose(vector: Array, matrix: Array, scalar: Array) -> None:
             move[i, lane] = right[i, lane]
     factor_plain(information, diagonal, matrix[LOWER], inverse)
     solve_plain(matrix[LOWER], inverse, move)
+    hold(model, room)
     x, trial = vector[X], vector[TRIAL]
     for i in range(d):
         for lane in range(LANES):
@@ -103,11 +108,13 @@ def propose(vector: Array, matrix: Array, scalar: Array) -> None:
             # no pivot.
             share = inverse[i, lane] * diagonal[i, lane]
             solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / PIVOT else 0.0
+    restore(model, room, 1)
 
 
 @compiled
-def decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
+def decide(room: Room, tolerance: float) -> bool:
     """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
+    vector, matrix, scalar, face = room.vector, room.matrix, room.scalar, room.face
     d = vector.shape[1]
     # Lanes that are finished go through the rule too, and are left as they are: their step counts as unsolvable.
     kept, alive = scalar[SPARE], scalar[ALIVE]
@@ -136,6 +143,10 @@ def decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> boo
         for j in range(i + 1):
             for lane in range(LANES):
                 matrix[H, i, j, lane] = matrix[H_TRIAL, i, j, lane] if kept[lane] != 0.0 else matrix[H, i, j, lane]
+    for k in range(face.shape[1]):
+        for j in range(room.d):
+            for lane in range(LANES):
+                face[0, k, j, lane] = face[1, k, j, lane] if kept[lane] != 0.0 else face[0, k, j, lane]
     left = 0.0
     for lane in range(LANES):
         left += alive[lane]

@@ -9,6 +9,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES, eliminate_last, principal_axes
+from optloc.engine.admission import restore
 from optloc.engine.evaluator import costs
 from optloc.engine.memory import (
     AXES,
@@ -18,6 +19,7 @@ from optloc.engine.memory import (
     COST_TRIAL,
     DIAGONAL,
     EIGEN,
+    H_TRIAL,
     HIGH,
     LOW,
     MARGIN,
@@ -28,6 +30,7 @@ from optloc.engine.memory import (
     TRIAL,
     G,
     H,
+    Model,
     Room,
     X,
 )
@@ -41,20 +44,24 @@ _REACH = 3.0
 _NONE = 1e-9
 # Share by which eigenvalues may differ and still be equal: the axes between them are then any axes.
 _EQUAL = 0.05
+# Share of the largest variance below which one is rounding.
+_EXACT = 1e-14
 # Least inverse range, in that of the fix: a step ends a million times as far away, where fronts are flat.
 _HORIZON = 1e-6
 
 
 @compiled
-def measure_shape(rows: Any, room: Room, inverse: bool, turned: bool, out: Array) -> None:
+def measure_shape(model: Model, rows: Any, room: Room, inverse: bool, turned: bool, out: Array) -> None:
     """Find kappa of fixes in row X, with their information and costs.
 
     Parameters
     ----------
+    model : Model
+        Says what holds fixes.
     rows : named tuple
         Of the evaluator.
     room : Room
-        Unknowns, information and costs; rows of scratch are overwritten.
+        Unknowns, information, covariance in H_TRIAL, and costs; rows of scratch are overwritten.
     inverse : bool
         In inverse range about the mean of the stations that take part, instead of in metres.
     turned : bool
@@ -68,7 +75,7 @@ def measure_shape(rows: Any, room: Room, inverse: bool, turned: bool, out: Array
         _leave_position(room)
     if inverse:
         _span(vector, room.axes[BASE], spare)
-    _axes(room, inverse, spare)
+    _axes(room, inverse, model.admission.exact > 0, spare)
     for lane in range(LANES):
         high[lane], low[lane] = 1.0, 1.0
     for k in range(d):
@@ -77,10 +84,12 @@ def measure_shape(rows: Any, room: Room, inverse: bool, turned: bool, out: Array
             for i in range(d):
                 for lane in range(LANES):
                     vector[MOVE, i, lane] = size * room.axes[AXES, i, k, lane]
-            _probe(rows, room, inverse)
+            _probe(model, rows, room, inverse)
+            if model.admission.exact:
+                _spare_still(room, k)
             _note(scalar, high, low)
     if turned:
-        _turn(rows, room, inverse)
+        _turn(model, rows, room, inverse)
     for lane in range(LANES):
         out[lane] = np.log(max(high[lane], 1.0 / max(low[lane], _NONE)))
 
@@ -112,11 +121,12 @@ def find_even(eigen: Array, out: Array) -> None:
 @compiled
 def _even(eigen: Array, i: int, j: int, lane: int) -> float:
     first, second = eigen[i, i, lane], eigen[j, j, lane]
-    return 1.0 if abs(first - second) <= _EQUAL * max(first, second) else 0.0
+    most = max(first, second)
+    return 1.0 if abs(first - second) <= _EQUAL * most and most > 0.0 else 0.0
 
 
 @compiled
-def _turn(rows: Any, room: Room, inverse: bool) -> None:
+def _turn(model: Model, rows: Any, room: Room, inverse: bool) -> None:
     """Go along the diagonals between axes of equal eigenvalues, and note them where they are equal."""
     vector, axes, scalar = room.vector, room.axes, room.scalar
     d, share = room.d, scalar[SHARE]
@@ -136,7 +146,7 @@ def _turn(rows: Any, room: Room, inverse: bool) -> None:
                     for lane in range(LANES):
                         along = first * axes[AXES, i, j, lane]
                         vector[MOVE, i, lane] = along + second * axes[AXES, i, k, lane]
-                _probe(rows, room, inverse)
+                _probe(model, rows, room, inverse)
                 for lane in range(LANES):
                     # a quadratic rise stands for what is not asked
                     rise = scalar[COST, lane] + 1.0 / share[lane]
@@ -174,10 +184,10 @@ def _span(vector: Array, base: Array, r: Array) -> None:
 
 
 @compiled
-def _axes(room: Room, inverse: bool, spare: Array) -> None:
+def _axes(room: Room, inverse: bool, held: bool, spare: Array) -> None:
     """Write the principal axes of the position's information, or of it in the chart, one sigma long, to AXES."""
     d, base, work, axes = room.d, room.axes[BASE], room.axes[EIGEN], room.axes[AXES]
-    source = room.matrix[MARGIN if room.vector.shape[1] > d else H]
+    source = room.matrix[H_TRIAL if held else MARGIN if room.vector.shape[1] > d else H]
     for i in range(d):
         for j in range(i + 1):
             for lane in range(LANES):
@@ -195,16 +205,33 @@ def _axes(room: Room, inverse: bool, spare: Array) -> None:
                     for lane in range(LANES):
                         work[i, j, lane] += base[k, j, lane] * spare[lane]
     principal_axes(work, axes, spare)
+    if held:
+        _drop_exact(work, spare)
     for k in range(d):
         for lane in range(LANES):
-            spare[lane] = 1.0 / np.sqrt(work[k, k, lane])
+            spare[lane] = np.sqrt(work[k, k, lane]) if held else 1.0 / np.sqrt(work[k, k, lane])
         for i in range(d):
             for lane in range(LANES):
                 axes[i, k, lane] *= spare[lane]
 
 
 @compiled
-def _probe(rows: Any, room: Room, inverse: bool) -> None:
+def _drop_exact(variance: Array, most: Array) -> None:
+    """Make variances on a diagonal (d, d, W) zero that are rounding beside the largest."""
+    d = len(variance)
+    for lane in range(LANES):
+        most[lane] = 0.0
+    for k in range(d):
+        for lane in range(LANES):
+            most[lane] = max(most[lane], variance[k, k, lane])
+    for k in range(d):
+        for lane in range(LANES):
+            exact = variance[k, k, lane] <= _EXACT * most[lane]
+            variance[k, k, lane] = 0.0 if exact else variance[k, k, lane]
+
+
+@compiled
+def _probe(model: Model, rows: Any, room: Room, inverse: bool) -> None:
     """Find the cost a step MOVE away, and one over the rise of a quadratic one; a step past the horizon ends there."""
     vector, scalar, base = room.vector, room.scalar, room.axes[BASE]
     d, move, trial, share, w = room.d, vector[MOVE], vector[TRIAL], scalar[SHARE], scalar[SPARE]
@@ -236,7 +263,17 @@ def _probe(rows: Any, room: Room, inverse: bool) -> None:
         for j in range(k):
             for lane in range(LANES):
                 trial[k, lane] -= room.matrix[MARGIN, k, j, lane] * (trial[j, lane] - vector[X, j, lane])
+    restore(model, room, 1)
     costs(rows, room)
+
+
+@compiled
+def _spare_still(room: Room, axis: int) -> None:
+    """Let the cost rise as that of a Gaussian where an axis has no length: surfaces hold fixes across it."""
+    scalar = room.scalar
+    for lane in range(LANES):
+        if room.axes[EIGEN, axis, axis, lane] == 0.0:
+            scalar[COST_TRIAL, lane] = scalar[COST, lane] + 1.0 / scalar[SHARE, lane]
 
 
 @compiled

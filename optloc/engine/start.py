@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
+from optloc.compute.gtrs import meet
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES
+from optloc.engine.admission import restore
 from optloc.engine.evaluator import complete, minimise_start
-from optloc.engine.memory import GOOD, ROUNDING, SCALE, SOLVABLE, SPARE, SPREAD, Model, Room, X
+from optloc.engine.memory import GOOD, OTHER, ROUNDING, SCALE, SECOND, SOLVABLE, SPARE, SPREAD, Model, Room, X
 
 NEAR = 1e-3
 """Least distance from a station that weighs a row, in units of the stations' spread: at the station itself a squared
@@ -36,7 +38,12 @@ def begin(model: Model, rows: Any, room: Room) -> None:
     for turn in range(2):
         weigh(room.squared, room.place, room.y, scalar[SCALE], model.white, turn == 0, room.rows, scalar[SPARE])
         minimise_start(model, rows, room, turn == 0)
+        meet(room.rows, model.reference >= 0, room.y, room.second, scalar[SOLVABLE], scalar[SECOND], room.work)
         _accept(room.y, scalar[SOLVABLE], scalar[GOOD], scalar[SCALE], room.vector[X])
+    for i in range(room.d):
+        for lane in range(LANES):
+            room.vector[OTHER, i, lane] = room.second[i, lane] * scalar[SCALE, lane]
+    restore(model, room, 0)
     complete(rows, room)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
+from optloc.engine.admission import GRAZE, GROUND, SATELLITE
 from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_held, violation
 from optloc.linear.normal import marginal
 from optloc.models import MODELS
@@ -19,12 +20,6 @@ from optloc.problem.problem import Problem
 from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
 from optloc.solvers.refine import refine
-
-# Height above which a station is a satellite, Earth radii: above all aircraft, below all orbits.
-_SATELLITE = 1.0 + 100e3 / WGS84_A
-# How deep a line may dip: 5 km to a satellite, for refraction and for targets below the ellipsoid or badly measured; 50
-# km from the ground to a target in space: only what is clearly on the other side of the Earth is excluded.
-_GRAZE, _GROUND = 1.0 - 5e3 / WGS84_A, 1.0 - 50e3 / WGS84_A
 
 
 def is_hidden(problem: Problem, x: Array) -> Array:
@@ -103,11 +98,11 @@ def _is_blocked(point: Array, station: Array, heard: Array, seen: Array) -> Arra
     heard, seen : bool array (N,)
         Whether the station has a row, and whether it has an angle.
     """
-    satellite = (station**2).sum(-1) > _SATELLITE**2
-    limit = np.where(satellite, _GRAZE, _GROUND)
+    satellite = (station**2).sum(-1) > SATELLITE**2
+    limit = np.where(satellite, GRAZE, GROUND)
     line = station - point
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        outside = seen | satellite | ((point**2).sum(-1) > _SATELLITE**2)
+        outside = seen | satellite | ((point**2).sum(-1) > SATELLITE**2)
         # the point of the segment next to the centre; at its ends nothing lies in between
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[:, None] * line) ** 2).sum(-1)
@@ -132,7 +127,7 @@ def lowest_sight(problem: Problem, x: Array) -> Array:
         up = np.stack(geodetic_normal((point[:, 0], point[:, 1], point[:, 2])), axis=-1)
         for epoch, station, heard in _heard(problem, target):
             line = stations[:, epoch, station] - point
-            high = heard & ((stations[:, epoch, station] ** 2).sum(-1) > (_SATELLITE * WGS84_A) ** 2)
+            high = heard & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
             sine = (line * up).sum(-1) / np.sqrt((line**2).sum(-1))
             worst = np.where(high, np.minimum(worst, sine), worst)
     return np.where(np.isfinite(worst), worst, 0.0)

@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optloc.base.records import take
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
-from optloc.engine.plan import Plan, plan_of, rows_at
-from optloc.problem.fix import Stage
+from optloc.engine.plan import Load, Plan, plan_of
+from optloc.problem.fix import Active, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import equal_cost
 from optloc.solvers.pool import Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
@@ -51,14 +50,13 @@ class Quick:
             return in_parts(problem, work)
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         z = z if z.ndim == 2 and len(z) == count else np.broadcast_to(z, (count, problem.count))
-        return settle_directly(plan, plan.rows(problem), z, plan.places(problem), problem.take, refinement)
+        return settle_directly(plan, plan.load(problem), z, problem.take, refinement)
 
 
 def settle_directly(
     plan: Plan,
-    rows: Any,
+    load: Load,
     z: Array,
-    place: Array,
     problems_at: Callable[[Array], Problem],
     refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror,
     threads: int | None = None,
@@ -69,12 +67,10 @@ def settle_directly(
     ----------
     plan : Plan
         Of the problems.
-    rows : named tuple
+    load : Load
         Of the plan.
     z : array (N, m)
         Measurements.
-    place : array (N or 1, s, d)
-        Of the stations that take part.
     problems_at : callable
         Maps the numbers of problems whose answer is not plain to the problems.
     refinement : callable
@@ -83,35 +79,23 @@ def settle_directly(
         At most so many; as many as `optloc.base.threads.thread_count` says if absent.
     """
     began = perf_counter()
-    answer, steps = plan.run(rows, z, place, threads)
-    left = np.flatnonzero(~_is_final(plan, answer, problems_at))
+    answer, steps = plan.run(load, z, threads)
+    left = np.flatnonzero(~answer.settled)
     if not len(left):
         return _pool(plan, _preferred(answer, problems_at), steps, began)
     # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
     some = problems_at(left)
     start = in_parts(some, lambda part, _: gtrs(part, None))
-    own = place[left] if len(place) > 1 else place
-    more, again = plan.run(rows_at(rows, left), z[left], own, threads, start.x[:, 0])
+    alone = np.isfinite(start.x).all(-1).sum(1) == 1  # where there are several, all of them compete
+    more, again = plan.run(load.take(left), z[left], threads, np.where(alone[:, None], start.x[:, 0], np.nan))
     for whole, part in zip(answer, more, strict=True):
         whole[left] = part
     pool = _pool(plan, _preferred(answer, problems_at), max(steps, again), began)
-    lost = np.flatnonzero(~_is_final(plan, more, some.take))
+    lost = np.flatnonzero(~more.settled)
     if not len(lost):
         return pool
     start = take(start, lost)
     return pool.merge(left[lost], in_parts(some.take(lost), lambda part, which: refinement(part, take(start, which))))
-
-
-def _is_final(plan: Plan, answer: Answer, problems_at: Callable[[Array], Problem]) -> Array:
-    """Return which fixes (N,) need no other means: settled ones.
-
-    On Earth those which it hides from a station are not final: what lies before it competes, and is told.
-    """
-    if not plan.frame.geodetic:
-        return answer.settled
-    out, items = np.array(answer.settled), np.flatnonzero(answer.settled)
-    out[items] = ~is_hidden(problems_at(items), answer.x[items])
-    return out
 
 
 def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answer:
@@ -159,10 +143,21 @@ def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
         np.broadcast_to(np.int32(plan.dof), count),
         direct_stages(count, steps, seconds),
         refined=True,
-        curvature=Curvature(answer.covariance, kappa=answer.kappa),
+        curvature=Curvature(answer.covariance, kappa=answer.kappa, active=active_of(plan, answer.multiplier)),
         plain=answer.settled & ~rivalled,
         infinity=answer.infinity,
+        free=answer.cost if len(plan.model.admission.output) else None,
     )
+
+
+def active_of(plan: Plan, multiplier: Array) -> Array | None:
+    """Return the constraints (N,) that hold fixes, with their multipliers (N, c); None where none does."""
+    if not plan.held:
+        return None
+    out = np.empty(len(multiplier), dtype=object)
+    for i, own in enumerate(multiplier.tolist()):
+        out[i] = tuple(map(Active, plan.held, own))
+    return out
 
 
 _STARTED = Stage("gtrs", "1 candidates at most", 0.0)

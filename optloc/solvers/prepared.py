@@ -89,7 +89,7 @@ class Prepared:
             return solve_in_stages(self.problem.with_rows(z=wide), Method.parse(self.method))
         flat = self._flat(values, shape)
         try:
-            pool = settle_directly(self.plan, self.plan.rows(flat), flat.z, self.plan.places(flat), flat.take)
+            pool = settle_directly(self.plan, self.plan.load(flat), flat.z, flat.take)
             fix = verdict(flat, pool)
         except NUMERICAL:
             # one of them fails: which one is told where all take the stages

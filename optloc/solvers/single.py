@@ -23,7 +23,7 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.compute.jit import usable
 from optloc.engine.memory import Answer
-from optloc.engine.plan import LIMIT, TOLERANCE, Plan, is_planned, key_of, plan_of
+from optloc.engine.plan import LIMIT, TOLERANCE, Load, Plan, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
 from optloc.problem.chart import Chart, quantile
 from optloc.problem.claims import Claims, alike, claim
@@ -36,14 +36,14 @@ from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
 from optloc.proof.scope import is_run, unsupported
 from optloc.solvers.certify.branch_and_bound import METHOD, budgets, certify_stage, gaps_below, sentence
 from optloc.solvers.certify.position_cost import agrees
-from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.methods import Method
-from optloc.solvers.planned import direct_stages
-from optloc.solvers.policy import COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
+from optloc.solvers.planned import active_of, direct_stages
+from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
 from optloc.solvers.verdict.findings import (
     BENT_SENTENCE,
     NO_PROOF,
     NOT_TRIED,
+    ambiguity,
     centre_of,
     chart_kind,
     largest,
@@ -93,10 +93,12 @@ class _Room:
         Of the charts.
     claims : Claims
         Of the fixes, without the bounds and boxes of proofs.
+    nothing : object array (...)
+        Constraints that hold fixes: none.
+    alone : Alternatives
+        Other minima: none.
     kept : dict
         Fields of a fix that are the same for all measurements; nobody can write into them.
-    many : Problem, optional
-        n times the problem, on Earth: of what it hides no measurement matters.
     checked : bool
         Whether the position cost of a fix was compared with its own.
     """
@@ -108,8 +110,9 @@ class _Room:
     answered: Answered
     centre: Array
     claims: Claims
+    nothing: Array
+    alone: Alternatives
     kept: dict[str, Any]
-    many: Problem | None
     checked: bool = False
 
 
@@ -123,10 +126,8 @@ class Single:
         What it was made of; its own measurements do not matter.
     plan : Plan
         What fixes it.
-    rows : named tuple
-        Rows of the plan.
-    place : array (1, s, d)
-        Stations that take part, metres.
+    load : Load
+        What the problem has to itself.
     map : Affine, optional
         Of the costs of the proof; None for methods without one.
     absent : bool array (m,), optional
@@ -144,8 +145,7 @@ class Single:
 
     problem: Problem
     plan: Plan
-    rows: Any
-    place: Array
+    load: Load
     map: Affine | None
     absent: Array | None
     centre: Array
@@ -170,18 +170,19 @@ class Single:
         if self.absent is not None:
             room.z[:, self.absent] = 0.0
         answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *room.found)
-        steps = kernel(plan.model, self.rows, room.z, self.place, TOLERANCE, LIMIT, False, answer)
+        steps = kernel(*self.load[:2], room.z, self.load.place, TOLERANCE, LIMIT, False, answer)
         costs = answer.cost.tolist()
         for cost, settled, rival in zip(costs, answer.settled.tolist(), answer.rival_cost.tolist(), strict=True):
-            if not settled or rival < np.inf or not cost <= self.doubt:
+            # on Earth the sight of satellites says which of two that cost the same is meant
+            tied = self.plan.frame.geodetic and rival - cost <= equal_cost(cost)
+            listed = self.map is not None and rival < np.inf  # a proof leaves it out
+            if not settled or tied or listed or not cost <= self.doubt:
                 return None
         x = answer.x
-        if room.many is not None and is_hidden(room.many, x).any():  # the stages say what lies behind the Earth
-            return None
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
         if self.map is not None:
-            if not self._proves(self.map, x[:, : self.place.shape[-1]], costs, room):
+            if not self._proves(self.map, x[:, : self.load.place.shape[-1]], costs, room):
                 return None
             stages = (*stages, certify_stage(f"{n} global", fixed))
         fix = self._judge(shape, answer, costs, stages, room)
@@ -221,18 +222,21 @@ class Single:
         room: _Room,
     ) -> Fix | None:
         """Return the fixes with their verdicts, or None where more stands against one than words without numbers."""
-        marks, kinds = [], []
-        for cost, bent, least in zip(costs, answer.kappa.tolist(), answer.infinity.tolist(), strict=True):
-            more = least - cost
+        marks, kinds, gaps = [], [], []
+        numbers = (answer.kappa.tolist(), answer.infinity.tolist(), answer.rival_cost.tolist())
+        for cost, bent, least, rival in zip(costs, *numbers, strict=True):
+            more, gap = least - cost, rival - cost
             if bent[0] > STRAIGHT and more != more:  # nobody has looked at infinity  # noqa: PLR0124
                 return None
-            marks.append(marks_of(cost > self.refuted, more, self.region, np.inf, bent[0], self.map is not None))
+            marks.append(marks_of(cost > self.refuted, more, self.region, gap, bent[0], self.map is not None))
             kinds.append(chart_kind(*bent))
-        told = _told(tuple(marks), tuple(kinds), shape)
+            gaps.append(ambiguity(self.problem, gap) if gap < AMBIGUOUS_GAP else "")
+        told = _told(tuple(marks), tuple(kinds), tuple(gaps), shape)
         if told is None:
             return None
         x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
-        cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.place.shape[-1]
+        held = active_of(self.plan, answer.multiplier)
+        cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.load.place.shape[-1]
         if self.map is not None:
             bound, boxes = room.answered.bound.reshape(shape).copy(), room.answered.boxes.reshape(shape).copy()
             claims = Claims(
@@ -250,6 +254,8 @@ class Single:
             marks=told.marks,
             chart=Chart(told.kind, x[..., :d], covariance[..., :d, :d], room.centre),
             infinity=answer.infinity.reshape(shape) - cost,
+            alternatives=room.alone if min(numbers[2]) == np.inf else _rivals(answer, shape),
+            active=room.nothing if held is None else held.reshape(shape),
             **room.kept,
         )
 
@@ -265,8 +271,9 @@ class Single:
         return rooms[shape]
 
     def _make_room(self, shape: tuple[int, ...]) -> _Room:
-        n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.place.shape[-1], self.problem.count
+        n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
         found = (
+            np.empty((n, len(self.plan.held))),
             np.empty(n),
             np.empty(n, dtype=np.bool_),
             np.empty((n, size)),
@@ -297,16 +304,24 @@ class Single:
         kept = {
             "layout": self.plan.layout,
             "frame": self.plan.frame,
-            "alternatives": Alternatives(np.empty((*shape, 0, size)), np.empty((*shape, 0))),
             # views that nobody can write into
             "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
             "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
-            "active": np.broadcast_to(_NOTHING, shape),  # constraints that hold fixes: none
             "reach": np.broadcast_to(centre_and_spread(self.problem.stations.places)[1].reshape(()), shape),
         }
         claims = alike(NO_PROOF if affine is None else _PROVEN, shape)
-        many = self.problem.with_rows(z=np.zeros((n, m))) if self.problem.frame.geodetic else None
-        return _Room(np.empty((n, m)), found, costs, asked, empty_answer(n, d), centre, claims, kept, many)
+        alone = Alternatives(np.empty((*shape, 0, size)), np.empty((*shape, 0)))
+        nothing = np.broadcast_to(_NOTHING, shape)
+        z, answered = np.empty((n, m)), empty_answer(n, d)
+        return _Room(z, found, costs, asked, answered, centre, claims, nothing, alone, kept)
+
+
+def _rivals(answer: Answer, shape: tuple[int, ...]) -> Alternatives:
+    """Return the other minima of fixes, with an empty slot where there is none."""
+    there = answer.rival_cost < np.inf
+    x = np.where(there[:, None], answer.rival, np.nan)
+    gap = np.where(there, answer.rival_cost - answer.cost, np.inf)
+    return Alternatives(x.reshape(*shape, 1, -1), gap.reshape(*shape, 1))
 
 
 class _Told(NamedTuple):
@@ -319,10 +334,15 @@ class _Told(NamedTuple):
 
 
 @lru_cache(maxsize=256)  # few things are said of plain fixes
-def _told(marks: tuple[int, ...], kinds: tuple[int, ...], shape: tuple[int, ...]) -> _Told | None:
+def _told(
+    marks: tuple[int, ...], kinds: tuple[int, ...], gaps: tuple[str, ...], shape: tuple[int, ...]
+) -> _Told | None:
     code = [Status(int(one)) for one in first_status(np.array(marks))]
     curved = [kind if status == Status.CURVED else None for status, kind in zip(code, kinds, strict=True)]
-    said = [_SENTENCES.get(both) for both in zip(code, curved, strict=True)]
+    said = [
+        gap if status == Status.AMBIGUOUS else _SENTENCES.get((status, kind))
+        for status, kind, gap in zip(code, curved, gaps, strict=True)
+    ]
     if None in said:
         return None
     told = zip((code, said, marks, kinds), (np.int8, object, np.int32, np.int8), strict=True)
@@ -352,17 +372,16 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         return None
     bare = _alone(problem)
     plan = None if bare.batch_shape else plan_of(bare)
-    if plan is None or (proves and (unsupported(bare) or is_run(bare))):
+    if plan is None or (proves and (bare.constraints or unsupported(bare) or is_run(bare))):
         return None
     affine = affine_costs(bare) if proves else None
     if proves and affine is None:
         return None
-    weight, d = bare.weight, problem.dimension
+    weight, d, load = bare.weight, problem.dimension, plan.load(bare)
     return Single(
         bare,
         plan,
-        plan.rows(bare),
-        np.require(plan.places(bare), dtype=float, requirements=["C", "W"]),
+        load._replace(place=np.require(load.place, dtype=float, requirements=["C", "W"])),
         affine,
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),

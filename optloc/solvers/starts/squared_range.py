@@ -304,14 +304,14 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
     else:
         known = None if found is None else _known(found, rows, to)
         entry = enter(model, m, a, b, known)
+        if known is not None and entry is not None and _stays_unknown(entry, known):
+            return None
     if entry is None:
         return None
     size = problem.batch_shape[0]
     row, right = _wide([*entry.x, entry.last], size, rows.count), _wide([entry.right], size, rows.count)[..., 0]
     weight = np.broadcast_to(rows.weight, right.shape)
     present = (weight > 0.0) & (True if paired is None else paired)
-    if ((np.isnan(row).any(-1) | np.isnan(right)) & present & np.isfinite(m)).any():
-        return None  # a range stays unknown
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
     # a row of weight w counts as one of variance sigma^2 / w; absent ones have zero coefficients
     sigma = sigma / np.sqrt(np.where(present, weight, 1.0))
@@ -342,6 +342,12 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
     return Point(components, None, tuple(tuple(axes[..., i, c] for c in d) for i in d))
 
 
+def _stays_unknown(entry: Entry, known: tuple[Known, Known]) -> bool:
+    """Return whether a row has a range that is not known, nor up to the common unknown."""
+    lost = np.isnan(known[0].sign) | np.isnan(known[1].sign)
+    return bool((np.isnan(entry.last) & lost).any())
+
+
 def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[Known, Known]:
     """Return the ranges of both ends of rows, scaled; NaN where one stays unknown."""
     both = []
@@ -349,7 +355,7 @@ def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[Known, Known]:
         node = np.array([_node(found, int(s), int(e)) for s, e in zip(index, rows.epoch, strict=True)])
         offset = np.where(node >= 0, found.offset[:, node], np.nan) / to.scale[:, None]
         # on the paraboloid ranges are known (sign 0), and the last coordinate is no range
-        both.append(Known(offset, found.sign[:, node] * to.on_cone))
+        both.append(Known(offset, np.where(node >= 0, found.sign[:, node] * to.on_cone, np.nan)))
     return both[0], both[1]
 
 

@@ -306,7 +306,7 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, proven: Claim
         p_value = tail_probability(cost[i : i + 1], np.array(pool.dof[i : i + 1]))[0]
         reason[i] = f"the residuals are larger than the noise allows (p = {p_value:.1g})"
     for i in np.flatnonzero(empty & (code == Status.AMBIGUOUS)):
-        reason[i] = _ambiguous(problem, float(gap[i].min()))
+        reason[i] = ambiguity(problem, float(gap[i].min()))
     for i in np.flatnonzero(empty & (code == Status.UNBOUNDED) & np.isfinite(cost)):
         assert pool.infinity is not None
         more = float(pool.infinity[i] - cost[i])
@@ -323,7 +323,8 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, proven: Claim
         reason[told] = pool.remark[told]
 
 
-def _ambiguous(problem: Problem, gap: float) -> str:
+def ambiguity(problem: Problem, gap: float) -> str:
+    """Return what is said of another minimum that costs so much more."""
     text = "another position " + ("fits as well" if gap < _ALIKE else f"costs only {gap:.2g} more")
     moving = problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions)
     return text + (": a bound on height, speed or place would decide" if moving else "")
