@@ -63,7 +63,8 @@ def assert_same(fix, other, apart=1e-6):
         fix.alternatives.gap.min(-1, initial=9.0) < 9.0, other.alternatives.gap.min(-1, initial=9.0) < 9.0
     )
     assert np.array_equal(np.isnan(fix.x), np.isnan(other.x))
-    sigma = np.sqrt(np.diagonal(other.cov, axis1=-2, axis2=-1))
+    # what is held has no deviation of its own
+    sigma = np.sqrt(np.maximum(np.diagonal(other.cov, axis1=-2, axis2=-1), 1e-6))
     n = sigma.shape[-1]
     assert np.nanmax(np.abs(fix.x[..., :n] - other.x[..., :n]) / sigma, initial=0.0) < apart
     assert np.allclose(fix.x[..., n:], other.x[..., n:], rtol=1e-9, atol=1e-5, equal_nan=True)

@@ -323,16 +323,19 @@ def _rows_of(problem: Problem) -> tuple[Array, Array, Array, Array, Array]:
 
 
 class Affine(NamedTuple):
-    """The costs of all problems that differ in their measurements z alone: of ``base + slope z``, see `PositionCosts`.
+    """The costs of all problems that differ in their measurements z alone, see `PositionCosts`.
 
     Parameters
     ----------
     kinds, data, K : int array (J,), array (1, J, width), array (1, q, J)
-        As of `PositionCosts`.
+        As of `PositionCosts`; of data what z = 0 makes of it.
     base, slope : array (p,), (p, m)
         Whitened measurements of z = 0, and what they gain with each measurement.
     basis : array (p, J), optional
         Orthonormal columns to which they are folded (`compress`); None where they are not.
+    place, first, gain : int array (e,), array (e,), array (e, m)
+        Which numbers of the nodes change with z, what they are for z = 0, and what they gain: one number for each
+        angle or ratio, none for ranges and rates.
     """
 
     kinds: Array
@@ -341,14 +344,25 @@ class Affine(NamedTuple):
     base: Array
     slope: Array
     basis: Array | None
+    place: Array
+    first: Array
+    gain: Array
 
-    def write(self, z: Array, w: Array) -> None:
-        """Write the whitened measurements (q,) of measurements (m,)."""
+    def room(self, count: int) -> PositionCosts:
+        """Return costs of so many problems, to be written."""
+        data = np.array(np.broadcast_to(self.data, (count, *self.data.shape[1:]))) if len(self.place) else self.data
+        return PositionCosts(self.kinds, data, self.K, np.empty((count, self.K.shape[1])), np.full(count, np.inf))
+
+    def write(self, z: Array, costs: PositionCosts, item: int) -> None:
+        """Write whitened measurements, and numbers of nodes, of measurements (m,) to those of a problem."""
+        w = costs.w[item]
         if self.basis is None:
             np.dot(self.slope, z, out=w)
             w += self.base
         else:
             w[:] = _fold(self.basis, self.slope @ z + self.base)
+        if len(self.place):
+            costs.data[item].reshape(-1)[self.place] = self.gain @ z + self.first
 
 
 def affine_costs(problem: Problem) -> Affine | None:
@@ -361,14 +375,17 @@ def affine_costs(problem: Problem) -> Affine | None:
     """
     # an affine map is known by its images of zero and of the unit vectors
     probes = np.concatenate([np.zeros((1, problem.count)), np.eye(problem.count)])
-    kinds, data, K, w, level = _rows_of(problem.with_rows(z=probes))
-    marked = any(NODES[int(kind)].mark is not None for kind in kinds)
-    counted = counts_from_measured(problem).any()
-    if marked or counted or np.isfinite(level).any() or len(K) > 1 or len(data) > 1:
+    kinds, numbers, K, w, level = _rows_of(problem.with_rows(z=probes))
+    if np.isfinite(level).any() or len(K) > 1:
         return None
     base, slope = w[0].copy(), np.ascontiguousarray((w[1:] - w[0]).T)
     basis = None if K.shape[1] <= K.shape[2] + 1 else np.linalg.qr(K[0])[0]
-    return Affine(kinds, data, compress(K, w)[0], base, slope, basis)
+    K, w = compress(K, w)
+    data = mark_alone(kinds, numbers, K, w)
+    change = (data[1:] - data[0]).reshape(len(data) - 1, data[0].size)
+    place = np.flatnonzero(change.any(0))
+    first, gain = data[0].reshape(-1)[place], np.ascontiguousarray(change[:, place].T)
+    return Affine(kinds, np.array(data[:1], order="C"), K, base, slope, basis, place, first, gain)
 
 
 @dataclass(frozen=True, slots=True)

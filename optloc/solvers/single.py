@@ -195,7 +195,7 @@ class Single:
         """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
         asked, answered = room.asked, room.answered
         for i, cost in enumerate(costs):
-            affine.write(room.z[i], room.costs.w[i])
+            affine.write(room.z[i], room.costs, i)
             asked.eps[i] = equal_cost(cost)
         asked.x[:] = position
         prove_here(room.costs, asked, answered)
@@ -282,8 +282,8 @@ class Single:
             np.empty(n),
         )
         affine = self.map
-        none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0))
-        kinds, data, K = none if affine is None else (affine.kinds, affine.data, affine.K)
+        none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0)), np.empty((n, 0)), np.empty(n)
+        costs = PositionCosts(*none) if affine is None else affine.room(n)
         gap, nowhere = np.full(n, LISTED_GAP), np.full((n, 2, d), np.nan)
         asked = Asked(
             x=np.empty((n, d)),
@@ -295,11 +295,10 @@ class Single:
             region=nowhere,
             # where all positions cannot be bounded the long way says what can
             fallback=nowhere,
-            budget=budgets(gap, len(kinds), 1),
+            budget=budgets(gap, len(costs.kinds), 1),
             planes=np.empty((n, 0, 3)),
             surface=np.empty((n, 0)),
         )
-        costs = PositionCosts(kinds, data, K, np.empty((n, K.shape[1])), np.full(n, np.inf))
         centre = np.broadcast_to(self.centre, (*shape, d))
         kept = {
             "layout": self.plan.layout,

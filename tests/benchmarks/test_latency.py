@@ -86,7 +86,7 @@ def kernels(place):
     def work(i):
         room.z[0] = z[i]
         fix_few_ranges(short.plan.model, short.rows, room.z, short.place, TOLERANCE, LIMIT, False, answer)
-        short.map.write(z[i], room.costs.w[0])
+        short.map.write(z[i], room.costs, 0)
         room.asked.x[0] = x[0]
         prove_here(room.costs, room.asked, room.answered)
 
