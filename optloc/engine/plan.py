@@ -18,7 +18,7 @@ from optloc.base.cache import Cache
 from optloc.base.frames import Frame
 from optloc.base.linalg import project_out
 from optloc.base.threads import mapped
-from optloc.base.types import Array, Band
+from optloc.base.types import Array, Band, Stations
 from optloc.compute.jit import enabled, ready, usable
 from optloc.compute.pack import pack
 from optloc.engine.admission import admission_of, levels_of
@@ -28,7 +28,7 @@ from optloc.engine.memory import Admission, Answer, Model
 from optloc.engine.ranges import RangeRows
 from optloc.engine.tapes import TapeRows
 from optloc.linear.constraints import exact, face_names, is_exact
-from optloc.linear.evaluate import block_links
+from optloc.linear.evaluate import block_links, columns
 from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.linear.normal import depends_on_place, weighed
 from optloc.linear.redundancy import degrees_of_freedom
@@ -275,10 +275,18 @@ def _is_ranged(problem: Problem) -> bool:
     """Return whether all rows are sums of ranges to stations that stay, and nothing else is unknown."""
     stations = problem.stations
     return (
-        not (problem.biases or problem.priors or stations.estimated)
+        not (problem.biases or problem.priors)
+        and (not stations.estimated or (problem.epochs == 1 and _are_alike(stations)))
         and stations.position.shape[-3] == 1
         and all(MODELS[rows.kind].ranges is not None for rows in problem.rows)
     )
+
+
+def _are_alike(stations: Stations) -> bool:
+    """Return whether errors of station positions are as large in all directions, and velocities have none."""
+    own, d = stations.covariance, stations.dimension
+    alike = own is not None and np.array_equal(own, np.eye(d) * own[..., :1, :1])
+    return bool(alike and stations.velocity_covariance is None)
 
 
 def _is_taped(problem: Problem) -> bool:
@@ -296,8 +304,11 @@ def _make(problem: Problem) -> Plan | None:
     dof = int(degrees_of_freedom(one.flat())[0])
     if dof < 0 or problem.layout.find("position")[0].start:
         return None
+    ranged, offset = _is_ranged(problem), None
+    if ranged and one.stations.estimated:  # along the lines to the target, they are noise
+        offset = columns(one.layout, "stations", np.zeros(1, dtype=int))[0]
+        one = replace(one, stations=replace(one.stations, span="noise"))
     found = ranges(weighed(_probe(hold_still(one.flat()))))
-    ranged = _is_ranged(problem)
     # Stations that no row links would have ranges that nothing relates.
     if ranged and (found is None or len(found.groups[0]) != 1):
         return None
@@ -316,11 +327,15 @@ def _make(problem: Problem) -> Plan | None:
     make: Callable[[Problem], Any]
     if ranged:
         turned, made = _range_rows(weighed(one), node[1])
+        if offset is not None:
+            assert one.stations.covariance is not None
+            first = offset.reshape(-1, one.dimension)[node[1], 0]
+            made = made._replace(wander=np.array(one.stations.covariance[node[1], 0, 0]), offset=first)
         model, make = model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made
     else:
         places = {(int(station), int(epoch)): i for i, (epoch, station) in enumerate(node.T)}
         lifts = lift(hold_still(one.flat()).take(np.zeros(1, dtype=int)), found, places, model.reference >= 0)
-        make = partial(_tape_rows, one.correction, vectors(one.flat(), None)[0], lifts)
+        make = partial(_tape_rows, one.correction, vectors(one.flat(), None)[0], lifts, _is_bounded(one))
         if make(one) is None or not (len(heard) or len(lifts.sigma)):
             return None
     layout = problem.layout
@@ -414,6 +429,8 @@ def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
         _anchors(one)[1],
         norm,
         bool(np.abs(share.sum(-1)).max(initial=0.0) <= _LEVEL * norm),
+        np.zeros(0),
+        np.zeros(0, dtype=np.int64),
     )
 
 
@@ -432,8 +449,28 @@ def _design(one: Problem, station: Array) -> tuple[Array, Array]:
     return design, emitted
 
 
-def _tape_rows(correction: Array, base: Array, lifts: Lifts, problem: Problem) -> TapeRows | None:
+def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, problem: Problem) -> TapeRows | None:
     """Return the rows of problems as tapes, or None where they have none."""
     bare = problem.with_rows(z=np.zeros(problem.count))
     found = pack(bare, whiten(weighed(bare).noise, bare.weight))
-    return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts)
+    return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts, bounded)
+
+
+def _is_bounded(one: Problem) -> bool:
+    """Return whether some row, or a prior, costs without bound wherever a target goes far away.
+
+    Ranges that add up do, but for a scale or an offset without a prior; so do heights, and a prior on the position.
+    """
+    free = {bias.name for bias in one.biases if bias.sigma is None or bias.form == "scale"}
+    touched = np.zeros(one.count, dtype=bool)
+    for bias in one.biases:
+        touched[bias.row] |= bias.name in free
+    if any(prior.name == "position" for prior in one.priors):
+        return True
+    for rows, start in zip(one.rows, one.starts, strict=True):
+        model = MODELS[rows.kind]
+        grows = rows.kind == "height" or (model.ranges is not None and sum(model.ranges) != 0 and not model.emission)
+        present = (rows.weight > 0.0) & ~touched[start : start + rows.count]
+        if grows and present.any():
+            return True
+    return False

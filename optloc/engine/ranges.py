@@ -55,6 +55,11 @@ class RangeRows(NamedTuple):
         Greatest singular value of K.
     level : bool
         Whether K takes no notice of what all ranges have in common: then the cost has limits at infinity.
+    wander : array (s,)
+        Variances of isotropic errors of station positions, square metres: they are part of the noise, for the nearest
+        place from which a range is another lies on the line to the target.
+    offset : int64 array (s,)
+        Where the errors of each station begin in parameter vectors; -1 where they are no unknowns.
     """
 
     correction: Array
@@ -63,6 +68,8 @@ class RangeRows(NamedTuple):
     start: Array
     norm: float
     level: bool
+    wander: Array
+    offset: Array
 
 
 class RangeRoom(NamedTuple):
@@ -191,12 +198,23 @@ def note_nearest(room: Room, least: Array) -> None:
 
 @compiled
 def finish(rows: RangeRows, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Write the emission times at row X: less the ranges' share, plus the measurement that they count from."""
-    item, r, sent, start, d = room.item, room.own.r, room.own.sent, rows.start, room.d
-    if not len(start):
+    """Write emission times and station errors at row X."""
+    if not len(rows.start) and not len(rows.wander):
         return
+    ranges(room.place, room.vector[X], room.own.r, room.own.unit, room.scalar[SPARE])
+    _emit(rows, z, room, size, mark, marked, x)
+    if len(rows.wander):
+        _write_residuals(rows, room)
+        for i in range(len(rows.offset)):
+            if rows.offset[i] >= 0:
+                _shift(rows, room, i, size, mark, marked, x)
+
+
+@compiled
+def _emit(rows: RangeRows, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+    """Write the emission times: less the ranges' share, plus the measurement that they count from."""
+    item, r, sent, start, d = room.item, room.own.r, room.own.sent, rows.start, room.d
     first = len(room.place) + len(rows.K)
-    ranges(room.place, room.vector[X], r, room.own.unit, room.scalar[SPARE])
     for j in range(len(start)):
         at = start[j]
         for lane in range(LANES):
@@ -209,6 +227,34 @@ def finish(rows: RangeRows, z: Array, room: Room, size: int, mark: Array, marked
         if not marked or mark[lane] != 0.0:
             for j in range(len(start)):
                 x[item[lane], d + j] = sent[j, lane]
+
+
+@compiled
+def _write_residuals(rows: RangeRows, room: Room) -> None:
+    """Write the whitened residuals of ranges that are at hand."""
+    K, residual, r, s = rows.K, room.own.residual, room.own.r, len(room.place)
+    for k in range(len(K)):
+        for lane in range(LANES):
+            residual[k, lane] = room.value[s + k, lane]
+        for i in range(s):
+            part = K[k, i]
+            if part != 0.0:
+                for lane in range(LANES):
+                    residual[k, lane] -= part * r[i, lane]
+
+
+@compiled
+def _shift(rows: RangeRows, room: Room, station: int, size: int, mark: Array, marked: bool, x: Array) -> None:
+    """Write the error of a station: along the line to the target, by what the residuals say of its range."""
+    K, residual, unit, first = rows.K, room.own.residual, room.own.unit, rows.offset[station]
+    for lane in range(size):
+        if not marked or mark[lane] != 0.0:
+            longer = 0.0
+            for k in range(len(K)):
+                longer += K[k, station] * residual[k, lane]
+            for j in range(room.d):
+                # a step towards the target makes the range shorter
+                x[room.item[lane], first + j] = -rows.wander[station] * longer * unit[station, j, lane]
 
 
 @compiled
@@ -324,14 +370,7 @@ def bend(rows: RangeRows, room: Room) -> None:
     left, pull = scalar[SPARE], scalar[HIGH]
     out, residual, r, unit = matrix[H_TRIAL], room.own.residual, room.own.r, room.own.unit
     ranges(room.place, vector[X], r, unit, left)
-    for k in range(len(K)):
-        for lane in range(LANES):
-            residual[k, lane] = room.value[s + k, lane]
-        for i in range(s):
-            part = K[k, i]
-            if part != 0.0:
-                for lane in range(LANES):
-                    residual[k, lane] -= part * r[i, lane]
+    _write_residuals(rows, room)
     for i in range(d):
         for j in range(i + 1):
             for lane in range(LANES):

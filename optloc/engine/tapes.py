@@ -53,6 +53,8 @@ class TapeRows(NamedTuple):
         Where the unknowns beside the position begin.
     lifts : Lifts
         Rows that are linear beside squared ranges.
+    bounded : bool
+        Whether the cost grows without bound at infinity.
     """
 
     tables: Tables
@@ -60,6 +62,7 @@ class TapeRows(NamedTuple):
     correction: Array
     base: Array
     lifts: Lifts
+    bounded: bool
 
 
 class TapeRoom(NamedTuple):
@@ -307,9 +310,9 @@ def bend(rows: TapeRows, room: Room) -> None:
 
 @compiled
 def measure_infinity(rows: TapeRows, room: Room) -> None:
-    """Write that nobody has looked."""
+    """Write infinity where no position far away fits; elsewhere nobody has looked."""
     for lane in range(LANES):
-        room.scalar[BEYOND, lane] = np.nan
+        room.scalar[BEYOND, lane] = np.inf if rows.bounded else np.nan
 
 
 @compiled

@@ -56,7 +56,7 @@ class Scene:
 
     def answer(self):
         plan = plan_of(self.problem)
-        return plan.run(plan.rows(self.problem), self.z, self.place)[0]
+        return plan.run(plan.load(self.problem), self.z)[0]
 
 
 def scene(kind, place, truth, seed):
