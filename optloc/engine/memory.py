@@ -118,6 +118,8 @@ class Answer(NamedTuple):
         Of the first n unknowns.
     multiplier : array (N, c)
         Of what is held: the gradient of the cost and its gradients times these add up to nothing.
+    normal : array (N, c, d)
+        Gradients of what is held.
     cost : array (N,)
         Weighted sums of squared residuals.
     settled : bool array (N,)
@@ -137,6 +139,7 @@ class Answer(NamedTuple):
     x: Array
     covariance: Array
     multiplier: Array
+    normal: Array
     cost: Array
     settled: Array
     rival: Array

@@ -140,7 +140,10 @@ class Plan:
             Where refinements begin; starts are found where none are given.
         """
         kernel, count = self.kernel(len(z)), len(z)
-        answer, given = blank_answer(count, self.size, self.shared, len(self.held)), start is not None
+        answer, given = (
+            blank_answer(count, load.place.shape[-1], self.size, self.shared, len(self.held)),
+            start is not None,
+        )
         if start is not None:
             answer = answer._replace(x=np.array(start))
 
@@ -192,12 +195,13 @@ _BY_RANGES = (fix_few_ranges, fix_ranges, 8)
 _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
-def blank_answer(count: int, size: int, shared: int, held: int) -> Answer:
+def blank_answer(count: int, d: int, size: int, shared: int, held: int) -> Answer:
     """Return arrays for what is found of so many problems, of so many unknowns and surfaces that hold them."""
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),
         np.empty((count, held)),
+        np.empty((count, held, d)),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
         np.empty((count, size)),
@@ -243,8 +247,8 @@ def key_of(problem: Problem) -> tuple[Hashable, ...]:
     if problem.stations.axes is not None:
         numbers.append(problem.stations.axes)
     numbers += [band.coefficients for band in problem.constraints if isinstance(band, Band)]
-    held = (tuple(map(is_exact, problem.constraints)),) if problem.constraints else ()
-    return (problem.structure, *(array.tobytes() for array in numbers), *held)
+    held = tuple((is_exact(constraint), constraint.name) for constraint in problem.constraints)
+    return (problem.structure, *(array.tobytes() for array in numbers), held)
 
 
 def is_planned(problem: Problem) -> bool:

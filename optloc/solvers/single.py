@@ -20,11 +20,12 @@ import numpy as np
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
-from optloc.base.types import Array, Certificate, Status, first_status
+from optloc.base.types import Array, Band, Certificate, Status, first_status
 from optloc.compute.jit import usable
 from optloc.engine.memory import Answer
-from optloc.engine.plan import LIMIT, TOLERANCE, Load, Plan, is_planned, key_of, plan_of
+from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
+from optloc.linear.constraints import is_exact
 from optloc.problem.chart import Chart, quantile
 from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable
@@ -34,8 +35,9 @@ from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_
 from optloc.proof.near import UNIQUE
 from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
 from optloc.proof.scope import is_run, unsupported
-from optloc.solvers.certify.branch_and_bound import METHOD, budgets, certify_stage, gaps_below, sentence
-from optloc.solvers.certify.position_cost import agrees
+from optloc.proof.surface import UP
+from optloc.solvers.certify.branch_and_bound import ALL_AROUND, METHOD, budgets, certify_stage, gaps_below, sentence
+from optloc.solvers.certify.position_cost import agrees, surfaces_of
 from optloc.solvers.methods import Method
 from optloc.solvers.planned import active_of, direct_stages
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
@@ -130,6 +132,10 @@ class Single:
         What the problem has to itself.
     map : Affine, optional
         Of the costs of the proof; None for methods without one.
+    planes, surface : array (1, e, 3), array (1, 0) or (1, SURFACE_WIDTH)
+        To which proofs are limited, see `optloc.proof.batch.Asked`.
+    upward : int, optional
+        Which of what holds fixes is the height whose gradient is the surface's upward axis.
     absent : bool array (m,), optional
         Rows of weight zero, which may hold anything; None where all count.
     centre : array (d,)
@@ -147,6 +153,9 @@ class Single:
     plan: Plan
     load: Load
     map: Affine | None
+    planes: Array
+    surface: Array
+    upward: int | None
     absent: Array | None
     centre: Array
     doubt: float
@@ -175,14 +184,12 @@ class Single:
         for cost, settled, rival in zip(costs, answer.settled.tolist(), answer.rival_cost.tolist(), strict=True):
             # on Earth the sight of satellites says which of two that cost the same is meant
             tied = self.plan.frame.geodetic and rival - cost <= equal_cost(cost)
-            listed = self.map is not None and rival < np.inf  # a proof leaves it out
-            if not settled or tied or listed or not cost <= self.doubt:
+            if not settled or tied or not cost <= self.doubt:
                 return None
-        x = answer.x
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
         if self.map is not None:
-            if not self._proves(self.map, x[:, : self.load.place.shape[-1]], costs, room):
+            if not self._proves(self.map, answer, costs, room):
                 return None
             stages = (*stages, certify_stage(f"{n} global", fixed))
         fix = self._judge(shape, answer, costs, stages, room)
@@ -191,13 +198,18 @@ class Single:
             return fix if room.checked else None
         return fix
 
-    def _proves(self, affine: Affine, position: Array, costs: list[float], room: _Room) -> bool:
+    def _proves(self, affine: Affine, answer: Answer, costs: list[float], room: _Room) -> bool:
         """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
-        asked, answered = room.asked, room.answered
+        asked, answered, d = room.asked, room.answered, self.load.place.shape[-1]
+        asked.known[:] = answer.rival_cost < np.inf
+        asked.others[:, 0] = np.where(asked.known[:, None] > 0, answer.rival[:, :d], 0.0)
+        if self.upward is not None:
+            normal = answer.normal[:, self.upward]
+            asked.surface[:, UP:] = normal / np.sqrt((normal * normal).sum(-1, keepdims=True))
         for i, cost in enumerate(costs):
             affine.write(room.z[i], room.costs, i)
             asked.eps[i] = equal_cost(cost)
-        asked.x[:] = position
+        asked.x[:] = answer.x[:, :d]
         prove_here(room.costs, asked, answered)
         told = zip(costs, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
         for cost, verdict, bound, everywhere, shown, met in told:
@@ -239,8 +251,9 @@ class Single:
         cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.load.place.shape[-1]
         if self.map is not None:
             bound, boxes = room.answered.bound.reshape(shape).copy(), room.answered.boxes.reshape(shape).copy()
+            reason = claims.reason if min(numbers[2]) == np.inf else _reasons(answer.rival_cost < np.inf, shape)
             claims = Claims(
-                claims.proof, claims.reason, claims.method, bound, cost - bound,
+                claims.proof, reason, claims.method, bound, cost - bound,
                 claims.unique, claims.margin, boxes, claims.region, claims.asked,
             )  # fmt: skip
         return Fix(
@@ -274,6 +287,7 @@ class Single:
         n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
         found = (
             np.empty((n, len(self.plan.held))),
+            np.empty((n, len(self.plan.held), d)),
             np.empty(n),
             np.empty(n, dtype=np.bool_),
             np.empty((n, size)),
@@ -287,7 +301,7 @@ class Single:
         gap, nowhere = np.full(n, LISTED_GAP), np.full((n, 2, d), np.nan)
         asked = Asked(
             x=np.empty((n, d)),
-            others=np.empty((n, 0, d)),
+            others=np.zeros((n, 1, d)),
             known=np.zeros(n, dtype=np.int64),
             hidden=np.zeros(n, dtype=np.int64),
             gaps=np.tile(gaps_below(LISTED_GAP, d), (n, 1)),
@@ -295,9 +309,9 @@ class Single:
             region=nowhere,
             # where all positions cannot be bounded the long way says what can
             fallback=nowhere,
-            budget=budgets(gap, len(costs.kinds), 1),
-            planes=np.empty((n, 0, 3)),
-            surface=np.empty((n, 0)),
+            budget=budgets(gap, len(costs.kinds), 1) * (1 if self.upward is None else ALL_AROUND),
+            planes=np.repeat(self.planes, n, axis=0),
+            surface=np.repeat(self.surface, n, axis=0),
         )
         centre = np.broadcast_to(self.centre, (*shape, d))
         kept = {
@@ -313,6 +327,13 @@ class Single:
         nothing = np.broadcast_to(_NOTHING, shape)
         z, answered = np.empty((n, m)), empty_answer(n, d)
         return _Room(z, found, costs, asked, answered, centre, claims, nothing, alone, kept)
+
+
+def _reasons(listed: Array, shape: tuple[int, ...]) -> Array:
+    """Return what is claimed of proven fixes, of which some (n,) have another minimum that is listed."""
+    out = np.empty(len(listed), dtype=object)
+    out[:] = [sentence(LISTED_GAP, int(one), None) for one in listed]
+    return out.reshape(shape)
 
 
 def _rivals(answer: Answer, shape: tuple[int, ...]) -> Alternatives:
@@ -371,17 +392,24 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         return None
     bare = _alone(problem)
     plan = None if bare.batch_shape else plan_of(bare)
-    if plan is None or (proves and (bare.constraints or unsupported(bare) or is_run(bare))):
+    limited = any(not is_exact(constraint) for constraint in bare.constraints)  # proofs look along all edges
+    if plan is None or (proves and (limited or unsupported(bare) or is_run(bare))):
         return None
     affine = affine_costs(bare) if proves else None
     if proves and affine is None:
         return None
     weight, d, load = bare.weight, problem.dimension, plan.load(bare)
+    planes, surface = surfaces_of(bare.flat(), load.place[:1, 0])
+    held = [constraint for constraint in bare.constraints if is_exact(constraint)]
+    upward = [i for i, band in enumerate(held) if isinstance(band, Band) and band.kind == "height"]
     return Single(
         bare,
         plan,
         load._replace(place=np.require(load.place, dtype=float, requirements=["C", "W"])),
         affine,
+        planes,
+        surface,
+        upward[0] if upward else None,
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),
         largest(plan.dof, DOUBT),
@@ -412,16 +440,23 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
     What does not depend on the measurements is kept for the next problem of the same structure.
     """
     shape, place = problem.batch_shape, problem.stations.position
-    if not is_few(shape) or place.size != prod(place.shape[-3:]) or not is_planned(problem):
+    # a problem without batch axes shares all that it has, and `single` finds out the rest once
+    few = is_few(shape) and problem.count <= MOST and place.size == prod(place.shape[-3:])
+    if not few or (shape and not is_planned(problem)):
         return None
     with suppress(*NUMERICAL):  # the stages tell which of them fails
-        rates = problem.stations.velocity
-        numbers = (place.tobytes(), None if rates is None else rates.tobytes())
-        ready = _KEPT.find((method, *numbers, *key_of(problem)), lambda: single(problem, method))
+        ready = _KEPT.find((method, *_own_numbers(problem), *key_of(problem)), lambda: single(problem, method))
         if ready is not None:
             z = problem.z
             return ready(z if z.shape[:-1] == shape else np.broadcast_to(z, (*shape, z.shape[-1])))
     return None
+
+
+def _own_numbers(problem: Problem) -> tuple[Any, ...]:
+    """Return what a plan takes as arguments and `Single` keeps, but for measurements: stations, levels, as bytes."""
+    rates, bands = problem.stations.velocity, problem.constraints
+    levels = tuple((b.lower.tobytes(), b.upper.tobytes()) for b in bands if isinstance(b, Band))
+    return (problem.stations.position.tobytes(), None if rates is None else rates.tobytes(), levels)
 
 
 def is_few(shape: tuple[int, ...]) -> bool:

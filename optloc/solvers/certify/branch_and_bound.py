@@ -133,9 +133,9 @@ _ROUNDS = 6
 # Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
 # for each: a budget of all.
 _BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
-# Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth, of
-# two coordinates and 2 us each.
-_AROUND = 15
+ALL_AROUND = 15
+"""Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth,
+of two coordinates and 2 us each."""
 # Within what share of its distance from the fix a minimum that was met is one that is listed: a descent's accuracy.
 _SAME = 1e-3
 # Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
@@ -325,7 +325,7 @@ def _asked(work: Work, items: Array) -> Asked:
         eps=equal_cost(fix.cost[items]),
         region=work.region[items],
         fallback=work.fallback[items],
-        budget=budgets(kappa, work.costs.dense, work.effort) * (_AROUND if surface.shape[1] else 1),
+        budget=budgets(kappa, work.costs.dense, work.effort) * (ALL_AROUND if surface.shape[1] else 1),
         planes=planes,
         surface=surface,
     )
