@@ -48,7 +48,7 @@ _ON = 1e-15
 
 @compiled
 def _measure(a: Admission, room: Room, shift: int, last: int) -> None:
-    """Write the first quantities at row X, or at TRIAL with shift 1; and the gradients of the exact ones."""
+    """Write the first quantities at row X, or at TRIAL with shift 1, and their gradients."""
     d, r, x, origin = room.d, room.registers, room.vector[X + shift], room.vector[ORIGIN]
     for k in range(last):
         begin, end = a.block[k, INPUT], a.block[k + 1, INPUT]
@@ -62,11 +62,10 @@ def _measure(a: Admission, room: Room, shift: int, last: int) -> None:
         run(a.code, a.block[k, CODE], a.block[k + 1, CODE], r, LANES)
         for lane in range(LANES):
             room.quantity[k, lane] = r[a.output[k, 0], lane]
-        if k < a.exact:
-            for j in range(d):
-                to = a.output[k, 1 + j]
-                for lane in range(LANES):
-                    room.face[shift, k, j, lane] = r[to, lane] if to >= 0 else 0.0
+        for j in range(d):
+            to = a.output[k, 1 + j]
+            for lane in range(LANES):
+                room.face[shift, k, j, lane] = r[to, lane] if to >= 0 else 0.0
 
 
 @compiled
@@ -98,7 +97,7 @@ def restore(model: Model, room: Room, shift: int) -> None:
 def _square(left: Array, right: Array, room: Room, d: int) -> None:
     """Factor the products (c, c, W) of gradients (c, d, W) with vectors (c, d, W)."""
     small, pivot = room.small, room.pivot
-    for k in range(len(left)):
+    for k in range(len(small[0])):
         for m in range(k + 1):
             for lane in range(LANES):
                 small[0, k, m, lane] = 0.0

@@ -211,6 +211,8 @@ def _write_fixes(model: Model, rows: Any, z: Array, room: Room, size: int, answe
         cost[i] = scalar[COST, lane]
         for k in range(len(room.part)):
             answer.multiplier[i, k] = room.part[k, lane]
+        for k in range(len(room.quantity)):
+            answer.quantity[i, k] = room.quantity[k, lane]
             for j in range(room.d):
                 answer.normal[i, k, j] = room.face[0, k, j, lane]
         for j in range(covariance.shape[1]):

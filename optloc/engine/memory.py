@@ -118,8 +118,8 @@ class Answer(NamedTuple):
         Of the first n unknowns.
     multiplier : array (N, c)
         Of what is held: the gradient of the cost and its gradients times these add up to nothing.
-    normal : array (N, c, d)
-        Gradients of what is held.
+    quantity, normal : array (N, k), (N, k, d)
+        What is held or bounded, and its gradients.
     cost : array (N,)
         Weighted sums of squared residuals.
     settled : bool array (N,)
@@ -139,6 +139,7 @@ class Answer(NamedTuple):
     x: Array
     covariance: Array
     multiplier: Array
+    quantity: Array
     normal: Array
     cost: Array
     settled: Array
@@ -169,8 +170,8 @@ class Room(NamedTuple):
         Squared-range answers, second ones, and scratch of `optloc.compute.gtrs.minimise`.
     vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (22, W)
         See the names of their rows. Positions count from the origin, row ORIGIN.
-    face, push : array (2, c, d, W), (c, p, W)
-        Gradients of what is held at rows X and TRIAL, and their products with an inverse.
+    face, push : array (2, k, d, W), (c, p, W)
+        Gradients of quantities at rows X and TRIAL; of those that are held, their products with an inverse.
     small, part, pivot, diagonal : array (2, c, c, W), (c, W), (c, W), (c, W)
         Products of these with each other, and scratch.
     level, quantity : array (k, 2, W), (k, W)
@@ -228,7 +229,7 @@ def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, othe
         np.zeros((6, p, p, LANES)),
         np.zeros((3, d, d, LANES)),
         np.zeros((22, LANES)),
-        np.zeros((2, c, d, LANES)),
+        np.zeros((2, k, d, LANES)),
         np.zeros((c, p, LANES)),
         np.zeros((2, c, c, LANES)),
         np.zeros((c, LANES)),

@@ -76,6 +76,8 @@ class Plan:
         Whether all rows are sums of ranges, and nothing else is unknown but emission times.
     size, shared : int
         Numbers of all unknowns, and of those that all epochs share.
+    widths : tuple of int
+        As of `blank_answer`.
     held : tuple of str
         Names of the constraints that hold fixes.
     """
@@ -90,6 +92,7 @@ class Plan:
     ranged: bool
     size: int
     shared: int
+    widths: tuple[int, ...]
     held: tuple[str, ...]
 
     def load(self, problem: Problem) -> Load:
@@ -141,7 +144,7 @@ class Plan:
         """
         kernel, count = self.kernel(len(z)), len(z)
         answer, given = (
-            blank_answer(count, load.place.shape[-1], self.size, self.shared, len(self.held)),
+            blank_answer(count, *self.widths),
             start is not None,
         )
         if start is not None:
@@ -195,13 +198,14 @@ _BY_RANGES = (fix_few_ranges, fix_ranges, 8)
 _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
-def blank_answer(count: int, d: int, size: int, shared: int, held: int) -> Answer:
-    """Return arrays for what is found of so many problems, of so many unknowns and surfaces that hold them."""
+def blank_answer(count: int, d: int, size: int, shared: int, held: int, sides: int) -> Answer:
+    """Return arrays for what is found of so many problems, of so many unknowns, and held and other quantities."""
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),
         np.empty((count, held)),
-        np.empty((count, held, d)),
+        np.empty((count, sides)),
+        np.empty((count, sides, d)),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
         np.empty((count, size)),
@@ -343,8 +347,9 @@ def _make(problem: Problem) -> Plan | None:
         if make(one) is None or not (len(heard) or len(lifts.sigma)):
             return None
     layout = problem.layout
-    held, sizes = face_names(one, exact(one)), (layout.size, layout.n_shared)
-    return Plan(layout, problem.frame, one.weight, dof, node, model, make, ranged, *sizes, held)
+    held, size, shared = face_names(one, exact(one)), layout.size, layout.n_shared
+    widths = (one.dimension, size, shared, len(held), len(one.constraints))
+    return Plan(layout, problem.frame, one.weight, dof, node, model, make, ranged, size, shared, widths, held)
 
 
 def _bare(problem: Problem) -> Problem:
@@ -353,9 +358,13 @@ def _bare(problem: Problem) -> Problem:
     place = stations.position.reshape(-1, *stations.position.shape[-3:])[0]
     rates = stations.velocity
     rates = None if rates is None else rates.reshape(-1, *rates.shape[-3:])[0]
-    return replace(
-        problem.with_rows(z=np.zeros(problem.count)), stations=replace(stations, position=place, velocity=rates)
+    # levels are arguments of a run
+    bands = tuple(
+        replace(band, lower=band.lower.ravel()[0], upper=band.upper.ravel()[0]) if isinstance(band, Band) else band
+        for band in problem.constraints
     )
+    bare = problem.with_rows(z=np.zeros(problem.count))
+    return replace(bare, stations=replace(stations, position=place, velocity=rates), constraints=bands)
 
 
 def _probe(problem: Problem) -> Problem:

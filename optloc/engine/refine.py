@@ -143,7 +143,7 @@ def decide(room: Room, tolerance: float) -> bool:
         for j in range(i + 1):
             for lane in range(LANES):
                 matrix[H, i, j, lane] = matrix[H_TRIAL, i, j, lane] if kept[lane] != 0.0 else matrix[H, i, j, lane]
-    for k in range(face.shape[1]):
+    for k in range(len(room.push)):
         for j in range(room.d):
             for lane in range(LANES):
                 face[0, k, j, lane] = face[1, k, j, lane] if kept[lane] != 0.0 else face[0, k, j, lane]

@@ -218,6 +218,11 @@ def costs_at(costs: PositionCosts, x: Array) -> tuple[Array, Array]:
     return out[0], out[1]
 
 
+def cost_here(costs: PositionCosts, x: Array, out: Array) -> None:
+    """Write costs and their rounding at positions x (n, P, d) to (2, n, P), by machine code; see `prove_here`."""
+    _evaluate(costs, x, out)
+
+
 def plainly(array: Array) -> Array:
     """Return an array in one form for all calls: machine code is made anew for read-only or strided arrays."""
     return np.require(array, requirements=["C", "W"])

@@ -290,6 +290,9 @@ _ENDLESS = 1e300
 # Corners of what is searched are moved out by this share, for the rounding of the enclosure.
 _OUTWARDS = 1e-9
 
+# By how much less than a place costs a proof may ask for where the place is no minimum: rounding is far below it.
+_MUCH = 1.0
+
 # Verdicts of a proof.
 UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
 COARSE = 9
@@ -380,17 +383,20 @@ def prove(
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
     margin = steepness(slope, noise) / (0.5 * eps if bent else eps)
     minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
-    if count == 0:
+    # Where much less is asked about than the place costs, it need be no minimum: then its own box is searched, too.
+    if count == 0 and not (kappa <= 0.0 and eps > _MUCH and _holds_origin(low, high)):
         return STATIONARY, 0, -inf
-    if not _extent(low, high, sides[0]) <= reach:
+    if count and not _extent(low, high, sides[0]) <= reach:
         return BUDGET, 0, -inf
+    hole = sides[0] if count else np.zeros(3)
+    own, free = (1, free) if count else (0, 0)
     count = free if kappa <= 0.0 else count  # the value alone: boxes of other minima are bounded as all others are
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     better, whole = least - 0.5 * eps, (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
-    aim, stack = Aim(level, least - eps, better, whole, free, own=1), np.empty((_CAPACITY, DEPTH))
-    size = push_around(stack, 0, low, high, sides[0], 0)
+    aim, stack = Aim(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
+    size = push_around(stack, 0, low, high, hole, 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
     if outcome == CLEAR and not alone:
         outcome, boxes = _search_sides(cost, chart, box, known, aim, budget, boxes, stack)
@@ -401,6 +407,15 @@ def prove(
     for k in range(x.shape[0]):
         found[k] = box.centre[k]
     return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
+
+
+@inlined
+def _holds_origin(low: Array, high: Array) -> bool:
+    """Return whether what is searched holds the place itself."""
+    inside = True
+    for k in range(3):
+        inside = inside and low[k] <= 0.0 <= high[k]
+    return inside
 
 
 @inlined

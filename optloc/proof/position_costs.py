@@ -350,7 +350,7 @@ class Affine(NamedTuple):
 
     def room(self, count: int) -> PositionCosts:
         """Return costs of so many problems, to be written."""
-        data = np.array(np.broadcast_to(self.data, (count, *self.data.shape[1:]))) if len(self.place) else self.data
+        data = np.repeat(self.data, count, axis=0) if len(self.place) else self.data
         return PositionCosts(self.kinds, data, self.K, np.empty((count, self.K.shape[1])), np.full(count, np.inf))
 
     def write(self, z: Array, costs: PositionCosts, item: int) -> None:
@@ -385,7 +385,9 @@ def affine_costs(problem: Problem) -> Affine | None:
     change = (data[1:] - data[0]).reshape(len(data) - 1, data[0].size)
     place = np.flatnonzero(change.any(0))
     first, gain = data[0].reshape(-1)[place], np.ascontiguousarray(change[:, place].T)
-    return Affine(kinds, np.array(data[:1], order="C"), K, base, slope, basis, place, first, gain)
+    # arrays of one form, for which there is machine code
+    data, K = (np.require(array, requirements=["C", "W"]) for array in (data[:1].copy(), K))
+    return Affine(kinds, data, K, base, slope, basis, place, first, gain)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,9 +23,9 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band, Certificate, Status, first_status
 from optloc.compute.jit import usable
 from optloc.engine.memory import Answer
-from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, is_planned, key_of, plan_of
+from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
-from optloc.linear.constraints import is_exact
+from optloc.linear.constraints import is_exact, violation_names
 from optloc.problem.chart import Chart, quantile
 from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable
@@ -37,6 +37,7 @@ from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
 from optloc.proof.scope import is_run, unsupported
 from optloc.proof.surface import UP
 from optloc.solvers.certify.branch_and_bound import ALL_AROUND, METHOD, budgets, certify_stage, gaps_below, sentence
+from optloc.solvers.certify.out_of_reach import Edges, Scratch, are_out_of_reach, edges_of, scratch
 from optloc.solvers.certify.position_cost import agrees, surfaces_of
 from optloc.solvers.methods import Method
 from optloc.solvers.planned import active_of, direct_stages
@@ -99,6 +100,8 @@ class _Room:
         Constraints that hold fixes: none.
     alone : Alternatives
         Other minima: none.
+    beside : Scratch, optional
+        Of the proofs that bounds are out of reach.
     kept : dict
         Fields of a fix that are the same for all measurements; nobody can write into them.
     checked : bool
@@ -114,6 +117,7 @@ class _Room:
     claims: Claims
     nothing: Array
     alone: Alternatives
+    beside: Scratch | None
     kept: dict[str, Any]
     checked: bool = False
 
@@ -136,6 +140,8 @@ class Single:
         To which proofs are limited, see `optloc.proof.batch.Asked`.
     upward : int, optional
         Which of what holds fixes is the height whose gradient is the surface's upward axis.
+    edges : Edges, optional
+        Bounds, of which proofs show that they are out of reach; None where there are none.
     absent : bool array (m,), optional
         Rows of weight zero, which may hold anything; None where all count.
     centre : array (d,)
@@ -156,6 +162,7 @@ class Single:
     planes: Array
     surface: Array
     upward: int | None
+    edges: Edges | None
     absent: Array | None
     centre: Array
     doubt: float
@@ -191,7 +198,8 @@ class Single:
         if self.map is not None:
             if not self._proves(self.map, answer, costs, room):
                 return None
-            stages = (*stages, certify_stage(f"{n} global", fixed))
+            told = "global" if self.edges is None else f"within {violation_names(self.problem)}"
+            stages = (*stages, certify_stage(f"{n} {told}", fixed))
         fix = self._judge(shape, answer, costs, stages, room)
         if fix is not None and not room.checked:
             room.checked = self._agrees(fix, room)
@@ -211,6 +219,8 @@ class Single:
             asked.eps[i] = equal_cost(cost)
         asked.x[:] = answer.x[:, :d]
         prove_here(room.costs, asked, answered)
+        if self.edges is not None and not self._is_inside(self.edges, answer, room):
+            return False
         told = zip(costs, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
         for cost, verdict, bound, everywhere, shown, met in told:
             if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
@@ -219,6 +229,16 @@ class Single:
             if not abs(cost - bound) <= _APART * equal_cost(cost):
                 return False
         return True
+
+    def _is_inside(self, edges: Edges, answer: Answer, room: _Room) -> bool:
+        """Return whether nothing on a bound costs as little as what the proofs are about."""
+        assert room.beside is not None
+        if (answer.rival_cost < np.inf).any():  # what is low about a rival may reach elsewhere
+            return False
+        d = self.load.place.shape[-1]
+        x, cov = answer.x[:, :d], answer.covariance[:, :d, :d]
+        numbers = (x, cov, answer.cost, answer.quantity, answer.normal)
+        return are_out_of_reach(edges, room.beside, room.costs, *numbers)
 
     def _agrees(self, fix: Fix, room: _Room) -> bool:
         """Return whether the position costs are the problem's own, at the first fixes of a thread and beside them."""
@@ -285,16 +305,7 @@ class Single:
 
     def _make_room(self, shape: tuple[int, ...]) -> _Room:
         n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
-        found = (
-            np.empty((n, len(self.plan.held))),
-            np.empty((n, len(self.plan.held), d)),
-            np.empty(n),
-            np.empty(n, dtype=np.bool_),
-            np.empty((n, size)),
-            np.empty(n),
-            np.empty((n, 2)),
-            np.empty(n),
-        )
+        found = tuple(blank_answer(n, *self.plan.widths))[2:]
         affine = self.map
         none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0)), np.empty((n, 0)), np.empty(n)
         costs = PositionCosts(*none) if affine is None else affine.room(n)
@@ -326,7 +337,8 @@ class Single:
         alone = Alternatives(np.empty((*shape, 0, size)), np.empty((*shape, 0)))
         nothing = np.broadcast_to(_NOTHING, shape)
         z, answered = np.empty((n, m)), empty_answer(n, d)
-        return _Room(z, found, costs, asked, answered, centre, claims, nothing, alone, kept)
+        beside = None if affine is None or self.edges is None else scratch(affine, self.edges, n, d)
+        return _Room(z, found, costs, asked, answered, centre, claims, nothing, alone, beside, kept)
 
 
 def _reasons(listed: Array, shape: tuple[int, ...]) -> Array:
@@ -392,8 +404,11 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         return None
     bare = _alone(problem)
     plan = None if bare.batch_shape else plan_of(bare)
-    limited = any(not is_exact(constraint) for constraint in bare.constraints)  # proofs look along all edges
-    if plan is None or (proves and (limited or unsupported(bare) or is_run(bare))):
+    if plan is None or (proves and (unsupported(bare) or is_run(bare))):
+        return None
+    limited = proves and any(not is_exact(constraint) for constraint in bare.constraints)
+    edges = edges_of(bare) if limited else None
+    if limited and edges is None:  # proofs look along all of them
         return None
     affine = affine_costs(bare) if proves else None
     if proves and affine is None:
@@ -410,6 +425,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         planes,
         surface,
         upward[0] if upward else None,
+        edges,
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),
         largest(plan.dof, DOUBT),
