@@ -292,6 +292,8 @@ _OUTWARDS = 1e-9
 
 # By how much less than a place costs a proof may ask for where the place is no minimum: rounding is far below it.
 _MUCH = 1.0
+# Share of a cost that counts as equal (`optloc.solvers.policy.equal_cost`).
+_EQUAL = 1e-6
 
 # Verdicts of a proof.
 UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
@@ -394,6 +396,8 @@ def prove(
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     better, whole = least - 0.5 * eps, (closed or isnan(lower[0])) and known.hidden == 0
+    if eps > _MUCH:  # what costs less than the place, but no less than is asked about, refutes nothing
+        better = least - eps + 0.5 * equal_within(_EQUAL * (1.0 + least - eps), least, noise)
     level = least + kappa if kappa > 0.0 else least - eps
     aim, stack = Aim(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, hole, 0)
