@@ -346,6 +346,6 @@ def with_constants(
     assert isinstance(kernel, _Kernel)
     out = copy(kernel)
     for one in {*made, *others}:
-        if one in _KERNELS and not closure(cast(_Kernel, one)).isdisjoint(cast(Iterable[_Kernel], others)):
-            _KERNELS.remove(cast(_Kernel, one))  # a pattern, of which there will be no machine code
+        if one in _KERNELS and not closure(one).isdisjoint(cast(Iterable[_Kernel], others)):
+            _KERNELS.remove(one)  # a pattern, of which there will be no machine code
     return cast(_Function, out)

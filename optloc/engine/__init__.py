@@ -1,1 +1,1 @@
-"""Fixes of one target by one compiled call: minima, covariance, and what tells how good they are."""
+"""Fixes of one target by one compiled call: minima, covariance and measures of quality."""

@@ -42,7 +42,7 @@ from optloc.problem.problem import Problem
 CODE, CONSTANT, INPUT = range(3)
 # Steps that put a position back: Newton's squares a small relative distance, so that three are enough from 1 % off.
 _BACK = 8
-# Share of a level, or metres beside zero, by which a position may miss it: rounding of coordinates of the Earth's size.
+# Share of a level by which a position may miss it: rounding of coordinates of the Earth's size.
 _ON = 1e-15
 
 
@@ -223,7 +223,7 @@ def find_multipliers(model: Model, room: Room) -> None:
         for lane in range(LANES):
             part[k, lane] = 0.0
         for j in range(d):
-            # half the gradient stands in the normal equations
+            # the normal equations have half the gradient
             for lane in range(LANES):
                 part[k, lane] += 2.0 * face[k, j, lane] * room.vector[G, j, lane]
     solve_plain(room.small[1], room.pivot, part)
@@ -231,7 +231,7 @@ def find_multipliers(model: Model, room: Room) -> None:
 
 @compiled
 def admit(model: Model, room: Room, out: Array) -> None:
-    """Write 0.0 to `out` (W,) where row X breaks a bound, or where the Earth hides it from a station that hears it."""
+    """Write 0.0 to `out` (W,) where row X breaks a bound, or where the Earth hides it from a station with a row."""
     a = model.admission
     if len(a.output) > a.exact:
         _measure(a, room, 0, len(a.output))
@@ -254,7 +254,7 @@ measured; 50 km from the ground to a target in space: only what is clearly on th
 
 @compiled
 def _is_hidden(a: Admission, room: Room, lane: int) -> bool:
-    """Return whether the Earth hides row X of a lane from a station that hears it: `optloc.solvers.inequalities`."""
+    """Return whether the Earth hides row X of a lane from a station with a row of it: `optloc.solvers.inequalities`."""
     point, line, origin = room.spot[0], room.spot[1], room.vector[ORIGIN]
     for i in range(3):
         point[i] = a.origin[i]
@@ -280,7 +280,7 @@ def _is_hidden(a: Admission, room: Room, lane: int) -> bool:
         satellite = far > SATELLITE * SATELLITE
         if not (satellite or a.seen[s] != 0.0 or high > SATELLITE * SATELLITE):
             continue
-        # the point of the segment next to the centre; at its ends nothing lies in between
+        # the point of the segment next to the centre; at its ends nothing is in between
         share = min(along / long, 1.0)
         nearest = 0.0
         for i in range(3):
@@ -299,7 +299,7 @@ _STRETCH = (1.0 / WGS84_A, 1.0 / WGS84_A, 1.0 / WGS84_A / (1.0 - WGS84_F))
 
 
 def admission_of(problem: Problem, node: Array) -> Admission | None:
-    """Return what admits positions of one problem, or None where machine code does not know one of its constraints.
+    """Return the constraints of one problem as tapes, or None where a constraint has no tape.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the steps of the engine ask of the rows of a problem: one interface, for which `evaluated_by` puts in one form.
+"""The interface between the steps of the engine and the rows of a problem; `evaluated_by` fills it in.
 
 There are two: `optloc.engine.ranges` for rows that are sums of ranges and nothing else unknown, `optloc.engine.tapes`
 for rows of every kind. Each has kernels of these names. Machine code is made for each form, so that nothing is chosen
@@ -20,7 +20,7 @@ _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
 @compiled
 def count_unknowns(rows: Any, d: int, size: int) -> int:
-    """Return how many unknowns are refined together: of positions of d coordinates, and parameter vectors of a size."""
+    """Return the number of unknowns that are refined together, for d coordinates and parameter vectors of a size."""
     raise NotImplementedError
 
 
@@ -50,7 +50,7 @@ def minimise_start(model: Model, rows: Any, room: Room, first: bool) -> None:
 
 @compiled
 def complete(rows: Any, room: Room) -> None:
-    """Write the unknowns beside the position to row X where a refinement begins."""
+    """Write the start of the other unknowns, after the position, to row X."""
     raise NotImplementedError
 
 
@@ -62,13 +62,13 @@ def equations(rows: Any, room: Room, shift: int) -> None:
 
 @compiled
 def costs(rows: Any, room: Room) -> None:
-    """Write to COST_TRIAL the cost at TRIAL, the least over the unknowns beside the position."""
+    """Write to COST_TRIAL the cost at TRIAL, the least over the other unknowns."""
     raise NotImplementedError
 
 
 @compiled
 def bow_of(rows: Any, room: Room) -> float:
-    """Return how much the rows may bend: all residuals together by this times D^2 / r over a step D at range r."""
+    """Return the curvature b of the rows: over a step D at range r all residuals change by up to b D^2 / r more."""
     raise NotImplementedError
 
 
@@ -123,7 +123,7 @@ def evaluated_by(kernel: _Kernel, rows: ModuleType, mark: str, **constants: Any)
     rows : module
         Has one of each name.
     mark : str
-        Tells names of machine code from those of other forms.
+        Distinguishes the names of machine code.
     constants : object
         As of `optloc.compute.jit.with_constants`.
     """

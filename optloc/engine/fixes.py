@@ -1,4 +1,4 @@
-"""Fixes in one compiled call: start, refinement, covariance, and what tells how far each is to be trusted.
+"""Fixes in one compiled call: start, refinement, covariance, shape of the cost and rivals.
 
 Problems go through in blocks of lanes. Some things few problems need: more steps, a mirror image that leads on, another
 look at the shape. Those that do are collected and go through again in full blocks, so that no block waits for one of
@@ -75,7 +75,7 @@ _FAR = 2.5e3
 _TIED = 1e-6
 # Difference of logarithms of distances that is rounding, as of `optloc.solvers.verdict.minima.likelihood_of`.
 _SAME_DISTANCE = 1e-6
-# Lanes of a block from which on it goes on as it is: collecting problems anew costs a start and half a step.
+# Fewest lanes for which a block goes on: collecting problems again costs a start and half a step.
 _WORTH = LANES // 2
 
 
@@ -83,7 +83,7 @@ _WORTH = LANES // 2
 def fixes(
     model: Model, rows: Any, z: Array, station: Array, tolerance: float, most: int, given: bool, answer: Answer
 ) -> int:
-    """Fix N positions, each from measurements alone, and return the most steps that one took.
+    """Fix N positions, each from measurements alone, and return the greatest number of steps.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ def fixes(
     tolerance, most : float, int
         Tolerance and limit of `optloc.engine.refine.refine`.
     given : bool
-        Whether starts stand in the answer's positions: those that the start here does not find, mostly because another
-        position fits the squared ranges as well. Every mirror image of them is refined.
+        Whether the answer has starts that were found elsewhere, mostly because another position fits the squared ranges
+        as well. Every mirror image of them is refined.
     answer : Answer
         Written.
     """
@@ -183,7 +183,7 @@ def _see(model: Model, rows: Any, z: Array, station: Array, room: Room, begins: 
 def _refine(
     model: Model, rows: Any, z: Array, room: Room, size: int, tolerance: float, limit: int, answer: Answer
 ) -> int:
-    """Refine the unknowns of a block and write them; return the most steps that one took."""
+    """Refine the unknowns of a block and write them; return the greatest number of steps."""
     refine(model, rows, room, tolerance, limit)
     _write_fixes(model, rows, z, room, size, answer)
     steps = 0
@@ -345,7 +345,7 @@ def _pursue(
                 scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
                 scalar[STEPS, lane] = course[2, i]
             follow(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
-            # those that wait on stand before the blocks that are still to come
+            # waiting problems are written before the blocks that follow
             images = _end_images(model, rows, z, room, size, answer, look, hidden, images, course)
 
 
@@ -389,7 +389,7 @@ def _end_images(
                 _exchange(answer.x, cost, answer.rival, rival, i)
                 look[i] = True
                 if rival[i] == np.inf:
-                    # so much cheaper that the start was in a wrong place: its own mirror image may lead on
+                    # much cheaper: the start was in a wrong place, and its mirror image may lead on
                     _reflect_lane(room.vector, lane, answer.rival[i])
                     course[0, i], course[1, i], course[2, i] = FIRST_DAMPING, FIRST_GROWTH, 0.0
                     hidden[images] = i
@@ -436,7 +436,7 @@ def _exchange(x: Array, cost: Array, rival: Array, rival_cost: Array, i: int) ->
 
 @compiled
 def _look_again(model: Model, rows: Any, z: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
-    """Write covariance and shape of fixes in row X anew."""
+    """Write covariance and shape of fixes in row X again."""
     evaluate(model, rows, room, 0)
     for lane in range(LANES):
         room.scalar[ALIVE, lane] = 0.0
@@ -495,6 +495,6 @@ def _invert(room: Room) -> None:
 
 fix_ranges = evaluated_by(fixes, ranges, "ranges")
 fix_tapes = evaluated_by(fixes, tapes, "tapes")
-# A block works out all of its lanes, whatever stands in them: one problem takes 55 us in 64 lanes, 30 in 8, 25 in 4.
+# A block works out all of its lanes, empty or not: one problem takes 55 us in 64 lanes, 30 in 8, 25 in 4.
 fix_few_ranges = evaluated_by(fixes, ranges, "few_ranges", LANES=4, _WORTH=2)
 fix_one_by_tapes = evaluated_by(fixes, tapes, "one_by_tapes", LANES=1, _WORTH=1)

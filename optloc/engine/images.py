@@ -50,7 +50,7 @@ from optloc.engine.memory import (
 from optloc.engine.refine import decide, propose
 
 LISTED = 25.0
-"""Cost above that of the fix up to which a rival counts (`optloc.solvers.policy.LISTED_GAP`)."""
+"""Cost above the fix up to which a rival counts (`optloc.solvers.policy.LISTED_GAP`)."""
 SAME = 1e-2
 """Squared distance in standard deviations below which two minima are one (`optloc.solvers.policy.SAME_PLACE`)."""
 
@@ -137,7 +137,7 @@ def follow(model: Model, rows: Any, room: Room, tolerance: float, fewest: int, e
     Parameters
     ----------
     model : Model
-        Says what holds fixes.
+        With the constraints that hold fixes.
     rows : named tuple
         Of the evaluator.
     room : Room
@@ -193,7 +193,7 @@ def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
     nearest : array (W,)
         Ranges to the nearest stations, metres.
     every : bool
-        Whether no image is given up for the first reason: rivals of a start that is one of two stand farther off.
+        Whether no image is given up for the first reason: rivals of a start that is one of two are farther away.
     """
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, spare, trace = vector.shape[1], scalar[SPARE], scalar[LOW]
@@ -211,7 +211,7 @@ def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
     alive = 0.0
     for lane in range(LANES):
         ball = _BALL * _BALL * scalar[HEIGHT, lane] * scalar[HEIGHT, lane]
-        # the gain is that of the damped step: within the ball the damping is worth no more than this
+        # the gain belongs to the damped step: within the ball the damping is worth no more than this
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
         near = spare[lane] < NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > RISEN * spare[lane]

@@ -1,7 +1,7 @@
-"""Rows that are linear in the position and one more coordinate: angles and gain ratios beside squared ranges.
+"""Rows that are linear in the position and one more coordinate: angles and gain ratios.
 
-The coordinates are ``y = ((x - origin) / scale, last)``. The last one is the range to a reference station, or the
-squared distance from the origin. Each row is written once, elementwise: for arrays, and as a tape for machine code.
+The coordinates are ``y = ((x - origin) / scale, last)``. The last coordinate is the range to a reference station, or
+the squared distance from the origin. Each row is written once, elementwise: for arrays, and as a tape for machine code.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _vanishes(value: Any) -> bool:
 
 
 def azimuths_beside(problem: Problem, rows: Rows) -> Array | None:
-    """Return the global number of the azimuth beside each elevation (same station, target and epoch), (m,), or None.
+    """Return the global number (m,) of the azimuth of the same station, target and epoch as each elevation, or None.
 
     None if any has no such row.
     """
@@ -121,15 +121,15 @@ def azimuths_beside(problem: Problem, rows: Rows) -> Array | None:
 
 # The same rows for machine code: a tape for each block of rows, and where each of its inputs comes from.
 
-# Columns of `Lifts.block`; of every block the parts begin there, and end where those of the next one begin.
+# Columns of `Lifts.block`; parts of a block begin there, and end where the next block begins.
 CODE, CONSTANT, INPUT, ROW = range(4)
-# What an input is: a number of the structure, a measurement, a coordinate of a station, a least-squares range, or a
+# Sorts of inputs: a number of the structure, a measurement, a coordinate of a station, a least-squares range, or a
 # coordinate of the place where the error of the row is taken.
 NUMBER, SEEN, STATION, OFFSET, POINT = range(5)
 
 
 class Lifts(NamedTuple):
-    """Linear rows beside squared ranges, of a structure.
+    """Linear rows of a structure.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _tape_of(model: Model, d: int, turned: bool, paired: bool, known: bool) -> T
         if entry is None:
             return None
         return tape(recorder, [*entry.x, entry.last, entry.right, entry.factor(point(_T, False))])
-    except (TypeError, AttributeError, ValueError):  # it asks for more than the elementary functions
+    except (TypeError, AttributeError, ValueError):  # it needs more than the elementary functions
         return None
 
 
@@ -247,7 +247,7 @@ class _Scene:
         return out
 
     def _source(self, seed: int, rows: Rows, i: int, start: int, beside: Array | None) -> tuple[int, int]:
-        """Return what an input of the tape of a row is, and which: -1 where there is none."""
+        """Return sort and number of an input of the tape of a row; number -1 where it does not exist."""
         if seed in (_M, _AZIMUTH):
             return SEEN, int(start + i if beside is None or seed == _M else beside[i])
         if seed >= _T:
@@ -284,7 +284,7 @@ def lift(problem: Problem, found: Ranges | None, node: dict[tuple[int, int], int
     problem : Problem
         One problem of a static target, nothing else unknown; measurements do not matter.
     found : Ranges, optional
-        Its least-squares ranges, which stand in the place of unknown ones.
+        Its least-squares ranges, which replace unknown ranges.
     node : dict
         Place of each (station, epoch) among the stations; the epoch is 0 where stations stay.
     on_cone : bool

@@ -1,4 +1,4 @@
-"""What all problems of a plan share, the memory of a block of them, and what is found."""
+"""Data that all problems of a plan share, the memory of a block of problems, and answers."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from optloc.compute.systems import LANES
 ROUNDING = 4.0 * 2.220446049250313e-16
 """Share of a measurement that is rounding: four of a double lie between it and its residual."""
 
-# Rows of `Room.vector`: where a refinement stands and what it tries, each followed by the same of a trial; FIX and
+# Rows of `Room.vector`: current and tried values of a refinement, each followed by its trial; FIX and
 # NORMAL are the fix whose mirror image is refined, and the direction in which the stations spread least; OTHER is a
-# second start, where SECOND says so.
+# second start, where SECOND is 1.
 X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE, FIX, NORMAL, OTHER = range(13)
-# Rows of `Room.matrix`: information and factor; FIX_H is the information at the fix, MARGIN what is left of it without
-# the unknowns beside the position, and REST the same at a trial.
+# Rows of `Room.matrix`: information and factor; FIX_H is the information at the fix, MARGIN the information about
+# the position alone, and REST the same at a trial.
 H, H_TRIAL, LOWER, FIX_H, MARGIN, REST = range(6)
 # Rows of `Room.axes`: BASE spans a chart, AXES are principal axes, EIGEN is the matrix that they make diagonal.
 BASE, AXES, EIGEN = range(3)
@@ -29,12 +29,12 @@ FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND = range(14, 22)
 
 
 class Admission(NamedTuple):
-    """Quantities of a position that are held or bounded, as tapes, and the Earth, which hides positions.
+    """Quantities of a position that are held or bounded, as tapes, and the Earth.
 
     Parameters
     ----------
     exact : int
-        So many of the first quantities are held.
+        Number of held quantities; they come first.
     code : int64 array (n, 4)
         Operations of all tapes, see `optloc.compute.trace.Tape`.
     block : int64 array (k + 1, 3)
@@ -54,7 +54,7 @@ class Admission(NamedTuple):
     turn, origin : array (3, 3), (3,)
         See there.
     heard, seen : array (s,)
-        1.0 for the places that a row is of, and for those that an angle is of.
+        1.0 for places with a row, and for places with an angle.
     """
 
     exact: int
@@ -108,7 +108,7 @@ class Model(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What is found of N problems, in arrays that are written.
+    """Answers to N problems, in arrays that are written.
 
     Parameters
     ----------
@@ -128,12 +128,12 @@ class Answer(NamedTuple):
     rival : array (N, size)
         Another minimum that the mirror image of the fix leads to, and which costs no more than `LISTED` more; NaN.
     rival_cost : array (N,)
-        Its cost; infinite where there is none.
+        Its cost; infinite without a rival.
     kappa : array (N, 2)
         How far the cost is from the square of a distance, in metres and in inverse range; NaN where not measured.
     infinity : array (N,)
         Least cost at infinity, exactly where it is less than `BEYOND_DOUBT` above the fix, else a lower bound above
-        that; infinite where the cost grows without bound, NaN where nobody has looked.
+        that; infinite where the cost grows without bound, NaN where not measured.
     """
 
     x: Array
@@ -211,7 +211,7 @@ class Room(NamedTuple):
 
 @compiled
 def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, others: int) -> Room:
-    """Return the memory of a block of problems: of so many unknowns, with so many linear rows of other kinds."""
+    """Return the memory of a block of problems, for numbers of stations, coordinates, unknowns and linear rows."""
     s, p, m = stations, unknowns, model.row.shape[1]
     c, k = model.admission.exact, len(model.admission.output)
     return Room(

@@ -1,7 +1,7 @@
 """Plans: a problem structure as arrays, made once and kept; measurements and station positions are arguments of a run.
 
-A plan serves one target at rest, whatever its rows measure and whatever else is unknown beside its position, as long as
-the problems of a batch share all but measurements, positions and velocities of stations.
+A plan serves one target at rest, for all kinds of rows and of other unknowns. The problems of a batch may differ in
+measurements, and in positions and velocities of stations.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ TOLERANCE, LIMIT = 1e-7, 100
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What turns measurements of one structure into fixes: all but the measurements and the stations.
+    """Everything that fixes of one structure need, except measurements and stations.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Plan:
     held: tuple[str, ...]
 
     def load(self, problem: Problem) -> Load:
-        """Return what problems of this structure have to themselves: one without batch axes, or a flat batch."""
+        """Return the data of problems of this structure: a problem without batch axes, or a flat batch."""
         model, admission = self.model, self.model.admission
         if len(admission.output):
             model = model._replace(admission=admission._replace(level=levels_of(problem)))
@@ -111,7 +111,7 @@ class Plan:
         return flat[:, self.node[0], self.node[1]]
 
     def kernel(self, count: int, *, often: bool = False) -> Callable[..., int]:
-        """Return the machine code for so many problems: narrow blocks for few, unless only the wide ones are loaded.
+        """Return the machine code for a number of problems: narrow blocks for few, unless only wide blocks are loaded.
 
         Parameters
         ----------
@@ -125,11 +125,11 @@ class Plan:
         return few if narrow else many
 
     def at_hand(self, count: int) -> bool:
-        """Return whether so many problems may be run: machine code is there, or they may wait for it."""
+        """Return whether a number of problems may be run: machine code exists, or they may wait for it."""
         return usable(self.kernel(count, often=True), count)
 
     def run(self, load: Load, z: Array, threads: int | None = None, start: Array | None = None) -> tuple[Answer, int]:
-        """Return what is found of N problems, and the most steps that a fix took.
+        """Return the answers to N problems, and the greatest number of steps.
 
         Parameters
         ----------
@@ -138,7 +138,7 @@ class Plan:
         z : array (N, m)
             Measurements.
         threads : int, optional
-            At most so many; as many as `optloc.base.threads.thread_count` says if absent.
+            Greatest number of threads; `optloc.base.threads.thread_count` by default.
         start : array (N, size), optional
             Where refinements begin; starts are found where none are given.
         """
@@ -159,7 +159,7 @@ class Plan:
 
 
 class Load(NamedTuple):
-    """What N problems of one structure have to themselves, but for their measurements.
+    """Data of N problems of one structure, except measurements.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
 def blank_answer(count: int, d: int, size: int, shared: int, held: int, sides: int) -> Answer:
-    """Return arrays for what is found of so many problems, of so many unknowns, and held and other quantities."""
+    """Return arrays for answers, for numbers of problems, coordinates, unknowns and constraints."""
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),
@@ -216,18 +216,18 @@ def blank_answer(count: int, d: int, size: int, shared: int, held: int, sides: i
 
 
 def _owned(values: Array) -> Array:
-    """Return values as the one type of array for which there is machine code: float, C order, writable."""
+    """Return values as the type of array that machine code takes: float, C order, writable."""
     return np.require(values, dtype=float, requirements=["C", "W"])
 
 
 # Which structures have a plan.
 
-# The plan of 64 rows takes 100 kB, that of six rows 2 kB.
+# The plan of 64 rows takes 100 kB, of six rows 2 kB.
 _KEPT = Cache["Plan | None"](256)
 
 
 def plan_of(problem: Problem) -> Plan | None:
-    """Return the plan of problems, or None where there is none; kept for the next problems of the same structure.
+    """Return the plan of problems, or None where they have no plan; plans are kept per structure.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def _bare(problem: Problem) -> Problem:
 
 def _probe(problem: Problem) -> Problem:
     """Return one problem for each row, whose measurement is one and all others zero."""
-    # What is linear is known by its images of the unit vectors.
+    # A linear map is known by its images of the unit vectors.
     parts = np.split(np.eye(problem.count), problem.starts[1:], axis=1)
     rows = tuple(replace(r, z=part, correction=np.zeros(r.count)) for r, part in zip(problem.rows, parts, strict=True))
     return replace(problem, rows=rows, stations=replace(problem.stations, velocity=None, axes=None))
@@ -389,7 +389,7 @@ def _nodes(one: Problem, found: Ranges | None, heard: Array) -> Array:
 
 
 def _model(one: Problem, found: Ranges | None, heard: Array, white: Array, admission: Admission) -> Model:
-    """Return how measurements of one problem become a start."""
+    """Return the maps from measurements of one problem to a start."""
     count, s, flat = one.count, len(white), one.flat()
     added, gain = np.zeros(count), np.zeros(count)
     base = vectors(flat, None)
@@ -408,7 +408,7 @@ def _model(one: Problem, found: Ranges | None, heard: Array, white: Array, admis
 
 
 def _anchors(one: Problem) -> tuple[Array, Array]:
-    """Return the row that each row with an emission time is counted from (m,), and that of each epoch (k,); or -1."""
+    """Return the row from which the emission time of each row (m,) and of each epoch (k,) is counted, or -1."""
     anchor, start = np.full(one.count, -1), np.full(one.epochs if one.layout.n_local else 0, -1)
     for rows, first in zip(one.rows, one.starts, strict=True):
         if MODELS[rows.kind].emission:

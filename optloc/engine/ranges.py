@@ -38,19 +38,19 @@ from optloc.engine.memory import (
 
 
 class RangeRows(NamedTuple):
-    """Whitened rows over ranges r: the cost is ``|u - K r|^2`` and that of the loops, which depend on no range.
+    """Whitened rows over ranges r: the cost is ``|u - K r|^2`` plus the cost of loops, which no range changes.
 
     Parameters
     ----------
     correction : array (m,)
         Known amount by which each measurement exceeds the model, metres.
     K : array (q, s)
-        Whitened rows, 1/metres. In `Model.linear` the maps to u stand behind those to ranges, then those to emission
-        times for zero ranges, then those to loops.
+        Whitened rows, 1/metres. In `Model.linear` the maps to u follow the maps to ranges; then come the maps to
+        emission times for zero ranges, and to loops.
     travel : array (e, s)
         How the ranges reduce the emission times.
     start : int64 array (e,)
-        Row that each emission time counts from, -1 where there is none.
+        Row that each emission time counts from, or -1.
     norm : float
         Greatest singular value of K.
     level : bool
@@ -73,7 +73,7 @@ class RangeRows(NamedTuple):
 
 
 class RangeRoom(NamedTuple):
-    """What is kept for a block of problems of s stations.
+    """Memory for a block of problems of s stations.
 
     Parameters
     ----------
@@ -177,10 +177,10 @@ def costs(rows: RangeRows, room: Room) -> None:
 
 @compiled
 def bow_of(rows: RangeRows, room: Room) -> float:
-    """Return how much all residuals bend over a step D at range r, times r / D^2.
+    """Return the curvature b of all residuals: over a step D at range r they change by up to b D^2 / r more.
 
-    A range is off its linear prediction by 0 to ``D^2 / 2 r``: all residuals together by no more than
-    ``norm(K) sqrt(s) D^2 / 2 r``, and by half of it where a common error of all ranges is nothing.
+    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``. All residuals together are off by
+    ``norm(K) sqrt(s) D^2 / 2 r`` at most. Where a common error of all ranges has no effect, half of it is the limit.
     """
     return float(rows.norm * np.sqrt(len(room.own.r)) * (0.25 if rows.level else 0.5))
 
@@ -391,10 +391,10 @@ def bend(rows: RangeRows, room: Room) -> None:
                     out[i, j, lane] -= pull[lane] * across / r[k, lane]
 
 
-# What infinity costs.
+# The cost at infinity.
 
 BEYOND_DOUBT = 16.0
-"""Cost above that of a fix from which on infinity is far outside every region that is reported."""
+"""Cost above a fix from which on infinity is far outside every region that is reported."""
 
 # Newton's steps on the secular equation: three to six from the start that is taken here.
 _STEPS = 20
@@ -533,9 +533,9 @@ def _step(
     moving = 0.0
     for lane in range(LANES):
         length = np.sqrt(square[lane])
-        # a direction that is too short even here lies between two of the same cost: the hard case, and the bound holds
+        # a direction that is too short even here is the mean of two of the same cost: the hard case; the bound holds
         left = length > 1.0 + _UNIT and low[lane] <= scalar[FIX_COST, lane] + BEYOND_DOUBT
-        # Newton's step for 1 / length = 1, which is all but straight
+        # Newton's step for 1 / length = 1, which is nearly straight
         more[lane] += square[lane] * (length - 1.0) / cube[lane] if left else 0.0
         moving += 1.0 if left else 0.0
     return moving > 0.0

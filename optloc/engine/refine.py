@@ -45,14 +45,14 @@ def refine(model: Model, rows: Any, room: Room, tolerance: float, limit: int) ->
     Parameters
     ----------
     model : Model
-        Says what holds fixes.
+        With the constraints that hold fixes.
     rows : named tuple
         Of the evaluator.
     room : Room
         Unknowns in row X, rounding error and which lanes are good in; unknowns, right sides, information (lower half),
         costs, steps, which are alive and which good out.
     tolerance : float
-        A fix is finished when its next step is shorter than this many of its own standard deviations.
+        A fix is finished when its next step is shorter than this number of standard deviations.
     limit : int
         Steps tried at most.
 

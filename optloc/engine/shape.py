@@ -36,7 +36,7 @@ from optloc.engine.memory import (
 )
 
 STRAIGHT = 0.3
-"""Greatest kappa of a Gaussian that covers: the cost at three sigma lies between 6.67 and 12.15 instead of 9."""
+"""Greatest kappa of a Gaussian that covers: the cost at three sigma is between 6.67 and 12.15 instead of 9."""
 
 # Where costs are compared, in standard deviations: far enough to see skewness, near enough to hold 99 %.
 _REACH = 3.0
@@ -46,7 +46,7 @@ _NONE = 1e-9
 _EQUAL = 0.05
 # Share of the largest variance below which one is rounding.
 _EXACT = 1e-14
-# Least inverse range, in that of the fix: a step ends a million times as far away, where fronts are flat.
+# Least inverse range, relative to the fix: a step ends a million times as far away, where fronts are flat.
 _HORIZON = 1e-6
 
 
@@ -57,7 +57,7 @@ def measure_shape(model: Model, rows: Any, room: Room, inverse: bool, turned: bo
     Parameters
     ----------
     model : Model
-        Says what holds fixes.
+        With the constraints that hold fixes.
     rows : named tuple
         Of the evaluator.
     room : Room
@@ -96,7 +96,7 @@ def measure_shape(model: Model, rows: Any, room: Room, inverse: bool, turned: bo
 
 @compiled
 def _leave_position(room: Room) -> None:
-    """Eliminate the unknowns beside the position: its information, and how they follow it, are written to MARGIN."""
+    """Eliminate the other unknowns: write the information about the position, and how they follow it, to MARGIN."""
     p, left, right = room.vector.shape[1], room.matrix[MARGIN], room.vector[MOVE]
     for i in range(p):
         for lane in range(LANES):
@@ -148,7 +148,7 @@ def _turn(model: Model, rows: Any, room: Room, inverse: bool) -> None:
                         vector[MOVE, i, lane] = along + second * axes[AXES, i, k, lane]
                 _probe(model, rows, room, inverse)
                 for lane in range(LANES):
-                    # a quadratic rise stands for what is not asked
+                    # a quadratic rise takes the place of other axes
                     rise = scalar[COST, lane] + 1.0 / share[lane]
                     scalar[COST_TRIAL, lane] = scalar[COST_TRIAL, lane] if even[lane] != 0.0 else rise
                 _note(scalar, scalar[HIGH], scalar[LOW])
@@ -217,7 +217,7 @@ def _axes(room: Room, inverse: bool, held: bool, spare: Array) -> None:
 
 @compiled
 def _drop_exact(variance: Array, most: Array) -> None:
-    """Make variances on a diagonal (d, d, W) zero that are rounding beside the largest."""
+    """Make variances on a diagonal (d, d, W) zero that are rounding relative to the largest."""
     d = len(variance)
     for lane in range(LANES):
         most[lane] = 0.0
@@ -269,7 +269,7 @@ def _probe(model: Model, rows: Any, room: Room, inverse: bool) -> None:
 
 @compiled
 def _spare_still(room: Room, axis: int) -> None:
-    """Let the cost rise as that of a Gaussian where an axis has no length: surfaces hold fixes across it."""
+    """Let the cost rise like a Gaussian's where an axis has no length: surfaces hold fixes across it."""
     scalar = room.scalar
     for lane in range(LANES):
         if room.axes[EIGEN, axis, axis, lane] == 0.0:
@@ -278,7 +278,7 @@ def _spare_still(room: Room, axis: int) -> None:
 
 @compiled
 def _note(scalar: Array, high: Array, low: Array) -> None:
-    """Keep the greatest and the least rise of the cost, relative to that of a quadratic one."""
+    """Keep the greatest and the least rise of the cost, relative to a quadratic cost."""
     for lane in range(LANES):
         rise = (scalar[COST_TRIAL, lane] - scalar[COST, lane]) * scalar[SHARE, lane]
         # what is no number is far from quadratic, and comparisons with it fail

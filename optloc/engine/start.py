@@ -1,4 +1,4 @@
-"""The start of a fix: squared ranges, and what is linear beside them, minimised exactly."""
+"""The start of a fix: squared ranges and other linear rows, minimised exactly."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def square(
 def weigh(
     rows: Array, place: Array, y: Array, scale: Array, white: Array, equal: bool, out: Array, spare: Array
 ) -> None:
-    """Divide squared-range rows by twice the ranges, which turns their errors into those of ranges, and whiten them.
+    """Divide squared-range rows by twice the ranges, so that their errors become range errors, and whiten them.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def weigh(
         for j in range(d + 2):
             for lane in range(LANES):
                 out[i, j, lane] = spare[lane] * rows[i, j, lane]
-    # From the last row up: each needs those above it as they were.
+    # From the last row up: each row needs the rows above it unchanged.
     for i in range(s - 1, -1, -1):
         for j in range(d + 2):
             for lane in range(LANES):

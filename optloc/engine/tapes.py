@@ -1,8 +1,8 @@
-"""Rows of every kind as tapes of h(x) and its derivatives, with whatever else is unknown beside the position."""
+"""Rows of every kind as tapes of h(x) and its derivatives, with all other unknowns."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,13 +46,13 @@ class TapeRows(NamedTuple):
     tables : Tables
         Indices.
     numbers : Numbers
-        What the problems share, and what each has to itself but for its measurements.
+        Shared numbers, and the numbers of each problem, except measurements.
     correction : array (m,)
         Known amount by which each measurement exceeds the model.
     base : array (p,)
-        Where the unknowns beside the position begin.
+        Start of the other unknowns.
     lifts : Lifts
-        Rows that are linear beside squared ranges.
+        Linear rows of other kinds than ranges.
     bounded : bool
         Whether the cost grows without bound at infinity.
     """
@@ -66,7 +66,7 @@ class TapeRows(NamedTuple):
 
 
 class TapeRoom(NamedTuple):
-    """What is kept for a block: where things stand in the memory of lanes, that memory, and registers."""
+    """Memory of a block: addresses in the memory of lanes, this memory, and registers."""
 
     at: Cells
     m: Array
@@ -81,7 +81,7 @@ def count_unknowns(rows: TapeRows, d: int, size: int) -> int:
 
 @compiled
 def count_lifted(rows: TapeRows) -> int:
-    """Return the number of linear rows beside squared ranges."""
+    """Return the number of linear rows of other kinds than ranges."""
     return len(rows.lifts.sigma)
 
 
@@ -109,7 +109,7 @@ def load(rows: TapeRows, z: Array, room: Room, anew: bool) -> None:
 
 @compiled
 def minimise_start(model: Model, rows: TapeRows, room: Room, first: bool) -> None:
-    """Write the minimiser of the weighed squared-range rows, and of linear ones beside them."""
+    """Write the minimiser of the weighed squared-range rows, and of the other linear rows."""
     _lift(rows.lifts, room, first)
     if rows.lifts.flat:
         _minimise_flat(room)
@@ -119,7 +119,7 @@ def minimise_start(model: Model, rows: TapeRows, room: Room, first: bool) -> Non
 
 @compiled
 def _lift(lifts: Lifts, room: Room, first: bool) -> None:
-    """Write the linear rows behind those of ranges, weighed by the error that they have at the last answer."""
+    """Write the linear rows behind the range rows, weighed by their error at the last answer."""
     s, r, scale, spare = len(room.place), room.own.r, room.scalar[SCALE], room.scalar[SPARE]
     together = max(1, r.shape[1] // LANES)
     for lane in range(LANES):
@@ -160,7 +160,7 @@ def _enter(lifts: Lifts, room: Room, r: Array, row: int, begin: int, low: int, i
 
 @compiled
 def _weigh(output: Array, sigma: float, r: Array, low: int, first: bool, out: Array) -> None:
-    """Write a row (d + 2, W) over the error that it has, or over that of a place one scale away."""
+    """Write a row (d + 2, W) divided by its error, or by its error at a place one scale away."""
     last = len(output) - 1
     for j in range(last):
         for lane in range(LANES):
@@ -205,7 +205,7 @@ _MOST = 1e13
 
 @compiled
 def complete(rows: TapeRows, room: Room) -> None:
-    """Write the unknowns beside the position that fit it best: exact where rows are linear in them."""
+    """Write the other unknowns that fit the position best: exact where rows are linear in them."""
     vector, d, p = room.vector, room.d, room.vector.shape[1]
     if p == d:
         return
@@ -256,7 +256,7 @@ def equations(rows: TapeRows, room: Room, shift: int) -> None:
 
 
 @compiled
-def _evaluate(rows: TapeRows, room: Room, shift: int) -> Array:
+def _evaluate(rows: TapeRows, room: Room, shift: int) -> Any:
     """Write the equations at row X, or at TRIAL with shift 1, into the memory of the lanes, which is returned."""
     own, x, origin = room.own, room.vector[X + shift], room.vector[ORIGIN]
     for i in range(room.vector.shape[1]):
@@ -268,7 +268,7 @@ def _evaluate(rows: TapeRows, room: Room, shift: int) -> Array:
 
 @compiled
 def costs(rows: TapeRows, room: Room) -> None:
-    """Write the cost at TRIAL, the least over the unknowns beside the position, to COST_TRIAL."""
+    """Write the cost at TRIAL, the least over the other unknowns, to COST_TRIAL."""
     p, d, at = room.vector.shape[1], room.d, room.own.at.after
     m = _evaluate(rows, room, 1)
     for lane in range(LANES):
@@ -287,7 +287,7 @@ def costs(rows: TapeRows, room: Room) -> None:
 
 @compiled
 def bow_of(rows: TapeRows, room: Room) -> float:
-    """Return infinity: nobody says how much rows of any kind bend."""
+    """Return infinity: tapes have no bound of their curvature."""
     return np.inf
 
 
@@ -310,7 +310,7 @@ def bend(rows: TapeRows, room: Room) -> None:
 
 @compiled
 def measure_infinity(rows: TapeRows, room: Room) -> None:
-    """Write infinity where no position far away fits; elsewhere nobody has looked."""
+    """Write infinity where no far position fits, else NaN: not measured."""
     for lane in range(LANES):
         room.scalar[BEYOND, lane] = np.inf if rows.bounded else np.nan
 

@@ -1,4 +1,4 @@
-"""Parameter vectors of problems of one position: what is unknown beside it takes its prior mean, or what fits."""
+"""Parameter vectors of problems of one position: other unknowns take their prior mean, or fit it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _fit_emission_times(problem: Problem, x: Array) -> Array:
     usable = np.asarray(np.isfinite(out).all(-1))
     left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
     present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
-    # an emission enters each of its rows with factor one: the mean of the rest fits it; one nobody hears stays zero
+    # an emission enters each of its rows with factor one: the mean of the rest fits it; without a row it stays zero
     for links, start in zip(block_links(problem), problem.starts, strict=True):
         own = np.isin(links.adds.column, emissions) & links.model.emission
         column, rows = links.adds.column[own], start + links.adds.row[own]

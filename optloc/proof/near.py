@@ -290,7 +290,7 @@ _ENDLESS = 1e300
 # Corners of what is searched are moved out by this share, for the rounding of the enclosure.
 _OUTWARDS = 1e-9
 
-# By how much less than a place costs a proof may ask for where the place is no minimum: rounding is far below it.
+# A level this far below the cost of a place: the place need be no minimum. Rounding is far less.
 _MUCH = 1.0
 # Share of a cost that counts as equal (`optloc.solvers.policy.equal_cost`).
 _EQUAL = 1e-6
@@ -385,7 +385,7 @@ def prove(
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
     margin = steepness(slope, noise) / (0.5 * eps if bent else eps)
     minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
-    # Where much less is asked about than the place costs, it need be no minimum: then its own box is searched, too.
+    # A place far above the level need be no minimum. Then its box is searched as well.
     if count == 0 and not (kappa <= 0.0 and eps > _MUCH and _holds_origin(low, high)):
         return STATIONARY, 0, -inf
     if count and not _extent(low, high, sides[0]) <= reach:
@@ -396,7 +396,7 @@ def prove(
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     better, whole = least - 0.5 * eps, (closed or isnan(lower[0])) and known.hidden == 0
-    if eps > _MUCH:  # what costs less than the place, but no less than is asked about, refutes nothing
+    if eps > _MUCH:  # a point below the place, but above the level, refutes nothing
         better = least - eps + 0.5 * equal_within(_EQUAL * (1.0 + least - eps), least, noise)
     level = least + kappa if kappa > 0.0 else least - eps
     aim, stack = Aim(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))

@@ -349,12 +349,12 @@ class Affine(NamedTuple):
     gain: Array
 
     def room(self, count: int) -> PositionCosts:
-        """Return costs of so many problems, to be written."""
+        """Return arrays for the costs of a number of problems."""
         data = np.repeat(self.data, count, axis=0) if len(self.place) else self.data
         return PositionCosts(self.kinds, data, self.K, np.empty((count, self.K.shape[1])), np.full(count, np.inf))
 
     def write(self, z: Array, costs: PositionCosts, item: int) -> None:
-        """Write whitened measurements, and numbers of nodes, of measurements (m,) to those of a problem."""
+        """Write whitened measurements and node numbers of one problem for measurements (m,)."""
         w = costs.w[item]
         if self.basis is None:
             np.dot(self.slope, z, out=w)

@@ -141,7 +141,7 @@ class Single:
     upward : int, optional
         Which of what holds fixes is the height whose gradient is the surface's upward axis.
     edges : Edges, optional
-        Bounds, of which proofs show that they are out of reach; None where there are none.
+        Bounds that proofs show to be out of reach; None without bounds.
     absent : bool array (m,), optional
         Rows of weight zero, which may hold anything; None where all count.
     centre : array (d,)

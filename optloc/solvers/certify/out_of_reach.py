@@ -1,9 +1,9 @@
-"""Bounds that the data do not reach: nothing on them costs as little as what a proof is about.
+"""Bounds that the data do not reach: every position on them costs too much to matter.
 
-A proof of all positions says that every region of low cost holds one of the minima that are known. Where these are
-admitted, and a plane between them and what is forbidden costs too much everywhere, no such region lies beyond it, and
-the bound may be forgotten. A bound on a coordinate is such a plane itself. Of "above ground" it is the tangent plane
-below the fix: the Earth is convex, so that all of it is on the other side.
+After a proof for all positions, every region of low cost contains a known minimum. Let these minima be admitted, and
+let every position of a plane between them and the forbidden side cost too much. Then no region of low cost crosses the
+plane, and the bound does not matter. A bound of a coordinate is such a plane. For "above ground" it is the tangent
+plane below the fix: the Earth is convex, so it is on the other side.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Edges:
 
 
 def edges_of(problem: Problem) -> Edges | None:
-    """Return the bounds of a problem; None where one of them cannot be told from its other side by a plane."""
+    """Return the bounds of a problem; None where a plane cannot separate both sides of one of them."""
     found: list[tuple[int, float]] = []
     for i, band in enumerate(problem.constraints):
         if not isinstance(band, Band) or is_exact(band) or band.lower.ndim or band.upper.ndim:
@@ -58,7 +58,7 @@ def edges_of(problem: Problem) -> Edges | None:
 
 
 class Scratch(NamedTuple):
-    """What a thread writes into, for n fixes and e edges: costs, questions, answers, costs at places."""
+    """Arrays of a thread, for n fixes and e edges: costs, questions, answers, costs at places."""
 
     costs: PositionCosts
     asked: Asked
@@ -67,7 +67,7 @@ class Scratch(NamedTuple):
 
 
 def scratch(affine: Affine, edges: Edges, count: int, d: int) -> Scratch:
-    """Return arrays for so many fixes."""
+    """Return arrays for a number of fixes."""
     n = count * len(edges.level)
     costs = affine.room(n)
     none = np.zeros(n, dtype=np.int64)

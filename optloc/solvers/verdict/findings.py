@@ -324,7 +324,7 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, proven: Claim
 
 
 def ambiguity(problem: Problem, gap: float) -> str:
-    """Return what is said of another minimum that costs so much more."""
+    """Return the sentence about a second minimum with a gap."""
     text = "another position " + ("fits as well" if gap < _ALIKE else f"costs only {gap:.2g} more")
     moving = problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions)
     return text + (": a bound on height, speed or place would decide" if moving else "")
