@@ -166,13 +166,24 @@ PARTS: Mapping[str, Part] = {
     "proofs": Part(
         "proofs of fixes", "optloc.proof", (_prove,), ("optloc.proof.batch._loop", "optloc.proof.batch._evaluate")
     ),
-    "fixes": Part(
-        "fixes, refinements and filters",
+    "tapes": Part(
+        "fixes from rows of every kind",
+        "optloc.engine",
+        (_fix_tapes,),
+        tuple(f"optloc.engine.fixes.fixes_{mark}" for mark in ("tapes", "one_by_tapes")),
+    ),
+    "ranges": Part(
+        "fixes from ranges",
+        "optloc.engine",
+        (_fix_ranges,),
+        tuple(f"optloc.engine.fixes.fixes_{mark}" for mark in ("ranges", "few_ranges")),
+    ),
+    "refinements": Part(
+        "refinements and filters",
         "optloc.compute",
-        (_fix_ranges, _fix_tapes, _refine, _filter),
+        (_refine, _filter),
         (
             "optloc.compute.filter.absorb",
-            *(f"optloc.engine.fixes.fixes_{mark}" for mark in ("ranges", "few_ranges", "tapes", "one_by_tapes")),
             "optloc.compute.refine.refine_block",
             "optloc.compute.refine.refine_runs",
             "optloc.compute.equations.normal_block",
