@@ -27,7 +27,7 @@ from optloc.models import MODELS
 from optloc.solvers.prepared import Prepared, prepare
 
 FAST = "gtrs+lsr"
-"""The method of the first phase: no proof, some ten microseconds a fix where rows are sums of ranges."""
+"""The method of the first phase: no proof, some ten microseconds a fix."""
 
 # Prepared problems that are kept, each some 100 kB: a network of ten has more sets of receivers, but few of them often.
 _KEPT = 64
