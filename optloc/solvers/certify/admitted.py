@@ -34,7 +34,8 @@ from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Asked
 from optloc.proof.near import BETTER, STATIONARY, VALUE
-from optloc.proof.scope import unsupported
+from optloc.proof.position_costs import PositionCosts
+from optloc.proof.scope import is_run, unsupported
 from optloc.solvers.certify.branch_and_bound import (
     HELD,
     RESTLESS,
@@ -47,6 +48,7 @@ from optloc.solvers.certify.branch_and_bound import (
     to_prove,
     unknown,
 )
+from optloc.solvers.certify.out_of_reach import edges_of, out_of_reach
 from optloc.solvers.certify.position_cost import (
     Costs,
     admitted,
@@ -91,6 +93,9 @@ def certified(
     if pool.tried_before is not None:
         proven.write(same, take(pool.tried_before.proven, same))
     items, more = np.flatnonzero(asked & ~same), 0
+    pool, told, done = _prove_freely(problem, pool, items, margin, effort)
+    proven.write(items[done], take(told, done))
+    items, fix = items[~done], judge(problem, pool)
     for _ in range(_ROUNDS):
         if not len(items):
             break
@@ -109,6 +114,29 @@ def certified(
     proven.write(items, unknown(RESTLESS))
     detail = f"{int(asked.sum())} within {violation_names(problem)}" + (f", {more} other minima found" if more else "")
     return replace(pool, proven=proven, stages=(*stages, certify_stage(detail, began)))
+
+
+def _prove_freely(problem: Problem, pool: Pool, items: Array, margin: float, effort: int) -> tuple[Pool, Claims, Array]:
+    """Return pools after proofs of some of them as if nothing were bounded, their claims, and which claims hold (n,).
+
+    They hold where the bounds are out of reach: then only the fix is a minimum, with them and without them.
+    """
+    edges, part = edges_of(problem), problem.take(items)
+    if edges is None or is_run(problem) or not len(items):
+        return pool, untried(len(items)), np.zeros(len(items), dtype=bool)
+    new = certified_freely(part, take(pool, items), None, margin, effort)
+    fix, told = judge(part, new), new.proven
+    assert told is not None
+    alone = ~np.isfinite(fix.alternatives.gap).any(-1) & fix.answered & is_free(part, fix, np.arange(len(items)))
+    sure = np.flatnonzero(alone & (told.proof == GLOBAL) & told.unique & (told.margin >= margin))
+    holds = np.zeros(len(items), dtype=bool)
+    if len(sure):
+        costs = eliminate_nuisance(part.take(sure))
+        assert isinstance(costs, PositionCosts)
+        holds[sure] = out_of_reach(part.take(sure), edges, costs, fix[sure], margin)
+    # a better minimum that was found on the way stays
+    kept = replace(new, proven=pool.proven if pool.proven is None else take(pool.proven, items))
+    return pool.merge(items, kept), told, holds
 
 
 def _is_new(fix: Fix, other: Fix) -> Array:

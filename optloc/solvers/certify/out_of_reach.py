@@ -14,47 +14,101 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array, Band
-from optloc.linear.constraints import is_exact
+from optloc.linear.constraints import Level, exact, levels
+from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.proof.batch import Answered, Asked, cost_here, empty_answer, prove_here
+from optloc.proof.batch import Answered, Asked, cost_here, costs_at, empty_answer, prove_all, prove_here
 from optloc.proof.near import VALUE
 from optloc.proof.position_costs import Affine, PositionCosts
 from optloc.solvers.certify.branch_and_bound import budgets
-from optloc.solvers.certify.position_cost import admitted
+from optloc.solvers.certify.position_cost import admitted, state_columns
 from optloc.solvers.policy import LISTED_GAP, equal_cost
 
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Bounds of a problem, each on one side of a quantity.
+    """Bounds of a problem, one for each side.
 
     Parameters
     ----------
-    quantity : int array (e,)
-        Which quantity each bounds, in the order of `optloc.engine.admission.admission_of`.
-    level : array (e,)
-        Its value there.
+    levels : tuple of Level
+        Which constraint, and which side.
+    value : array (e,)
+        Bound.
     region : array (2, d)
-        Corners of all that is admitted, where coordinates are bounded on all sides; else NaN.
+        Corners of the admitted box, where coordinates are bounded on all sides; else NaN.
     """
 
-    quantity: Array
-    level: Array
+    levels: tuple[Level, ...]
+    value: Array
     region: Array
+
+    @property
+    def constraint(self) -> Array:
+        """Return the number of the constraint of each edge, (e,)."""
+        return np.array([level.constraint for level in self.levels], dtype=np.int64)
 
 
 def edges_of(problem: Problem) -> Edges | None:
     """Return the bounds of a problem; None where a plane cannot separate both sides of one of them."""
-    found: list[tuple[int, float]] = []
+    found: list[tuple[Level, float]] = []
+    if exact(problem):
+        return None
     for i, band in enumerate(problem.constraints):
-        if not isinstance(band, Band) or is_exact(band) or band.lower.ndim or band.upper.ndim:
+        if not isinstance(band, Band) or band.lower.ndim or band.upper.ndim:
             return None
         if band.kind not in ("plane", "height") or (band.kind == "height" and np.isfinite(band.upper)):
             return None
-        found += [(i, float(side)) for side in (band.lower, band.upper) if np.isfinite(side)]
+        sides = (("lower", float(band.lower)), ("upper", float(band.upper)))
+        found += [(Level(i, side), value) for side, value in sides if np.isfinite(value)]
     region = admitted(problem, problem.dimension)
     region = region if np.isfinite(region).all() else np.full_like(region, np.nan)
-    return Edges(np.array([i for i, _ in found], dtype=np.int64), np.array([side for _, side in found]), region)
+    return Edges(tuple(level for level, _ in found), np.array([value for _, value in found]), region)
+
+
+def question(edges: Edges, count: int, d: int, nodes: float) -> Asked:
+    """Return arrays for the questions about the edges of a number of fixes, in d coordinates."""
+    n = count * len(edges.levels)
+    none = np.zeros(n, dtype=np.int64)
+    return Asked(
+        x=np.empty((n, d)),
+        others=np.zeros((n, 0, d)),
+        known=none,
+        hidden=none.copy(),
+        gaps=np.zeros((n, 1)),
+        eps=np.empty(n),
+        region=np.repeat(edges.region[None], n, axis=0),
+        fallback=np.full((n, 2, d), np.nan),
+        budget=budgets(np.zeros(n), nodes, 1),
+        planes=np.zeros((n, 1, 3)),
+        surface=np.zeros((n, 0)),
+    )
+
+
+def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array, asked: Asked) -> None:
+    """Write planes to questions, and the places on them where the quadratic model of the cost is least.
+
+    Parameters
+    ----------
+    edges : Edges
+        Of the problems.
+    x, cov : array (n, d), (n, d, d)
+        Fixes and covariances.
+    missing, slope : array (n, e), (n, e, d)
+        Bounds less the bounded quantities at the fixes, and gradients.
+    asked : Asked
+        Written.
+    """
+    d = x.shape[1]
+    across = (cov[:, None] @ slope[..., None])[..., 0]
+    place = x[:, None] + (missing / (slope * across).sum(-1))[..., None] * across
+    if np.isfinite(edges.region[0, 0]):
+        place = np.clip(place, *edges.region)
+    asked.x[:] = place.reshape(-1, d)
+    asked.planes[:, 0, :d] = (slope / np.sqrt((slope * slope).sum(-1, keepdims=True))).reshape(-1, d)
+
+
+# Few fixes by machine code, on arrays that are kept.
 
 
 class Scratch(NamedTuple):
@@ -68,29 +122,15 @@ class Scratch(NamedTuple):
 
 def scratch(affine: Affine, edges: Edges, count: int, d: int) -> Scratch:
     """Return arrays for a number of fixes."""
-    n = count * len(edges.level)
+    n = count * len(edges.levels)
     costs = affine.room(n)
-    none = np.zeros(n, dtype=np.int64)
-    asked = Asked(
-        x=np.empty((n, d)),
-        others=np.zeros((n, 0, d)),
-        known=none,
-        hidden=none.copy(),
-        gaps=np.zeros((n, 1)),
-        eps=np.empty(n),
-        region=np.repeat(edges.region[None], n, axis=0),
-        fallback=np.full((n, 2, d), np.nan),
-        budget=budgets(np.zeros(n), len(costs.kinds), 1),
-        planes=np.zeros((n, 1, 3)),
-        surface=np.zeros((n, 0)),
-    )
-    return Scratch(costs, asked, empty_answer(n, d), np.zeros((2, n, 1)))
+    return Scratch(costs, question(edges, count, d, len(costs.kinds)), empty_answer(n, d), np.zeros((2, n, 1)))
 
 
 def are_out_of_reach(
     edges: Edges, room: Scratch, costs: PositionCosts, x: Array, cov: Array, cost: Array, value: Array, normal: Array
 ) -> bool:
-    """Return whether nothing on the edges of n fixes costs less than `LISTED_GAP` more than them.
+    """Return whether every position on the edges of n fixes costs at least `LISTED_GAP` more than the fixes.
 
     Parameters
     ----------
@@ -103,26 +143,51 @@ def are_out_of_reach(
     value, normal : array (n, k), (n, k, d)
         Bounded quantities there, and their gradients.
     """
-    count, d = len(edges.level), x.shape[1]
-    slope = normal[:, edges.quantity]
-    across = (cov[:, None] @ slope[..., None])[..., 0]
-    away = (edges.level - value[:, edges.quantity]) / (slope * across).sum(-1)
-    # where the quadratic model is least on the plane
-    place = x[:, None] + away[..., None] * across
-    if np.isfinite(edges.region[0, 0]):
-        place = np.clip(place, *edges.region)
-    room.asked.x[:] = place.reshape(-1, d)
-    unit = slope / np.sqrt((slope * slope).sum(-1, keepdims=True))
-    room.asked.planes[:, 0, :d] = unit.reshape(-1, d)
+    count, own = len(edges.levels), edges.constraint
+    lay_planes(edges, x, cov, edges.value - value[:, own], normal[:, own], room.asked)
     room.costs.w[:] = np.repeat(costs.w, count, axis=0)
     if len(room.costs.data) > 1:
         room.costs.data[:] = np.repeat(costs.data, count, axis=0)
     cost_here(room.costs, room.asked.x[:, None], room.found)
     level = np.repeat(cost + LISTED_GAP, count)
-    more = room.found[0, :, 0] - level
-    if not (more > equal_cost(level)).all():
+    room.asked.eps[:] = room.found[0, :, 0] - level
+    if not (room.asked.eps > equal_cost(level)).all():
         return False
-    room.asked.eps[:] = more
     prove_here(room.costs, room.asked, room.answered)
-    answered = room.answered
-    return bool(((answered.verdict == VALUE) & (answered.bound > level - equal_cost(level))).all())
+    return bool(_are_shown(room.answered, level).all())
+
+
+def _are_shown(answered: Answered, level: Array) -> Array:
+    """Return which planes are proven to cost at least a level (n,) everywhere."""
+    # where rounding is coarse a bound may be lower than the level
+    return np.asarray((answered.verdict == VALUE) & (answered.bound > level - equal_cost(level)))
+
+
+def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix, gap: float) -> Array:
+    """Return where every position on the edges of fixes (N,) costs at least a gap more than the fix.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    edges : Edges
+        Their bounds.
+    costs : PositionCosts
+        Their costs over the position.
+    fix : Fix
+        Their fixes: answers that no bound holds.
+    gap : float
+        Difference of costs.
+    """
+    own, count = state_columns(problem), len(edges.levels)
+    values, gradients = levels(problem, edges.levels, fix.x)
+    asked = question(edges, len(fix.x), own.stop - own.start, costs.dense)
+    lay_planes(edges, fix.x[:, own], fix.cov[:, own, own], -values, gradients[..., own], asked)
+    every = costs.take(np.repeat(np.arange(len(fix.x)), count))
+    level = np.repeat(fix.cost + gap, count)
+    asked.eps[:] = costs_at(every, asked.x[:, None])[0][:, 0] - level
+    out = np.zeros(len(level), dtype=bool)
+    items = np.flatnonzero((asked.eps > equal_cost(level)) & (every.level > level))
+    if len(items):
+        out[items] = _are_shown(prove_all(every.take(items), asked.take(items)), level[items])
+    return np.asarray(out.reshape(-1, count).all(1))
