@@ -159,6 +159,11 @@ class Alternatives:
         return np.asarray(expit(-0.5 * self.gap))
 
 
+# Members by their number.
+_STATUSES = np.empty(1 + max(Status), dtype=object)
+_STATUSES[[int(status) for status in Status]] = list(Status)
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class Fix:
     """Estimates of a batch of problems; a single problem has no leading axes.
@@ -235,9 +240,19 @@ class Fix:
         return tuple(self.x.shape[:-1])
 
     @property
-    def status(self) -> Any:
-        """Return the `Status` of a single fix, or the int array (...) of a batch (compare with `Status` members)."""
-        return Status(int(self.code)) if self.shape == () else self.code
+    def status(self) -> Status:
+        """Return the status of a single fix; raise InvalidProblem for a batch, which has `statuses`."""
+        if self.shape:
+            what = f"these are fixes of shape {self.shape}"
+            raise InvalidProblem(what, "status", "use fix.statuses, or the status of one of them: fix[i].status")
+        return Status(int(self.code))
+
+    @property
+    def statuses(self) -> Array:
+        """Return the statuses (...), an array of `Status`."""
+        out = np.empty(self.shape, dtype=object)
+        out[...] = _STATUSES[np.asarray(self.code, dtype=np.intp)]
+        return out
 
     @property
     def certificate(self) -> Any:

@@ -334,8 +334,8 @@ class Affine(NamedTuple):
     basis : array (p, J), optional
         Orthonormal columns to which they are folded (`compress`); None where they are not.
     place, first, gain : int array (e,), array (e,), array (e, m)
-        Which numbers of the nodes change with z, what they are for z = 0, and what they gain: one number for each
-        angle or ratio, none for ranges and rates.
+        Numbers of the nodes that change with z, their values for z = 0, and their slopes. Each angle or ratio has one,
+        ranges and rates have none.
     """
 
     kinds: Array

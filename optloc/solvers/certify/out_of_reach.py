@@ -130,7 +130,7 @@ def scratch(affine: Affine, edges: Edges, count: int, d: int) -> Scratch:
 def are_out_of_reach(
     edges: Edges, room: Scratch, costs: PositionCosts, x: Array, cov: Array, cost: Array, value: Array, normal: Array
 ) -> bool:
-    """Return whether every position on the edges of n fixes costs at least `LISTED_GAP` more than the fixes.
+    """Return True if every position on the edges of n fixes costs at least `LISTED_GAP` more than the fixes.
 
     Parameters
     ----------
@@ -158,13 +158,13 @@ def are_out_of_reach(
 
 
 def _are_shown(answered: Answered, level: Array) -> Array:
-    """Return which planes are proven to cost at least a level (n,) everywhere."""
+    """Return flags (n,): a plane is proven to cost at least a level everywhere."""
     # where rounding is coarse a bound may be lower than the level
     return np.asarray((answered.verdict == VALUE) & (answered.bound > level - equal_cost(level)))
 
 
 def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix, gap: float) -> Array:
-    """Return where every position on the edges of fixes (N,) costs at least a gap more than the fix.
+    """Return flags (N,): every position on the edges costs at least a gap more than the fix.
 
     Parameters
     ----------
