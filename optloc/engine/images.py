@@ -179,9 +179,10 @@ def _note_nearest(room: Room, nearest: Array, every: bool) -> None:
 def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
     """Give up refinements that lead to no rival, and return how many lanes are alive.
 
-    Two reasons end one. Within a ball of radius D about it nothing costs as little as a rival: over a step of length
-    D all residuals together are off their linear prediction by no more than ``bow D^2 / r``. Or the refinement is back at the fix: within three standard
-    deviations of it, where the cost has risen as the curvature of the fix says.
+    Two reasons end one. Within a ball of radius D about it no position costs as little as a rival. Over a step of
+    length D all residuals together are off their linear prediction by no more than ``bow D^2 / r``. Or the refinement
+    is back at the fix: within three standard deviations of it, where the cost has risen as the curvature of the fix
+    says.
 
     Parameters
     ----------
