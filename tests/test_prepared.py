@@ -361,3 +361,34 @@ def test_parts_make_the_whole(method):
     assert np.allclose(parts.alternatives.gap, fix.alternatives.gap, atol=1e-6)
     assert [s.name for s in parts.stages] == [s.name for s in fix.stages]
     assert "parts" in parts.stages[0].detail
+
+
+@compiled
+@pytest.mark.parametrize("method", ["gtrs+lsr", "auto"])
+def test_what_is_kept_knows_levels_names_and_rates(method):
+    """Problems of one structure, one after the other: each has its own height, bounds and names."""
+    a, b = pairs(3)
+    rows = measured("tdoa", simulate(CASES["tdoa-3d"].problem, TARGET[3], 5).z, a=a, b=b, arrival_sigma=5.0)
+    for level in (1000.0, 4000.0, 1000.0):
+        problem = assemble(STATIONS[3], rows, frame=ENU, constraints=height(exactly=level))
+        fix = solve(problem, method)
+        assert ENU.to_geodetic(fix.position)[2] == pytest.approx(level, abs=1e-6)
+        assert [held.name for held in fix.active[()]] == ["height equal"]
+    for name in ("first", "second"):
+        held = Band("plane", np.array(900.0), np.array(900.0), np.eye(3)[2], name)
+        fix = solve(assemble(STATIONS[3], rows, constraints=(held,)), method)
+        assert [one.name for one in fix.active[()]] == [f"{name} equal"]
+    for most, inside in ((1e6, True), (TARGET[3][2] - 500.0, False), (1e6, True)):
+        fix = solve(assemble(STATIONS[3], rows, constraints=box([-1e6] * 3, [1e6, 1e6, most])), method)
+        assert bool(fix.active[()]) != inside
+
+
+def test_a_batch_has_statuses():
+    batch = trials(PROBLEMS["tdoa-3d"], count=4)
+    fix = solve(batch, "gtrs+lsr")
+    assert fix.statuses.shape == (4,)
+    assert all(isinstance(one, Status) for one in fix.statuses)
+    assert (fix.statuses == Status.UNPROVEN).all()
+    assert fix[0].status is Status.UNPROVEN
+    with pytest.raises(InvalidProblem, match=r"fix\.statuses"):
+        _ = fix.status
