@@ -144,3 +144,12 @@ def _alike(word: str, known: Iterable[str]) -> list[str]:
     same = [name for name in names if len(name) == len(word)]
     found = get_close_matches(word, names, n=2, cutoff=0.6) or begun or get_close_matches(word, same, n=2, cutoff=0.5)
     return found if len(word) > 1 else []
+
+
+def status_named(label: str) -> Status:
+    """Return the status of a label such as "too few rows"; raise InvalidProblem for one that there is not."""
+    wanted = label.strip().lower().replace("_", " ").replace("-", " ")
+    for status in Status:
+        if status.label == wanted:
+            return status
+    raise InvalidProblem(f"there is no status {label!r}", "status", nearest(label, [one.label for one in Status]))

@@ -408,6 +408,15 @@ def first_status(marks: Array) -> Array:
     return code
 
 
+def statuses_of(code: Array) -> Array:
+    """Return the members (...), objects, of status numbers (...)."""
+    numbers = np.asarray(code, dtype=np.intp)
+    out = np.empty(numbers.shape, dtype=object)
+    for number in np.unique(numbers):
+        out[numbers == number] = Status(int(number))
+    return out
+
+
 @dataclass(frozen=True, slots=True)
 class Certificate:
     """How sure it is that a fix is the best one.

@@ -19,13 +19,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest, status_named
 from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
 from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.base.units import LARGEST
 from optloc.compute.progress import keep_quiet
-from optloc.problem.fix import status_named
 
 if TYPE_CHECKING:
     from optloc.files.schema import ConstraintTable

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, NoSolution, nearest
+from optloc.base.errors import InvalidProblem, NoSolution, status_named
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.types import ANSWERED, NOTES, PRECEDENCE, Array, Status
+from optloc.base.types import ANSWERED, NOTES, PRECEDENCE, Array, Status, statuses_of
 from optloc.problem.chart import Chart, Extent
 from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
@@ -159,11 +159,6 @@ class Alternatives:
         return np.asarray(expit(-0.5 * self.gap))
 
 
-# Members by their number.
-_STATUSES = np.empty(1 + max(Status), dtype=object)
-_STATUSES[[int(status) for status in Status]] = list(Status)
-
-
 @dataclass(frozen=True, slots=True, repr=False)
 class Fix:
     """Estimates of a batch of problems; a single problem has no leading axes.
@@ -243,16 +238,14 @@ class Fix:
     def status(self) -> Status:
         """Return the status of a single fix; raise InvalidProblem for a batch, which has `statuses`."""
         if self.shape:
-            what = f"these are fixes of shape {self.shape}"
-            raise InvalidProblem(what, "status", "use fix.statuses, or the status of one of them: fix[i].status")
+            advice = "use fix.statuses, or the status of one of them: fix[i].status"
+            raise InvalidProblem(f"these are fixes of shape {self.shape}", "status", advice)
         return Status(int(self.code))
 
     @property
     def statuses(self) -> Array:
         """Return the statuses (...), an array of `Status`."""
-        out = np.empty(self.shape, dtype=object)
-        out[...] = _STATUSES[np.asarray(self.code, dtype=np.intp)]
-        return out
+        return statuses_of(self.code)
 
     @property
     def certificate(self) -> Any:
@@ -588,15 +581,6 @@ _TELLER: list[Callable[[], Any]] = []
 def told_by(teller: Callable[[], Any]) -> None:
     """Say which module, loaded when it is needed, tells fixes in words and tables: `optloc.report.fixes`."""
     _TELLER[:] = [teller]
-
-
-def status_named(label: str) -> Status:
-    """Return the status of a label such as "too few rows"; raise InvalidProblem for one that there is not."""
-    wanted = label.strip().lower().replace("_", " ").replace("-", " ")
-    for status in Status:
-        if status.label == wanted:
-            return status
-    raise InvalidProblem(f"there is no status {label!r}", "status", nearest(label, [one.label for one in Status]))
 
 
 def tail_probability(cost: Array, dof: Array) -> Array:

@@ -385,19 +385,14 @@ def prove(
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
     margin = steepness(slope, noise) / (0.5 * eps if bent else eps)
     minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
-    # A place far above the level need be no minimum. Then its box is searched as well.
     if count == 0 and not (kappa <= 0.0 and eps > _MUCH and _holds_origin(low, high)):
         return STATIONARY, 0, -inf
     if count and not _extent(low, high, sides[0]) <= reach:
         return BUDGET, 0, -inf
-    hole = sides[0] if count else np.zeros(3)
-    own, free = (1, free) if count else (0, 0)
+    own, free, hole = (1, free, sides[0]) if count else (0, 0, np.zeros(3))
     count = free if kappa <= 0.0 else count  # the value alone: boxes of other minima are bounded as all others are
-    # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
-    better, whole = least - 0.5 * eps, (closed or isnan(lower[0])) and known.hidden == 0
-    if eps > _MUCH:  # a point below the place, but above the level, refutes nothing
-        better = least - eps + 0.5 * equal_within(_EQUAL * (1.0 + least - eps), least, noise)
+    better, whole = _refuting(least, eps, noise), (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
     aim, stack = Aim(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, hole, 0)
@@ -411,6 +406,18 @@ def prove(
     for k in range(x.shape[0]):
         found[k] = box.centre[k]
     return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
+
+
+@inlined
+def _refuting(least: float, eps: float, noise: float) -> float:
+    """Return the cost below which a point refutes a claim about the cost less eps.
+
+    Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less. A
+    point far below the place, but above the level, refutes nothing.
+    """
+    if eps > _MUCH:
+        return least - eps + 0.5 * equal_within(_EQUAL * (1.0 + least - eps), least, noise)
+    return least - 0.5 * eps
 
 
 @inlined
