@@ -33,8 +33,9 @@ finally:
 # its curvature and the costs over the position; two since every file is read through one door and written through
 # another; four since machine code has a folder that is looked into and a manifest of what it is made for, and what a
 # proof covers is a file of its own; one since `solve` asks for the short way of few fixes first;
-# two for the digest of a kernel and the options of its compilation.
-MOST = 74
+# two for the digest of a kernel and the options of its compilation; three for plans, which positions they admit, and
+# parameter vectors.
+MOST = 77
 
 
 @pytest.mark.slow
