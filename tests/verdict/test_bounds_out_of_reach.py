@@ -7,9 +7,11 @@ import pytest
 from scipy.optimize import minimize
 
 from optloc import Status, assemble, measured, prepare, solve
+from optloc.base.types import Band
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import box, height
 from optloc.solvers import solve_in_stages
+from optloc.solvers.certify.out_of_reach import edges_of, lay_planes, question
 from optloc.solvers.methods import Method
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no short way without machine code")
@@ -62,6 +64,22 @@ def test_no_position_in_a_box_is_cheaper_or_comes_near(d, s):
                 # a search that has stopped on its way is no rival
                 assert apart @ np.linalg.solve(fix.covariance(), apart) < 30.0 or done.nit > 500, (seed, x)
     assert short >= (TRIALS // 3 if s > d + 1 else 1)
+
+
+def test_a_place_that_leaves_its_plane_proves_nothing():
+    """An oblique plane and a box: the least place of the model on the plane is outside the box."""
+    plane = Band("plane", np.array(-np.inf), np.array(30.0), np.array([1.0, 1.0]), "oblique")
+    place = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
+    rows = measured("range", a=np.arange(4), sigma=1.0)
+    problem = assemble(place, rows, constraints=(*box([-1.0, -50.0], [5.0, 50.0]), plane))
+    edges = edges_of(problem)
+    assert len(edges.levels) == 5
+    asked = question(edges, 1, 2, 4.0)
+    x, slope = np.array([[1.0, 2.0]]), np.array([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0], [1.0, 1.0]]])
+    missing = edges.value - (slope * x[:, None]).sum(-1)
+    lay_planes(edges, x, np.eye(2)[None], missing, slope, asked)
+    assert np.isfinite(asked.x[:4]).all()
+    assert np.isnan(asked.x[4]).all()
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -25,6 +25,10 @@ from optloc.solvers.certify.position_cost import admitted, state_columns
 from optloc.solvers.policy import LISTED_GAP, equal_cost
 
 
+# Share of the distance between fix and plane by which rounding may move a place off the plane.
+_ON_PLANE = 1e-9
+
+
 @dataclass(frozen=True, slots=True)
 class Edges:
     """Bounds of a problem, one for each side.
@@ -102,10 +106,14 @@ def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array,
     d = x.shape[1]
     across = (cov[:, None] @ slope[..., None])[..., 0]
     place = x[:, None] + (missing / (slope * across).sum(-1))[..., None] * across
+    unit = slope / np.sqrt((slope * slope).sum(-1, keepdims=True))
     if np.isfinite(edges.region[0, 0]):
-        place = np.clip(place, *edges.region)
+        inside = np.clip(place, *edges.region)
+        # an oblique plane does not contain the clipped place: nothing is proven about it then
+        left = np.abs(((inside - place) * unit).sum(-1)) > _ON_PLANE * np.abs(missing)
+        place = np.where(left[..., None], np.nan, inside)
     asked.x[:] = place.reshape(-1, d)
-    asked.planes[:, 0, :d] = (slope / np.sqrt((slope * slope).sum(-1, keepdims=True))).reshape(-1, d)
+    asked.planes[:, 0, :d] = unit.reshape(-1, d)
 
 
 # Few fixes by machine code, on arrays that are kept.
