@@ -24,7 +24,6 @@ from optloc.solvers.certify.branch_and_bound import budgets
 from optloc.solvers.certify.position_cost import admitted, state_columns
 from optloc.solvers.policy import LISTED_GAP, equal_cost
 
-
 # Share of the distance between fix and plane by which rounding may move a place off the plane.
 _ON_PLANE = 1e-9
 
