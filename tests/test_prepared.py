@@ -27,6 +27,8 @@ from optloc.base.types import Band
 from optloc.compute.jit import enabled
 from optloc.engine.plan import plan_of
 from optloc.linear.constraints import box, height
+from optloc.solvers import solve_in_stages
+from optloc.solvers.methods import Method
 from optloc.solvers.pool import in_parts
 from optloc.solvers.stages import gtrs_lsr
 from optloc.solvers.verdict.judge import verdict
@@ -392,3 +394,19 @@ def test_a_batch_has_statuses():
     assert fix[0].status is Status.UNPROVEN
     with pytest.raises(InvalidProblem, match=r"fix\.statuses"):
         _ = fix.status
+
+
+@compiled
+def test_of_two_exact_positions_the_nearer_to_the_heard_stations_is_answered():
+    """As many ranges as coordinates, and stations without rows: the short way and the stages choose alike."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        place, truth = rng.uniform(-5e3, 5e3, (5, 3)), rng.uniform(-9e3, 9e3, 3)
+        a = np.arange(3)
+        r = np.sqrt(((place[a] - truth) ** 2).sum(-1))
+        problem = assemble(place, measured("range", r, a=a, sigma=5.0))
+        fix, other = solve(problem), solve_in_stages(problem, Method.parse("auto"))
+        assert fix.status == other.status == Status.AMBIGUOUS
+        assert np.allclose(fix.x, other.x, atol=1e-3)
+        alone = solve(assemble(place[a], measured("range", r, a=a, sigma=5.0)))
+        assert np.allclose(fix.x, alone.x, atol=1e-3)

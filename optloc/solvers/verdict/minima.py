@@ -22,6 +22,7 @@ from optloc.solvers.inequalities import lowest_sight
 from optloc.solvers.policy import AMBIGUOUS_GAP, FAR, FLAT, LISTED_GAP, SAME_PLACE, WEAK, equal_cost
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of, one_position, spread_of
+from optloc.solvers.verdict.findings import centre_of
 
 # Information that is none: no square of a Jacobian is as small, and its root still has an inverse.
 _DEAD = 1e-300
@@ -267,8 +268,9 @@ def likelihood_of(problem: Problem, x: Array) -> tuple[Array, Array]:
     if problem.frame.geodetic:
         first = lowest_sight(problem, x)  # sines of elevations
     else:
-        with np.errstate(divide="ignore"):
-            first = -np.log(distance_of(problem, place))
+        # of stations with rows: another station changes nothing
+        with np.errstate(divide="ignore", over="ignore"):
+            first = -0.5 * np.log(((place - centre_of(problem)) ** 2).sum(-1))
     return np.round(first, 6), place[:, -1]
 
 
