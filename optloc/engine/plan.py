@@ -358,9 +358,11 @@ def _bare(problem: Problem) -> Problem:
     place = stations.position.reshape(-1, *stations.position.shape[-3:])[0]
     rates = stations.velocity
     rates = None if rates is None else rates.reshape(-1, *rates.shape[-3:])[0]
-    # levels are arguments of a run
+    # Levels are arguments of a run. A band that is exact in some problems of a batch only is not exact.
     bands = tuple(
-        replace(band, lower=band.lower.ravel()[0], upper=band.upper.ravel()[0]) if isinstance(band, Band) else band
+        replace(band, lower=np.array(0.0), upper=np.array(0.0 if is_exact(band) else 1.0))
+        if isinstance(band, Band)
+        else band
         for band in problem.constraints
     )
     bare = problem.with_rows(z=np.zeros(problem.count))

@@ -100,6 +100,17 @@ def test_exact_sides_come_first_and_levels_with_them():
     assert np.array_equal(levels_of(problem)[:, 1], [[0.0, np.inf]] * 2)
 
 
+def test_a_band_that_is_exact_in_some_problems_only_holds_none():
+    band = Band("plane", np.array([900.0, -1e5]), np.array([900.0, 1e5]), np.eye(3)[2], "z")
+    truth = np.array([3e3, 4e3, 1500.0])
+    r = np.sqrt(((STATIONS - truth) ** 2).sum(-1))
+    problem = posed((band,)).with_rows(z=np.tile(r[1:] - r[:1], (2, 1)))
+    assert plan_of(problem).model.admission.exact == 0
+    fix = optloc.solve(problem, "gtrs+lsr")
+    np.testing.assert_allclose(fix.position[1], truth, atol=1e-3)
+    np.testing.assert_allclose(fix.position[0, 2], 900.0, atol=1e-6)
+
+
 def test_what_has_no_tape_has_no_plan():
     from optloc.linear.constraints import polygon
 
