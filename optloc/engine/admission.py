@@ -231,11 +231,11 @@ def find_multipliers(model: Model, room: Room) -> None:
 
 @compiled
 def admit(model: Model, room: Room, out: Array) -> None:
-    """Write 0.0 to `out` (W,) where row X breaks a bound, or where the Earth hides it from a station with a row."""
+    """Write 0.0 to `out` (W,) where row X breaks a constraint, or where the Earth hides it from a used station."""
     a = model.admission
-    if len(a.output) > a.exact:
+    if len(a.output):
         _measure(a, room, 0, len(a.output))
-        for k in range(a.exact, len(a.output)):
+        for k in range(len(a.output)):
             for lane in range(LANES):
                 low, high, value = room.level[k, 0, lane], room.level[k, 1, lane], room.quantity[k, lane]
                 above = value >= low - TOLERANCE * (1.0 + abs(low))
