@@ -36,6 +36,8 @@ class Relaxed:
     ----------
     y : Array, shape (n,)
         Point read off the relaxation; on the quadric only where tight.
+    points : Array, shape (2, n)
+        Points of the quadric whose mixture the answer is; NaN where it is tight, or one is at infinity.
     value : float
         Optimal ``|By - g|^2`` of the relaxation (the second-order one squared).
     bound : float
@@ -48,6 +50,7 @@ class Relaxed:
     """
 
     y: Array
+    points: Array
     value: float
     bound: float
     rank_ratio: float
@@ -146,7 +149,8 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     factor, scale = _triangle(B, g)
     answer = _relaxation("shor", quadric, backend).solve({"gram": factor.T @ factor}, bound=bound)
     lift = answer.values["lift"]
-    return Relaxed(lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2, rank_ratio(lift), answer)
+    y, value, low = lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2
+    return Relaxed(y, mixed_points(lift, quadric), value, low, rank_ratio(lift), answer)
 
 
 def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True) -> Relaxed:
@@ -179,7 +183,90 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     y = answer.values["y"]
     off = float(abs(quadric.value(y)) / (1.0 + np.sum(y * y)))
     value, low = answer.primal * scale, max(answer.bound, 0.0) * scale  # norms: squared below, so no sign may be lost
-    return Relaxed(y, value**2, low**2, off, answer)
+    return Relaxed(y, crossings(factor[:, :-1], y, quadric), value**2, low**2, off, answer)
+
+
+# Second over first eigenvalue of a lift, and distance from the quadric, below which an answer is one point.
+_TIGHT = 1e-6
+
+
+def mixed_points(lift: Array, quadric: Quadric) -> Array:
+    """Points of the quadric whose mixture a lift of rank two is.
+
+    As few rows as unknowns have two answers; an interior-point method ends between them. With one quadratic constraint
+    a lift is always a sum of lifts of points that keep it.
+
+    Parameters
+    ----------
+    lift : Array, shape (n + 1, n + 1)
+        Symmetric positive semidefinite.
+    quadric : Quadric
+        The constraint, of size n.
+
+    Returns
+    -------
+    Array, shape (2, n)
+        NaN where the rank is one, or where a point is at infinity.
+
+    Notes
+    -----
+    J. F. Sturm, S. Zhang, "On cones of nonnegative quadratic functions", Math. Oper. Res. 28 (2003), proposition 3.
+    """
+    n, out = quadric.size, np.full((2, quadric.size), np.nan)
+    if not np.isfinite(lift).all():  # the solver has no answer
+        return out
+    values, vectors = np.linalg.eigh(lift)
+    if not values[-2] > _TIGHT * values[-1]:
+        return out
+    first, second = (np.sqrt(values[i]) * vectors[:, i] for i in (-1, -2))
+    a, b, c = _form(first, first, quadric), _form(first, second, quadric), _form(second, second, quadric)
+    if not a * c < 0.0:
+        return out
+    turn = (-b + np.sqrt(b * b - a * c)) / c
+    for i, point in enumerate((first + turn * second, second - turn * first)):
+        if abs(point[n]) > _TIGHT * np.abs(point).max():
+            out[i] = point[:n] / point[n]
+    return out
+
+
+def _form(u: Array, v: Array, quadric: Quadric) -> float:
+    """Bilinear form of the constraint on points (y, 1) times any number."""
+    linear = quadric.linear @ (u[:-1] * v[-1] + v[:-1] * u[-1])
+    return float(np.sum(quadric.square * u[:-1] * v[:-1]) + linear)
+
+
+def crossings(factor: Array, y: Array, quadric: Quadric) -> Array:
+    """Where the line through a point along which its fit changes least meets the quadric.
+
+    Parameters
+    ----------
+    factor : Array, shape (q, n)
+        Rows.
+    y : Array, shape (n,)
+        Point.
+    quadric : Quadric
+        The constraint.
+
+    Returns
+    -------
+    Array, shape (2, n)
+        NaN where the point is on the quadric, or where the line misses it.
+    """
+    out = np.full((2, quadric.size), np.nan)
+    if not abs(quadric.value(y)) > _TIGHT * (1.0 + np.sum(y * y)):
+        return out
+    along = np.linalg.svd(factor)[2][-1]
+    a = float(np.sum(quadric.square * along * along))
+    b = float(np.sum(quadric.square * along * y) + quadric.linear @ along)
+    c = float(quadric.value(y))
+    if b * b - a * c < 0.0:
+        return out
+    # the root of larger size first, so that no digits are lost
+    q = -(b + np.copysign(np.sqrt(b * b - a * c), b))
+    for i, (over, under) in enumerate(((q, a), (c, q))):
+        if abs(under) > _TIGHT * abs(over):
+            out[i] = y + over / under * along
+    return out
 
 
 def _triangle(B: Array, g: Array) -> tuple[Array, float]:

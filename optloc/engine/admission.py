@@ -12,20 +12,27 @@ import numpy as np
 
 from optloc.base.types import Array, Band
 from optloc.compute.jit import compiled
-from optloc.compute.lanes import run
 from optloc.compute.systems import LANES, factor_plain, solve_plain
-from optloc.compute.tables import starts
+from optloc.compute.tape_table import INPUT, OUTPUT, run_tape, tape_table
 from optloc.compute.trace import Recorder, Tape, tape
 from optloc.engine.evaluator import equations
 from optloc.engine.memory import (
+    BASE,
     BLUR,
+    BOUNDED,
+    CENTRE,
     H_TRIAL,
+    HEARD,
     INVERSE,
     LOWER,
+    LOWER_BOUND,
     MOVE,
     ORIGIN,
+    RADIUS,
     ROUNDING,
+    SEEN,
     SPARE,
+    UPPER_BOUND,
     Admission,
     G,
     H,
@@ -34,12 +41,9 @@ from optloc.engine.memory import (
     X,
 )
 from optloc.linear.constraints import TOLERANCE, bounded, is_exact
-from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, Jet
 from optloc.problem.problem import Problem
 
-# Columns of `Admission.block`.
-CODE, CONSTANT, INPUT = range(3)
 # Steps that put a position back: Newton's squares a small relative distance, so that three are enough from 1 % off.
 _BACK = 8
 # Share of a level by which a position may miss it: rounding of coordinates of the Earth's size.
@@ -49,21 +53,18 @@ _ON = 1e-15
 @compiled
 def _measure(a: Admission, room: Room, shift: int, last: int) -> None:
     """Write the first quantities at row X, or at TRIAL with shift 1, and their gradients."""
-    d, r, x, origin = room.d, room.registers, room.vector[X + shift], room.vector[ORIGIN]
+    d, r, x, origin, table = room.d, room.registers, room.vector[X + shift], room.vector[ORIGIN], a.tapes.table
     for k in range(last):
-        begin, end = a.block[k, INPUT], a.block[k + 1, INPUT]
-        for i in range(begin, end):
-            to, j = a.input[i, 0], a.input[i, 1]
+        for i in range(table[k, INPUT], table[k + 1, INPUT]):
+            to, j = table[i, 0], table[i, 1]
             for lane in range(LANES):
                 r[to, lane] = x[j, lane] + origin[j, lane]
-        for i in range(a.block[k, CONSTANT], a.block[k + 1, CONSTANT]):
-            for lane in range(LANES):
-                r[a.constant[i], lane] = a.value[i]
-        run(a.code, a.block[k, CODE], a.block[k + 1, CODE], r, LANES)
+        run_tape(a.tapes, k, r, LANES)
+        first = table[k, OUTPUT]
         for lane in range(LANES):
-            room.quantity[k, lane] = r[a.output[k, 0], lane]
+            room.side[BOUNDED, k, lane] = r[table[first, 0], lane]
         for j in range(d):
-            to = a.output[k, 1 + j]
+            to = table[first + 1 + j, 0]
             for lane in range(LANES):
                 room.face[shift, k, j, lane] = r[to, lane] if to >= 0 else 0.0
 
@@ -72,6 +73,9 @@ def _measure(a: Admission, room: Room, shift: int, last: int) -> None:
 def restore(model: Model, room: Room, shift: int) -> None:
     """Put row X, or TRIAL with shift 1, back onto the exact surfaces, along the shortest way."""
     a, d = model.admission, room.d
+    if room.scalar[RADIUS, 0] > 0.0:
+        _restore_radius(room, shift)
+        return
     if a.exact == 0:
         return
     for _ in range(_BACK):
@@ -79,13 +83,13 @@ def restore(model: Model, room: Room, shift: int) -> None:
         worst = 0.0
         for k in range(a.exact):
             for lane in range(LANES):
-                room.part[k, lane] = room.quantity[k, lane] - room.level[k, 0, lane]
-                size = _ON * (WGS84_A if a.earth else abs(room.level[k, 0, lane]))
+                room.part[k, lane] = room.side[BOUNDED, k, lane] - room.side[LOWER_BOUND, k, lane]
+                size = _ON * (WGS84_A if a.earth else abs(room.side[LOWER_BOUND, k, lane]))
                 worst = max(worst, 1.0 if abs(room.part[k, lane]) > size else 0.0)
         if worst == 0.0:
             return
         _square(room.face[shift], room.face[shift], room, d)
-        solve_plain(room.small[1], room.pivot, room.part)
+        solve_plain(room.small[1], room.pivot[0], room.part)
         for k in range(a.exact):
             for j in range(d):
                 for lane in range(LANES):
@@ -94,9 +98,25 @@ def restore(model: Model, room: Room, shift: int) -> None:
 
 
 @compiled
+def _restore_radius(room: Room, shift: int) -> None:
+    """Put row X, or TRIAL with shift 1, at its distance from CENTRE."""
+    x, centre, far = room.vector[X + shift], room.vector[CENTRE], room.scalar[SPARE]
+    for lane in range(LANES):
+        far[lane] = 0.0
+    for j in range(room.d):
+        for lane in range(LANES):
+            far[lane] += (x[j, lane] - centre[j, lane]) ** 2
+    for lane in range(LANES):
+        far[lane] = room.scalar[RADIUS, lane] / np.sqrt(far[lane])
+    for j in range(room.d):
+        for lane in range(LANES):
+            x[j, lane] = centre[j, lane] + far[lane] * (x[j, lane] - centre[j, lane])
+
+
+@compiled
 def _square(left: Array, right: Array, room: Room, d: int) -> None:
     """Factor the products (c, c, W) of gradients (c, d, W) with vectors (c, d, W)."""
-    small, pivot = room.small, room.pivot
+    small, pivot, diagonal = room.small, room.pivot[0], room.pivot[1]
     for k in range(len(small[0])):
         for m in range(k + 1):
             for lane in range(LANES):
@@ -105,8 +125,8 @@ def _square(left: Array, right: Array, room: Room, d: int) -> None:
                 for lane in range(LANES):
                     small[0, k, m, lane] += left[k, j, lane] * right[m, j, lane]
         for lane in range(LANES):
-            room.diagonal[k, lane] = small[0, k, k, lane]
-    factor_plain(small[0], room.diagonal, small[1], pivot)
+            diagonal[k, lane] = small[0, k, k, lane]
+    factor_plain(small[0], diagonal, small[1], pivot)
 
 
 @compiled
@@ -118,8 +138,11 @@ def evaluate(model: Model, rows: Any, room: Room, shift: int) -> None:
     """
     equations(rows, room, shift)
     a, d, matrix, spare = model.admission, room.d, room.matrix[H + shift], room.scalar[SPARE]
-    for k in range(a.exact):
-        face = room.face[shift, k]
+    wide = room.scalar[RADIUS, 0] > 0.0
+    for k in range(-1 if wide else 0, a.exact):
+        face = room.axes[BASE, 0] if k < 0 else room.face[shift, k]
+        if k < 0:
+            _point_out(room, shift, face)
         for lane in range(LANES):
             spare[lane] = 0.0
         for j in range(d):
@@ -134,6 +157,14 @@ def evaluate(model: Model, rows: Any, room: Room, shift: int) -> None:
             for j in range(i + 1):
                 for lane in range(LANES):
                     matrix[i, j, lane] += spare[lane] * face[i, lane] * face[j, lane]
+
+
+@compiled
+def _point_out(room: Room, shift: int, out: Array) -> None:
+    """Write the direction (d, W) away from CENTRE."""
+    for j in range(room.d):
+        for lane in range(LANES):
+            out[j, lane] = room.vector[X + shift, j, lane] - room.vector[CENTRE, j, lane]
 
 
 @compiled
@@ -175,7 +206,7 @@ def _keep_off(room: Room, move: Array, p: int) -> None:
         for j in range(d):
             for lane in range(LANES):
                 part[k, lane] += face[k, j, lane] * move[j, lane]
-    solve_plain(room.small[1], room.pivot, part)
+    solve_plain(room.small[1], room.pivot[0], part)
     for k in range(len(push)):
         for j in range(p):
             for lane in range(LANES):
@@ -226,23 +257,25 @@ def find_multipliers(model: Model, room: Room) -> None:
             # the normal equations have half the gradient
             for lane in range(LANES):
                 part[k, lane] += 2.0 * face[k, j, lane] * room.vector[G, j, lane]
-    solve_plain(room.small[1], room.pivot, part)
+    solve_plain(room.small[1], room.pivot[0], part)
 
 
 @compiled
 def admit(model: Model, room: Room, out: Array) -> None:
     """Write 0.0 to `out` (W,) where row X breaks a constraint, or where the Earth hides it from a used station."""
     a = model.admission
-    if len(a.output):
-        _measure(a, room, 0, len(a.output))
-        for k in range(len(a.output)):
+    sides = room.side.shape[1]
+    if sides:
+        _measure(a, room, 0, sides)
+        for k in range(sides):
             for lane in range(LANES):
-                low, high, value = room.level[k, 0, lane], room.level[k, 1, lane], room.quantity[k, lane]
+                low, high = room.side[LOWER_BOUND, k, lane], room.side[UPPER_BOUND, k, lane]
+                value = room.side[BOUNDED, k, lane]
                 above = value >= low - TOLERANCE * (1.0 + abs(low))
                 out[lane] = out[lane] if above and value <= high + TOLERANCE * (1.0 + abs(high)) else 0.0
     if a.earth:
         for lane in range(LANES):
-            out[lane] = 0.0 if _is_hidden(a, room, lane) else out[lane]
+            out[lane] = 0.0 if _is_hidden(model, room, lane) else out[lane]
 
 
 SATELLITE = 1.0 + 100e3 / WGS84_A
@@ -253,38 +286,37 @@ measured; 50 km from the ground to a target in space: only what is clearly on th
 
 
 @compiled
-def _is_hidden(a: Admission, room: Room, lane: int) -> bool:
+def _is_hidden(model: Model, room: Room, lane: int) -> bool:
     """Return whether the Earth hides row X of a lane from a station with a row of it: `optloc.solvers.inequalities`."""
-    point, line, origin = room.spot[0], room.spot[1], room.vector[ORIGIN]
-    for i in range(3):
-        point[i] = a.origin[i]
-        for j in range(3):
-            point[i] += a.turn[i, j] * (room.vector[X, j, lane] + origin[j, lane])
+    a, origin, base = model.admission, room.vector[ORIGIN], room.axes[BASE]
     high = 0.0
     for i in range(3):
-        point[i] *= _STRETCH[i]
-        high += point[i] * point[i]
+        at = a.globe[3, i]
+        for j in range(3):
+            at += a.globe[i, j] * (room.vector[X, j, lane] + origin[j, lane])
+        base[0, i, lane] = at * _STRETCH[i]
+        high += base[0, i, lane] * base[0, i, lane]
     for s in range(len(room.place)):
-        if a.heard[s] == 0.0:
+        if model.station[HEARD, s] == 0.0:
             continue
         far, long, along = 0.0, 0.0, 0.0
         for i in range(3):
-            at = a.origin[i]
+            at = a.globe[3, i]
             for j in range(3):
-                at += a.turn[i, j] * (room.place[s, j, lane] + origin[j, lane])
+                at += a.globe[i, j] * (room.place[s, j, lane] + origin[j, lane])
             at *= _STRETCH[i]
             far += at * at
-            line[i] = at - point[i]
-            long += line[i] * line[i]
-            along -= point[i] * line[i]
+            base[1, i, lane] = at - base[0, i, lane]
+            long += base[1, i, lane] * base[1, i, lane]
+            along -= base[0, i, lane] * base[1, i, lane]
         satellite = far > SATELLITE * SATELLITE
-        if not (satellite or a.seen[s] != 0.0 or high > SATELLITE * SATELLITE):
+        if not (satellite or model.station[SEEN, s] != 0.0 or high > SATELLITE * SATELLITE):
             continue
         # the point of the segment next to the centre; at its ends nothing is in between
         share = min(along / long, 1.0)
         nearest = 0.0
         for i in range(3):
-            nearest += (point[i] + share * line[i]) ** 2
+            nearest += (base[0, i, lane] + share * base[1, i, lane]) ** 2
         limit = GRAZE if satellite else GROUND
         if share > 0.0 and nearest < limit * limit:
             return True
@@ -298,15 +330,13 @@ _STRETCH = (1.0 / WGS84_A, 1.0 / WGS84_A, 1.0 / WGS84_A / (1.0 - WGS84_F))
 # How it is made.
 
 
-def admission_of(problem: Problem, node: Array) -> Admission | None:
+def admission_of(problem: Problem) -> Admission | None:
     """Return the constraints of one problem as tapes, or None where a constraint has no tape.
 
     Parameters
     ----------
     problem : Problem
         Without batch axes but for the levels of its constraints, which are left out.
-    node : int array (2, s)
-        Epoch and station of each place.
     """
     d, bands = problem.dimension, list(problem.constraints)
     if not all(isinstance(band, Band) and band.coefficients.ndim == 1 for band in bands):
@@ -316,31 +346,20 @@ def admission_of(problem: Problem, node: Array) -> Admission | None:
     found = [one for one in traced if one is not None]
     if len(found) < len(bands):
         return None
-    tapes = [one for one, _ in found]
     output = np.full((len(found), d + 1), -1, dtype=np.int64)
     for k, (one, seeds) in enumerate(found):
         output[k, 0] = one.outputs[0]
         output[k, [1 + seed for seed in seeds]] = one.outputs[1:]
-    constant = [pair for one in tapes for pair in one.constants]
-    parts = [[len(part) for part in one] for one in zip(*((t.code, t.constants, t.inputs) for t in tapes), strict=True)]
-    parts = parts or [[], [], []]
     earth = problem.frame.geodetic and d == _SPACE
-    heard, seen = _hearing(problem, node)
+    globe = np.zeros((_SPACE + 1, _SPACE))
+    if earth:
+        globe[:_SPACE], globe[_SPACE] = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
     return Admission(
         sum(is_exact(band) for band in bands),
-        np.concatenate([np.zeros((0, 4), dtype=np.int64), *(one.code for one in tapes)]),
-        np.stack([starts(part) for part in parts], axis=1),
-        np.array([register for register, _ in constant], dtype=np.int64),
-        np.array([value for _, value in constant], dtype=float),
-        np.array([(register, seed) for one in tapes for seed, register in one.inputs], dtype=np.int64).reshape(-1, 2),
-        output,
+        tape_table([one for one, _ in found], output.tolist()),
         np.zeros((1, len(bands), 2)),
-        max((one.registers for one in tapes), default=1),
         earth,
-        np.array(problem.frame.rotation_to_ecef() if earth else np.eye(_SPACE), order="C"),
-        np.array(problem.frame.origin_ecef() if earth else np.zeros(_SPACE), order="C"),
-        heard,
-        seen,
+        globe,
     )
 
 
@@ -369,16 +388,3 @@ def _trace(problem: Problem, band: Band) -> tuple[Tape, tuple[int, ...]] | None:
         return tape(recorder, [value.value, *partials.values()]), tuple(partials)
     except (TypeError, AttributeError, ValueError, AssertionError, IndexError):  # of a velocity, or untraceable
         return None
-
-
-def _hearing(problem: Problem, node: Array) -> tuple[Array, Array]:
-    """Return 1.0 for the places (s,) that a row is of, and for those that an angle is of."""
-    moving = problem.stations.position.shape[-3] > 1
-    heard, seen = np.zeros(node.shape[1]), np.zeros(node.shape[1])
-    for rows in problem.rows:
-        for index in (rows.a, rows.b)[: MODELS[rows.kind].stations]:
-            for i in np.flatnonzero(rows.weight > 0.0):
-                own = (node[1] == index[i]) & (node[0] == (rows.epoch[i] if moving else 0))
-                heard[own] = 1.0
-                seen[own] = 1.0 if MODELS[rows.kind].quantity == "angle" else seen[own]
-    return heard, seen

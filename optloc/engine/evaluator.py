@@ -49,6 +49,12 @@ def minimise_start(model: Model, rows: Any, room: Room, first: bool) -> None:
 
 
 @compiled
+def scout(model: Model, rows: Any, room: Room) -> None:
+    """Write starts that squared ranges do not give to row X, and second ones to row OTHER, see `Model.start`."""
+    raise NotImplementedError
+
+
+@compiled
 def complete(rows: Any, room: Room) -> None:
     """Write the start of the other unknowns, after the position, to row X."""
     raise NotImplementedError
@@ -91,6 +97,12 @@ def measure_infinity(rows: Any, room: Room) -> None:
 
 
 @compiled
+def search_infinity(model: Model, rows: Any, room: Room) -> None:
+    """Write the same by whatever means; row X and its information stay as they are."""
+    raise NotImplementedError
+
+
+@compiled
 def finish(rows: Any, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Write the unknowns that are not refined of the first lanes, or of those that are marked, to x (N, size)."""
     raise NotImplementedError
@@ -102,6 +114,7 @@ _INTERFACE = (
     keep,
     load,
     minimise_start,
+    scout,
     complete,
     equations,
     costs,
@@ -109,6 +122,7 @@ _INTERFACE = (
     note_nearest,
     bend,
     measure_infinity,
+    search_infinity,
     finish,
 )
 

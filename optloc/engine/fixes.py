@@ -25,14 +25,19 @@ from optloc.engine.evaluator import (
     keep,
     load,
     measure_infinity,
+    search_infinity,
 )
 from optloc.engine.images import LISTED, confirm, find_plane, follow, keep_fix, reflect
 from optloc.engine.memory import (
     ALIVE,
+    AT_INFINITY,
     BEYOND,
     BLUR,
+    BOUNDED,
     CENTRE,
     COST,
+    COST_OF_FIX,
+    COST_OF_RIVAL,
     DAMPING,
     DIAGONAL,
     EIGEN,
@@ -40,19 +45,27 @@ from optloc.engine.memory import (
     FIX_COST,
     FIX_GOOD,
     GOOD,
+    GRADIENT,
     GROWTH,
     H_TRIAL,
     INVERSE,
+    KAPPA,
+    KAPPA_FAR,
     LOWER,
+    LOWER_BOUND,
     MOVE,
+    MULTIPLIER,
     NORMAL,
     ORIGIN,
     ROW,
     SECOND,
+    SETTLED,
     SOLVABLE,
     SPARE,
     SPREAD,
     STEPS,
+    UPPER_BOUND,
+    VALUE,
     Answer,
     H,
     Model,
@@ -159,10 +172,10 @@ def _see(model: Model, rows: Any, z: Array, station: Array, room: Room, begins: 
     """Take measurements and stations of a block; stations that all problems share are taken when a call begins."""
     scalar, vector, anew = room.scalar, room.vector, len(station) > 1 or begins
     level = model.admission.level
-    for k in range(len(room.level)):
+    for k in range(level.shape[1]):
         for lane in range(LANES):
             at = room.item[lane] if len(level) > 1 else 0
-            room.level[k, 0, lane], room.level[k, 1, lane] = level[at, k, 0], level[at, k, 1]
+            room.side[LOWER_BOUND, k, lane], room.side[UPPER_BOUND, k, lane] = level[at, k, 0], level[at, k, 1]
     read(z, room.item, model.row, model.anchor, model.linear, room.seen, room.value, scalar[BLUR], scalar[GOOD])
     if anew:
         stand(
@@ -204,17 +217,16 @@ def _write_fixes(model: Model, rows: Any, z: Array, room: Room, size: int, answe
         good = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
         scalar[FIX_GOOD, lane] = 1.0 if good else 0.0
         scalar[FIX_COST, lane] = scalar[COST, lane]
-    settled, cost, covariance, found = answer.settled, answer.cost, answer.covariance, room.matrix[H_TRIAL]
+    covariance, found, side = answer.covariance, room.matrix[H_TRIAL], answer.side
     for lane in range(size):
         i = room.item[lane]
-        settled[i] = scalar[FIX_GOOD, lane] != 0.0
-        cost[i] = scalar[COST, lane]
-        for k in range(len(room.part)):
-            answer.multiplier[i, k] = room.part[k, lane]
-        for k in range(len(room.quantity)):
-            answer.quantity[i, k] = room.quantity[k, lane]
+        answer.number[i, SETTLED] = scalar[FIX_GOOD, lane]
+        answer.number[i, COST_OF_FIX] = scalar[COST, lane]
+        for k in range(side.shape[1]):
+            side[i, k, MULTIPLIER] = room.part[k, lane] if k < len(room.part) else 0.0
+            side[i, k, VALUE] = room.side[BOUNDED, k, lane]
             for j in range(room.d):
-                answer.normal[i, k, j] = room.face[0, k, j, lane]
+                side[i, k, GRADIENT + j] = room.face[0, k, j, lane]
         for j in range(covariance.shape[1]):
             for k in range(covariance.shape[1]):
                 covariance[i, j, k] = found[max(j, k), min(j, k), lane]
@@ -258,17 +270,15 @@ def _examine(
     kappa, even, closer, turned = room.vector[ROW, 0], room.vector[ROW, 1], 0, False
     measure_shape(model, rows, room, False, False, kappa)
     find_even(room.axes[EIGEN], even)
-    shape, rival, infinity, item = answer.kappa, answer.rival_cost, answer.infinity, room.item
+    number, item = answer.number, room.item
     for lane in range(size):
         i, good = item[lane], settled[lane] != 0.0
-        shape[i, 0], shape[i, 1] = (kappa[lane] if good else np.nan), np.nan
-        rival[i], infinity[i] = np.inf, np.inf
+        number[i, KAPPA], number[i, KAPPA_FAR] = (kappa[lane] if good else np.nan), np.nan
+        number[i, COST_OF_RIVAL], number[i, AT_INFINITY] = np.inf, np.inf
         look[i] = good and (kappa[lane] > STRAIGHT or even[lane] != 0.0)
         closer += 1 if look[i] else 0
         turned = turned or even[lane] != 0.0
-    if closer >= _WORTH or (closer and size < LANES):
-        _measure_closely(model, rows, room, size, answer, look, turned)
-    if len(model.admission.output):  # bounds limit, or bar, the way there
+    if room.side.shape[1]:  # bounds limit, or bar, the way there
         for lane in range(LANES):
             scalar[BEYOND, lane] = np.nan
     else:
@@ -276,7 +286,9 @@ def _examine(
     left = 0.0
     for lane in range(size):
         if settled[lane] != 0.0:
-            infinity[item[lane]] = scalar[BEYOND, lane]
+            number[item[lane], AT_INFINITY] = scalar[BEYOND, lane]
+    if closer >= _WORTH or (closer and size < LANES):
+        _measure_closely(model, rows, room, size, answer, look, turned)
     for lane in range(LANES):
         scalar[GOOD, lane] = settled[lane]
         left += settled[lane]
@@ -291,25 +303,38 @@ def _examine(
 @compiled
 def _measure_closely(model: Model, rows: Any, room: Room, size: int, answer: Answer, look: Array, turned: bool) -> None:
     """Measure the shape in metres along turned axes as well, if asked, and in inverse range where it is poor there."""
-    kappa, item, settled, shape, far = room.vector[ROW, 0], room.item, answer.settled, answer.kappa, 0
+    kappa, item, number, far = room.vector[ROW, 0], room.item, answer.number, 0
     if turned:
         measure_shape(model, rows, room, False, True, kappa)
     for lane in range(size):
         i = item[lane]
-        if settled[i]:
+        if number[i, SETTLED] != 0.0:
             look[i] = False
-            shape[i, 0] = kappa[lane] if turned else shape[i, 0]
-            far += 1 if shape[i, 0] > STRAIGHT else 0
+            number[i, KAPPA] = kappa[lane] if turned else number[i, KAPPA]
+            far += 1 if number[i, KAPPA] > STRAIGHT else 0
     if far and model.admission.exact:  # the chart knows of no surface
         for lane in range(size):
-            if settled[item[lane]]:
-                shape[item[lane], 1] = np.inf
+            if number[item[lane], SETTLED] != 0.0:
+                number[item[lane], KAPPA_FAR] = np.inf
     elif far:
         measure_shape(model, rows, room, True, True, kappa)
         for lane in range(size):
             i = item[lane]
-            if settled[i] and shape[i, 0] > STRAIGHT:
-                shape[i, 1] = kappa[lane]
+            if number[i, SETTLED] != 0.0 and number[i, KAPPA] > STRAIGHT:
+                number[i, KAPPA_FAR] = kappa[lane]
+        if room.side.shape[1] == 0:
+            _look_beyond(model, rows, room, size, answer)
+
+
+@compiled
+def _look_beyond(model: Model, rows: Any, room: Room, size: int, answer: Answer) -> None:
+    """Search infinity for the fixes that are bent."""
+    number = answer.number
+    search_infinity(model, rows, room)
+    for lane in range(size):
+        i = room.item[lane]
+        if number[i, SETTLED] != 0.0 and number[i, KAPPA] > STRAIGHT:
+            number[i, AT_INFINITY] = room.scalar[BEYOND, lane]
 
 
 @compiled
@@ -328,7 +353,7 @@ def _pursue(
     course: Array,
 ) -> None:
     """Refine the mirror images that are on their way, again and again in full blocks, until none is."""
-    scalar, item, cost = room.scalar, room.item, answer.cost
+    scalar, item = room.scalar, room.item
     while images:
         waiting = images
         images = 0
@@ -341,7 +366,8 @@ def _pursue(
             _resume(model, answer.rival, room)
             for lane in range(LANES):
                 i = item[lane]
-                scalar[FIX_COST, lane], scalar[GOOD, lane], scalar[ALIVE, lane] = cost[i], 1.0, 1.0
+                scalar[FIX_COST, lane] = answer.number[i, COST_OF_FIX]
+                scalar[GOOD, lane], scalar[ALIVE, lane] = 1.0, 1.0
                 scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
                 scalar[STEPS, lane] = course[2, i]
             follow(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
@@ -378,17 +404,18 @@ def _end_images(
         return images
     _place(room.vector, item, answer.rival, scalar[GOOD], True, size)
     finish(rows, z, room, size, scalar[GOOD], True, answer.rival)
-    rival, cost = answer.rival_cost, answer.cost
+    number = answer.number
     for lane in range(size):
         if scalar[GOOD, lane] != 0.0:
             i = item[lane]
-            rival[i] = scalar[COST, lane]
+            rival, cost = scalar[COST, lane], number[i, COST_OF_FIX]
+            number[i, COST_OF_RIVAL] = rival
             # of two that cost the same the likelier by its place, whatever rounding says
-            tied = abs(rival[i] - cost[i]) <= _TIED * (1.0 + cost[i])
-            if _is_likelier(room, lane) if tied else rival[i] < cost[i]:
-                _exchange(answer.x, cost, answer.rival, rival, i)
+            tied = abs(rival - cost) <= _TIED * (1.0 + cost)
+            if _is_likelier(room, lane) if tied else rival < cost:
+                _exchange(answer, i)
                 look[i] = True
-                if rival[i] == np.inf:
+                if number[i, COST_OF_RIVAL] == np.inf:
                     # much cheaper: the start was in a wrong place, and its mirror image may lead on
                     _reflect_lane(room.vector, lane, answer.rival[i])
                     course[0, i], course[1, i], course[2, i] = FIRST_DAMPING, FIRST_GROWTH, 0.0
@@ -426,12 +453,13 @@ def _reflect_lane(vector: Array, lane: int, out: Array) -> None:
 
 
 @compiled
-def _exchange(x: Array, cost: Array, rival: Array, rival_cost: Array, i: int) -> None:
+def _exchange(answer: Answer, i: int) -> None:
     """Make the rival the fix, and the fix the rival where it still counts as one."""
+    x, rival, number = answer.x, answer.rival, answer.number
     for j in range(x.shape[1]):
         x[i, j], rival[i, j] = rival[i, j], x[i, j]
-    best, other = rival_cost[i], cost[i]
-    cost[i], rival_cost[i] = best, other if other <= best + LISTED else np.inf
+    best, other = number[i, COST_OF_RIVAL], number[i, COST_OF_FIX]
+    number[i, COST_OF_FIX], number[i, COST_OF_RIVAL] = best, other if other <= best + LISTED else np.inf
 
 
 @compiled

@@ -15,6 +15,7 @@ import numpy as np
 from optloc.base.cache import Cache
 from optloc.base.types import Array, Rows
 from optloc.compute.tables import starts
+from optloc.compute.tape_table import TapeTable, tape_table
 from optloc.compute.trace import Recorder, Symbol, Tape, tape
 from optloc.linear.least_squares_ranges import Ranges
 from optloc.models import MODELS, Model, distance, lifted_row, namespace
@@ -121,54 +122,36 @@ def azimuths_beside(problem: Problem, rows: Rows) -> Array | None:
 
 # The same rows for machine code: a tape for each block of rows, and where each of its inputs comes from.
 
-# Columns of `Lifts.block`; parts of a block begin there, and end where the next block begins.
-CODE, CONSTANT, INPUT, ROW = range(4)
 # Sorts of inputs: a number of the structure, a measurement, a coordinate of a station, a least-squares range, or a
 # coordinate of the place where the error of the row is taken.
 NUMBER, SEEN, STATION, OFFSET, POINT = range(5)
 
 
 class Lifts(NamedTuple):
-    """Linear rows of a structure.
+    """Linear rows of a structure, in blocks of one tape each.
 
     Parameters
     ----------
     flat : bool
         Whether no row has the last coordinate.
-    code : int64 array (n, 4)
-        Operations of all tapes, see `optloc.compute.trace.Tape`.
-    block : int64 array (b + 1, 4)
-        Where the parts of each block begin: columns as named above.
-    constant : int64 array (k,), value : array (k,)
-        Registers of constants, and what they hold.
-    input : int64 array (i,)
-        Registers of inputs.
-    output : int64 array (b, d + 3)
-        Registers of the coefficients, the right side and the factor.
-    source : int64 array (n, 2)
+    tapes : TapeTable
+        Of each block; outputs are the d + 1 coefficients, the right side and the factor.
+    first : int64 array (b + 1,)
+        First row of each block.
+    source : int64 array (l, i, 2)
         Of every input of every row: what it is, and which.
-    first : int64 array (l + 1,)
-        Where the sources of each row begin.
     number : array (m,)
         Numbers of the structure.
     sigma : array (l,)
         Standard deviation of each row's measurement.
-    registers : int
-        How many.
     """
 
     flat: bool
-    code: Array
-    block: Array
-    constant: Array
-    value: Array
-    input: Array
-    output: Array
-    source: Array
+    tapes: TapeTable
     first: Array
+    source: Array
     number: Array
     sigma: Array
-    registers: int
 
 
 # Seeds of the inputs of a tape; axes come last, row by row.
@@ -298,25 +281,15 @@ def lift(problem: Problem, found: Ranges | None, node: dict[tuple[int, int], int
     ]
     blocks = [block for block in lifted if block is not None and block.source]
     d, tapes = problem.dimension, [block.tape for block in blocks]
-    constant = [pair for one in tapes for pair in one.constants]
     every = [own for block in blocks for own in block.source]
-    parts = (
-        [len(one.code) for one in tapes],
-        [len(one.constants) for one in tapes],
-        [len(one.inputs) for one in tapes],
-        [len(block.source) for block in blocks],
-    )
+    source = np.zeros((len(every), max(map(len, every), default=0), 2), dtype=np.int64)
+    for row, own in zip(source, every, strict=True):
+        row[: len(own)] = own
     return Lifts(
         found is None and all((one.outputs[d], 0.0) in one.constants for one in tapes),
-        np.concatenate([np.zeros((0, 4), dtype=np.int64), *(one.code for one in tapes)]),
-        np.stack([starts(part) for part in parts], axis=1),
-        np.array([register for register, _ in constant], dtype=np.int64),
-        np.array([value for _, value in constant], dtype=float),
-        np.array([register for one in tapes for _, register in one.inputs], dtype=np.int64),
-        np.array([one.outputs for one in tapes], dtype=np.int64).reshape(-1, d + 3),
-        np.array([pair for own in every for pair in own], dtype=np.int64).reshape(-1, 2),
-        starts([len(own) for own in every]),
+        tape_table(tapes, [one.outputs for one in tapes]),
+        starts([len(block.source) for block in blocks]),
+        source,
         np.array(scene.number, dtype=float),
         np.array([one for block in blocks for one in block.sigma], dtype=float),
-        max((one.registers for one in tapes), default=1),
     )

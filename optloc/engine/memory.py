@@ -10,6 +10,7 @@ from optloc.base.types import Array
 from optloc.compute.gtrs import scratch
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES
+from optloc.compute.tape_table import TapeTable
 
 ROUNDING = 4.0 * 2.220446049250313e-16
 """Share of a measurement that is rounding: four of a double lie between it and its residual."""
@@ -25,7 +26,11 @@ H, H_TRIAL, LOWER, FIX_H, MARGIN, REST = range(6)
 BASE, AXES, EIGEN = range(3)
 # Rows of `Room.scalar`.
 COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
-FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND = range(14, 22)
+FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND, RADIUS = range(14, 23)
+
+
+LOWER_BOUND, UPPER_BOUND, BOUNDED = range(3)
+"""Rows of `Room.side`."""
 
 
 class Admission(NamedTuple):
@@ -35,42 +40,30 @@ class Admission(NamedTuple):
     ----------
     exact : int
         Number of held quantities; they come first.
-    code : int64 array (n, 4)
-        Operations of all tapes, see `optloc.compute.trace.Tape`.
-    block : int64 array (k + 1, 3)
-        Where operations, constants and inputs of each begin.
-    constant : int64 array (c,), value : array (c,)
-        Registers of constants, and what they hold.
-    input : int64 array (i, 2)
-        Registers of inputs, and which coordinate each is.
-    output : int64 array (k, 1 + d)
-        Registers of value and derivatives; -1 for a derivative of zero.
+    tapes : TapeTable
+        Value and derivatives of each; inputs are coordinates.
     level : array (N or 1, k, 2)
         Lower and upper bounds.
-    registers : int
-        How many.
     earth : bool
-        Whether there is one: then an Earth-centred position is ``turn x + origin``.
-    turn, origin : array (3, 3), (3,)
-        See there.
-    heard, seen : array (s,)
-        1.0 for places with a row, and for places with an angle.
+        Whether there is an Earth.
+    globe : array (4, 3)
+        Earth-centred positions are ``globe[:3] x + globe[3]`` then.
     """
 
     exact: int
-    code: Array
-    block: Array
-    constant: Array
-    value: Array
-    input: Array
-    output: Array
+    tapes: TapeTable
     level: Array
-    registers: int
     earth: bool
-    turn: Array
-    origin: Array
-    heard: Array
-    seen: Array
+    globe: Array
+
+
+SIGN, RANGED, HEARD, SEEN = range(4)
+"""Rows of `Model.station`: how the unknown range t enters, zeros where the ranges are determined; 1.0 for the stations
+whose range is known, up to t; 1.0 for those with a row, and for those with an angle."""
+
+
+BY_SQUARES, BY_HEIGHT, BY_PLACES = range(3)
+"""How a fix starts: squared ranges and linear rows; where ranges meet a known height; the cheapest of many places."""
 
 
 class Model(NamedTuple):
@@ -85,26 +78,41 @@ class Model(NamedTuple):
         Row whose measurement is subtracted first, -1 for none: emission times count from it.
     linear : array (s + v, m)
         Maps to the least-squares ranges c, known up to sign * t, and to v more values that an evaluator wants.
-    sign : array (s,)
-        How the unknown range t enters each; zeros where the ranges are determined.
-    ranged : array (s,)
-        1.0 for the stations whose range is known, up to t.
+    station : array (4, s)
+        See the names of its rows.
     reference : int
         Station whose range is t; -1 where the ranges are determined.
     white : array (s, s)
         Lower triangular whitening matrix of c.
     admission : Admission
         Which positions are admitted.
+    start : int
+        One of the ways above.
+    height : int
+        Source of the height: the number of a held quantity, or -1 less the number of a row.
+    ahead : array (n, d)
+        Directions that are tried from the mean of the stations.
+    limit : float
+        Cost above which another place may hold a better minimum.
     """
 
     row: Array
     anchor: Array
     linear: Array
-    sign: Array
-    ranged: Array
+    station: Array
     reference: int
     white: Array
     admission: Admission
+    start: int
+    height: int
+    ahead: Array
+    limit: float
+
+
+COST_OF_FIX, COST_OF_RIVAL, SETTLED, AT_INFINITY, KAPPA, KAPPA_FAR = range(6)
+"""Columns of `Answer.number`."""
+MULTIPLIER, VALUE, GRADIENT = range(3)
+"""Last axis of `Answer.side`."""
 
 
 class Answer(NamedTuple):
@@ -116,37 +124,67 @@ class Answer(NamedTuple):
         Parameter vectors, the position first.
     covariance : array (N, n, n)
         Of the first n unknowns.
-    multiplier : array (N, c)
-        Of what is held: the gradient of the cost and its gradients times these add up to nothing.
-    quantity, normal : array (N, k), (N, k, d)
-        What is held or bounded, and its gradients.
-    cost : array (N,)
-        Weighted sums of squared residuals.
-    settled : bool array (N,)
-        Whether a fix is a good one: a finite input, an exact start, a finished refinement, a regular covariance, a
-        place that is not far away. The others need a closer look, and nothing below is known of them.
     rival : array (N, size)
         Another minimum that the mirror image of the fix leads to, and which costs no more than `LISTED` more; NaN.
-    rival_cost : array (N,)
-        Its cost; infinite without a rival.
-    kappa : array (N, 2)
-        How far the cost is from the square of a distance, in metres and in inverse range; NaN where not measured.
-    infinity : array (N,)
-        Least cost at infinity, exactly where it is less than `BEYOND_DOUBT` above the fix, else a lower bound above
-        that; infinite where the cost grows without bound, NaN where not measured.
+    number : array (N, 6)
+        See the names of its columns.
+    side : array (N, k, 2 + d)
+        Of each held or bounded quantity its multiplier, where it is held: the gradient of the cost and all gradients
+        times their multipliers add up to nothing; its value, and its gradient.
     """
 
     x: Array
     covariance: Array
-    multiplier: Array
-    quantity: Array
-    normal: Array
-    cost: Array
-    settled: Array
     rival: Array
-    rival_cost: Array
-    kappa: Array
-    infinity: Array
+    number: Array
+    side: Array
+
+    @property
+    def cost(self) -> Array:
+        """Weighted sums of squared residuals (N,)."""
+        return self.number[:, COST_OF_FIX]
+
+    @property
+    def rival_cost(self) -> Array:
+        """Costs (N,) of the rivals; infinite without one."""
+        return self.number[:, COST_OF_RIVAL]
+
+    @property
+    def settled(self) -> Array:
+        """Whether a fix (N,) is a good one.
+
+        A finite input, an exact start, a finished refinement, a regular covariance, a place that is not far away. The
+        others need a closer look, and nothing else is known of them.
+        """
+        return np.asarray(self.number[:, SETTLED] != 0.0)
+
+    @property
+    def infinity(self) -> Array:
+        """Least costs (N,) at infinity, exact where less than `BEYOND_DOUBT` above the fix, else a lower bound.
+
+        Infinite where the cost grows without bound, NaN where not measured.
+        """
+        return self.number[:, AT_INFINITY]
+
+    @property
+    def kappa(self) -> Array:
+        """How far costs are from squares of distances, in metres and in inverse range, (N, 2); NaN: not measured."""
+        return self.number[:, KAPPA:]
+
+    @property
+    def multiplier(self) -> Array:
+        """Multipliers (N, k) of quantities that are held."""
+        return self.side[..., MULTIPLIER]
+
+    @property
+    def quantity(self) -> Array:
+        """Values (N, k) of what is held or bounded."""
+        return self.side[..., VALUE]
+
+    @property
+    def normal(self) -> Array:
+        """Gradients (N, k, d) of what is held or bounded."""
+        return self.side[..., GRADIENT:]
 
 
 class Room(NamedTuple):
@@ -168,15 +206,16 @@ class Room(NamedTuple):
         Squared-range rows as they are; and weighed, behind them the l linear rows of other kinds.
     y, second, work : array (d + 1, W), (d + 1, W), (n, W)
         Squared-range answers, second ones, and scratch of `optloc.compute.gtrs.minimise`.
-    vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (22, W)
-        See the names of their rows. Positions count from the origin, row ORIGIN.
+    vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (23, W)
+        See the names of their rows. Positions count from the origin, row ORIGIN. Where RADIUS is not zero, they are
+        held at this distance from CENTRE.
     face, push : array (2, k, d, W), (c, p, W)
         Gradients of quantities at rows X and TRIAL; of those that are held, their products with an inverse.
-    small, part, pivot, diagonal : array (2, c, c, W), (c, W), (c, W), (c, W)
+    small, part, pivot : array (2, c, c, W), (c, W), (2, c, W)
         Products of these with each other, and scratch.
-    level, quantity : array (k, 2, W), (k, W)
-        Bounds, and what they bound.
-    registers, spot : array (r, W), (2, 3)
+    side : array (3, k, W)
+        Lower and upper bounds, and what they bound.
+    registers : array (r, W)
         Scratch.
     own : named tuple
         What the evaluator of the rows keeps.
@@ -201,11 +240,8 @@ class Room(NamedTuple):
     small: Array
     part: Array
     pivot: Array
-    diagonal: Array
-    level: Array
-    quantity: Array
+    side: Array
     registers: Array
-    spot: Array
     own: Any
 
 
@@ -213,7 +249,7 @@ class Room(NamedTuple):
 def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, others: int) -> Room:
     """Return the memory of a block of problems, for numbers of stations, coordinates, unknowns and linear rows."""
     s, p, m = stations, unknowns, model.row.shape[1]
-    c, k = model.admission.exact, len(model.admission.output)
+    c, k = model.admission.exact, model.admission.level.shape[1]
     return Room(
         d,
         np.empty(LANES, np.int64),
@@ -228,16 +264,13 @@ def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, othe
         np.zeros((13, p, LANES)),
         np.zeros((6, p, p, LANES)),
         np.zeros((3, d, d, LANES)),
-        np.zeros((22, LANES)),
+        np.zeros((23, LANES)),
         np.zeros((2, k, d, LANES)),
         np.zeros((c, p, LANES)),
         np.zeros((2, c, c, LANES)),
         np.zeros((c, LANES)),
-        np.zeros((c, LANES)),
-        np.zeros((c, LANES)),
-        np.zeros((k, 2, LANES)),
-        np.zeros((k, LANES)),
-        np.zeros((model.admission.registers, LANES)),
-        np.zeros((2, 3)),
+        np.zeros((2, c, LANES)),
+        np.zeros((3, k, LANES)),
+        np.zeros((model.admission.tapes.registers, LANES)),
         own,
     )

@@ -8,45 +8,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.base import linalg
 from optloc.base.cache import Cache
 from optloc.base.frames import Frame
-from optloc.base.linalg import project_out
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Band, Stations
 from optloc.compute.jit import enabled, ready, usable
-from optloc.compute.pack import pack
 from optloc.engine.admission import admission_of, levels_of
+from optloc.engine.draw import draw_ranges, draw_tapes
 from optloc.engine.fixes import fix_few_ranges, fix_one_by_tapes, fix_ranges, fix_tapes
-from optloc.engine.lifts import Lifts, lift
-from optloc.engine.memory import Admission, Answer, Model
-from optloc.engine.ranges import RangeRows
+from optloc.engine.memory import (
+    GRADIENT,
+    KAPPA_FAR,
+    Answer,
+    Model,
+)
 from optloc.engine.tapes import TapeRows
 from optloc.linear.constraints import exact, face_names, is_exact
-from optloc.linear.evaluate import block_links, columns
-from optloc.linear.least_squares_ranges import Ranges, ranges
-from optloc.linear.normal import depends_on_place, weighed
+from optloc.linear.normal import depends_on_place
 from optloc.linear.redundancy import degrees_of_freedom
-from optloc.linear.vectors import hold_still, vectors
 from optloc.linear.walks import walks
 from optloc.models import MODELS
 from optloc.problem.layout import Layout
-from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 
 # Rows, and epochs with emission times, up to which dense maps pay: their cost grows with the square.
 MOST = 64
 # Unknowns up to which systems are solved side by side in lanes.
 _UNKNOWNS = 40
-# Share of the largest weight below which a combination of rows is rounding: four digits above it.
-_NOTHING = 1e-12
-# Share of a combination of ranges that their common part may have left by rounding: differences have none of it.
-_LEVEL = 1e-9
 
 TOLERANCE, LIMIT = 1e-7, 100
 """Of the refinement of the method "lsr"."""
@@ -98,7 +90,7 @@ class Plan:
     def load(self, problem: Problem) -> Load:
         """Return the data of problems of this structure: a problem without batch axes, or a flat batch."""
         model, admission = self.model, self.model.admission
-        if len(admission.output):
+        if admission.level.shape[1]:
             model = model._replace(admission=admission._replace(level=levels_of(problem)))
         return Load(model, self.rows(problem), self._places(problem))
 
@@ -198,20 +190,14 @@ _BY_RANGES = (fix_few_ranges, fix_ranges, 8)
 _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
-def blank_answer(count: int, d: int, size: int, shared: int, held: int, sides: int) -> Answer:
+def blank_answer(count: int, d: int, size: int, shared: int, sides: int) -> Answer:
     """Return arrays for answers, for numbers of problems, coordinates, unknowns and constraints."""
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),
-        np.empty((count, held)),
-        np.empty((count, sides)),
-        np.empty((count, sides, d)),
-        np.empty(count),
-        np.empty(count, dtype=np.bool_),
         np.empty((count, size)),
-        np.empty(count),
-        np.empty((count, 2)),
-        np.empty(count),
+        np.empty((count, KAPPA_FAR + 1)),
+        np.empty((count, sides, GRADIENT + d)),
     )
 
 
@@ -312,44 +298,21 @@ def _make(problem: Problem) -> Plan | None:
     dof = int(degrees_of_freedom(one.flat())[0])
     if dof < 0 or problem.layout.find("position")[0].start:
         return None
-    ranged, offset = _is_ranged(problem), None
-    if ranged and one.stations.estimated:  # along the lines to the target, they are noise
-        offset = columns(one.layout, "stations", np.zeros(1, dtype=int))[0]
-        one = replace(one, stations=replace(one.stations, span="noise"))
-    found = ranges(weighed(_probe(hold_still(one.flat()))))
-    # Stations that no row links would have ranges that nothing relates.
-    if ranged and (found is None or len(found.groups[0]) != 1):
-        return None
-    heard = np.zeros(0, dtype=np.int64) if found is None else np.flatnonzero(found.inside[0])
-    node = _nodes(one, found, heard)
-    white = np.eye(node.shape[1])
-    if found is not None:
-        white[: len(heard), : len(heard)] = linalg.whitening(found.covariance[0, heard[:, None], heard])
-    # The compiled core takes triangular matrices only: a covariance that is singular has none.
-    if np.triu(white, 1).any():
-        return None
-    admission = admission_of(one, node)
+    admission = admission_of(one)
     if admission is None:
         return None
-    model = _model(one, found, heard, white, admission)
-    make: Callable[[Problem], Any]
-    if ranged:
-        turned, made = _range_rows(weighed(one), node[1])
-        if offset is not None:
-            assert one.stations.covariance is not None
-            first = offset.reshape(-1, one.dimension)[node[1], 0]
-            made = made._replace(wander=np.array(one.stations.covariance[node[1], 0, 0]), offset=first)
-        model, make = model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made
-    else:
-        places = {(int(station), int(epoch)): i for i, (epoch, station) in enumerate(node.T)}
-        lifts = lift(hold_still(one.flat()).take(np.zeros(1, dtype=int)), found, places, model.reference >= 0)
-        make = partial(_tape_rows, one.correction, vectors(one.flat(), None)[0], lifts, _is_bounded(one))
-        if make(one) is None or not (len(heard) or len(lifts.sigma)):
-            return None
+    drawn = draw_ranges(one, admission) if _is_ranged(problem) else None
+    if drawn is None and _is_taped(problem):
+        drawn = draw_tapes(one, admission, dof)
+    if drawn is None:
+        return None
     layout = problem.layout
     held, size, shared = face_names(one, exact(one)), layout.size, layout.n_shared
-    widths = (one.dimension, size, shared, len(held), len(one.constraints))
-    return Plan(layout, problem.frame, one.weight, dof, node, model, make, ranged, size, shared, widths, held)
+    widths = (one.dimension, size, shared, len(one.constraints))
+    ranged = drawn.ranged
+    return Plan(
+        layout, problem.frame, one.weight, dof, drawn.node, drawn.model, drawn.rows, ranged, size, shared, widths, held
+    )
 
 
 def _bare(problem: Problem) -> Problem:
@@ -367,125 +330,3 @@ def _bare(problem: Problem) -> Problem:
     )
     bare = problem.with_rows(z=np.zeros(problem.count))
     return replace(bare, stations=replace(stations, position=place, velocity=rates), constraints=bands)
-
-
-def _probe(problem: Problem) -> Problem:
-    """Return one problem for each row, whose measurement is one and all others zero."""
-    # A linear map is known by its images of the unit vectors.
-    parts = np.split(np.eye(problem.count), problem.starts[1:], axis=1)
-    rows = tuple(replace(r, z=part, correction=np.zeros(r.count)) for r, part in zip(problem.rows, parts, strict=True))
-    return replace(problem, rows=rows, stations=replace(problem.stations, velocity=None, axes=None))
-
-
-def _nodes(one: Problem, found: Ranges | None, heard: Array) -> Array:
-    """Return epoch and station (2, s) of the places that take part: first those whose ranges are known."""
-    moving = one.stations.position.shape[-3] > 1
-    first = [] if found is None else list(zip(found.epoch[heard].tolist(), found.station[heard].tolist(), strict=True))
-    others = {
-        (int(rows.epoch[i]) if moving else 0, int(end[i]))
-        for rows in one.rows
-        for end in (rows.a, rows.b)[: MODELS[rows.kind].stations]
-        for i in np.flatnonzero(rows.weight > 0.0)
-    }
-    return np.array([*first, *sorted(others - {*first})], dtype=np.int64).reshape(-1, 2).T
-
-
-def _model(one: Problem, found: Ranges | None, heard: Array, white: Array, admission: Admission) -> Model:
-    """Return the maps from measurements of one problem to a start."""
-    count, s, flat = one.count, len(white), one.flat()
-    added, gain = np.zeros(count), np.zeros(count)
-    base = vectors(flat, None)
-    for links, rows, start in zip(block_links(one), one.rows, one.starts, strict=True):
-        part = slice(start, start + rows.count)
-        gain[part], added[part] = links.gains.total(base, rows.count)[0], links.adds.total(base, rows.count)[0]
-    present = one.weight > 0.0
-    precision = np.where(present, 1.0 / np.where(present, variances(weighed(one).noise, count), 1.0), 0.0)
-    linear, sign, ranged, reference = np.zeros((s, count)), np.zeros(s), np.zeros(s), -1
-    if found is not None:
-        linear[: len(heard)] = found.offset[:, heard].T
-        sign[: len(heard)], ranged[: len(heard)] = found.sign[0, heard], 1.0
-        reference = int(np.searchsorted(heard, found.reference[0])) if found.free.all() else -1
-    row = np.stack([one.correction + added, precision, 1.0 / (1.0 + gain)])
-    return Model(row, _anchors(one)[0], linear, sign, ranged, reference, white, admission)
-
-
-def _anchors(one: Problem) -> tuple[Array, Array]:
-    """Return the row from which the emission time of each row (m,) and of each epoch (k,) is counted, or -1."""
-    anchor, start = np.full(one.count, -1), np.full(one.epochs if one.layout.n_local else 0, -1)
-    for rows, first in zip(one.rows, one.starts, strict=True):
-        if MODELS[rows.kind].emission:
-            for i in np.flatnonzero(rows.weight > 0.0):
-                epoch = int(rows.epoch[i])
-                start[epoch] = first + i if start[epoch] < 0 else start[epoch]
-                anchor[first + i] = start[epoch]
-    return anchor, start
-
-
-def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
-    """Return the maps to whitened rows, emission times and loops; and the rows over the ranges to stations (s,)."""
-    design, emitted = _design(one, station)
-    alone = whiten_rows(whiten(one.noise, one.weight), np.eye(one.count))
-    times = alone @ emitted
-    # Emission times projected out: what is left of the rows depends on ranges alone.
-    bare = project_out(times, alone)
-    basis, upper = np.linalg.qr(bare @ design, mode="complete")
-    inside = min(upper.shape)
-    turned = basis.T @ bare
-    loops = turned[inside:]
-    # Combinations of rows that no range moves: their cost is the misfit of loops.
-    loops = loops[np.abs(loops).max(-1, initial=0.0) > _NOTHING * np.abs(alone).max()]
-    emission = np.linalg.pinv(times) @ alone
-    share = upper[:inside]
-    norm = float(np.linalg.norm(share, 2)) if share.size else 0.0
-    return np.concatenate([turned[:inside], emission, loops]), RangeRows(
-        one.correction,
-        np.array(share, order="C"),
-        np.array(emission @ design, order="C"),
-        _anchors(one)[1],
-        norm,
-        bool(np.abs(share.sum(-1)).max(initial=0.0) <= _LEVEL * norm),
-        np.zeros(0),
-        np.zeros(0, dtype=np.int64),
-    )
-
-
-def _design(one: Problem, station: Array) -> tuple[Array, Array]:
-    """Return the rows over ranges (m, s) and emission times (m, k)."""
-    design, emitted = np.zeros((one.count, len(station))), np.zeros((one.count, len(_anchors(one)[1])))
-    place = {int(s): i for i, s in enumerate(station)}
-    for rows, first in zip(one.rows, one.starts, strict=True):
-        model = MODELS[rows.kind]
-        for i in np.flatnonzero(rows.weight > 0.0):
-            for coefficient, end in zip(model.ranges or (), (int(rows.a[i]), int(rows.b[i])), strict=False):
-                if coefficient:
-                    design[first + i, place[end]] += coefficient
-            if model.emission:
-                emitted[first + i, int(rows.epoch[i])] = 1.0
-    return design, emitted
-
-
-def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, problem: Problem) -> TapeRows | None:
-    """Return the rows of problems as tapes, or None where they have none."""
-    bare = problem.with_rows(z=np.zeros(problem.count))
-    found = pack(bare, whiten(weighed(bare).noise, bare.weight))
-    return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts, bounded)
-
-
-def _is_bounded(one: Problem) -> bool:
-    """Return whether some row, or a prior, costs without bound wherever a target goes far away.
-
-    Ranges that add up do, but for a scale or an offset without a prior; so do heights, and a prior on the position.
-    """
-    free = {bias.name for bias in one.biases if bias.sigma is None or bias.form == "scale"}
-    touched = np.zeros(one.count, dtype=bool)
-    for bias in one.biases:
-        touched[bias.row] |= bias.name in free
-    if any(prior.name == "position" for prior in one.priors):
-        return True
-    for rows, start in zip(one.rows, one.starts, strict=True):
-        model = MODELS[rows.kind]
-        grows = rows.kind == "height" or (model.ranges is not None and sum(model.ranges) != 0 and not model.emission)
-        present = (rows.weight > 0.0) & ~touched[start : start + rows.count]
-        if grows and present.any():
-            return True
-    return False

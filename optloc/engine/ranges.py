@@ -143,6 +143,11 @@ def minimise_start(model: Model, rows: RangeRows, room: Room, first: bool) -> No
 
 
 @compiled
+def scout(model: Model, rows: RangeRows, room: Room) -> None:
+    """Do nothing: sums of ranges that lack rows are run as tapes."""
+
+
+@compiled
 def complete(rows: RangeRows, room: Room) -> None:
     """Do nothing: the position is all that is refined."""
 
@@ -194,6 +199,12 @@ def note_nearest(room: Room, least: Array) -> None:
     for i in range(len(r)):
         for lane in range(LANES):
             least[lane] = min(least[lane], r[i, lane])
+
+
+@compiled
+def search_infinity(model: Model, rows: RangeRows, room: Room) -> None:
+    """Write what infinity costs: that is known in closed form."""
+    measure_infinity(rows, room)
 
 
 @compiled

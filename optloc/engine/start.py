@@ -11,8 +11,23 @@ from optloc.compute.gtrs import meet
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES
 from optloc.engine.admission import restore
-from optloc.engine.evaluator import complete, minimise_start
-from optloc.engine.memory import GOOD, OTHER, ROUNDING, SCALE, SECOND, SOLVABLE, SPARE, SPREAD, Model, Room, X
+from optloc.engine.evaluator import complete, minimise_start, scout
+from optloc.engine.memory import (
+    BY_SQUARES,
+    GOOD,
+    OTHER,
+    RANGED,
+    ROUNDING,
+    SCALE,
+    SECOND,
+    SIGN,
+    SOLVABLE,
+    SPARE,
+    SPREAD,
+    Model,
+    Room,
+    X,
+)
 
 NEAR = 1e-3
 """Least distance from a station that weighs a row, in units of the stations' spread: at the station itself a squared
@@ -21,12 +36,14 @@ range has no first-order error, and its weight would be infinite."""
 
 @compiled
 def begin(model: Model, rows: Any, room: Room) -> None:
-    """Find starts: squared ranges weighed as equal first, then by the ranges of that answer."""
+    """Find starts: squared ranges weighed as equal first, then by the ranges of that answer; or in other ways."""
     scalar, s = room.scalar, len(room.place)
+    if model.start != BY_SQUARES:
+        scout(model, rows, room)
+        return
     square(
         room.value[:s],
-        model.sign,
-        model.ranged,
+        model.station,
         model.reference,
         room.place,
         scalar[SPREAD],
@@ -159,8 +176,7 @@ def stand(
 @compiled
 def square(
     c: Array,
-    sign: Array,
-    ranged: Array,
+    station: Array,
     reference: int,
     place: Array,
     spread: Array,
@@ -174,8 +190,8 @@ def square(
     ----------
     c : array (s, W)
         Least-squares ranges, metres.
-    sign, ranged : array (s,)
-        How the unknown range t enters, and 1.0 where a range is known up to it.
+    station : array (4, s)
+        Of `optloc.engine.memory.Model`.
     reference : int
         Station whose range is t; -1 where ranges are determined.
     place, spread : array (s, d, W), (W,)
@@ -201,12 +217,13 @@ def square(
         spare[lane] = 1.0 / scale[lane]
     for i in range(s):
         # The reference's own row would read 0 = 0.
-        used = 0.0 if free and (i == reference or sign[i] == 0.0) else ranged[i]
+        sign = station[SIGN, i]
+        used = 0.0 if free and (i == reference or sign == 0.0) else station[RANGED, i]
         for lane in range(LANES):
             # r_i = c_i + s_i t squared, less |x|^2 = t^2: linear in x and t.
             known = used * c[i, lane] * spare[lane]
             rows[i, d + 1, lane] = known * known
-            rows[i, d, lane] = 2.0 * sign[i] * known if free else used
+            rows[i, d, lane] = 2.0 * sign * known if free else used
         for j in range(d):
             for lane in range(LANES):
                 at = used * place[i, j, lane] * spare[lane]

@@ -9,15 +9,20 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.gtrs import minimise
 from optloc.compute.jit import compiled
-from optloc.compute.lanes import Cells, arrange, blur_of, gather, memory, run
+from optloc.compute.lanes import Cells, arrange, blur_of, gather, memory
 from optloc.compute.lanes import load as load_lane
 from optloc.compute.pack import Numbers
+from optloc.compute.polynomial import DEGREE
 from optloc.compute.systems import LANES, eliminate_last, factor_plain, solve_plain
 from optloc.compute.tables import Tables
-from optloc.engine.lifts import CODE, CONSTANT, INPUT, NUMBER, OFFSET, ROW, SEEN, STATION, Lifts
+from optloc.compute.tape_table import INPUT, OUTPUT, run_tape
+from optloc.engine.candidates import CANDIDATES, RINGS, VECTORS, look_around, meet_ellipsoid, refine_candidates
+from optloc.engine.infinity import search_sphere
+from optloc.engine.lifts import NUMBER, OFFSET, SEEN, STATION, Lifts
 from optloc.engine.memory import (
     BEYOND,
     BLUR,
+    BY_HEIGHT,
     COST,
     COST_TRIAL,
     DIAGONAL,
@@ -66,11 +71,13 @@ class TapeRows(NamedTuple):
 
 
 class TapeRoom(NamedTuple):
-    """Memory of a block: addresses in the memory of lanes, this memory, and registers."""
+    """Memory of a block: addresses in the memory of lanes, this memory, registers, candidates and their scratch."""
 
     at: Cells
     m: Array
     r: Array
+    spot: Array
+    w: Array
 
 
 @compiled
@@ -90,9 +97,10 @@ def keep(model: Model, rows: TapeRows, stations: int, d: int, size: int) -> Tape
     """Return the memory for a block of problems."""
     at = arrange(rows.tables, rows.numbers, size)
     m, r = memory(rows.tables, at, LANES)
-    if rows.lifts.registers > len(r):
-        r = np.zeros((rows.lifts.registers, r.shape[1]))
-    return TapeRoom(at, m, r)
+    if rows.lifts.tapes.registers > len(r):
+        r = np.zeros((rows.lifts.tapes.registers, r.shape[1]))
+    spot, w = np.zeros((CANDIDATES, d + 1, LANES)), np.zeros((VECTORS, DEGREE + 2))
+    return TapeRoom(at, m, r, spot, w)
 
 
 @compiled
@@ -124,26 +132,24 @@ def _lift(lifts: Lifts, room: Room, first: bool) -> None:
     together = max(1, r.shape[1] // LANES)
     for lane in range(LANES):
         spare[lane] = 1.0 / scale[lane]
-    for b in range(len(lifts.block) - 1):
-        last, begin = lifts.block[b + 1, ROW], lifts.block[b, INPUT]
-        for row in range(lifts.block[b, ROW], last, together):
+    for b in range(len(lifts.first) - 1):
+        last = lifts.first[b + 1]
+        for row in range(lifts.first[b], last, together):
             end = min(row + together, last)
             for one in range(row, end):
-                _enter(lifts, room, r, one, begin, (one - row) * LANES, spare)
-            for k in range(lifts.block[b, CONSTANT], lifts.block[b + 1, CONSTANT]):
-                for i in range((end - row) * LANES):
-                    r[lifts.constant[k], i] = lifts.value[k]
-            run(lifts.code, lifts.block[b, CODE], lifts.block[b + 1, CODE], r, (end - row) * LANES)
+                _enter(lifts, b, room, r, one, (one - row) * LANES, spare)
+            run_tape(lifts.tapes, b, r, (end - row) * LANES)
             for one in range(row, end):
-                _weigh(lifts.output[b], lifts.sigma[one], r, (one - row) * LANES, first, room.rows[s + one])
+                _weigh(lifts.tapes.table, b, lifts.sigma[one], r, (one - row) * LANES, first, room.rows[s + one])
 
 
 @compiled
-def _enter(lifts: Lifts, room: Room, r: Array, row: int, begin: int, low: int, inverse: Array) -> None:
-    """Write the inputs of a row into their registers; `inverse` is one over the scale."""
-    for i in range(lifts.first[row + 1] - lifts.first[row]):
-        to, line = lifts.input[begin + i], lifts.first[row] + i
-        what, which = lifts.source[line, 0], lifts.source[line, 1]
+def _enter(lifts: Lifts, b: int, room: Room, r: Array, row: int, low: int, inverse: Array) -> None:
+    """Write the inputs of a row of a block into their registers; `inverse` is one over the scale."""
+    table = lifts.tapes.table
+    begin = table[b, INPUT]
+    for i in range(table[b + 1, INPUT] - begin):
+        to, what, which = table[begin + i, 0], lifts.source[row, i, 0], lifts.source[row, i, 1]
         for lane in range(LANES):
             if what == NUMBER:
                 value = lifts.number[which]
@@ -159,13 +165,13 @@ def _enter(lifts: Lifts, room: Room, r: Array, row: int, begin: int, low: int, i
 
 
 @compiled
-def _weigh(output: Array, sigma: float, r: Array, low: int, first: bool, out: Array) -> None:
-    """Write a row (d + 2, W) divided by its error, or by its error at a place one scale away."""
-    last = len(output) - 1
+def _weigh(table: Array, b: int, sigma: float, r: Array, low: int, first: bool, out: Array) -> None:
+    """Write a row (d + 2, W) of a block divided by its error, or by its error at a place one scale away."""
+    begin, last = table[b, OUTPUT], len(out)
     for j in range(last):
         for lane in range(LANES):
-            factor = 1.0 if first else max(abs(r[output[last], low + lane]), NEAR)
-            out[j, lane] = r[output[j], low + lane] / (factor * sigma)
+            factor = 1.0 if first else max(abs(r[table[begin + last, 0], low + lane]), NEAR)
+            out[j, lane] = r[table[begin + j, 0], low + lane] / (factor * sigma)
 
 
 @compiled
@@ -201,6 +207,19 @@ def _minimise_flat(room: Room) -> None:
 
 # One over the share of its diagonal that a pivot must keep: below it three digits of a start are left.
 _MOST = 1e13
+
+
+@compiled
+def scout(model: Model, rows: TapeRows, room: Room) -> None:
+    """Write the best candidates to rows X and OTHER."""
+    for k in range(room.d, room.vector.shape[1]):
+        for lane in range(LANES):
+            room.vector[X, k, lane] = rows.base[k]
+    if model.start == BY_HEIGHT:
+        meet_ellipsoid(model, room, room.own.w, room.own.spot)
+    else:
+        look_around(model, rows, room, room.own.spot, RINGS)
+    refine_candidates(model, rows, room, room.own.spot)
 
 
 @compiled
@@ -313,6 +332,15 @@ def measure_infinity(rows: TapeRows, room: Room) -> None:
     """Write infinity where no far position fits, else NaN: not measured."""
     for lane in range(LANES):
         room.scalar[BEYOND, lane] = np.inf if rows.bounded else np.nan
+
+
+@compiled
+def search_infinity(model: Model, rows: TapeRows, room: Room) -> None:
+    """Write to BEYOND what infinity costs: a search, for fixes that are bent."""
+    if rows.bounded:
+        measure_infinity(rows, room)
+    else:
+        search_sphere(model, rows, room, room.own.spot)
 
 
 @compiled

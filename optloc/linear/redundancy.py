@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.special import gammainccinv
 
 from optloc.base.types import Array
 from optloc.linear.constraints import exact
@@ -105,3 +107,9 @@ def _targets(problem: Problem) -> tuple[list[Array], list[Array]]:
     """Return the targets of the rows of each kind, and whether the rows contain the emission time."""
     targets = [np.asarray(rows.target) for rows in problem.rows]
     return targets, [np.full(rows.count, MODELS[rows.kind].emission) for rows in problem.rows]
+
+
+@lru_cache(maxsize=512)
+def largest(dof: int, probability: float) -> float:
+    """Return the cost that noise exceeds with a probability; infinite without redundancy."""
+    return float(2.0 * gammainccinv(dof / 2, probability)) if dof > 0 else np.inf

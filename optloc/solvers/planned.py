@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optloc.base.records import take
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
+from optloc.engine.memory import COST_OF_FIX, COST_OF_RIVAL, KAPPA, Answer
 from optloc.engine.plan import Load, Plan, plan_of
 from optloc.problem.fix import Active, Stage
 from optloc.problem.problem import Problem
@@ -19,9 +19,6 @@ from optloc.solvers.policy import equal_cost
 from optloc.solvers.pool import Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
 from optloc.solvers.verdict.minima import likelihood_of, measure_curvature
-
-if TYPE_CHECKING:
-    from optloc.engine.memory import Answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,16 +106,13 @@ def _preferred(answer: Answer, problems_at: Callable[[Array], Problem]) -> Answe
     items, some = tied[changed], some.take(np.flatnonzero(changed))
     if not len(items):
         return answer
-    x, rival, cost, rival_cost, covariance, kappa = (
-        np.array(values)
-        for values in (answer.x, answer.rival, answer.cost, answer.rival_cost, answer.covariance, answer.kappa)
-    )
+    x, rival, number, covariance = map(np.array, (answer.x, answer.rival, answer.number, answer.covariance))
     x[items], rival[items] = rival[items], x[items]
-    cost[items], rival_cost[items] = rival_cost[items], cost[items]
+    number[items, COST_OF_FIX], number[items, COST_OF_RIVAL] = answer.rival_cost[items], answer.cost[items]
     at = x[items]
     covariance[items] = measure_curvature(some, equations_at(some, at), at, np.zeros(len(at), dtype=int)).covariance
-    kappa[items] = np.nan  # the verdict looks at its shape
-    return answer._replace(x=x, rival=rival, cost=cost, rival_cost=rival_cost, covariance=covariance, kappa=kappa)
+    number[items, KAPPA:] = np.nan  # the verdict looks at its shape
+    return answer._replace(x=x, rival=rival, number=number, covariance=covariance)
 
 
 def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
@@ -146,17 +140,17 @@ def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
         curvature=Curvature(answer.covariance, kappa=answer.kappa, active=active_of(plan, answer.multiplier)),
         plain=answer.settled & ~rivalled,
         infinity=answer.infinity,
-        free=answer.cost if len(plan.model.admission.output) else None,
+        free=answer.cost if plan.model.admission.level.shape[1] else None,
     )
 
 
 def active_of(plan: Plan, multiplier: Array) -> Array | None:
-    """Return the constraints (N,) that hold fixes, with their multipliers (N, c); None where none does."""
+    """Return the constraints (N,) that hold fixes, with their multipliers (N, k); None where none does."""
     if not plan.held:
         return None
     out = np.empty(len(multiplier), dtype=object)
     for i, own in enumerate(multiplier.tolist()):
-        out[i] = tuple(map(Active, plan.held, own))
+        out[i] = tuple(map(Active, plan.held, own[: len(plan.held)]))
     return out
 
 

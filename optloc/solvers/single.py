@@ -26,6 +26,7 @@ from optloc.engine.memory import Answer
 from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
 from optloc.linear.constraints import is_exact, violation_names
+from optloc.linear.redundancy import largest
 from optloc.problem.chart import Chart, quantile
 from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable
@@ -49,7 +50,6 @@ from optloc.solvers.verdict.findings import (
     ambiguity,
     centre_of,
     chart_kind,
-    largest,
     marks_of,
 )
 

@@ -93,8 +93,7 @@ def test_the_earth_hides_what_arrays_say_it_does():
 def test_exact_sides_come_first_and_levels_with_them():
     held = Band("plane", np.array([1.0, 2.0]), np.array([1.0, 2.0]), np.eye(3)[2], "z")
     problem = posed((*height(0.0), held))
-    node = np.stack([np.zeros(6, dtype=int), np.arange(6)])
-    found = admission_of(problem, node)
+    found = admission_of(problem)
     assert found.exact == 1
     assert np.array_equal(levels_of(problem)[:, 0], [[1.0, 1.0], [2.0, 2.0]])
     assert np.array_equal(levels_of(problem)[:, 1], [[0.0, np.inf]] * 2)
@@ -117,4 +116,4 @@ def test_what_has_no_tape_has_no_plan():
     problem = posed(polygon([[0.0, 0.0], [1e4, 0.0], [0.0, 1e4]]))
     assert plan_of(problem) is None
     speed = Band("speed", np.array(0.0), np.array(3.0), np.zeros(0), "speed")
-    assert admission_of(replace(posed(), constraints=(speed,)), np.zeros((2, 1), dtype=int)) is None
+    assert admission_of(replace(posed(), constraints=(speed,))) is None

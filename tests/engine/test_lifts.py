@@ -5,7 +5,7 @@ import pytest
 
 from optloc import assemble, measured, simulate
 from optloc.compute import jit
-from optloc.compute.lanes import run
+from optloc.compute.tape_table import INPUT, OUTPUT, run_tape
 from optloc.compute.trace import evaluate
 from optloc.engine import lifts
 from optloc.engine.lifts import lift
@@ -29,18 +29,13 @@ ROWS = {
 
 def entries(found, row, inputs):
     """Return the outputs of the tape of a row for numbers by sort of input."""
-    block = int(np.searchsorted(found.block[:, lifts.ROW], row, side="right")) - 1
-    begin, first = found.block[block, lifts.INPUT], found.first[row]
-    registers = np.zeros(found.registers)
-    for i in range(found.first[row + 1] - first):
-        what, which = found.source[first + i]
-        registers[found.input[begin + i]] = found.number[which] if what == lifts.NUMBER else inputs[what][which]
-    span = slice(*found.block[block : block + 2, lifts.CONSTANT])
-    registers[found.constant[span]] = found.value[span]
-    wide = registers[:, None].copy()
+    block, table = int(np.searchsorted(found.first, row, side="right")) - 1, found.tapes.table
+    registers = np.zeros((found.tapes.registers, 1))
+    for (to, *_), (what, which) in zip(table[slice(*table[block : block + 2, INPUT])], found.source[row], strict=False):
+        registers[to] = found.number[which] if what == lifts.NUMBER else inputs[what][which]
     with jit.plain():
-        run(found.code, *found.block[block : block + 2, lifts.CODE], wide, 1)
-    return wide[found.output[block], 0]
+        run_tape(found.tapes, block, registers, 1)
+    return registers[table[slice(*table[block : block + 2, OUTPUT]), 0], 0]
 
 
 @pytest.mark.parametrize("name", ROWS)

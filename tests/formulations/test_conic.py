@@ -138,3 +138,30 @@ def test_cone_projections():
             np.testing.assert_allclose(project(once), once, atol=1e-12)
             # Moreau: what is cut off is orthogonal to what is left
             assert abs(once @ (z - once)) < 1e-12
+
+
+@pytest.mark.parametrize("quadric", [cone(2), cone(3), paraboloid(2), paraboloid(3)])
+@pytest.mark.parametrize("relax", [shor, hull])
+def test_as_few_rows_as_coordinates_give_both_points(relax, quadric):
+    """A line that meets the quadric twice: the relaxation ends between, and its points are the two."""
+    rng, found, n = np.random.default_rng(quadric.size), 0, quadric.size
+    for _ in range(20):
+        ends = rng.uniform(-1.0, 1.0, (2, n))
+        square = (ends[:, :-1] ** 2).sum(-1)
+        ends[:, -1] = np.sqrt(square) if quadric.shape == "cone" else square
+        B = np.linalg.qr(np.stack([ends[1] - ends[0], *rng.standard_normal((n - 1, n))]).T)[0].T[1:]
+        points = relax(B, B @ ends[0], quadric).points
+        there = points[np.isfinite(points).all(-1)]
+        np.testing.assert_allclose(quadric.value(there), 0.0, atol=1e-5)
+        np.testing.assert_allclose(there @ B.T, np.broadcast_to(B @ ends[0], (len(there), n - 1)), atol=1e-4)
+        apart = np.abs(there[:, None] - ends).max(-1).min(0, initial=np.inf)
+        found += (apart < 1e-3).all()
+    assert found >= 15
+
+
+def test_a_tight_answer_has_no_other_points():
+    rng = np.random.default_rng(5)
+    B, g = rng.standard_normal((8, 4)), rng.standard_normal(8)
+    found = shor(B, g, cone(3))
+    assert found.rank_ratio < 1e-6
+    assert np.isnan(found.points).all()

@@ -27,6 +27,9 @@ Factor = Callable[[Array | None], Array]
 # has to be right.
 _NEAR = 1e-3
 
+# Share of the right sides' squares below which a cost is rounding.
+_ALIKE = 1e-12
+
 Pick = Callable[[Array, Array, Quadric], tuple[Array, Array]]
 """Maps rows (N, m, n), right sides (N, m) and the quadric to points (N, q, n), and which of them exist (N, q)."""
 
@@ -102,9 +105,19 @@ def _pick(squared: Squared, distance: Array, point: Array | None, pick: Pick) ->
 
 
 def minimum(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the exact minimiser (N, 1, n) of squared-range problems, and where it exists."""
-    y, ok = minimiser(rows, right, quadric, positive=quadric.shape == "cone")
-    return y[:, None], ok[:, None]
+    """Return the exact minimisers (N, 1 or 2, n) of squared-range problems, and which exist: a minimal set has two."""
+    positive = quadric.shape == "cone"
+    y, ok = minimiser(rows, right, quadric, positive=positive)
+    # a row less than unknowns: the quadric meets the line of points that fit, twice
+    few = np.flatnonzero((rows != 0.0).any(-1).sum(-1) < quadric.size)
+    if not len(few):
+        return y[:, None], ok[:, None]
+    both, valid = np.stack([y, np.full_like(y, np.nan)], axis=1), np.stack([ok, np.zeros_like(ok)], axis=1)
+    points, cost, real = stationary(rows[few], right[few], quadric, positive=positive)
+    fits = real & (cost <= _ALIKE * (1.0 + (right[few] ** 2).sum(-1, keepdims=True)))
+    both[few], valid[few] = points[:, :2], fits[:, :2]
+    both[few, 0], valid[few, 0] = np.where(fits[:, :1], points[:, 0], y[few]), fits[:, 0] | ok[few]
+    return both, valid
 
 
 def every(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
@@ -114,26 +127,28 @@ def every(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
 
 
 def shor(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the answers (N, 1, n) of Shor's semidefinite relaxation, over threads."""
+    """Return the answers (N, 3, n) of Shor's semidefinite relaxation, over threads: see `_one_by_one`."""
     from formulations.squared_range_conic import shor as relax
 
     return _one_by_one(relax, rows, right, quadric)
 
 
 def hull(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the answers (N, 1, n) of the second-order cone relaxation, over threads."""
+    """Return the answers (N, 3, n) of the second-order cone relaxation, over threads: see `_one_by_one`."""
     from formulations.squared_range_conic import hull as relax
 
     return _one_by_one(relax, rows, right, quadric)
 
 
 def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
+    """Return relaxed points, and the points of the quadric that they are between where there are two answers."""
     # missing data: the solver is not asked
     usable = np.isfinite(rows).all((-1, -2)) & np.isfinite(right).all(-1)
-    y = np.full((len(rows), 1, quadric.size), np.nan)
+    y = np.full((len(rows), 3, quadric.size), np.nan)
 
     def solve_one(i: int) -> None:
-        y[i, 0] = relax(rows[i], right[i], quadric, bound=False).y
+        found = relax(rows[i], right[i], quadric, bound=False)
+        y[i, 0], y[i, 1:] = found.y, found.points
 
     mapped(solve_one, np.flatnonzero(usable).tolist(), least=WORTH)
     return y, np.isfinite(y).all(-1)

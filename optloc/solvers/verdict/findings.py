@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.special import gammainccinv
 
 from optloc.adequacy.shape import BENT, cost_at_infinity, departure
 from optloc.base.linalg import centre_and_spread, centre_of_points
 from optloc.base.records import present, take
 from optloc.base.types import Array, Certificate, Status
 from optloc.linear.constraints import faces
+from optloc.linear.redundancy import largest
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.claims import GLOBAL, Claims, claim
 from optloc.problem.fix import tail_probability
@@ -118,12 +117,6 @@ def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
     for level in np.unique(dof[dof > 0]):
         out |= (dof == level) & (cost > largest(int(level), probability))
     return out
-
-
-@lru_cache(maxsize=512)
-def largest(dof: int, probability: float) -> float:
-    """Return the cost that noise exceeds with a probability; infinite without redundancy, which tells nothing."""
-    return float(2.0 * gammainccinv(dof / 2, probability)) if dof > 0 else np.inf
 
 
 def _is_unique(pool: Pool) -> Array:

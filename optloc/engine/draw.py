@@ -1,0 +1,286 @@
+"""How a plan is drawn: one problem's structure as the arrays that the steps of the engine follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optloc.base.linalg import project_out, whitening
+from optloc.base.types import Array, Band
+from optloc.compute.pack import pack
+from optloc.engine.candidates import directions
+from optloc.engine.lifts import Lifts, lift
+from optloc.engine.memory import (
+    BY_HEIGHT,
+    BY_PLACES,
+    BY_SQUARES,
+    HEARD,
+    RANGED,
+    SEEN,
+    SIGN,
+    Admission,
+    Model,
+)
+from optloc.engine.ranges import RangeRows
+from optloc.engine.tapes import TapeRows
+from optloc.linear.constraints import is_exact
+from optloc.linear.evaluate import block_links, columns
+from optloc.linear.least_squares_ranges import Ranges, ranges
+from optloc.linear.normal import weighed
+from optloc.linear.redundancy import degrees_of_freedom, largest
+from optloc.linear.vectors import hold_still, vectors
+from optloc.models import MODELS
+from optloc.problem.noise import variances, whiten, whiten_rows
+from optloc.problem.problem import Problem
+
+# Share of the largest weight below which a combination of rows is rounding: four digits above it.
+_NOTHING = 1e-12
+# Share of a combination of ranges that their common part may have left by rounding: differences have none of it.
+_LEVEL = 1e-9
+
+
+class Drawn(NamedTuple):
+    """The places of a plan, how its measurements become a start, and its rows."""
+
+    node: Array
+    model: Model
+    rows: Callable[[Problem], Any]
+    ranged: bool
+
+
+def draw_ranges(one: Problem, admission: Admission) -> Drawn | None:
+    """Return rows that are sums of ranges; None where they lack rows for a start, or links between stations."""
+    offset = None
+    if one.stations.estimated:  # along the lines to the target, they are noise
+        offset = columns(one.layout, "stations", np.zeros(1, dtype=int))[0]
+        one = replace(one, stations=replace(one.stations, span="noise"))
+    found = _find_ranges(one)
+    # Stations that no row links would have ranges that nothing relates.
+    if found is None or len(found.groups[0]) != 1:
+        return None
+    node = _nodes(one, found)
+    model = _model(one, found, node, admission)
+    if model is None or _start_of(one, found, admission, 0) != BY_SQUARES:
+        return None
+    turned, made = _range_rows(weighed(one), node[1])
+    if offset is not None:
+        assert one.stations.covariance is not None
+        first = offset.reshape(-1, one.dimension)[node[1], 0]
+        made = made._replace(wander=np.array(one.stations.covariance[node[1], 0, 0]), offset=first)
+    return Drawn(node, model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made, True)
+
+
+def draw_tapes(one: Problem, admission: Admission, dof: int) -> Drawn | None:
+    """Return rows as tapes; None where they have none, or no start."""
+    found = _find_ranges(one)
+    node = _nodes(one, found)
+    model = _model(one, found, node, admission)
+    if model is None:
+        return None
+    places = {(int(station), int(epoch)): i for i, (epoch, station) in enumerate(node.T)}
+    lifts = lift(hold_still(one.flat()).take(np.zeros(1, dtype=int)), found, places, model.reference >= 0)
+    make = partial(_tape_rows, one.correction, vectors(one.flat(), None)[0], lifts, _is_bounded(one))
+    start = _start_of(one, found, admission, len(lifts.sigma))
+    if start is None or make(one) is None:
+        return None
+    height = _height_of(one)
+    if start == BY_HEIGHT and height is not None:
+        model = model._replace(start=start, height=height)
+    elif start == BY_PLACES:
+        model = model._replace(start=start, limit=largest(dof, _POOR))
+    return Drawn(node, model, make, False)
+
+
+def _find_ranges(one: Problem) -> Ranges | None:
+    """Return the least-squares ranges of one problem as maps: of measurements that are unit vectors."""
+    return ranges(weighed(_probe(hold_still(one.flat()))))
+
+
+# Probability of the chi-square test below which a better place is looked for, as `optloc.solvers.policy.DOUBT`.
+_POOR = 1e-3
+# Ranges that are known up to one unknown, with a height: they determine a position.
+_THREE = 3
+
+
+def _start_of(one: Problem, found: Ranges | None, admission: Admission, lifted: int) -> int | None:
+    """Return the way fixes start, see `Model.start`; None for rows without a start.
+
+    Squared ranges need a linear row for each coordinate; the quadric gives the last unknown.
+    """
+    known = 0 if found is None else int(found.inside[0].sum())
+    if lifted + known == 0:
+        return None
+    on_cone = found is not None and bool(found.free.all())
+    if lifted + known - on_cone >= one.dimension:
+        return BY_SQUARES
+    if known == _THREE and on_cone and not lifted and admission.earth and _height_of(one) is not None:
+        return BY_HEIGHT
+    moving = one.stations.position.shape[-3] > 1
+    spare = degrees_of_freedom(one.flat())[0] > 0  # without, any place would fit
+    return BY_PLACES if moving and one.epochs > 1 and spare else BY_SQUARES
+
+
+def _height_of(one: Problem) -> int | None:
+    """Return the source of the height of the target, see `Model.height`."""
+    held = [band for band in one.constraints if is_exact(band)]
+    for i, band in enumerate(held):
+        if isinstance(band, Band) and band.kind == "height":
+            return i
+    for rows, start in zip(one.rows, one.starts, strict=True):
+        if rows.kind == "height" and (rows.weight > 0.0).any():
+            return -1 - start - int((rows.weight > 0.0).argmax())
+    return None
+
+
+def _probe(problem: Problem) -> Problem:
+    """Return one problem for each row, whose measurement is one and all others zero."""
+    # A linear map is known by its images of the unit vectors.
+    parts = np.split(np.eye(problem.count), problem.starts[1:], axis=1)
+    rows = tuple(replace(r, z=part, correction=np.zeros(r.count)) for r, part in zip(problem.rows, parts, strict=True))
+    return replace(problem, rows=rows, stations=replace(problem.stations, velocity=None, axes=None))
+
+
+def _nodes(one: Problem, found: Ranges | None) -> Array:
+    """Return epoch and station (2, s) of the places that take part: first those whose ranges are known."""
+    moving = one.stations.position.shape[-3] > 1
+    known = _known(found)
+    first = [] if found is None else list(zip(found.epoch[known].tolist(), found.station[known].tolist(), strict=True))
+    others = {
+        (int(rows.epoch[i]) if moving else 0, int(end[i]))
+        for rows in one.rows
+        for end in (rows.a, rows.b)[: MODELS[rows.kind].stations]
+        for i in np.flatnonzero(rows.weight > 0.0)
+    }
+    return np.array([*first, *sorted(others - {*first})], dtype=np.int64).reshape(-1, 2).T
+
+
+def _known(found: Ranges | None) -> Array:
+    """Return the stations with ranges."""
+    return np.zeros(0, dtype=np.int64) if found is None else np.flatnonzero(found.inside[0])
+
+
+def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> Model | None:
+    """Return the maps from measurements of one problem to a start by squares; None where noise is singular."""
+    count, s, flat, known = one.count, node.shape[1], one.flat(), _known(found)
+    white = np.eye(s)
+    if found is not None:
+        white[: len(known), : len(known)] = whitening(found.covariance[0, known[:, None], known])
+    # The compiled core takes triangular matrices only: a covariance that is singular has none.
+    if np.triu(white, 1).any():
+        return None
+    added, gain = np.zeros(count), np.zeros(count)
+    base = vectors(flat, None)
+    for links, rows, start in zip(block_links(one), one.rows, one.starts, strict=True):
+        part = slice(start, start + rows.count)
+        gain[part], added[part] = links.gains.total(base, rows.count)[0], links.adds.total(base, rows.count)[0]
+    present = one.weight > 0.0
+    precision = np.where(present, 1.0 / np.where(present, variances(weighed(one).noise, count), 1.0), 0.0)
+    linear, station, reference = np.zeros((s, count)), np.zeros((SEEN + 1, s)), -1
+    if found is not None:
+        linear[: len(known)] = found.offset[:, known].T
+        station[SIGN, : len(known)], station[RANGED, : len(known)] = found.sign[0, known], 1.0
+        reference = int(np.searchsorted(known, found.reference[0])) if found.free.all() else -1
+    station[HEARD], station[SEEN] = _hearing(one, node)
+    row = np.stack([one.correction + added, precision, 1.0 / (1.0 + gain)])
+    anchor, ahead = _anchors(one)[0], directions(one.dimension)
+    return Model(row, anchor, linear, station, reference, white, admission, BY_SQUARES, -1, ahead, np.inf)
+
+
+def _hearing(one: Problem, node: Array) -> tuple[Array, Array]:
+    """Return 1.0 for the places (s,) that a row is of, and for those that an angle is of."""
+    moving = one.stations.position.shape[-3] > 1
+    heard, seen = np.zeros(node.shape[1]), np.zeros(node.shape[1])
+    for rows in one.rows:
+        model = MODELS[rows.kind]
+        for index in (rows.a, rows.b)[: model.stations]:
+            for i in np.flatnonzero(rows.weight > 0.0):
+                own = (node[1] == index[i]) & (node[0] == (rows.epoch[i] if moving else 0))
+                heard[own] = 1.0
+                seen[own] = 1.0 if model.quantity == "angle" else seen[own]
+    return heard, seen
+
+
+def _anchors(one: Problem) -> tuple[Array, Array]:
+    """Return the row from which the emission time of each row (m,) and of each epoch (k,) is counted, or -1."""
+    anchor, start = np.full(one.count, -1), np.full(one.epochs if one.layout.n_local else 0, -1)
+    for rows, first in zip(one.rows, one.starts, strict=True):
+        if MODELS[rows.kind].emission:
+            for i in np.flatnonzero(rows.weight > 0.0):
+                epoch = int(rows.epoch[i])
+                start[epoch] = first + i if start[epoch] < 0 else start[epoch]
+                anchor[first + i] = start[epoch]
+    return anchor, start
+
+
+def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
+    """Return the maps to whitened rows, emission times and loops; and the rows over the ranges to stations (s,)."""
+    design, emitted = _design(one, station)
+    alone = whiten_rows(whiten(one.noise, one.weight), np.eye(one.count))
+    times = alone @ emitted
+    # Emission times projected out: what is left of the rows depends on ranges alone.
+    bare = project_out(times, alone)
+    basis, upper = np.linalg.qr(bare @ design, mode="complete")
+    inside = min(upper.shape)
+    turned = basis.T @ bare
+    loops = turned[inside:]
+    # Combinations of rows that no range moves: their cost is the misfit of loops.
+    loops = loops[np.abs(loops).max(-1, initial=0.0) > _NOTHING * np.abs(alone).max()]
+    emission = np.linalg.pinv(times) @ alone
+    share = upper[:inside]
+    norm = float(np.linalg.norm(share, 2)) if share.size else 0.0
+    return np.concatenate([turned[:inside], emission, loops]), RangeRows(
+        one.correction,
+        np.array(share, order="C"),
+        np.array(emission @ design, order="C"),
+        _anchors(one)[1],
+        norm,
+        bool(np.abs(share.sum(-1)).max(initial=0.0) <= _LEVEL * norm),
+        np.zeros(0),
+        np.zeros(0, dtype=np.int64),
+    )
+
+
+def _design(one: Problem, station: Array) -> tuple[Array, Array]:
+    """Return the rows over ranges (m, s) and emission times (m, k)."""
+    design, emitted = np.zeros((one.count, len(station))), np.zeros((one.count, len(_anchors(one)[1])))
+    place = {int(s): i for i, s in enumerate(station)}
+    for rows, first in zip(one.rows, one.starts, strict=True):
+        model = MODELS[rows.kind]
+        for i in np.flatnonzero(rows.weight > 0.0):
+            for coefficient, end in zip(model.ranges or (), (int(rows.a[i]), int(rows.b[i])), strict=False):
+                if coefficient:
+                    design[first + i, place[end]] += coefficient
+            if model.emission:
+                emitted[first + i, int(rows.epoch[i])] = 1.0
+    return design, emitted
+
+
+def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, problem: Problem) -> TapeRows | None:
+    """Return the rows of problems as tapes, or None where they have none."""
+    bare = problem.with_rows(z=np.zeros(problem.count))
+    found = pack(bare, whiten(weighed(bare).noise, bare.weight))
+    return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts, bounded)
+
+
+def _is_bounded(one: Problem) -> bool:
+    """Return whether some row, or a prior, costs without bound wherever a target goes far away.
+
+    Ranges that add up do, but for a scale or an offset without a prior; so do heights, and a prior on the position.
+    """
+    free = {bias.name for bias in one.biases if bias.sigma is None or bias.form == "scale"}
+    touched = np.zeros(one.count, dtype=bool)
+    for bias in one.biases:
+        touched[bias.row] |= bias.name in free
+    if any(prior.name == "position" for prior in one.priors):
+        return True
+    for rows, start in zip(one.rows, one.starts, strict=True):
+        model = MODELS[rows.kind]
+        grows = rows.kind == "height" or (model.ranges is not None and sum(model.ranges) != 0 and not model.emission)
+        present = (rows.weight > 0.0) & ~touched[start : start + rows.count]
+        if grows and present.any():
+            return True
+    return False

@@ -1,0 +1,85 @@
+"""The cost of infinity: the least of all directions, on a sphere so wide that wave fronts are flat."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.systems import LANES
+from optloc.engine.admission import restore
+from optloc.engine.candidates import look_around
+from optloc.engine.memory import (
+    BEYOND,
+    COST,
+    FIX,
+    FIX_H,
+    GOOD,
+    RADIUS,
+    SPREAD,
+    H,
+    Model,
+    Room,
+    X,
+)
+from optloc.engine.refine import refine
+
+# Distance in the place of infinity, spreads of the stations: wave fronts bend by 5e-8 of the spread there, and rounding
+# of a difference of ranges is 1e-9 of it.
+_INFINITE = 1e7
+# Of the refinement of directions: their costs are compared with gaps of several.
+_TOLERANCE, _STEPS = 1e-2, 12
+
+
+@compiled
+def search_sphere(model: Model, rows: Any, room: Room, spot: Array) -> None:
+    """Write the least cost of infinity to BEYOND; row X and its information stay as they are.
+
+    The direction of the fix is refined, and the cheapest of each sector.
+    """
+    scalar, vector, d = room.scalar, room.vector, room.d
+    _keep(room)
+    for lane in range(LANES):
+        scalar[BEYOND, lane] = np.inf
+        scalar[RADIUS, lane] = _INFINITE * scalar[SPREAD, lane]
+    look_around(model, rows, room, spot, 1)
+    for k in range(-1, len(spot)):
+        for lane in range(LANES):
+            scalar[GOOD, lane] = 1.0 if k < 0 or spot[k, 0, lane] < np.inf else 0.0
+            for j in range(vector.shape[1]):
+                there = spot[k, j, lane] if k >= 0 and j < d else vector[FIX, j, lane]
+                vector[X, j, lane] = there if scalar[GOOD, lane] != 0.0 else vector[FIX, j, lane]
+        restore(model, room, 0)
+        refine(model, rows, room, _TOLERANCE, _STEPS)
+        for lane in range(LANES):
+            cost = min(np.inf, scalar[COST, lane])
+            scalar[BEYOND, lane] = min(scalar[BEYOND, lane], cost)
+    for lane in range(LANES):
+        scalar[RADIUS, lane] = 0.0
+    _bring_back(room)
+
+
+@compiled
+def _keep(room: Room) -> None:
+    """Copy row X and its information to row FIX and its own."""
+    vector, matrix = room.vector, room.matrix
+    for i in range(vector.shape[1]):
+        for lane in range(LANES):
+            vector[FIX, i, lane] = vector[X, i, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                matrix[FIX_H, i, j, lane] = matrix[H, i, j, lane]
+
+
+@compiled
+def _bring_back(room: Room) -> None:
+    """Copy row FIX and its information to row X and its own."""
+    vector, matrix = room.vector, room.matrix
+    for i in range(vector.shape[1]):
+        for lane in range(LANES):
+            vector[X, i, lane] = vector[FIX, i, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                matrix[H, i, j, lane] = matrix[FIX_H, i, j, lane]
