@@ -10,7 +10,7 @@ from functools import cache, partial, update_wrapper
 from importlib import import_module
 from threading import Lock
 from types import FunctionType
-from typing import Any, TypeVar, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.threads import held_by_forks
@@ -21,6 +21,12 @@ from optloc.compute.kept import begin_child, folder, is_kept, kept, locked, name
 from optloc.compute.progress import Reporter
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+Constant: TypeAlias = int
+"""The annotation of an argument that has machine code for each constant in the calls, not one for all.
+
+Annotations are read as text, so a module with kernels has ``from __future__ import annotations``.
+"""
 
 # A context variable: one thread may run plainly while others run machine code.
 _PLAIN = ContextVar("plain", default=False)
@@ -91,6 +97,8 @@ class _Kernel(Compilable):
                 made = self._forms.get(callee)
                 if made is None:
                     made = _numba().njit(**options(callee=callee, taken_in=self.taken_in))(self.function)
+                    if callee:
+                        _take_as_variables(made, self.function)
                     # What numba's own option `cache` sets; where nothing can be written, machine code is not kept.
                     made._cache = kept(self, callee=callee) or made._cache  # noqa: SLF001
                     self._forms[callee] = made
@@ -124,6 +132,26 @@ class _Kernel(Compilable):
         finally:
             REPORTER.end()
         self.ready = True
+
+
+def _take_as_variables(made: Any, function: Callable[..., Any]) -> None:
+    """Compile constants in calls like variables, except for arguments that are a `Constant`.
+
+    numba compiles a callee once more for each constant that it is handed, and for its callees in turn: of a thousand
+    forms, 175 differed by a constant. LLVM knows the constants in what it inlines all the same.
+    """
+    from numba.core import types
+
+    numba: Any = types  # half typed
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    kept = {name for name, kind in function.__annotations__.items() if kind == "Constant"}
+    template, fold = made.get_call_template, made._compiler.fold_argument_types  # noqa: SLF001
+
+    def template_of_variables(args: Any, kws: Any) -> Any:
+        args = fold(args, kws)[1]
+        return template([a if n in kept else numba.unliteral(a) for n, a in zip(names, args, strict=True)], {})
+
+    made.get_call_template = template_of_variables
 
 
 @contextmanager
@@ -340,6 +368,7 @@ def with_constants(
         if changed:
             own = FunctionType(old.__code__, {**old.__globals__, **changed}, old.__name__, old.__defaults__)
             own.__qualname__, own.__doc__ = f"{old.__qualname__}_{mark}", old.__doc__
+            own.__annotations__ = old.__annotations__
             made[one] = _Kernel(own, taken_in=one.taken_in)
         return made[one]
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import Constant, compiled
 from optloc.compute.pack import AT, FULL, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
 from optloc.compute.tables import (
     DERIVATIVE,
@@ -176,13 +176,13 @@ def blocks(packed: Packed, size: int, count: int) -> int:
 
 
 @compiled
-def memory(t: Tables, room: Cells, lanes: int) -> tuple[Array, Array]:
+def memory(t: Tables, room: Cells, lanes: Constant) -> tuple[Array, Array]:
     """Return cells and registers for a number of lanes."""
     return np.zeros((room.cells, lanes)), np.zeros((t.registers, max(LENGTH, lanes)))
 
 
 @compiled
-def run(code: Array, first: int, last: int, r: Array, count: int) -> None:
+def run(code: Array, first: int, last: int, r: Array, count: Constant) -> None:
     """Run operations on the first numbers of registers; see `Tape` and `symbol.OPERATIONS`."""
     # The operation is chosen once for all lanes, and each loop is one that the compiler turns into vector
     # instructions.
@@ -208,7 +208,7 @@ def run(code: Array, first: int, last: int, r: Array, count: int) -> None:
 
 
 @compiled
-def _rare(operation: int, r: Array, to: int, u: int, v: int, count: int) -> None:
+def _rare(operation: int, r: Array, to: int, u: int, v: int, count: Constant) -> None:
     if operation == NEG:
         for i in range(count):
             r[to, i] = -r[u, i]
@@ -234,7 +234,7 @@ def _rare(operation: int, r: Array, to: int, u: int, v: int, count: int) -> None
 
 
 @compiled
-def measure(t: Tables, common: Array, m: Array, r: Array, room: Cells, packet: int, x: int, lanes: int) -> None:
+def measure(t: Tables, common: Array, m: Array, r: Array, room: Cells, packet: int, x: int, lanes: Constant) -> None:
     """Write derivatives and residuals of a packet: columns of the row's group, then the residual.
 
     Parameters
@@ -280,7 +280,7 @@ def measure(t: Tables, common: Array, m: Array, r: Array, room: Cells, packet: i
 
 @compiled
 def _inputs(
-    t: Tables, common: Array, m: Array, own: int, r: Array, begin: int, row: int, end: int, x: int, lanes: int
+    t: Tables, common: Array, m: Array, own: int, r: Array, begin: int, row: int, end: int, x: int, lanes: Constant
 ) -> None:
     """Write the inputs of rows of one kind, which `begin` in the table of inputs, into their registers."""
     index = t.table
@@ -302,7 +302,7 @@ def _inputs(
 
 
 @compiled
-def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int, to: int, lanes: int) -> None:
+def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int, to: int, lanes: Constant) -> None:
     """Write the derivatives of h of one row by the unknowns that move its inputs."""
     index = t.table
     source = index[line, ROW_SOURCE]
@@ -320,7 +320,7 @@ def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int,
 
 @compiled
 def _measurement(
-    t: Tables, m: Array, r: Array, place: int, line: int, low: int, to: int, x: int, scale: int, lanes: int
+    t: Tables, m: Array, r: Array, place: int, line: int, low: int, to: int, x: int, scale: int, lanes: Constant
 ) -> None:
     """Write the value of one row behind its derivatives, and what scales and offsets do to both."""
     index = t.table
@@ -353,7 +353,7 @@ def _measurement(
 
 
 @compiled
-def _residual(m: Array, value: int, observed: int, periodic: int, lanes: int) -> None:
+def _residual(m: Array, value: int, observed: int, periodic: int, lanes: Constant) -> None:
     """Replace values by residuals, angles wrapped."""
     for b in range(lanes):
         m[value, b] = m[observed, b] - m[value, b]
@@ -365,7 +365,7 @@ def _residual(m: Array, value: int, observed: int, periodic: int, lanes: int) ->
 
 
 @compiled
-def _mask(m: Array, value: int, present: int, lanes: int) -> None:
+def _mask(m: Array, value: int, present: int, lanes: Constant) -> None:
     """Make the residuals of absent rows zero."""
     for b in range(lanes):
         m[value, b] = m[value, b] if m[present, b] != 0.0 else 0.0
@@ -375,7 +375,7 @@ def _mask(m: Array, value: int, present: int, lanes: int) -> None:
 
 
 @compiled
-def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool, lanes: int) -> None:
+def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool, lanes: Constant) -> None:
     """Write the normal equations at `room.trial` into `room.after`.
 
     Parameters
@@ -407,7 +407,7 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool,
 
 
 @compiled
-def clear(m: Array, first: int, count: int, lanes: int) -> None:
+def clear(m: Array, first: int, count: int, lanes: Constant) -> None:
     """Write zeros."""
     for cell in range(first, first + count):
         for b in range(lanes):
@@ -415,7 +415,7 @@ def clear(m: Array, first: int, count: int, lanes: int) -> None:
 
 
 @compiled
-def add_group(t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, lanes: int) -> None:
+def add_group(t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, lanes: Constant) -> None:
     """Add the whitened rows of a group to the equations in `room.after`."""
     line = t.group + group
     begin, size = t.table[line, GROUP_COLUMN], t.table[line, GROUP_ROWS]
@@ -426,7 +426,7 @@ def add_group(t: Tables, common: Array, place: Array, m: Array, room: Cells, gro
 
 @compiled
 def whiten_group(
-    t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, residual: bool, lanes: int
+    t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, residual: bool, lanes: Constant
 ) -> int:
     """Whiten the rows of a group, or their residuals alone, and return the cell of the first."""
     line = t.group + group
@@ -450,7 +450,7 @@ def _whiten(
     size: int,
     columns: int,
     to: int,
-    lanes: int,
+    lanes: Constant,
 ) -> None:
     """Write `size` rows from cell `first` on, whitened, to cell `to`."""
     for i in range(size):
@@ -482,7 +482,7 @@ def _square(
     columns: int,
     to: int,
     last: int,
-    lanes: int,
+    lanes: Constant,
 ) -> None:
     """Add the products of the columns of whitened rows; the last column is the residual."""
     for i in range(columns):
@@ -505,7 +505,7 @@ def _square(
 
 @compiled
 def add_prior(
-    common: Array, place: int, size: int, m: Array, room: Cells, x: int, start: int, last: int, lanes: int
+    common: Array, place: int, size: int, m: Array, room: Cells, x: int, start: int, last: int, lanes: Constant
 ) -> None:
     """Add a Gaussian prior of the `size` unknowns at cell x on, whose first column is `start`."""
     error, pull, to = room.error, room.error + size, room.after
