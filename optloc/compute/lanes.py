@@ -178,7 +178,7 @@ def blocks(packed: Packed, size: int, count: int) -> int:
 @compiled
 def memory(t: Tables, room: Cells, lanes: Constant) -> tuple[Array, Array]:
     """Return cells and registers for a number of lanes."""
-    return np.zeros((room.cells, lanes)), np.zeros((t.registers, max(LENGTH, lanes)))
+    return np.zeros((room.cells, lanes)), np.empty((t.registers, max(LENGTH, lanes)))
 
 
 @compiled

@@ -109,7 +109,18 @@ class Model(NamedTuple):
     limit: float
 
 
-COST_OF_FIX, COST_OF_RIVAL, SETTLED, AT_INFINITY, KAPPA, KAPPA_FAR = range(6)
+class Found(NamedTuple):
+    """One line of `Answer.number`; `Answer` has the columns by the same names."""
+
+    cost: float
+    rival_cost: float
+    settled: float
+    infinity: float
+    kappa: float
+    kappa_far: float
+
+
+COST_OF_FIX, COST_OF_RIVAL, SETTLED, AT_INFINITY, KAPPA, KAPPA_FAR = range(len(Found._fields))
 """Columns of `Answer.number`."""
 MULTIPLIER, VALUE, GRADIENT = range(3)
 """Last axis of `Answer.side`."""
@@ -127,7 +138,7 @@ class Answer(NamedTuple):
     rival : array (N, size)
         Another minimum that the mirror image of the fix leads to, and which costs no more than `LISTED` more; NaN.
     number : array (N, 6)
-        See the names of its columns.
+        See `Found`.
     side : array (N, k, 2 + d)
         Of each held or bounded quantity its multiplier, where it is held: the gradient of the cost and all gradients
         times their multipliers add up to nothing; its value, and its gradient.

@@ -98,7 +98,7 @@ def keep(model: Model, rows: TapeRows, stations: int, d: int, size: int) -> Tape
     at = arrange(rows.tables, rows.numbers, size)
     m, r = memory(rows.tables, at, LANES)
     if rows.lifts.tapes.registers > len(r):
-        r = np.zeros((rows.lifts.tapes.registers, r.shape[1]))
+        r = np.empty((rows.lifts.tapes.registers, r.shape[1]))
     spot, w = np.zeros((CANDIDATES, d + 1, LANES)), np.zeros((VECTORS, DEGREE + 2))
     return TapeRoom(at, m, r, spot, w)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from math import prod
+from math import inf, isnan, prod
 from threading import local
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band, Certificate, Status, first_status
 from optloc.compute.jit import usable
-from optloc.engine.memory import Answer
+from optloc.engine.memory import Answer, Found
 from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
 from optloc.linear.constraints import is_exact, violation_names
@@ -187,26 +187,26 @@ class Single:
             room.z[:, self.absent] = 0.0
         answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *room.found)
         steps = kernel(*self.load[:2], room.z, self.load.place, TOLERANCE, LIMIT, False, answer)
-        costs = answer.cost.tolist()
-        for cost, settled, rival in zip(costs, answer.settled.tolist(), answer.rival_cost.tolist(), strict=True):
+        found = [Found(*numbers) for numbers in answer.number.tolist()]
+        for one in found:
             # on Earth the sight of satellites says which of two that cost the same is meant
-            tied = self.plan.frame.geodetic and rival - cost <= equal_cost(cost)
-            if not settled or tied or not cost <= self.doubt:
+            tied = self.plan.frame.geodetic and one.rival_cost - one.cost <= equal_cost(one.cost)
+            if not one.settled or tied or not one.cost <= self.doubt:
                 return None
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
         if self.map is not None:
-            if not self._proves(self.map, answer, costs, room):
+            if not self._proves(self.map, answer, found, room):
                 return None
             told = "global" if self.edges is None else f"within {violation_names(self.problem)}"
             stages = (*stages, certify_stage(f"{n} {told}", fixed))
-        fix = self._judge(shape, answer, costs, stages, room)
+        fix = self._judge(shape, answer, found, stages, room)
         if fix is not None and not room.checked:
             room.checked = self._agrees(fix, room)
             return fix if room.checked else None
         return fix
 
-    def _proves(self, affine: Affine, answer: Answer, costs: list[float], room: _Room) -> bool:
+    def _proves(self, affine: Affine, answer: Answer, found: list[Found], room: _Room) -> bool:
         """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
         asked, answered, d = room.asked, room.answered, self.load.place.shape[-1]
         asked.known[:] = answer.rival_cost < np.inf
@@ -214,19 +214,19 @@ class Single:
         if self.upward is not None:
             normal = answer.normal[:, self.upward]
             asked.surface[:, UP:] = normal / np.sqrt((normal * normal).sum(-1, keepdims=True))
-        for i, cost in enumerate(costs):
+        for i, one in enumerate(found):
             affine.write(room.z[i], room.costs, i)
-            asked.eps[i] = equal_cost(cost)
+            asked.eps[i] = equal_cost(one.cost)
         asked.x[:] = answer.x[:, :d]
         prove_here(room.costs, asked, answered)
         if self.edges is not None and not self._is_inside(self.edges, answer, room):
             return False
-        told = zip(costs, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
-        for cost, verdict, bound, everywhere, shown, met in told:
+        told = zip(found, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
+        for one, verdict, bound, everywhere, shown, met in told:
             if verdict != UNIQUE or not everywhere or shown != LISTED_GAP or met:
                 return False
             # a bound that is not that of this cost is one of another: the long way finds out which is wrong
-            if not abs(cost - bound) <= _APART * equal_cost(cost):
+            if not abs(one.cost - bound) <= _APART * equal_cost(one.cost):
                 return False
         return True
 
@@ -249,29 +249,28 @@ class Single:
         self,
         shape: tuple[int, ...],
         answer: Any,
-        costs: list[float],
+        found: list[Found],
         stages: tuple[Stage, ...],
         room: _Room,
     ) -> Fix | None:
         """Return the fixes with their verdicts, or None where more stands against one than words without numbers."""
         marks, kinds, gaps = [], [], []
-        numbers = (answer.kappa.tolist(), answer.infinity.tolist(), answer.rival_cost.tolist())
-        for cost, bent, least, rival in zip(costs, *numbers, strict=True):
-            more, gap = least - cost, rival - cost
-            if bent[0] > STRAIGHT and more != more:  # nobody has looked at infinity  # noqa: PLR0124
+        for one in found:
+            more, gap = one.infinity - one.cost, one.rival_cost - one.cost
+            if one.kappa > STRAIGHT and isnan(more):  # nobody has looked at infinity
                 return None
-            marks.append(marks_of(cost > self.refuted, more, self.region, gap, bent[0], self.map is not None))
-            kinds.append(chart_kind(*bent))
+            marks.append(marks_of(one.cost > self.refuted, more, self.region, gap, one.kappa, self.map is not None))
+            kinds.append(chart_kind(one.kappa, one.kappa_far))
             gaps.append(ambiguity(self.problem, gap) if gap < AMBIGUOUS_GAP else "")
         told = _told(tuple(marks), tuple(kinds), tuple(gaps), shape)
         if told is None:
             return None
         x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
-        held = active_of(self.plan, answer.multiplier)
+        held, alone = active_of(self.plan, answer.multiplier), all(one.rival_cost == inf for one in found)
         cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.load.place.shape[-1]
         if self.map is not None:
             bound, boxes = room.answered.bound.reshape(shape).copy(), room.answered.boxes.reshape(shape).copy()
-            reason = claims.reason if min(numbers[2]) == np.inf else _reasons(answer.rival_cost < np.inf, shape)
+            reason = claims.reason if alone else _reasons(answer.rival_cost < np.inf, shape)
             claims = Claims(
                 claims.proof, reason, claims.method, bound, cost - bound,
                 claims.unique, claims.margin, boxes, claims.region, claims.asked,
@@ -287,7 +286,7 @@ class Single:
             marks=told.marks,
             chart=Chart(told.kind, x[..., :d], covariance[..., :d, :d], room.centre),
             infinity=answer.infinity.reshape(shape) - cost,
-            alternatives=room.alone if min(numbers[2]) == np.inf else _rivals(answer, shape),
+            alternatives=room.alone if alone else _rivals(answer, shape),
             active=room.nothing if held is None else held.reshape(shape),
             **room.kept,
         )

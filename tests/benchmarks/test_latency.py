@@ -85,7 +85,7 @@ def kernels(place):
 
     def work(i):
         room.z[0] = z[i]
-        fix_few_ranges(short.plan.model, short.rows, room.z, short.place, TOLERANCE, LIMIT, False, answer)
+        fix_few_ranges(short.load.model, short.load.rows, room.z, short.load.place, TOLERANCE, LIMIT, False, answer)
         short.map.write(z[i], room.costs, 0)
         room.asked.x[0] = x[0]
         prove_here(room.costs, room.asked, room.answered)
