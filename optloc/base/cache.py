@@ -11,13 +11,21 @@ What is kept is shared by all threads: nobody writes into it.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from threading import Lock
-from typing import Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
+
+import numpy as np
 
 from optloc.base.threads import held_by_forks
 
 Value = TypeVar("Value")
+
+# Most entries of an array in a key: copying and hashing them takes some 30 us.
+_ENTRIES = 4096
+# Types of values that cannot change.
+_ATOMS = frozenset({str, bytes, bool, int, float, complex, type(None)})
 
 # None is a value (there are no tables for some structures), so a place that waits for its value holds this.
 _NOTHING = object()
@@ -99,3 +107,45 @@ class Cache(Generic[Value]):
             self._total += place.weight
             while self._total > self._most:
                 self._total -= self._places.pop(next(iter(self._places))).weight
+
+
+class _NoKeyError(Exception):
+    """A value is too large for a key, or may change without notice."""
+
+
+def key_of(*values: Any) -> Hashable | None:
+    """Return a key that is equal for equal content, bit by bit; None where a value is too large or of another type.
+
+    Parameters
+    ----------
+    *values : object
+        Numbers, texts, numpy arrays, and tuples, lists, dictionaries and dataclasses of these.
+    """
+    try:
+        return tuple([_content(value) for value in values])
+    except _NoKeyError:
+        return None
+
+
+def _content(value: Any) -> Hashable:
+    kind = type(value)
+    if kind in _ATOMS:
+        return cast("Hashable", value)
+    if kind is np.ndarray:
+        if value.size > _ENTRIES or value.dtype.hasobject:
+            raise _NoKeyError
+        return value.shape, value.dtype.str, value.tobytes()
+    if kind is tuple or kind is list:
+        return (kind, *[_content(each) for each in value])
+    if kind is dict:
+        return (kind, *value, *[_content(each) for each in value.values()])
+    if isinstance(value, np.generic):
+        return kind, cast("Hashable", value.item())
+    return (kind, *[_content(getattr(value, name)) for name in _fields(cast("Hashable", kind))])
+
+
+@cache
+def _fields(kind: Any) -> tuple[str, ...]:
+    if not is_dataclass(kind):
+        raise _NoKeyError
+    return tuple(one.name for one in fields(kind))

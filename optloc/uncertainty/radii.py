@@ -126,7 +126,7 @@ def probability(variance: Array, square: Array) -> tuple[Array, Array, Array]:
     """
     nodes, weights = _contour()
     factors = 1.0 + (2.0 * variance / square[..., None])[..., None] * nodes
-    # Each factor has a root of its own: the product may have turned past the negative axis.
+    # Roots of the factors, not of their product, whose angle may exceed half a turn.
     found = ((1.0 / np.sqrt(factors).prod(-2)) @ weights).real
     return found[..., 0], found[..., 1], found[..., 2]
 
