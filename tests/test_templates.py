@@ -9,6 +9,8 @@ import optloc
 from optloc import InvalidProblem, assemble, constraints, measured
 from optloc.base.cache import key_of
 from optloc.base.types import Bias, Prior, Stations
+from optloc.files import by_station
+from optloc.files import locate as locating
 from optloc.problem import build
 from optloc.problem.problem import Problem
 
@@ -171,3 +173,82 @@ def test_keys_tell_shapes_types_and_names_apart():
     assert None not in keys
     assert len(set(keys)) == len(keys)
     assert key_of(np.arange(3.0), ["a", bias]) == key_of(np.arange(3.0), ["a", replace(bias)])
+
+
+# One call from receivers to a fix: what it reads of stations, units and names is kept.
+
+PLACES = {"A": (0.0, 0.0, 10.0), "B": (900.0, 0.0, 0.0), "C": (0.0, 900.0, 50.0), "D": (800.0, 900.0, 0.0)}
+GLOBE = {"A": (47.0, 11.0), "B": (47.01, 11.0), "C": (47.0, 11.01), "D": (47.01, 11.01)}
+LENGTHS = {"A": 500.0, "B": 640.0, "C": 640.0, "D": 700.0}
+TIMES = {name: length / 299792458.0 for name, length in LENGTHS.items()}
+ANGLES = {"A": 40.0, "B": -50.0, "C": 140.0, "D": float("nan")}
+CALLS = {
+    "ranges": ((PLACES,), {"ranges": LENGTHS, "sigma": 30.0}),
+    "whole numbers": ((PLACES,), {"ranges": {name: int(r) for name, r in LENGTHS.items()}, "sigma": 30}),
+    "lists": (([*PLACES.values()],), {"ranges": [*LENGTHS.values()], "sigma": "3e1 m"}),
+    "arrays": ((np.array([*PLACES.values()]),), {"ranges": np.array([[*LENGTHS.values()]] * 2), "sigma": 30.0}),
+    "stations": ((Stations(np.array([[*PLACES.values()]]), tuple(PLACES)),), {"ranges": LENGTHS, "sigma": 30.0}),
+    "other names": (({f"{name}1": p for name, p in PLACES.items()},), {"ranges": [*LENGTHS.values()], "sigma": 30.0}),
+    "numbers as names": (
+        (dict(enumerate(PLACES.values())),),
+        {"ranges": dict(enumerate(LENGTHS.values())), "sigma": 9},
+    ),
+    "names that look like them": (
+        (dict(zip([False, 1.0, 2, 3], PLACES.values(), strict=True)),),
+        {"ranges": dict(zip([False, 1.0, 2, 3], LENGTHS.values(), strict=True)), "sigma": 9},
+    ),
+    "arrivals": ((PLACES,), {"toa": TIMES, "sigma": "100 ns"}),
+    "nanoseconds": ((PLACES,), {"toa": {n: round(1e9 * t) for n, t in TIMES.items()}, "unit": "ns", "sigma": 100.0}),
+    "differences": ((PLACES,), {"tdoa": {(n, "A"): 1e-7 for n in "BCD"}, "sigma": 1e-7, "height": (0.0, 500.0)}),
+    "reference": ((PLACES,), {"tdoa": dict.fromkeys("ACD", 1e-7), "reference": "B", "sigma": 1e-7}),
+    "on Earth": ((), {"latlon": GLOBE, "toa": TIMES, "sigma": 1e-7}),
+    "bearings": ((), {"latlon": GLOBE, "bearings": ANGLES, "sigma": 2.0, "declination": "4 deg"}),
+    "anticlockwise": ((), {"latlon": GLOBE, "bearings": ANGLES, "sigma": 2.0, "azimuth": "north-counterclockwise"}),
+    "two kinds": ((PLACES,), {"ranges": LENGTHS, "bearings": ANGLES, "sigma": {"ranges": 30.0, "bearings": "2 deg"}}),
+    "no such unit": ((PLACES,), {"ranges": LENGTHS, "sigma": 30.0, "unit": "parsec"}),
+    "no such station": ((PLACES,), {"ranges": {"A": 1.0, "E": 2.0}, "sigma": 30.0}),
+    "no sigma": ((PLACES,), {"ranges": LENGTHS}),
+    "a list as sigma": ((PLACES,), {"ranges": LENGTHS, "sigma": [30.0]}),
+    "sigma of a boolean": ((PLACES,), {"ranges": LENGTHS, "sigma": True}),
+    "no such frame": ((PLACES,), {"ranges": LENGTHS, "sigma": 30.0, "frame": "moon"}),
+    "no stations": (({},), {"ranges": LENGTHS, "sigma": 30.0}),
+    "infinite": ((PLACES,), {"ranges": {"A": np.inf, "B": 2.0}, "sigma": 30.0}),
+    "an infinite instant": ((PLACES,), {"toa": {"A": np.inf, "B": np.nan}, "sigma": 1e-7}),
+    "too coarse": ((PLACES,), {"toa": {name: 1.7e9 + t for name, t in TIMES.items()}, "sigma": 1e-7}),
+    "too far": ((PLACES,), {"tdoa": {"B": 1.0, "C": 2.0}, "sigma": 1e-7}),
+}
+
+
+def posed(monkeypatch, args, options):
+    """Return the problem that `locate` makes, or the error."""
+    found = []
+    monkeypatch.setattr(locating, "solve", lambda problem, method: found.append(problem))
+    try:
+        locating.locate(*args, **options)
+    except InvalidProblem as error:
+        return str(error)
+    return found[0]
+
+
+def test_locate_reads_the_same_again(monkeypatch):
+    """Calls of all forms, one after the other, twice: a problem equals that of a process without anything kept."""
+    alone = {}
+    for name, (args, options) in CALLS.items():
+        for kept in (locating._PLACES, locating._SCALES, by_station._ENDS, build._TEMPLATES):
+            kept.clear()
+        alone[name] = posed(monkeypatch, args, options)
+    for _ in range(2):
+        for name, (args, options) in CALLS.items():
+            assert same(posed(monkeypatch, args, options), alone[name]), name
+    assert sum(isinstance(found, str) for found in alone.values()) == 11
+    assert alone["names that look like them"].stations.names == ("False", "1.0", "2", "3")
+    assert alone["numbers as names"].stations.names == ("0", "1", "2", "3")
+
+
+def test_locate_does_not_keep_what_a_caller_changes(monkeypatch):
+    place, names = np.array([*PLACES.values()]), [*LENGTHS.values()]
+    first = posed(monkeypatch, (place,), {"ranges": names, "sigma": 30.0})
+    place[0] = 77.0
+    second = posed(monkeypatch, (place,), {"ranges": names, "sigma": 30.0})
+    assert (first.stations.position[0, 0] == PLACES["A"]).all()
+    assert (second.stations.position[0, 0] == 77.0).all()

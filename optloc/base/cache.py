@@ -24,8 +24,8 @@ Value = TypeVar("Value")
 
 # Most entries of an array in a key: copying and hashing them takes some 30 us.
 _ENTRIES = 4096
-# Types of values that cannot change.
-_ATOMS = frozenset({str, bytes, bool, int, float, complex, type(None)})
+# Types of values that cannot change; equal numbers of the second ones differ as text.
+_ATOMS, _WHOLE = frozenset({str, bytes, float, type(None)}), frozenset({int, bool, complex})
 
 # None is a value (there are no tables for some structures), so a place that waits for its value holds this.
 _NOTHING = object()
@@ -89,6 +89,11 @@ class Cache(Generic[Value]):
                     self._fill(key, place, make)
         return cast("Value", place.value)
 
+    def call(self, make: Callable[..., Value], *values: Any) -> Value:
+        """Return the result of a function of values, from the cache where their content has a key."""
+        key = key_of(*values)
+        return make(*values) if key is None else self.find(key, lambda: make(*values))
+
     def _fill(self, key: Hashable, place: _Place, make: Callable[[], Value]) -> None:
         try:
             value = make()
@@ -114,7 +119,7 @@ class _NoKeyError(Exception):
 
 
 def key_of(*values: Any) -> Hashable | None:
-    """Return a key that is equal for equal content, bit by bit; None where a value is too large or of another type.
+    """Return a key that is equal for equal content; None where a value is too large or of another type.
 
     Parameters
     ----------
@@ -127,10 +132,10 @@ def key_of(*values: Any) -> Hashable | None:
         return None
 
 
-def _content(value: Any) -> Hashable:
+def _content(value: Any) -> Any:
     kind = type(value)
     if kind in _ATOMS:
-        return cast("Hashable", value)
+        return value
     if kind is np.ndarray:
         if value.size > _ENTRIES or value.dtype.hasobject:
             raise _NoKeyError
@@ -138,10 +143,12 @@ def _content(value: Any) -> Hashable:
     if kind is tuple or kind is list:
         return (kind, *[_content(each) for each in value])
     if kind is dict:
-        return (kind, *value, *[_content(each) for each in value.values()])
+        return (kind, *[_content(each) for pair in value.items() for each in pair])
+    if kind in _WHOLE:
+        return kind, value
     if isinstance(value, np.generic):
-        return kind, cast("Hashable", value.item())
-    return (kind, *[_content(getattr(value, name)) for name in _fields(cast("Hashable", kind))])
+        return kind, value.item()
+    return (kind, *[_content(getattr(value, name)) for name in _fields(kind)])  # type: ignore[arg-type]  # types are hashable
 
 
 @cache

@@ -251,12 +251,12 @@ class _Template(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Return the count of its numbers: a row has ten in the key, and its share of a covariance."""
-        return sum(10 * block.row.size + block.covariance.size for block in self.noise.blocks)
+        """Return about how many numbers it takes: 500 for objects, its covariances, and ten a row for the key."""
+        return 500 + sum(10 * block.row.size + block.covariance.size for block in self.noise.blocks)
 
 
-# 32 MB of numbers: 20 000 structures of five rows.
-_TEMPLATES = Cache[_Template](2**22, lambda template: template.size)
+# 8 MB of numbers: some 2 000 structures of few rows.
+_TEMPLATES = Cache[_Template](2**20, lambda template: template.size)
 # Cached properties of a problem, none of which depends on its measurements.
 _DERIVED = ("starts", "layout", "batch_shape", "structure")
 
