@@ -147,8 +147,8 @@ def test_no_loose_module():
 # headings of vehicles;
 # back ends of studies (a part of methods before) and their trial, contours and the regions that they draw;
 # the digest of a kernel, and how numba is asked to compile; the engine: what its steps ask of rows, rows of ranges and
-# of tapes, linear rows beside squared ranges, what is admitted, plans, and parameter vectors; bounds out of reach; values
-# of one call by station.
+# of tapes, linear rows beside squared ranges, what is admitted, plans, and parameter vectors; bounds out of reach;
+# values of one call by station.
 MODULES, LINES, BODY, RECURRING = 382, 600, 60, 20
 
 
