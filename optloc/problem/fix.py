@@ -17,7 +17,7 @@ from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
 
 _STATES = ("position", "velocity", "acceleration")
-# By status number: a search in the list takes 30 us, and a text asks five times.
+# By status number: a search in the list takes 30 us, and a text needs five.
 _HAS_ANSWER = np.isin(np.arange(1 + max(Status)), ANSWERED)
 # Sizes of stations and target together, beyond which a standard deviation of a position says nothing: a fix is not
 # Gaussian from one on, and what symmetry leaves open is wider by many decades.
