@@ -11,14 +11,12 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, NoSolution, status_named
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.types import ANSWERED, NOTES, PRECEDENCE, Array, Status, statuses_of
+from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Status, statuses_of
 from optloc.problem.chart import Chart, Extent
 from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
 
 _STATES = ("position", "velocity", "acceleration")
-# By status number: a search in the list takes 30 us, and a text needs five.
-_HAS_ANSWER = np.isin(np.arange(1 + max(Status)), ANSWERED)
 # Sizes of stations and target together, beyond which a standard deviation of a position says nothing: a fix is not
 # Gaussian from one on, and what symmetry leaves open is wider by many decades.
 _OPEN = 100.0
@@ -433,7 +431,7 @@ class Fix:
     def answered(self) -> Array:
         """Return where there is a position with a covariance, whatever stands against it, (...)."""
         # that of a run to infinity has none
-        return _HAS_ANSWER[self.code] & np.isfinite(self.x).any(-1)
+        return HAS_ANSWER[self.code] & np.isfinite(self.x).any(-1)
 
     def has(self, *statuses: Status) -> Array:
         """Return where one of some statuses is among the findings, (...)."""
