@@ -41,6 +41,21 @@ def test_geodetic_comes_back_at_every_height(height):
     assert np.abs(geodetic_to_ecef(lat2, lon2, height2) - p).max() < 1e-14 * size
 
 
+@pytest.mark.parametrize("height", [-6e6, -5e6])
+def test_latitudes_deep_in_the_earth(height):
+    lat = np.linspace(-np.pi / 2, np.pi / 2, 501)
+    assert ecef_to_geodetic(geodetic_to_ecef(lat, 0.3, height))[0] == pytest.approx(lat, abs=1e-12)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (1e-3, 0.0, 0.0), (0.0, 100.0, 0.0), (-3e4, 0.0, 0.0)])
+def test_places_at_the_centre_have_a_latitude_too(place):
+    lat, lon, height = ecef_to_geodetic(place)
+    assert lat == 0.0
+    assert geodetic_to_ecef(lat, lon, height) == pytest.approx(place, abs=1e-8)
+    axes = ECEF.enu_axes(place)
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-15)
+
+
 @pytest.mark.parametrize("shape", [(), (1,), (2, 3), (0,), (1, 1)])
 def test_leading_axes_stay(shape):
     p = np.broadcast_to(geodetic_to_ecef(0.5, 1.0, 100.0), (*shape, 3))

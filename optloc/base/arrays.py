@@ -117,6 +117,8 @@ def numbers(values: Any, name: str) -> Array | None:
 
 def whole(values: Any, name: str) -> Array | None:
     """Return values as an integer array, None for None; refuse what would have to be rounded."""
+    if isinstance(values, int | np.ndarray) and np.asarray(values).dtype.kind == "i":
+        return np.asarray(values, dtype=np.int64)
     array = numbers(values, name)
     if array is None:
         return None
@@ -132,10 +134,10 @@ def positive(values: Any, name: str, kind: str) -> Array | None:
     array = numbers(values, name)
     if array is None:
         return None
-    bad = np.argwhere(~((array > 0.0) & np.isfinite(array)))
-    if len(bad):
-        place, value = tuple(bad[0]), array[tuple(bad[0])]
-        row = place[-1] if place else 0
+    good = (array > 0.0) & (array < np.inf)
+    if not good.all():
+        place = tuple(np.argwhere(~good)[0])
+        row, value = place[-1] if place else 0, array[place]
         raise InvalidProblem(f"{kind} row {row} has {value:g}", name, "give a positive number")
     return array
 

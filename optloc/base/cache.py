@@ -11,13 +11,21 @@ What is kept is shared by all threads: nobody writes into it.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from threading import Lock
-from typing import Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
+
+import numpy as np
 
 from optloc.base.threads import held_by_forks
 
 Value = TypeVar("Value")
+
+# Most entries of an array in a key: copying and hashing them takes some 30 us.
+_ENTRIES = 4096
+# Types of values that cannot change; equal numbers of the second ones differ as text.
+_ATOMS, _WHOLE = frozenset({str, bytes, float, type(None)}), frozenset({int, bool, complex})
 
 # None is a value (there are no tables for some structures), so a place that waits for its value holds this.
 _NOTHING = object()
@@ -81,6 +89,11 @@ class Cache(Generic[Value]):
                     self._fill(key, place, make)
         return cast("Value", place.value)
 
+    def call(self, make: Callable[..., Value], *values: Any) -> Value:
+        """Return the result of a function of values, from the cache where their content has a key."""
+        key = key_of(*values)
+        return make(*values) if key is None else self.find(key, lambda: make(*values))
+
     def _fill(self, key: Hashable, place: _Place, make: Callable[[], Value]) -> None:
         try:
             value = make()
@@ -99,3 +112,47 @@ class Cache(Generic[Value]):
             self._total += place.weight
             while self._total > self._most:
                 self._total -= self._places.pop(next(iter(self._places))).weight
+
+
+class _NoKeyError(Exception):
+    """A value is too large for a key, or may change without notice."""
+
+
+def key_of(*values: Any) -> Hashable | None:
+    """Return a key that is equal for equal content; None where a value is too large or of another type.
+
+    Parameters
+    ----------
+    *values : object
+        Numbers, texts, numpy arrays, and tuples, lists, dictionaries and dataclasses of these.
+    """
+    try:
+        return tuple([_content(value) for value in values])
+    except _NoKeyError:
+        return None
+
+
+def _content(value: Any) -> Any:
+    kind = type(value)
+    if kind in _ATOMS:
+        return value
+    if kind is np.ndarray:
+        if value.size > _ENTRIES or value.dtype.hasobject:
+            raise _NoKeyError
+        return value.shape, value.dtype.str, value.tobytes()
+    if kind is tuple or kind is list:
+        return (kind, *[_content(each) for each in value])
+    if kind is dict:
+        return (kind, *[_content(each) for pair in value.items() for each in pair])
+    if kind in _WHOLE:
+        return kind, value
+    if isinstance(value, np.generic):
+        return kind, value.item()
+    return (kind, *[_content(getattr(value, name)) for name in _fields(kind)])  # type: ignore[arg-type]  # types are hashable
+
+
+@cache
+def _fields(kind: Any) -> tuple[str, ...]:
+    if not is_dataclass(kind):
+        raise _NoKeyError
+    return tuple(one.name for one in fields(kind))

@@ -396,6 +396,9 @@ ANSWERED = (
 )
 """Statuses of fixes that have a position with a covariance, as far as there is a finite one."""
 
+HAS_ANSWER = np.isin(np.arange(1 + max(Status)), ANSWERED)
+"""The same by status number: a search takes 30 us, and the text of a fix needs five."""
+
 
 def first_status(marks: Array) -> Array:
     """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing but notes does."""

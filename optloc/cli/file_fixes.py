@@ -168,7 +168,7 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     ]
     # One row a fix wherever it has one target and one epoch; else what belongs to the fix stands with the run.
     single = len(rows) == len(per_fix)
-    if len(rows) == 1 == len(per_fix):  # of one fix: the radii take milliseconds each
+    if len(rows) == 1 == len(per_fix):  # tables of many have their covariances
         per_fix[0]["accuracy"] = asdict(accuracy(level_covariance(found.columns, 0)))
     stages = {stage.name: stage for fix in found.fixes for stage in fix.stages}
     origin = None if frame.origin is None else [*np.degrees(frame.origin[:2]).tolist(), frame.origin[2]]

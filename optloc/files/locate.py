@@ -5,18 +5,20 @@ Everything becomes `optloc.problem.build.measured` and `assemble`; what these fu
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any, NamedTuple, cast, get_args
 
 import numpy as np
 
+from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Stations
 from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
-from optloc.files.columns import stem, unit_of
+from optloc.files.by_station import ARGUMENTS, StationValues, station_values
+from optloc.files.columns import stem
 from optloc.files.declination import angle_of, date_of, declinations
 from optloc.files.readings import CARTESIAN, COMPASS
 from optloc.files.roles import WORDS, worded
@@ -31,47 +33,28 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 
-
-class _Word(NamedTuple):
-    """What an argument of `locate` is: a kind, the unit of bare numbers, and what messages call its values."""
-
-    kind: str
-    unit: str
-    noun: str
-
-
-_WORDS = {
-    "toa": _Word("toa", "s", "times of arrival"),
-    "tdoa": _Word("tdoa", "s", "time differences"),
-    "ranges": _Word("range", "m", "ranges"),
-    "pseudoranges": _Word("toa", "m", "pseudoranges"),
-    "bearings": _Word("azimuth", "deg", "bearings"),
-    "elevations": _Word("elevation", "deg", "elevations"),
-}
 # Nothing is nearer to the centre of the Earth than its poles, metres.
 _SURFACE = 6.3e6
 # Arrivals differ by no more than the way between two stations; that many times as much is another unit.
 _TOO_FAR = 100.0
+# Receivers, and conversions with their standard deviations, of the last some hundred calls.
+_PLACES, _SCALES = Cache["_Receivers"](64), Cache[tuple[Conversion, float]](256)
 # Steps between two floats that stand for an instant, as a share of its standard deviation, which nobody would see.
 _STEP = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class _Receivers:
-    """Stations in their frame, and whether heights were left out on Earth."""
+    """Stations in their frame, whether heights were left out on Earth, and the greatest distance along an axis."""
 
     stations: Stations
     frame: Frame
     level: bool
+    extent: float
 
     @property
     def names(self) -> tuple[str, ...]:
         return self.stations.names
-
-    @property
-    def extent(self) -> float:
-        """Return the greatest distance between two stations along one axis."""
-        return float(np.ptp(self.stations.position, axis=-2).max())
 
 
 class _North(NamedTuple):
@@ -79,14 +62,6 @@ class _North(NamedTuple):
 
     azimuth: str
     declination: Any
-
-
-class _Readings(NamedTuple):
-    """Values (..., m) as they are given, what each belongs to, and the unit that their column names."""
-
-    values: Array
-    keys: list[Any]
-    unit: str | None = None
 
 
 def locate(
@@ -235,19 +210,26 @@ def _problem_of(
 ) -> Problem:
     """Return the problem of the arguments of `locate`."""
     medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
-    places = _receivers(stations, latlon, frame)
+    places = _PLACES.call(_receivers, stations, latlon, frame)
     rows = []
     for word, values in given.items():
-        found = _readings(word, values, places.names, reference)
-        units = Units(cast("Quantity", MODELS[_WORDS[word].kind].quantity), speed)
-        own = _per_word(unit, word, given, "unit") or found.unit or _WORDS[word].unit
-        convention = cast("AzimuthConvention", north.azimuth if word == "bearings" else CARTESIAN)
-        step = replace(units, convention=convention).conversion(own, f"unit of {word}")
-        spread = _spread(_per_word(sigma, word, given, "sigma"), word, units, own)
+        found = station_values(word, values, places.names, reference)
+        own = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
+        convention = north.azimuth if word == "bearings" else CARTESIAN
+        step, spread = _SCALES.call(_scale, word, own, sigma, list(given), speed, convention)
         made = _rows(word, found, spread, step, places, speed)
         rows.append(_from_north(made, north, own, places) if word == "bearings" else made)
     at = _heights(height, places, given)
     return assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
+
+
+def _scale(
+    word: str, unit: str, sigma: Any, words: Sequence[str], speed: float, convention: AzimuthConvention
+) -> tuple[Conversion, float]:
+    """Return the conversion of values to SI units, and their standard deviation in SI units."""
+    units = Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed)
+    step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
+    return step, _spread(_per_word(sigma, word, words, "sigma"), word, units, unit)
 
 
 # Where the receivers are.
@@ -273,7 +255,8 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     order = np.argsort(found.index)
     axes_of = None if found.axes is None else found.axes[order]
     made = station_array(found.position[order], found.names, axes=axes_of)
-    return _Receivers(made, own, globe and not table.has("height"))
+    extent = float(np.ptp(made.position, axis=-2).max())
+    return _Receivers(made, own, globe and not table.has("height"), extent)
 
 
 def _station_table(given: Any, where: str, axes: Sequence[str]) -> Table:
@@ -336,7 +319,7 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
 # What they measured.
 
 
-def _per_word(given: Any, word: str, words: Mapping[str, Any], name: str) -> Any:
+def _per_word(given: Any, word: str, words: Collection[str], name: str) -> Any:
     """Return what an argument that may be one for each kind says of a kind."""
     if isinstance(given, Mapping):
         unknown = [key for key in given if key not in words]
@@ -352,7 +335,7 @@ def _per_word(given: Any, word: str, words: Mapping[str, Any], name: str) -> Any
 
 def _spread(sigma: Any, word: str, units: Units, unit: str) -> float:
     """Return the standard deviation of one value, SI."""
-    noun, default = _WORDS[word].noun, units.conversion(unit, f"unit of {word}")
+    noun, default = ARGUMENTS[word].noun, units.conversion(unit, f"unit of {word}")
     if sigma is None:
         advice = f"give their standard deviation in {unit}, such as sigma=..., or as text with a unit"
         raise InvalidProblem(f"nothing says how accurate the {noun} are", "sigma", advice)
@@ -369,167 +352,11 @@ def _spread(sigma: Any, word: str, units: Units, unit: str) -> float:
     return value
 
 
-def _readings(word: str, given: Any, names: Sequence[str], reference: str | None) -> _Readings:
-    """Return values by what they belong to: a station, or of time differences a pair of them."""
-    if reference is not None and reference not in names:
-        raise InvalidProblem(f"there is no station {reference!r}", "reference", nearest(str(reference), names))
-    first = names[0] if reference is None else reference
-    given = _with_names(given)
-    if hasattr(given, "columns") and hasattr(given, "index"):
-        found = _of_table(word, given, names, first)
-    elif hasattr(given, "index") and hasattr(given, "to_numpy"):
-        found = _Readings(_numbers(word, given.to_numpy()), list(given.index))
-    elif isinstance(given, Mapping):
-        columns = [_numbers(word, value) for value in given.values()]
-        if len({np.shape(column) for column in columns}) > 1:
-            raise InvalidProblem("some stations have more values than others", word, "give each as many, NaN for none")
-        if any(column.dtype.kind == "M" for column in columns):
-            columns = [column if column.dtype.kind == "M" else _no_dates(word, column) for column in columns]
-        found = _Readings(np.stack(columns, axis=-1) if columns else np.zeros(0), list(given))
-    else:
-        values, keys = _numbers(word, given), list(names)
-        if word == "tdoa" and values.ndim and values.shape[-1] == len(names) - 1:
-            keys.remove(first)
-        if values.ndim == 0 or values.shape[-1] != len(keys):
-            what = f"{values.shape[-1] if values.ndim else 1} values for {len(names)} stations"
-            raise InvalidProblem(what, word, "give one for each, NaN where there is none, or name: value")
-        found = _Readings(values, keys)
-    if not found.keys:
-        raise InvalidProblem("there are no values", word, "give name: value")
-    ends = [_ends(word, key, names, first) for key in found.keys]
-    kept = [i for i, (a, b) in enumerate(ends) if a != b]  # the reference against itself says nothing
-    if not kept:
-        raise InvalidProblem("there is nothing but the reference", word, "give the other stations")
-    return _Readings(found.values[..., kept], [ends[i] for i in kept], found.unit)
-
-
-def _with_names(given: Any) -> Any:
-    """Return a structured array as a mapping, and tables of polars, pyarrow and xarray as pandas has them.
-
-    Each of them names what its values belong to: an array alone would take them in the order of the stations.
-    """
-    fields = getattr(getattr(given, "dtype", None), "names", None)
-    if fields:
-        return {name: given[name] for name in fields}
-    return given.to_pandas() if hasattr(given, "to_pandas") else given
-
-
-def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[int, int]:
-    """Return the numbers of the stations that a key names; -1 where there is one station only."""
-    pair = key if isinstance(key, tuple) else (key,)
-    if word == "tdoa" and len(pair) == 1 and str(key) not in names:
-        cut = [(str(key)[:i], str(key)[i + 1 :]) for i, sign in enumerate(str(key)) if sign == "-"]
-        pair = next((each for each in cut if set(each) <= set(names)), pair)
-    if word == "tdoa" and len(pair) == 1:
-        pair = (pair[0], reference)
-    if len(pair) != (2 if word == "tdoa" else 1):
-        raise InvalidProblem(f"{key!r} does not name what was measured", word, "use the name of a station")
-    unknown = [str(name) for name in pair if str(name) not in names]
-    if unknown:
-        raise InvalidProblem(f"there is no station {unknown[0]!r}", word, nearest(unknown[0], names))
-    one, *other = (names.index(str(name)) for name in pair)
-    return one, other[0] if other else -1
-
-
-def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: str) -> list[Any]:
-    """Return the columns of a data frame whose names are those of stations, or of pairs of them."""
-    found = []
-    for column in columns:
-        try:
-            _ends(word, column, names, reference)
-        except InvalidProblem:
-            continue
-        found.append(column)
-    return found
-
-
-def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> _Readings:
-    """Return the values of a data frame with one column for each station or pair; every column must be one."""
-    columns = list(frame.columns)
-    for column in columns:
-        try:
-            _ends(word, column, names, reference)
-        except InvalidProblem as error:
-            advice = f"{error.advice}; drop a column that holds no {_WORDS[word].noun}"
-            raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
-    # By number: two columns may have one name.
-    values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
-    return _Readings(np.stack(values, axis=-1), columns)
-
-
-def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> _Readings:
-    """Return the values of a data frame: one column for each station, or one row for each value."""
-    columns = list(frame.columns)
-    wide = _named(word, columns, names, reference)
-    if wide and len(wide) == len(columns):
-        return _wide(word, frame, names, reference)
-    stems = {stem(str(name)): name for name in reversed(list(frame.columns))}
-    kind = _WORDS[word].kind
-    value_words = [*WORDS["z"].split(), *(stem(each) for each in (word, word.rstrip("s"), kind, *MODELS[kind].aliases))]
-    value_words += ["time", "timestamp"] if word == "toa" else []
-    chosen = {
-        role: next((stems[each] for each in words if each in stems), None)
-        for role, words in (("a", WORDS["a"].split()), ("b", WORDS["b"].split()), ("z", value_words))
-    }
-    tidy = None not in (chosen["a"], chosen["z"]) and {*wide} <= {*chosen.values()}
-    if wide and not tidy:
-        return _wide(word, frame, names, reference)
-    for role, text in (("a", "station"), ("z", "value")):
-        if chosen[role] is None:
-            listed = ", ".join(str(name) for name in columns)
-            advice = "call columns by the stations, or use the columns station and value"
-            if {str(label) for label in frame.index} <= {*names}:
-                advice = "its rows are the stations: give the transposed frame, .T"
-            raise InvalidProblem(f"no column is a {text}; there are {listed}", word, advice)
-    epochs = next((stems[each] for each in ("epoch", "message", "msg", "pulse") if each in stems), None)
-    ends = [str(name) for name in frame[chosen["a"]]]
-    if word == "tdoa" and chosen["b"] is not None:
-        ends = list(zip(ends, (str(name) for name in frame[chosen["b"]]), strict=True))  # type: ignore[arg-type]
-    labels = [None] * len(ends) if epochs is None else frame[epochs].tolist()
-    keys, rows = ({one: i for i, one in enumerate(dict.fromkeys(each))} for each in (ends, labels))
-    values = _numbers(word, frame[chosen["z"]].to_numpy())
-    grid = np.full(
-        (len(rows), len(keys)),
-        np.datetime64("NaT") if values.dtype.kind == "M" else np.nan,
-        dtype=values.dtype if values.dtype.kind == "M" else float,
-    )
-    seen: set[tuple[int, int]] = set()
-    # Whole numbers are counted from the least, so that nanoseconds of today keep their digits as floats.
-    values = values - values.min() if values.dtype.kind in "iu" else values
-    for value, key, label in zip(values, ends, labels, strict=True):
-        place = (rows[label], keys[key])
-        if place in seen:
-            what = f"{key} has two values" + ("" if label is None else f" at {label}")
-            raise InvalidProblem(what, word, "leave one of them out, or give a column epoch")
-        seen.add(place)
-        grid[place] = value
-    named = unit_of(str(chosen["z"]), ("s", "ms", "us", "ns", "ps", "m", "km", "cm", "mm", "ft", "deg", "rad"))
-    return _Readings(grid if epochs is not None else grid[0], list(keys), named)
-
-
-def _no_dates(word: str, values: Array) -> Array:
-    """Return missing dates in the place of missing numbers; numbers beside dates are refused."""
-    if not np.isnan(values).all():
-        raise InvalidProblem("some instants are dates, and others are numbers", word, "give all as one or the other")
-    return np.full(values.shape, np.datetime64("NaT", "ns"))
-
-
-def _numbers(word: str, values: Any) -> Array:
-    """Return values as an array of numbers or dates; None is NaN."""
-    try:
-        array = np.asarray(values)
-        if array.dtype.kind in "OSU":
-            array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711  (of every entry)
-    except (TypeError, ValueError):
-        array = np.zeros(0, dtype=bool)
-    if array.dtype.kind not in "iufM" or (array.dtype.kind == "M" and word != "toa"):
-        raise InvalidProblem("these are not numbers", word, "give numbers, NaN where there is none")
-    return array
-
-
-def _rows(word: str, found: _Readings, sigma: float, unit: Conversion, places: _Receivers, speed: float) -> Measured:
+def _rows(
+    word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, speed: float
+) -> Measured:
     """Return readings in SI units as rows."""
-    kind = _WORDS[word].kind
+    kind = ARGUMENTS[word].kind
     a, b = np.array(found.keys, dtype=np.int64).T
     values = found.values
     if word == "toa":
@@ -574,20 +401,20 @@ def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
         return np.where(known, (counted - first) * 1e-9, np.nan)
     if times.dtype.kind in "iu":
         return np.asarray((times - times.min(-1, keepdims=True)).astype(float))
-    coarse = np.spacing(np.nanmax(np.abs(times))) * unit.factor if np.isfinite(times).any() else 0.0
+    with np.errstate(invalid="ignore"):
+        coarse = np.spacing(np.fmax.reduce(np.abs(times), axis=None, initial=0.0)) * unit.factor
+        first = np.fmin.reduce(times, axis=-1, keepdims=True)
+        counted = np.asarray(times - np.where(np.isfinite(first), first, 0.0))
     if coarse > _STEP * sigma:
         what = f"these instants are rounded to {coarse:.3g} m of the way, more than their sigma tells"
         advice = "give whole nanoseconds with unit='ns', numpy.datetime64, or times since a recent instant"
         raise InvalidProblem(what, "toa", advice)
-    with np.errstate(all="ignore"):
-        return np.asarray(
-            times - np.nanmin(np.where(np.isfinite(times).any(-1, keepdims=True), times, 0.0), axis=-1, keepdims=True)
-        )
+    return counted
 
 
 def _check_far(word: str, z: Array, sigma: float, places: _Receivers) -> None:
     """Refuse times that no signal takes between stations: they have another unit."""
-    most = float(np.nanmax(np.abs(z), initial=0.0))
+    most = float(np.fmax.reduce(np.abs(z), axis=None, initial=0.0))
     if most > _TOO_FAR * max(places.extent, sigma):
         what = f"the arrivals are {most / 1e3:.3g} km apart, and the stations {places.extent / 1e3:.3g} km"
         raise InvalidProblem(what, word, "say the unit of the times, such as unit='ns', or correct them")

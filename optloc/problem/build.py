@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from optloc.base.arrays import numbers, positive, whole
+from optloc.base.cache import Cache, key_of
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
 from optloc.base.types import Array, Bias, Motion, Prior, Rows, Stations
 from optloc.models import BEARING, MODELS, kind_named
 from optloc.models.medium import Medium
 from optloc.problem import noise as noises
-from optloc.problem.problem import Problem
+from optloc.problem.problem import Problem, at_rest
 from optloc.problem.signal import Signal
-from optloc.problem.validation import checked
+from optloc.problem.validation import check_values, checked
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,15 +116,13 @@ def measured(
     a, b, epoch, target = (whole(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target")))
     count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
 
-    # Own, writable copies: what a caller does to its arrays later must not change a problem.
     def index(values: Array | None, needed: bool, name: str) -> Array:
         if needed and values is None:
             raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
-        return np.array(np.broadcast_to(values if needed and values is not None else np.int64(-1), (count,)))
+        return _filled(values if needed and values is not None else -1, (count,), np.int64)
 
     def row(values: Array | None) -> Array:
-        array = np.asarray(np.nan) if values is None else values
-        return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
+        return _filled(np.nan, (count,)) if values is None else _filled(values, (*values.shape[:-1], count))
 
     _check_noise(kind, covariance, signal, sigma is not None or arrival_sigma is not None)
     rows = Rows(
@@ -143,6 +142,13 @@ def measured(
         covariance,
         signal,
     )
+
+
+def _filled(values: Any, shape: tuple[int, ...], dtype: Any = float) -> Array:
+    """Return a copy of values as an array of a shape: a caller may write into its own arrays afterwards."""
+    out = np.empty(shape, dtype)
+    out[...] = values
+    return out
 
 
 def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> None:
@@ -212,8 +218,6 @@ def assemble(
     """
     if not measurements:
         raise InvalidProblem("there are no measurements", where="measurements", advice="give at least one")
-    # Rows are numbered through all kinds in the order of the arguments; noise and biases go by these numbers.
-    blocks = _number(measurements)
     # Epochs without rows are epochs all the same where later ones have some.
     epochs = 1 + max(int(m.rows.epoch.max(initial=0)) for m in measurements)
     made = Problem(
@@ -227,10 +231,56 @@ def assemble(
         frame,
         tuple(c for given in constraints for c in (given if isinstance(given, tuple | list) else (given,))),
     )
-    if covariance is None:
-        noise = noises.group([block for m, start in blocks for block in _noise(m, start, made.stations.count)])
+    full = numbers(covariance, "covariance")
+    key = _key(made, measurements, full, medium)
+    if key is None:
+        return _complete(made, measurements, full, medium)
+    template = _TEMPLATES.find(key, lambda: _template(_complete(made, measurements, full, medium)))
+    for rows in made.rows:
+        check_values(rows)
+    made = replace(at_rest(made if medium is None else made.in_medium(medium)), noise=template.noise)
+    vars(made).update(template.derived)
+    return made
+
+
+class _Template(NamedTuple):
+    """Checked noise and indices, the same for all problems that differ in their measurements alone."""
+
+    noise: noises.Noise
+    derived: dict[str, Any]
+
+    @property
+    def size(self) -> int:
+        """Return about how many numbers it takes: 500 for objects, its covariances, and ten a row for the key."""
+        return 500 + sum(10 * block.row.size + block.covariance.size for block in self.noise.blocks)
+
+
+# 8 MB of numbers: some 2 000 structures of few rows.
+_TEMPLATES = Cache[_Template](2**20, lambda template: template.size)
+# Cached properties of a problem, none of which depends on its measurements.
+_DERIVED = ("starts", "layout", "batch_shape", "structure")
+
+
+def _key(made: Problem, measurements: Sequence[Measured], full: Array | None, medium: Medium | None) -> Any:
+    """Return a key of everything in a problem except the values of its measurements; None for large problems."""
+    rows = [(r.kind, r.z.shape, r.a, r.b, r.epoch, r.target, r.weight, r.correction) for r in made.rows]
+    noise = [(m.variance, m.arrival, m.covariance, m.signal) for m in measurements]
+    rest = (made.times, made.motions, made.biases, made.priors, made.frame, made.constraints)
+    return key_of(made.stations, rows, noise, full, rest, medium)
+
+
+def _template(made: Problem) -> _Template:
+    # Copies: a covariance may be the caller's array.
+    noise = noises.Noise(tuple(noises.Block(b.row, np.array(b.covariance)) for b in made.noise.blocks))
+    return _Template(noise, {name: getattr(made, name) for name in _DERIVED})
+
+
+def _complete(made: Problem, measurements: Sequence[Measured], full: Array | None, medium: Medium | None) -> Problem:
+    """Return a problem with its noise and medium; raise InvalidProblem where it cannot be right."""
+    if full is None:
+        parts = zip(measurements, made.starts, strict=True)
+        noise = noises.group([block for m, start in parts for block in _noise(m, start, made.stations.count)])
     else:
-        full = np.asarray(numbers(covariance, "covariance"))
         if full.shape[-2:] != (made.count, made.count):
             raise InvalidProblem(
                 f"the joint covariance has shape {full.shape}", "covariance", f"give one of {made.count} x {made.count}"
@@ -274,11 +324,6 @@ def station_array(
 
 def _dated(array: Any, rank: int) -> Any:
     return array[None] if array is not None and array.ndim == rank else array
-
-
-def _number(measurements: Sequence[Measured]) -> list[tuple[Measured, int]]:
-    starts = np.cumsum([0, *(m.rows.count for m in measurements)])
-    return [(m, int(start)) for m, start in zip(measurements, starts, strict=False)]
 
 
 def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:

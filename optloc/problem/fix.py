@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, NoSolution, status_named
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.types import ANSWERED, NOTES, PRECEDENCE, Array, Status, statuses_of
+from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Status, statuses_of
 from optloc.problem.chart import Chart, Extent
 from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
@@ -431,7 +431,7 @@ class Fix:
     def answered(self) -> Array:
         """Return where there is a position with a covariance, whatever stands against it, (...)."""
         # that of a run to infinity has none
-        return np.isin(self.code, ANSWERED) & np.isfinite(self.x).any(-1)
+        return HAS_ANSWER[self.code] & np.isfinite(self.x).any(-1)
 
     def has(self, *statuses: Status) -> Array:
         """Return where one of some statuses is among the findings, (...)."""

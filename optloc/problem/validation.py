@@ -182,17 +182,25 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
     if model.stations > 1 and np.any(rows.a == rows.b):
         row = int(np.flatnonzero(rows.a == rows.b)[0])
         raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
-    # NaN passes: it stands for a measurement that is simulated later, or that rejects its own fix alone.
-    large = np.argwhere(np.abs(rows.z) > LARGEST)
-    if len(large):
-        why = "infinite" if np.isinf(rows.z[tuple(large[0])]) else f"beyond {LARGEST:g}"
-        what = f"{rows.kind} row {large[0][-1]} is {why}"
-        raise InvalidProblem(what, "z", "remove the row or give it weight zero")
+    check_values(rows)
     bad, why = _beyond(rows.correction)
     if bad.any():
         raise InvalidProblem(f"{rows.kind} has a correction that is {why}", "correction", "give 0 where none is known")
     if not ((rows.weight >= 0.0) & (rows.weight <= 1.0)).all():
         raise InvalidProblem(f"{rows.kind} has a weight outside 0 to 1", "weight", "use 0 for absent, 1 for present")
+
+
+def check_values(rows: Rows) -> None:
+    """Refuse measurements that are infinite, or too large for their squares to be numbers.
+
+    NaN passes: it stands for a measurement that is simulated later, or that rejects its own fix alone.
+    """
+    large = np.abs(rows.z) > LARGEST
+    if large.any():
+        place = tuple(np.argwhere(large)[0])
+        why = "infinite" if np.isinf(rows.z[place]) else f"beyond {LARGEST:g}"
+        what = f"{rows.kind} row {place[-1]} is {why}"
+        raise InvalidProblem(what, "z", "remove the row or give it weight zero")
 
 
 def _check_noise(noise: Noise, count: int) -> None:

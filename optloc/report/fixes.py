@@ -330,7 +330,8 @@ def _lines(sheet: Sheet) -> Iterable[str]:
     indent = sum(widths) + 2 * len(widths)
     for row in rows:
         lead = "".join(f"{cell:{width}}  " for cell, width in zip(row, widths, strict=False))
-        folded = wrap(row[-1], max(_WIDTH - indent, 30)) or [""]
+        width = max(_WIDTH - indent, 30)
+        folded = [row[-1]] if len(row[-1]) <= width and row[-1].isprintable() else wrap(row[-1], width) or [""]
         yield (lead + folded[0]).rstrip()
         yield from (" " * indent + line for line in folded[1:])
 

@@ -12,7 +12,7 @@ from benchmarks.scenes import Scene
 from benchmarks.with_general import scipy_from_the_truth
 from monte_carlo.tables import write
 
-from optloc import Motion, assemble, measured, prepare, solve
+from optloc import Motion, assemble, locate, measured, prepare, solve
 from optloc.compute.jit import enabled
 from optloc.engine.fixes import fix_few_ranges
 from optloc.engine.memory import Answer
@@ -123,6 +123,20 @@ def assembled():
     return timed(lambda i: problem_of(z[i]))
 
 
+def located():
+    """One call from time differences to a fix, with names, units and stations that were read before."""
+    names, light = tuple("ABCDEF"), 299_792_458.0
+    places = dict(zip(names, map(tuple, STATIONS.tolist()), strict=True))
+    z = [dict(zip(names[1:], times, strict=True)) for times in (scene(PLACES[0]).z / light).tolist()]
+    return timed(lambda i: locate(places, tdoa=z[i], sigma=SIGMA * np.sqrt(2.0) / light))
+
+
+def printed():
+    """The text of a fix."""
+    fixes = [solve(problem_of(z)) for z in scene(PLACES[0]).z]
+    return timed(lambda i: str(fixes[i]))
+
+
 def update(name):
     """The update of a predicted state by a scan of five differences."""
     truth, rng = scene(PLACES[0]).truth[0], np.random.default_rng(1)
@@ -155,6 +169,8 @@ def figures():
         yield f"inside: `solve`, auto, of {count} sets of measurements at once", *few(count), PLACES[0]
     yield "`solve`, auto, of a new structure", *new(), PLACES[0]
     yield "`assemble`", *assembled(), PLACES[0]
+    yield "`locate`", *located(), PLACES[0]
+    yield "`print` of a fix", *printed(), PLACES[0]
     for name in ("ekf", "iekf"):
         yield f"prediction and update of a tracker, {name}", *update(name), PLACES[0]
 
@@ -166,6 +182,12 @@ def test_one_fix_takes_as_long_as_scipy_from_the_truth(place, proven):
     assert prepared("gtrs+lsr", place)[0] < 0.5 * theirs
     assert prepared("auto", place)[0] < proven * theirs
     assert fresh(place)[0] < 1.5 * proven * theirs
+
+
+@pytest.mark.parametrize(("work", "most"), [(assembled, 0.8), (located, 2.0), (printed, 5.0)])
+def test_what_surrounds_a_fix_takes_little(work, most):
+    """In solutions of SciPy: to put a known structure together, one call to a fix, and its text."""
+    assert work()[0] < most * general(PLACES[0])[0]
 
 
 @pytest.mark.full

@@ -1,0 +1,210 @@
+"""Values of `optloc.locate` by what they belong to: a station, or of time differences a pair of them.
+
+Mappings, arrays, series, and data frames with a column for each station or a row for each value say the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optloc.base.cache import Cache
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.files.columns import stem, unit_of
+from optloc.files.roles import WORDS
+from optloc.models import MODELS
+
+
+class Argument(NamedTuple):
+    """Kind of an argument of `locate`, the unit of bare numbers, and the noun for its values in messages."""
+
+    kind: str
+    unit: str
+    noun: str
+
+
+ARGUMENTS = {
+    "toa": Argument("toa", "s", "times of arrival"),
+    "tdoa": Argument("tdoa", "s", "time differences"),
+    "ranges": Argument("range", "m", "ranges"),
+    "pseudoranges": Argument("toa", "m", "pseudoranges"),
+    "bearings": Argument("azimuth", "deg", "bearings"),
+    "elevations": Argument("elevation", "deg", "elevations"),
+}
+# Pairs of stations of the last some hundred kinds of values.
+_ENDS = Cache[list[tuple[int, int]]](256)
+
+
+class StationValues(NamedTuple):
+    """Values (..., m) as they are given, what each belongs to, and the unit that their column names."""
+
+    values: Array
+    keys: list[Any]
+    unit: str | None = None
+
+
+def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
+    """Return values by what they belong to: a station, or of time differences a pair of them."""
+    if reference is not None and reference not in names:
+        raise InvalidProblem(f"there is no station {reference!r}", "reference", nearest(str(reference), names))
+    first = names[0] if reference is None else reference
+    given = _with_names(given)
+    if hasattr(given, "columns") and hasattr(given, "index"):
+        found = _of_table(word, given, names, first)
+    elif hasattr(given, "index") and hasattr(given, "to_numpy"):
+        found = StationValues(_numbers(word, given.to_numpy()), list(given.index))
+    elif isinstance(given, Mapping) and given and {*map(type, given.values())} <= {int, float}:
+        found = StationValues(_numbers(word, [*given.values()]), list(given))
+    elif isinstance(given, Mapping):
+        columns = [_numbers(word, value) for value in given.values()]
+        if len({np.shape(column) for column in columns}) > 1:
+            raise InvalidProblem("some stations have more values than others", word, "give each as many, NaN for none")
+        if any(column.dtype.kind == "M" for column in columns):
+            columns = [column if column.dtype.kind == "M" else _no_dates(word, column) for column in columns]
+        found = StationValues(np.stack(columns, axis=-1) if columns else np.zeros(0), list(given))
+    else:
+        values, keys = _numbers(word, given), list(names)
+        if word == "tdoa" and values.ndim and values.shape[-1] == len(names) - 1:
+            keys.remove(first)
+        if values.ndim == 0 or values.shape[-1] != len(keys):
+            what = f"{values.shape[-1] if values.ndim else 1} values for {len(names)} stations"
+            raise InvalidProblem(what, word, "give one for each, NaN where there is none, or name: value")
+        found = StationValues(values, keys)
+    if not found.keys:
+        raise InvalidProblem("there are no values", word, "give name: value")
+    ends = _ENDS.call(_all_ends, word, found.keys, names, first)
+    kept = [i for i, (a, b) in enumerate(ends) if a != b]  # the reference against itself says nothing
+    if not kept:
+        raise InvalidProblem("there is nothing but the reference", word, "give the other stations")
+    return StationValues(found.values[..., kept], [ends[i] for i in kept], found.unit)
+
+
+def _with_names(given: Any) -> Any:
+    """Return a structured array as a mapping, and tables of polars, pyarrow and xarray as pandas has them.
+
+    Each of them names what its values belong to: an array alone would take them in the order of the stations.
+    """
+    fields = getattr(getattr(given, "dtype", None), "names", None)
+    if fields:
+        return {name: given[name] for name in fields}
+    return given.to_pandas() if hasattr(given, "to_pandas") else given
+
+
+def _all_ends(word: str, keys: Sequence[Any], names: Sequence[str], reference: str) -> list[tuple[int, int]]:
+    return [_ends(word, key, names, reference) for key in keys]
+
+
+def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[int, int]:
+    """Return the numbers of the stations that a key names; -1 where there is one station only."""
+    pair = key if isinstance(key, tuple) else (key,)
+    if word == "tdoa" and len(pair) == 1 and str(key) not in names:
+        cut = [(str(key)[:i], str(key)[i + 1 :]) for i, sign in enumerate(str(key)) if sign == "-"]
+        pair = next((each for each in cut if set(each) <= set(names)), pair)
+    if word == "tdoa" and len(pair) == 1:
+        pair = (pair[0], reference)
+    if len(pair) != (2 if word == "tdoa" else 1):
+        raise InvalidProblem(f"{key!r} does not name what was measured", word, "use the name of a station")
+    unknown = [str(name) for name in pair if str(name) not in names]
+    if unknown:
+        raise InvalidProblem(f"there is no station {unknown[0]!r}", word, nearest(unknown[0], names))
+    one, *other = (names.index(str(name)) for name in pair)
+    return one, other[0] if other else -1
+
+
+def _named(word: str, columns: Sequence[Any], names: Sequence[str], reference: str) -> list[Any]:
+    """Return the columns of a data frame whose names are those of stations, or of pairs of them."""
+    found = []
+    for column in columns:
+        try:
+            _ends(word, column, names, reference)
+        except InvalidProblem:
+            continue
+        found.append(column)
+    return found
+
+
+def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
+    """Return the values of a data frame with one column for each station or pair; every column must be one."""
+    columns = list(frame.columns)
+    for column in columns:
+        try:
+            _ends(word, column, names, reference)
+        except InvalidProblem as error:
+            advice = f"{error.advice}; drop a column that holds no {ARGUMENTS[word].noun}"
+            raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
+    # By number: two columns may have one name.
+    values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
+    return StationValues(np.stack(values, axis=-1), columns)
+
+
+def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
+    """Return the values of a data frame: one column for each station, or one row for each value."""
+    columns = list(frame.columns)
+    wide = _named(word, columns, names, reference)
+    if wide and len(wide) == len(columns):
+        return _wide(word, frame, names, reference)
+    stems = {stem(str(name)): name for name in reversed(list(frame.columns))}
+    kind = ARGUMENTS[word].kind
+    value_words = [*WORDS["z"].split(), *(stem(each) for each in (word, word.rstrip("s"), kind, *MODELS[kind].aliases))]
+    value_words += ["time", "timestamp"] if word == "toa" else []
+    chosen = {
+        role: next((stems[each] for each in words if each in stems), None)
+        for role, words in (("a", WORDS["a"].split()), ("b", WORDS["b"].split()), ("z", value_words))
+    }
+    tidy = None not in (chosen["a"], chosen["z"]) and {*wide} <= {*chosen.values()}
+    if wide and not tidy:
+        return _wide(word, frame, names, reference)
+    for role, text in (("a", "station"), ("z", "value")):
+        if chosen[role] is None:
+            listed = ", ".join(str(name) for name in columns)
+            advice = "call columns by the stations, or use the columns station and value"
+            if {str(label) for label in frame.index} <= {*names}:
+                advice = "its rows are the stations: give the transposed frame, .T"
+            raise InvalidProblem(f"no column is a {text}; there are {listed}", word, advice)
+    epochs = next((stems[each] for each in ("epoch", "message", "msg", "pulse") if each in stems), None)
+    ends = [str(name) for name in frame[chosen["a"]]]
+    if word == "tdoa" and chosen["b"] is not None:
+        ends = list(zip(ends, (str(name) for name in frame[chosen["b"]]), strict=True))  # type: ignore[arg-type]
+    labels = [None] * len(ends) if epochs is None else frame[epochs].tolist()
+    keys, rows = ({one: i for i, one in enumerate(dict.fromkeys(each))} for each in (ends, labels))
+    values = _numbers(word, frame[chosen["z"]].to_numpy())
+    grid = np.full(
+        (len(rows), len(keys)),
+        np.datetime64("NaT") if values.dtype.kind == "M" else np.nan,
+        dtype=values.dtype if values.dtype.kind == "M" else float,
+    )
+    seen: set[tuple[int, int]] = set()
+    # Whole numbers are counted from the least, so that nanoseconds of today keep their digits as floats.
+    values = values - values.min() if values.dtype.kind in "iu" else values
+    for value, key, label in zip(values, ends, labels, strict=True):
+        place = (rows[label], keys[key])
+        if place in seen:
+            what = f"{key} has two values" + ("" if label is None else f" at {label}")
+            raise InvalidProblem(what, word, "leave one of them out, or give a column epoch")
+        seen.add(place)
+        grid[place] = value
+    named = unit_of(str(chosen["z"]), ("s", "ms", "us", "ns", "ps", "m", "km", "cm", "mm", "ft", "deg", "rad"))
+    return StationValues(grid if epochs is not None else grid[0], list(keys), named)
+
+
+def _no_dates(word: str, values: Array) -> Array:
+    """Return missing dates in the place of missing numbers; numbers beside dates are refused."""
+    if not np.isnan(values).all():
+        raise InvalidProblem("some instants are dates, and others are numbers", word, "give all as one or the other")
+    return np.full(values.shape, np.datetime64("NaT", "ns"))
+
+
+def _numbers(word: str, values: Any) -> Array:
+    """Return values as an array of numbers or dates; None is NaN."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind in "OSU":
+            array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711  (of every entry)
+    except (TypeError, ValueError):
+        array = np.zeros(0, dtype=bool)
+    if array.dtype.kind not in "iufM" or (array.dtype.kind == "M" and word != "toa"):
+        raise InvalidProblem("these are not numbers", word, "give numbers, NaN where there is none")
+    return array
