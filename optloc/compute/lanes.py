@@ -152,7 +152,7 @@ def blur_of(sigma: Array, size: Array, m: Array, room: Cells, lane: int, item: i
         if not room.absent or m[room.present + i, lane] != 0.0:
             ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
             squares += ratio * ratio
-    # Four roundings, as in `optloc.solvers.refine`.
+    # Four roundings, as in `optloc.compute.least_squares`.
     coarse = 4.0 * _EPSILON * np.sqrt(squares)
     return coarse if np.isfinite(coarse) else 0.0
 

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.solvers.refine`, lane by lane.
+"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.compute.least_squares`, lane by lane.
 
 A lane whose problem is finished takes the next one, so that the lanes are full until the problems run out.
 """
@@ -40,7 +40,7 @@ _OK, LIMIT, _STALLED, NUMERICAL = (
 
 
 class Rules(NamedTuple):
-    """When a refinement ends; see `optloc.solvers.refine.refine`, whose defaults these are."""
+    """When a refinement ends; see `optloc.compute.least_squares.refine`, whose defaults these are."""
 
     tolerance: float = 1e-7
     limit: int = 60

@@ -10,12 +10,12 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import tangent
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import eliminated, step
 from optloc.linear.vectors import vectors
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers.refine import refine
 
 # Steps at most: places far from any fit take their time, and a picture does not wait for the last of them.
 _STEPS = 40

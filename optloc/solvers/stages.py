@@ -14,6 +14,7 @@ from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.normal import decrement, step
@@ -25,7 +26,6 @@ from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, offer, pack
-from optloc.solvers.refine import refine
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.position import (

@@ -11,11 +11,11 @@ from monte_carlo.tables import write
 from runs import drawn, estimated, run, truth
 
 from optloc.compute.jit import enabled
+from optloc.compute.least_squares import refine
 from optloc.compute.pack import pack
 from optloc.compute.refine import Rules, answers, refine_block, refine_runs
 from optloc.linear.normal import weighed
 from optloc.problem.noise import whiten
-from optloc.solvers.refine import refine
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="kernels are not compiled")
 ROUNDS, EPOCHS, RUNS = 9, 700, 64
@@ -62,7 +62,7 @@ def iteration(scene):
 def by_numpy(scene, monkeypatch):
     """Microseconds of a fix by numpy."""
     problem, start = array(scene)
-    monkeypatch.setattr(import_module("optloc.solvers.refine"), "serves", lambda problem, starts: False)
+    monkeypatch.setattr(import_module("optloc.compute.least_squares"), "serves", lambda problem, starts: False)
     many = problem.take(np.arange(1000)), start[:1000]
     return 1e6 * quickest(lambda: refine(*many), 3) / 1000
 

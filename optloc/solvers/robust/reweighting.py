@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at, summed
 from optloc.linear.constraints import Face
 from optloc.linear.evaluate import predict
@@ -15,7 +16,6 @@ from optloc.models import MODELS, wrap
 from optloc.problem.loss import LATE, Loss
 from optloc.problem.noise import Noise, variances, whiten
 from optloc.problem.problem import Problem
-from optloc.solvers.refine import refine
 
 # Rows of a correlated group are never quite absent while their weights are sought: their partners still foretell them.
 # At a millionth of its weight a row no longer counts in the sums, and one over it is far from overflow.

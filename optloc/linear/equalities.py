@@ -37,9 +37,9 @@ class Equalities:
     each: Face
 
     @classmethod
-    def of(cls, problem: Problem) -> Equalities:
-        """Return the equalities of a problem."""
-        face = exact(problem)
+    def of(cls, problem: Problem, face: Face | None = None) -> Equalities:
+        """Return the equalities of a problem, by default those that it states, else the levels of a face."""
+        face = exact(problem) if face is None else face
         own = {i for level in face if problem.motions[_target(problem, i := level.constraint)].span == "epoch"}
         lasting = tuple(level for level in face if level.constraint not in own)
         if not own:

@@ -13,7 +13,8 @@ from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.pack import coarseness, pack
 from optloc.compute.sums import equations_at, serves
-from optloc.linear.constraints import Face, is_height, restore, tangent_at
+from optloc.linear.constraints import Face, is_height
+from optloc.linear.equalities import Equalities
 from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
 from optloc.models.primitives import WGS84_A
 from optloc.problem.epochs import whole, windows
@@ -56,7 +57,7 @@ class Refined:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What does not change during an iteration: see `optloc.solvers.refine.refine`.
+    """What does not change during an iteration: see `optloc.compute.least_squares.refine`.
 
     Parameters
     ----------
@@ -109,7 +110,8 @@ def refine(
     damped : bool
         False: plain Taylor iteration, every step is taken whatever it does to the cost.
     face : Face
-        Constraints that hold with equality: steps follow their tangent space and are put back onto them.
+        Constraints that hold with equality, also in every epoch of a run: steps follow their tangent space and are put
+        back onto them.
 
     Returns
     -------
@@ -168,7 +170,7 @@ class _Weights:
 def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules) -> Refined:
     """Return where the iteration ends whose weights stay as they are."""
     with np.errstate(all="ignore"):
-        start = restore(problem, rules.face, start) if rules.face else start
+        start = Equalities.of(problem, rules.face).restore(start) if rules.face else start
         state = _State.begin(problem, start, weights)
         active, part = np.arange(len(start)), _Part(problem, weights, _blur(problem, len(start)))
         for iteration in range(rules.limit):
@@ -259,8 +261,9 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     now = state.equations if everything else _at(state.equations, active)
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
-    move, solvable = step(now, damping, tangent_at(part.problem, rules.face, here) if rules.face else None)
-    x = restore(part.problem, rules.face, here + move) if rules.face else here + move
+    held = Equalities.of(part.problem, rules.face) if rules.face else None
+    move, solvable = step(now, damping) if held is None else held.step(now, damping, here)
+    x = here + move if held is None else held.restore(here + move)
     after = part.weights.equations(part.problem, x)
     found = judge(
         now.cost,
