@@ -13,7 +13,7 @@ from runs import drawn, estimated, run, truth
 from optloc.compute.jit import enabled
 from optloc.compute.least_squares import refine
 from optloc.compute.pack import pack
-from optloc.compute.refine import Rules, answers, refine_block, refine_runs
+from optloc.compute.refine import Rules, answers, refine_block
 from optloc.linear.normal import weighed
 from optloc.problem.noise import whiten
 
@@ -80,10 +80,10 @@ def registration(eliminated):
     problem = drawn(estimated(problem) if eliminated else problem, 1, RUNS).flat()
     start = np.tile(truth(problem), (RUNS, 1)) + 20.0
     ours, item = ready(problem), np.arange(RUNS)
-    kernel, kept = (refine_runs, 0) if eliminated else (refine_block, None)
+    kept = 0 if eliminated else None
     out = answers(start, kept)
-    kernel(ours, item, 0, RUNS, Rules(), out)
-    seconds = quickest(lambda: kernel(ours, item, 0, RUNS, Rules(), answers(start, kept)), 3)
+    refine_block(ours, item, 0, RUNS, Rules(), out)
+    seconds = quickest(lambda: refine_block(ours, item, 0, RUNS, Rules(), answers(start, kept)), 3)
     each = 1e6 * seconds / (int(out.iterations.sum()) + RUNS)
     return each, each / problem.count
 
