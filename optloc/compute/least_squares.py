@@ -121,7 +121,7 @@ def refine(
     # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost; sixty steps are ten
     # times what fixes near their stations take.
     rules = Rules(problem.layout.n_shared, tolerance, limit, damped, face)
-    quick = by_machine_code(problem, start, item, rules, _remade)
+    quick = _by_machine_code(problem, start, item, rules)
     if quick is not None:
         return quick
     weights = None
@@ -310,48 +310,28 @@ _UNKNOWNS = 40
 # Numbers of the derivatives from which weights that depend on the place are made at a time: 16 MB.
 _WEIGHED = 2**21
 
-Refinement = Callable[[Problem, Array, Rules], Refined]
 
-
-def by_machine_code(
-    problem: Problem, start: Array, item: Array | None, rules: Rules, otherwise: Refinement
-) -> Refined | None:
-    """Return where a refinement by machine code ends, or None where it does not serve the problem.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems.
-    start : array (M, size)
-        Starting vectors.
-    item : int array (M,), optional
-        Problem of each start; None: M = N.
-    rules : Rules
-        When to stop.
-    otherwise : callable
-        Refines what machine code gives up: an epoch of a run left its own unknowns open.
-    """
+def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: Rules) -> Refined | None:
+    """Return where a refinement by machine code ends, or None where it does not serve the problem."""
     few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
     if rules.face or not few or not serves(problem, len(start)):
         return None
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
     if not depends_on_place(problem):
-        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules, otherwise)
+        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules)
     width = problem.layout.n_shared + offsets_of(problem)
     # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
 
     def work(part: Array) -> Refined | None:
-        return _anew(problem.take(own[part]), start[part], rules, otherwise)
+        return _anew(problem.take(own[part]), start[part], rules)
 
     done = mapped(work, parts) if len(parts) > 1 else [work(parts[0])]
     found = [one for one in done if one is not None]
     return _join(found) if len(found) == len(parts) else None
 
 
-def _at_once(
-    problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules, otherwise: Refinement
-) -> Refined | None:
+def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules) -> Refined | None:
     """Return where machine code ends with given weights, or None where it does not serve."""
     found = pack(problem, noise)
     if found is None:
@@ -363,17 +343,17 @@ def _at_once(
     done, lost = refine.refined(found, item, start, kernel)
     # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
     if lost.any():
-        more = otherwise(problem.take(item[lost]), start[lost], rules)
+        more = _remade(problem.take(item[lost]), start[lost], rules)
         for name in ("x", "cost", "status", "iterations"):
             getattr(done, name)[lost] = getattr(more, name)
     return Refined(done.x, done.cost, done.status, done.iterations, lambda: refine.equations(found, item, done))
 
 
-def _anew(problem: Problem, start: Array, rules: Rules, otherwise: Refinement) -> Refined | None:
+def _anew(problem: Problem, start: Array, rules: Rules) -> Refined | None:
     """Return where machine code ends for one start of each problem, weighed where they are and once more at the end."""
     done = None
     for _ in range(WEIGHINGS):
-        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules, otherwise)
+        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules)
         if done is None:
             return None
         start = done.x
