@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Bias
 from optloc.compute.least_squares import refine
@@ -41,8 +42,6 @@ _ORDER = (*_FORMS, "step", "burst")
 _STRETCHED_TIME = 9.0
 # Share of its information that is left of a candidate once the other unknowns follow it, below which it is rounding.
 _OPEN = 1e-9
-# Relative size of an eigenvalue of scaled information that is rounding.
-_ROUNDING = 1e-12
 # Epochs of a run from which steps and bursts are looked for, and how many times of them are tried.
 _STEP_EPOCHS, _STEP_TIMES = 6, 12
 
@@ -338,15 +337,15 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
         old = [layout.find(slot.name)[0].start + i for slot in problem.layout.shared for i in range(slot.size)]
         space = np.zeros((layout.n_shared, along.shape[1]))
         space[old] = along
-    root = space @ _root(space.T @ information @ space)
+    root = space @ linalg.root(space.T @ information @ space)[0]
     out = []
     for part in own:
         coupling = root.T @ information[:, part]
         left = information[part, part] - coupling.T @ coupling
         pull = vector[part] - coupling.T @ (root.T @ vector)
         told = np.diagonal(left) > _OPEN * np.diagonal(information[part, part])
-        inverse = _root(left)
-        inverse = inverse @ inverse.T if told.all() else np.zeros_like(left)
+        half, _ = linalg.root(left)
+        inverse = half @ half.T if told.all() else np.zeros_like(left)
         value = inverse @ pull
         out.append((float(pull @ value), value, part.stop - part.start))
     return out
@@ -356,17 +355,6 @@ def _shared(problem: Problem, x: Array) -> tuple[Array, Array]:
     """Return information (n, n) and vector (n,) of the shared unknowns of one problem, local ones eliminated."""
     information, vector = Equalities.of(problem).shared(equations_at(problem, x), x)
     return information[0], vector[0]
-
-
-def _root(matrix: Array) -> Array:
-    """Return B (n, r) with B B' the inverse of a matrix where it is regular: open directions are left out."""
-    if not len(matrix):
-        return matrix
-    scale = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
-    scale = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
-    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale)
-    kept = values > _ROUNDING
-    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
 def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Problem, list[tuple[str, tuple[int, int]]]]:
@@ -422,7 +410,7 @@ def _sigma(problem: Problem, x: Array, part: slice) -> Array:
     """Return the standard deviations (q,) of a part of the shared unknowns."""
     information, _ = _shared(problem, x)
     space = Equalities.of(problem).lasting_space(x)[0]
-    root = space @ _root(space.T @ information @ space)
+    root = space @ linalg.root(space.T @ information @ space)[0]
     return np.asarray(np.sqrt((root[part] ** 2).sum(-1)))
 
 

@@ -111,11 +111,6 @@ gtrs, roots = start_with("gtrs"), start_with("roots")
 _ARRIVED = 1e-4
 
 
-def gtrs_lsr(problem: Problem, pool: Pool | None) -> Pool:
-    """Return what the method "gtrs+lsr" returns: the start and its mirror image, refined."""
-    return lsr_with_mirror(problem, gtrs(problem, pool))
-
-
 def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
     """Return starts and their mirror images, refined.
 
