@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge
 from optloc.compute.pack import coarseness, pack
 from optloc.compute.sums import equations_at, serves
 from optloc.linear.constraints import Face, is_height
@@ -55,31 +55,6 @@ class Refined:
         return self.make()
 
 
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """What does not change during an iteration: see `optloc.compute.least_squares.refine`.
-
-    Parameters
-    ----------
-    n : int
-        Number of shared unknowns.
-    tolerance : float
-        Length of the last step in its own standard deviations.
-    limit : int
-        Steps tried at most.
-    damped : bool
-        Whether steps are damped and refused.
-    face : Face
-        Constraints that hold with equality.
-    """
-
-    n: int
-    tolerance: float
-    limit: int
-    damped: bool
-    face: Face
-
-
 def refine(
     problem: Problem,
     start: Array,
@@ -120,8 +95,8 @@ def refine(
     """
     # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost; sixty steps are ten
     # times what fixes near their stations take.
-    rules = Rules(problem.layout.n_shared, tolerance, limit, damped, face)
-    quick = _by_machine_code(problem, start, item, rules)
+    rules = Rules(float(tolerance), int(limit), bool(damped))
+    quick = None if face else _by_machine_code(problem, start, item, rules)
     if quick is not None:
         return quick
     weights = None
@@ -132,9 +107,9 @@ def refine(
     if item is not None:
         problem = problem.take(item)
     if weights is not None:
-        return _iterate(problem, start, weights, rules)
+        return _iterate(problem, start, weights, rules, face)
     for _ in range(WEIGHINGS):
-        done = _remade(problem, start, rules)
+        done = _remade(problem, start, rules, face)
         start = done.x
     return done
 
@@ -142,8 +117,8 @@ def refine(
 # By numpy: all problems of a batch side by side, those that are finished leave it.
 
 
-def _remade(problem: Problem, start: Array, rules: Rules) -> Refined:
-    return _iterate(problem, start, _Weights.of(problem, start), rules)
+def _remade(problem: Problem, start: Array, rules: Rules, face: Face = ()) -> Refined:
+    return _iterate(problem, start, _Weights.of(problem, start), rules, face)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,12 +142,12 @@ class _Weights:
         return equations_at(problem, x, self.matrices, at=self.at)
 
 
-def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules) -> Refined:
+def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules, face: Face) -> Refined:
     """Return where the iteration ends whose weights stay as they are."""
     with np.errstate(all="ignore"):
-        start = Equalities.of(problem, rules.face).restore(start) if rules.face else start
+        start = Equalities.of(problem, face).restore(start) if face else start
         state = _State.begin(problem, start, weights)
-        active, part = np.arange(len(start)), _Part(problem, weights, _blur(problem, len(start)))
+        active, part = np.arange(len(start)), _Part(problem, weights, face, _blur(problem, len(start)))
         for iteration in range(rules.limit):
             # The status until another is found: what still moves.
             moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
@@ -218,11 +193,12 @@ class _Part:
 
     problem: Problem
     weights: _Weights
+    face: Face
     blur: Array
 
     def take(self, items: Array) -> _Part:
         """Return some of them."""
-        return _Part(self.problem.take(items), self.weights.take(items), self.blur[items])
+        return _Part(self.problem.take(items), self.weights.take(items), self.face, self.blur[items])
 
 
 # Roundings that lie between a measurement and its residual.
@@ -261,16 +237,16 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     now = state.equations if everything else _at(state.equations, active)
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
-    held = Equalities.of(part.problem, rules.face) if rules.face else None
+    held = Equalities.of(part.problem, part.face) if part.face else None
     move, solvable = step(now, damping) if held is None else held.step(now, damping, here)
     x = here + move if held is None else held.restore(here + move)
     after = part.weights.equations(part.problem, x)
     found = judge(
         now.cost,
         after.cost,
-        decrement(now, move, rules.n),
+        decrement(now, move, part.problem.layout.n_shared),
         solvable,
-        part.blur + (_blur_of_face(part.problem, rules.face, now) if rules.face else 0.0),
+        part.blur + (_blur_of_face(part.problem, part.face, now) if part.face else 0.0),
         damping,
         state.growth[active],
         rules.tolerance,
@@ -314,7 +290,7 @@ _WEIGHED = 2**21
 def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: Rules) -> Refined | None:
     """Return where a refinement by machine code ends, or None where it does not serve the problem."""
     few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
-    if rules.face or not few or not serves(problem, len(start)):
+    if not few or not serves(problem, len(start)):
         return None
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
     if not depends_on_place(problem):
@@ -337,10 +313,8 @@ def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener,
     if found is None:
         return None
     from optloc.compute import refine
-    from optloc.compute.refine import Rules as Limits
 
-    kernel = Limits(float(rules.tolerance), int(rules.limit), bool(rules.damped))
-    done, lost = refine.refined(found, item, start, kernel)
+    done, lost = refine.refined(found, item, start, rules)
     # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
     if lost.any():
         more = _remade(problem.take(item[lost]), start[lost], rules)

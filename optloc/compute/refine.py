@@ -12,7 +12,7 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
 from optloc.compute.equations import chunks, normal_at
 from optloc.compute.jit import compiled
 from optloc.compute.lanes import (
@@ -37,14 +37,6 @@ from optloc.linear.normal import OPEN, Normal
 _OK, LIMIT, _STALLED, NUMERICAL = (
     int(status) for status in (Status.OK, Status.MAX_ITERATIONS, Status.STALLED, Status.NUMERICAL)
 )
-
-
-class Rules(NamedTuple):
-    """When a refinement ends; see `optloc.compute.least_squares.refine`, whose defaults these are."""
-
-    tolerance: float = 1e-7
-    limit: int = 60
-    damped: bool = True
 
 
 class Answers(NamedTuple):

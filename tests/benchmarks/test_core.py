@@ -10,10 +10,11 @@ from benchmarks.speed import SCENES, batch
 from monte_carlo.tables import write
 from runs import drawn, estimated, run, truth
 
+from optloc.compute.damping import Rules
 from optloc.compute.jit import enabled
 from optloc.compute.least_squares import refine
 from optloc.compute.pack import pack
-from optloc.compute.refine import Rules, answers, refine_block
+from optloc.compute.refine import answers, refine_block
 from optloc.linear.normal import weighed
 from optloc.problem.noise import whiten
 
