@@ -143,7 +143,7 @@ class _Weights:
 
 
 def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules, face: Face) -> Refined:
-    """Return where the iteration ends whose weights stay as they are."""
+    """Return the refinement with fixed weights."""
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         state = _State.begin(problem, start, weights)
@@ -288,7 +288,7 @@ _WEIGHED = 2**21
 
 
 def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: Rules) -> Refined | None:
-    """Return where a refinement by machine code ends, or None where it does not serve the problem."""
+    """Return the refinement by machine code, or None without machine code for the problem."""
     few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
     if not few or not serves(problem, len(start)):
         return None
@@ -308,7 +308,7 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
 
 
 def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules) -> Refined | None:
-    """Return where machine code ends with given weights, or None where it does not serve."""
+    """Return the refinement by machine code with given weights, or None without machine code."""
     found = pack(problem, noise)
     if found is None:
         return None
@@ -324,7 +324,7 @@ def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener,
 
 
 def _anew(problem: Problem, start: Array, rules: Rules) -> Refined | None:
-    """Return where machine code ends for one start of each problem, weighed where they are and once more at the end."""
+    """Return the refinement of one start of each problem, with weights of the start and then of the end."""
     done = None
     for _ in range(WEIGHINGS):
         done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules)
