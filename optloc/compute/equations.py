@@ -30,10 +30,10 @@ class Sums(NamedTuple):
     cost: Array
 
 
-def chunks(count: int, least: int = _SHARE) -> list[tuple[int, int]]:
+def chunks(count: int) -> list[tuple[int, int]]:
     """Return stretches (first, last) of a number of starts, one for each thread that is worth it."""
     # Threads get stretches of equal length: starts take about the same time, and each stretch keeps its memory.
-    parts = max(1, min(thread_count(), count // least))
+    parts = max(1, min(thread_count(), count // _SHARE))
     ends = np.linspace(0, count, parts + 1).round().astype(int).tolist()
     return list(pairwise(ends))
 
