@@ -30,7 +30,7 @@ from optloc.linear.constraints import box, height
 from optloc.solvers import solve_in_stages
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import in_parts
-from optloc.solvers.stages import gtrs_lsr
+from optloc.solvers.stages import gtrs, lsr_with_mirror
 from optloc.solvers.verdict.judge import verdict
 
 compiled = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
@@ -39,7 +39,7 @@ TRIALS = 100
 
 def by_stages(problem):
     """Return the fixes of a flat batch by the stages, never directly."""
-    return verdict(problem, gtrs_lsr(problem, None))
+    return verdict(problem, lsr_with_mirror(problem, gtrs(problem, None)))
 
 
 def without_numbers(sentence):

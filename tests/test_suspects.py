@@ -17,9 +17,9 @@ from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, si
 from optloc.adequacy.evidence import errors, influence, log_tail, reliability, significance
 from optloc.adequacy.groups import groups_of
 from optloc.cli import app
+from optloc.compute.least_squares import refine
 from optloc.problem.arrivals import as_arrivals, restore_order
 from optloc.solvers.policy import AMBIGUOUS_GAP
-from optloc.solvers.refine import refine
 from optloc.solvers.suspects import subsets
 
 RNG = np.random.default_rng(20251121)

@@ -177,7 +177,7 @@ def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
     face = exact(problem)
     if face:
         # What an equality holds is no unknown: one column less for each.
-        along, n = tangent_at(problem, face, x).along, problem.layout.n_shared
+        along, n = tangent_at(problem, face, x), problem.layout.n_shared
         jacobian = np.concatenate([jacobian[..., :n] @ along, jacobian[..., n:]], axis=-1)
     return residual, jacobian
 

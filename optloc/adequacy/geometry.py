@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -233,9 +233,3 @@ def _say_side(problem: Problem, shape: _Shape) -> tuple[str, str]:
 
 def _spell(vector: Array) -> str:
     return "(" + ", ".join(f"{v:.2f}" for v in vector) + ")"
-
-
-def without_silent(problem: Problem) -> Problem:
-    """Return a problem whose rows that are no numbers have weight zero."""
-    known = np.isfinite(problem.z)
-    return problem if known.all() else replace(problem.with_rows(weight=np.where(known, problem.weight, 0.0)))

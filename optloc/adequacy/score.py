@@ -8,11 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from optloc.adequacy.equalities import Equalities, spare_rows
+from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Bias
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
-from optloc.linear.normal import Normal
+from optloc.linear.constraints import exact
+from optloc.linear.equalities import Equalities, spare_rows
 from optloc.models import MODELS
 from optloc.problem.bias import Form, Per, family
 from optloc.problem.chart import quantile
@@ -40,8 +42,6 @@ _ORDER = (*_FORMS, "step", "burst")
 _STRETCHED_TIME = 9.0
 # Share of its information that is left of a candidate once the other unknowns follow it, below which it is rounding.
 _OPEN = 1e-9
-# Relative size of an eigenvalue of scaled information that is rounding.
-_ROUNDING = 1e-12
 # Epochs of a run from which steps and bursts are looked for, and how many times of them are tried.
 _STEP_EPOCHS, _STEP_TIMES = 6, 12
 
@@ -337,15 +337,15 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
         old = [layout.find(slot.name)[0].start + i for slot in problem.layout.shared for i in range(slot.size)]
         space = np.zeros((layout.n_shared, along.shape[1]))
         space[old] = along
-    root = space @ _root(space.T @ information @ space)
+    root = space @ linalg.root(space.T @ information @ space)[0]
     out = []
     for part in own:
         coupling = root.T @ information[:, part]
         left = information[part, part] - coupling.T @ coupling
         pull = vector[part] - coupling.T @ (root.T @ vector)
         told = np.diagonal(left) > _OPEN * np.diagonal(information[part, part])
-        inverse = _root(left)
-        inverse = inverse @ inverse.T if told.all() else np.zeros_like(left)
+        half, _ = linalg.root(left)
+        inverse = half @ half.T if told.all() else np.zeros_like(left)
         value = inverse @ pull
         out.append((float(pull @ value), value, part.stop - part.start))
     return out
@@ -355,17 +355,6 @@ def _shared(problem: Problem, x: Array) -> tuple[Array, Array]:
     """Return information (n, n) and vector (n,) of the shared unknowns of one problem, local ones eliminated."""
     information, vector = Equalities.of(problem).shared(equations_at(problem, x), x)
     return information[0], vector[0]
-
-
-def _root(matrix: Array) -> Array:
-    """Return B (n, r) with B B' the inverse of a matrix where it is regular: open directions are left out."""
-    if not len(matrix):
-        return matrix
-    scale = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
-    scale = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
-    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale)
-    kept = values > _ROUNDING
-    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
 def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Problem, list[tuple[str, tuple[int, int]]]]:
@@ -421,26 +410,24 @@ def _sigma(problem: Problem, x: Array, part: slice) -> Array:
     """Return the standard deviations (q,) of a part of the shared unknowns."""
     information, _ = _shared(problem, x)
     space = Equalities.of(problem).lasting_space(x)[0]
-    root = space @ _root(space.T @ information @ space)
+    root = space @ linalg.root(space.T @ information @ space)[0]
     return np.asarray(np.sqrt((root[part] ** 2).sum(-1)))
 
 
 # Refits.
 
-# Marquardt's damping to begin with, and what a step that succeeds, or fails, makes of it.
-_DAMPING, _EASED, _RAISED = 1e-3, 0.1, 10.0
-# Damping beyond which a step is shorter than rounding.
-_STUCK = 1e12
-# Relative decrease of the cost that is none: far below what a p-value shows.
-_SMALL = 1e-9
+# Length of the last step, standard deviations, at which a refit ends: its cost is then known to 1e-8.
+_CLOSE = 1e-4
+# Steps at most: a search drops descents that run away, and those that arrive take a dozen.
+_STEPS = 30
 # Distances of the starts from the middle of the stations, spreads: inside the network, at its edge, and two outside.
 _DISTANCES = (0.4, 1.2, 4.0, 15.0)
 # Spreads of the stations beyond which a place is a direction, and differences of ranges begin to be rounding.
 _FLAT = 1e6
 
 
-def descend(problem: Problem, x: Array, steps: int = 30) -> tuple[Array, Array]:
-    """Return vectors (M, size) of least squares next to starts, and their costs (M,): damped Gauss-Newton.
+def descend(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return vectors (M, size) of least squares next to starts, and their costs (M,).
 
     Parameters
     ----------
@@ -448,32 +435,9 @@ def descend(problem: Problem, x: Array, steps: int = 30) -> tuple[Array, Array]:
         Flat batch of M problems; equalities are kept, inequalities are not looked at.
     x : array (M, size)
         Starts.
-    steps : int
-        Greatest number of steps.
     """
-    held = Equalities.of(problem)
-    with np.errstate(all="ignore"):
-        x = held.restore(np.array(x))
-        equations = equations_at(problem, x)
-        damping, over = np.full(len(x), _DAMPING), ~np.isfinite(equations.cost)
-        for _ in range(steps):
-            if over.all():
-                break
-            move, _ = held.step(equations, damping, x)
-            trial = held.restore(np.where(over[:, None] | ~np.isfinite(move), x, x + move))
-            new = equations_at(problem, trial)
-            better = (new.cost < equations.cost) & ~over
-            over = over | (better & (equations.cost - new.cost <= _SMALL * (1.0 + new.cost))) | (damping > _STUCK)
-            x = np.where(better[:, None], trial, x)
-            equations = _merge(better, new, equations)
-            damping = damping * np.where(better, _EASED, _RAISED)
-    return x, np.where(np.isfinite(equations.cost), equations.cost, np.inf)
-
-
-def _merge(where: Array, one: Normal, other: Normal) -> Normal:
-    """Return the equations of one where a mask (M,) holds, else of the other."""
-    parts = zip(one.parts, other.parts, strict=True)
-    return Normal(*(np.where(where.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in parts))
+    done = refine(problem, np.array(x), tolerance=_CLOSE, limit=_STEPS, face=exact(problem))
+    return done.x, np.where(np.isfinite(done.cost), done.cost, np.inf)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
+from optloc.compute.damping import FIRST_GROWTH, judge
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import Face, exact, levels, restore, tangent_at, violation
-from optloc.linear.normal import Normal, decrement, depends_on_place, marginal, step
+from optloc.linear.normal import decrement, depends_on_place, marginal, step
 from optloc.problem.chart import INVERSE_RANGE, Chart, basis
 from optloc.problem.problem import Problem
 
@@ -44,79 +45,45 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
     """
     slot, _ = problem.layout.find("position")
     part, n = slice(slot.start, slot.start + slot.size), problem.layout.n_shared
-    own = others = np.r_[0 : slot.start, slot.start + slot.size : n]
     weighed = np.broadcast_to(at, x.shape) if depends_on_place(problem) else None
-    alone = problem.layout.size == slot.size
-    for left in range(passes - 1, -1, -1):
+    move = np.zeros(x.shape)
+    for _ in range(passes):
+        x = x + move
         equations = equations_at(problem, x, at=weighed)
-        if alone:
+        if problem.layout.size == slot.size:
             return equations.cost, equations.shared, equations.shared_vector
-        turn = _kept(problem, x, part, others)
-        if turn is not None:
-            equations, part = _turned(equations, turn), slice(0, slot.size)
-            own = np.arange(slot.size, turn.shape[-1])
-        rest = _without(equations, own)
-        move, _ = step(rest, np.zeros(rest.cost.shape))
-        if left:
-            x, shared = np.array(x), move[..., : len(own)]
-            if turn is not None:
-                shared = (turn[..., others[:, None], own] @ shared[..., None])[..., 0]
-            x[..., others] += shared
-            x[..., n:] += move[..., len(own) :]
+        along = _others(problem, x, part)
+        move, _ = step(equations, np.zeros(equations.cost.shape), along)
+    # the model is quadratic: it falls by the product of step and slope
+    cost = equations.cost - decrement(equations, move, n)
     information, vector, _ = marginal(equations)
-    cost = equations.cost - decrement(rest, move, len(own))
-    if not len(own):
-        return cost, information, vector
-    coupling = information[..., part, own]
-    right = np.concatenate([np.swapaxes(coupling, -1, -2), vector[..., own, None]], axis=-1)
-    solved, _ = linalg.solve(information[..., own[:, None], own], right)
-    lost = coupling @ solved
+    across = information[..., part, :] @ along
+    turned = np.swapaxes(along, -1, -2)
+    right = np.concatenate([np.swapaxes(across, -1, -2), turned @ vector[..., None]], axis=-1)
+    solved, _ = linalg.solve(turned @ information @ along, right)
+    lost = across @ solved
     return cost, information[..., part, part] - lost[..., :-1], vector[..., part] - lost[..., -1]
 
 
-def _kept(problem: Problem, x: Array, part: slice, own: Array) -> Array | None:
-    """Return the directions (q, N, n, m) that equalities leave: those of the position, then of the other unknowns.
+def _others(problem: Problem, x: Array, part: slice) -> Array:
+    """Return the directions (..., n, q) of the shared unknowns but the position, along the equalities about them.
 
-    None where no equality is about other unknowns: a height that is kept along a course is about the velocity as well.
+    A height that is kept along a course is about the velocity as well.
     """
-    face = exact(problem)
-    if not face or not len(own):
-        return None
-    gradients = np.stack([levels(problem, face, one)[1] for one in x])[..., own]
+    n, face = problem.layout.n_shared, exact(problem)
+    free = np.eye(n)[:, np.r_[0 : part.start, part.stop : n]]
+    if not face or not free.shape[1]:
+        return free
+    gradients = np.stack([levels(problem, face, one)[1] for one in x]) @ free
     if not gradients.any():
-        return None
+        return free
     _, sizes, axes = np.linalg.svd(np.where(np.isfinite(gradients), gradients, 0.0))
     rank = int((sizes > _DEPENDENT * sizes.max(-1, keepdims=True)).sum(-1).max())
-    turn = np.zeros((*gradients.shape[:2], problem.layout.n_shared, part.stop - part.start + len(own) - rank))
-    for k, column in enumerate(range(part.start, part.stop)):
-        turn[..., column, k] = 1.0
-    turn[..., own, part.stop - part.start :] = np.swapaxes(axes[..., rank:, :], -1, -2)
-    return turn
+    return np.asarray(free @ np.swapaxes(axes[..., rank:, :], -1, -2))
 
 
 # Share of the largest gradient below which an equality says nothing that another one does not.
 _DEPENDENT = 1e-9
-
-
-def _turned(equations: Normal, turn: Array) -> Normal:
-    """Return the normal equations of other shared unknowns: ``turn`` (..., n, m) times those are the old ones."""
-    back = np.swapaxes(turn, -1, -2)
-    vector = (back @ equations.shared_vector[..., None])[..., 0]
-    shared, cross = back @ equations.shared @ turn, back[..., None, :, :] @ equations.cross
-    return replace(equations, shared=shared, cross=cross, shared_vector=vector)
-
-
-def _without(equations: Normal, own: Array) -> Normal:
-    """Return the normal equations of the unknowns other than the position, which stays."""
-    return Normal(
-        equations.shared[..., own[:, None], own],
-        equations.local,
-        equations.cross[..., own, :],
-        equations.shared_vector[..., own],
-        equations.local_vector,
-        equations.cost,
-        equations.link,
-    )
 
 
 # How far the cost is that of a Gaussian.
@@ -278,8 +245,8 @@ _DIRECTIONS = {2: 16, 3: 50}
 _REFINED, _STEPS = 2, 12
 # Share of a cost that no step promises any more at the end: what is compared with it is a gap of several.
 _STILL = 1e-4
-# Marquardt's damping to begin with, and what a step that succeeds makes of it.
-_DAMPING, _EASED = 1e-3, 0.1
+# Damping of the first steps (Nielsen's tau): the directions that are tried are no closed forms near a minimum.
+_DAMPING = 1e-3
 # Relative violation of a constraint (`optloc.linear.constraints.violation`) beyond rounding at such distances.
 _BROKEN = 1e-4
 
@@ -298,7 +265,7 @@ def cost_at_infinity(problem: Problem, x: Array) -> Array:
     part = slice(slot.start, slot.start + slot.size)
     centre, spread = centre_and_spread(problem.stations.places)
     centre = np.broadcast_to(centre, x[:, part].shape)
-    along = None if not (face := exact(problem)) else tangent_at(problem, face, x).along[:, part]
+    along = None if not (face := exact(problem)) else tangent_at(problem, face, x)[:, part]
     sphere = _Sphere(problem, x, part, centre, _INFINITE * np.broadcast_to(spread, (len(x),)), along)
     with np.errstate(all="ignore"):
         own = sphere.direction(x[:, part] - centre)
@@ -339,24 +306,26 @@ class _Sphere:
     def descend(self, direction: Array) -> Array:
         """Return the least costs (q, N) next to directions (q, N, d): damped Gauss-Newton on the sphere."""
         cost, information, vector = self.look(direction)
-        damping, scale = np.full(cost.shape, _DAMPING), self.radius[:, None, None]
+        damping, growth = np.full(cost.shape, _DAMPING), np.full(cost.shape, FIRST_GROWTH)
+        scale = self.radius[:, None, None]
         for _ in range(_STEPS):
             across = scale * basis(direction)
             turned = np.swapaxes(across, -1, -2)
             inner = turned @ information @ across
             grown = inner * (1.0 + damping[..., None, None] * np.eye(inner.shape[-1]))
             pull = turned @ vector[..., None]
-            move, _ = linalg.solve(grown, pull)
+            move, ok = linalg.solve(grown, pull)
             # what the step promises: where that is nothing for any start, all have arrived
-            if not ((move * pull).sum((-1, -2)) > _STILL * (1.0 + cost)).any():
+            gain = (move * pull).sum((-1, -2))
+            if not (gain > _STILL * (1.0 + cost)).any():
                 break
             trial = self.direction(direction + (across @ move)[..., 0] / self.radius[:, None])
             new, more, other = self.look(trial)
-            better = new < cost
+            better, _, _, damping, growth = judge(cost, new, gain, ok, 0.0 * cost, damping, growth, 0.0, True)
             direction = np.where(better[..., None], trial, direction)
             information = np.where(better[..., None, None], more, information)
             vector = np.where(better[..., None], other, vector)
-            cost, damping = np.where(better, new, cost), damping * np.where(better, _EASED, _EASED**-1)
+            cost = np.where(better, new, cost)
         return np.asarray(cost)
 
 

@@ -303,25 +303,23 @@ def tangent(gradients: Array, scale: Array) -> Tangent:
     return Tangent(scale[..., None] * q[..., c:], scale[..., None] * (q[..., :c] @ restore))
 
 
-def solve_within(information: Array, vector: Array, space: Tangent) -> tuple[Array, Array]:
-    """Return the step (N, n) within the tangent space that solves the normal equations, and where it exists (N,)."""
-    z = space.along
-    if z.shape[-1] == 0:
+def solve_within(information: Array, vector: Array, along: Array) -> tuple[Array, Array]:
+    """Return the step (..., n) along a basis (..., n, q) that solves normal equations, and where it exists (...)."""
+    if along.shape[-1] == 0:
         # As many equalities as unknowns leave no step, which is an answer and no failure.
-        return np.zeros_like(vector), np.ones(len(vector), dtype=bool)
-    transposed = np.swapaxes(z, -1, -2)
-    part, ok = solve(transposed @ information @ z, transposed @ vector[..., None])
-    return (z @ part)[..., 0], ok
+        return np.zeros_like(vector), np.ones(vector.shape[:-1], dtype=bool)
+    transposed = np.swapaxes(along, -1, -2)
+    part, ok = solve(transposed @ information @ along, transposed @ vector[..., None])
+    return (along @ part)[..., 0], ok
 
 
-def inverse_within(information: Array, space: Tangent) -> tuple[Array, Array]:
-    """Return the covariance (N, n, n) on the tangent space, zero across it, and where it exists (N,)."""
-    z = space.along
-    if z.shape[-1] == 0:
+def inverse_within(information: Array, along: Array) -> tuple[Array, Array]:
+    """Return the covariance (N, n, n) along a basis (N, n, q), zero across it, and where it exists (N,)."""
+    if along.shape[-1] == 0:
         return np.zeros_like(information), np.ones(len(information), dtype=bool)
-    transposed = np.swapaxes(z, -1, -2)
-    inner, ok = inverse(transposed @ information @ z)
-    return z @ inner @ transposed, ok
+    transposed = np.swapaxes(along, -1, -2)
+    inner, ok = inverse(transposed @ information @ along)
+    return along @ inner @ transposed, ok
 
 
 # Points: their centre and spread, error ellipses and ellipsoids of covariances.

@@ -57,8 +57,8 @@ def crlb(problem: Problem, truth: Array) -> Array:
         return covariance(equations)[0]
     information, _, ok = marginal(equations)
     vectors = np.broadcast_to(x, (*ok.shape, x.shape[-1])).reshape(-1, x.shape[-1])
-    space = tangent_at(problem.flat(), held, vectors)
-    bound, good = linalg.inverse_within(information.reshape(-1, *information.shape[-2:]), space)
+    along = tangent_at(problem.flat(), held, vectors)
+    bound, good = linalg.inverse_within(information.reshape(-1, *information.shape[-2:]), along)
     return np.where((ok.ravel() & good)[:, None, None], bound, np.nan).reshape(information.shape)
 
 

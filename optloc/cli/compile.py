@@ -185,7 +185,6 @@ PARTS: Mapping[str, Part] = {
         (
             "optloc.compute.filter.absorb",
             "optloc.compute.refine.refine_block",
-            "optloc.compute.refine.refine_runs",
             "optloc.compute.equations.normal_block",
         ),
     ),

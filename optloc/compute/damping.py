@@ -34,6 +34,14 @@ _MOST = 1e12
 _FALL, _QUICK_FALL, _AGREED = 1.0 / 3.0, 0.1, 0.9
 
 
+class Rules(NamedTuple):
+    """When a refinement ends; see `optloc.compute.least_squares.refine`, whose defaults these are."""
+
+    tolerance: float = 1e-7
+    limit: int = 60
+    damped: bool = True
+
+
 class Judged(NamedTuple):
     """What becomes of a step: each an array (N,), or a scalar.
 

@@ -10,9 +10,9 @@ import numpy as np
 from optloc.base.threads import mapped, thread_count
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.compute.lanes import Cells, add_group, add_prior, arrange, blocks, clear, gather, load, measure, memory
-from optloc.compute.pack import AT, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
-from optloc.compute.tables import FIRST, GROUP_EPOCH, Tables
+from optloc.compute.lanes import Cells, add_groups, add_priors, arrange, blocks, clear, gather, load, memory
+from optloc.compute.pack import Numbers, Packed
+from optloc.compute.tables import Tables
 from optloc.linear.normal import Normal
 
 # Starts that are worth a thread of their own: one block of lanes, see `optloc.compute.lanes`.
@@ -30,10 +30,10 @@ class Sums(NamedTuple):
     cost: Array
 
 
-def chunks(count: int, least: int = _SHARE) -> list[tuple[int, int]]:
+def chunks(count: int) -> list[tuple[int, int]]:
     """Return stretches (first, last) of a number of starts, one for each thread that is worth it."""
     # Threads get stretches of equal length: starts take about the same time, and each stretch keeps its memory.
-    parts = max(1, min(thread_count(), count // least))
+    parts = max(1, min(thread_count(), count // _SHARE))
     ends = np.linspace(0, count, parts + 1).round().astype(int).tolist()
     return list(pairwise(ends))
 
@@ -110,18 +110,9 @@ def _epochs(
     clear(m, room.now, (last + 1) ** 2, used)
     for epoch in range(t.epochs):
         clear(m, room.after, (last + 1) ** 2, used)
-        # Groups come in the order of their epochs, packets in that of their groups: one pass goes through all.
-        while group < t.groups and t.table[t.group + group, GROUP_EPOCH] == epoch:
-            if packet < t.packets and t.table[t.packet + packet, FIRST] == group:
-                measure(t, c.common, m, r, room, packet, room.trial, used)
-                packet += 1
-            add_group(t, c.common, c.place, m, room, group, used)
-            group += 1
-        for i in range(t.groups, c.place.shape[0]):
-            if priors and c.place[i, PRIOR_LOCAL]:
-                start = t.shared + c.place[i, PRIOR_START]
-                x = room.trial + start + epoch * t.local
-                add_prior(c.common, c.place[i, AT], c.place[i, PRIOR_SIZE], m, room, x, start, last, used)
+        group, packet = add_groups(t, c, m, r, room, room.trial, epoch, group, packet, used)
+        if priors:
+            add_priors(t, c, m, room, room.trial, True, epoch, used)
         _own(m, room.after, t.shared, t.local, begin, epoch, used, local, cross, vector)
         # Only what concerns the shared unknowns is summed; couplings belong to the epoch and are written out.
         for i in range(last + 1):
@@ -133,10 +124,8 @@ def _epochs(
     for cell in range((last + 1) ** 2):
         for b in range(used):
             m[room.after + cell, b] = m[room.now + cell, b]
-    for i in range(t.groups, c.place.shape[0]):
-        if priors and not c.place[i, PRIOR_LOCAL]:
-            start = c.place[i, PRIOR_START]
-            add_prior(c.common, c.place[i, AT], c.place[i, PRIOR_SIZE], m, room, room.trial + start, start, last, used)
+    if priors:
+        add_priors(t, c, m, room, room.trial, False, 0, used)
 
 
 @compiled

@@ -16,6 +16,7 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled, put
 from optloc.compute.lanes import Cells, arrange, gather, load, memory
 from optloc.compute.pack import Packed
+from optloc.compute.systems import cholesky, solve_factored, substitute
 
 # Halvings of a step that raises the cost, and the rise that is rounding: as in `optloc.track.updates`.
 _HALVINGS, _RISE = 8, 1e-9
@@ -68,7 +69,8 @@ def absorb(packed: Packed, mean: Array, cov: Array, limit: int, tolerance: float
         return -1
     put(mean, out.mean)
     cost = _equations(packed, m, r, room, root, y, out.mean, half, factor, slope)
-    _solve(factor, slope, move)
+    put(slope, move)
+    solve_factored(factor, move)
     # The innovations' own square is the least of the cost along straight rows: written so that an error of the step
     # enters squared, since the cost itself may be larger by many digits.
     out.said[0], out.said[1] = cost, 0.0
@@ -100,7 +102,8 @@ def absorb(packed: Packed, mean: Array, cov: Array, limit: int, tolerance: float
         cost = now
         if not sqrt(length) > tolerance:
             break
-        _solve(factor, slope, move)
+        put(slope, move)
+        solve_factored(factor, move)
     _covariance(root, factor, out.cov)
     return steps
 
@@ -165,25 +168,9 @@ def _equations(
             value = 1.0 if i == j else 0.0
             for k in range(i, n):
                 value += root[k, i] * half[k, j]
-            for k in range(j):
-                value -= factor[i, k] * factor[j, k]
-            factor[i, j] = sqrt(value) if i == j else value / factor[j, j]
+            factor[i, j] = value
+    cholesky(factor, n, 0.0)  # no less than the unit matrix
     return float(cost)
-
-
-@compiled
-def _solve(factor: Array, right: Array, out: Array) -> None:
-    """Write the solution of ``C C' out = right``."""
-    n = len(right)
-    for i in range(n):
-        out[i] = right[i]
-        for k in range(i):
-            out[i] -= factor[i, k] * out[k]
-        out[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            out[i] -= factor[k, i] * out[k]
-        out[i] /= factor[i, i]
 
 
 @compiled
@@ -200,15 +187,13 @@ def _covariance(root: Array, factor: Array, out: Array) -> None:
     """Write ``L (C C')^-1 L'``: symmetric and positive, whatever rounding does."""
     n = len(root)
     rows = np.zeros((n, n))
-    for i in range(n):  # C^-1 L', column by column of L'
-        for j in range(n):
-            rows[j, i] = root[i, j] if j <= i else 0.0
-            for k in range(j):
-                rows[j, i] -= factor[j, k] * rows[k, i]
-            rows[j, i] /= factor[j, j]
+    for i in range(n):  # rows of (C^-1 L')'
+        for j in range(i + 1):
+            rows[i, j] = root[i, j]
+        substitute(factor, rows[i])
     for i in range(n):
         for j in range(i + 1):
             value = 0.0
             for k in range(n):
-                value += rows[k, i] * rows[k, j]
+                value += rows[i, k] * rows[j, k]
             out[i, j] = out[j, i] = value

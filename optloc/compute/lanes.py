@@ -20,6 +20,7 @@ from optloc.compute.tables import (
     DERIVATIVE,
     FIRST,
     GROUP_COLUMN,
+    GROUP_EPOCH,
     GROUP_ROWS,
     KIND_CODE,
     KIND_CONSTANT,
@@ -75,7 +76,7 @@ class Cells(NamedTuple):
     absent: int  # 1 where some rows do not count
 
 
-STATE = 10
+STATE = 8
 """Cells that a refinement keeps of every problem."""
 _EPSILON = float(np.finfo(float).eps)
 
@@ -152,7 +153,7 @@ def blur_of(sigma: Array, size: Array, m: Array, room: Cells, lane: int, item: i
         if not room.absent or m[room.present + i, lane] != 0.0:
             ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
             squares += ratio * ratio
-    # Four roundings, as in `optloc.solvers.refine`.
+    # Four roundings, as in `optloc.compute.least_squares`.
     coarse = 4.0 * _EPSILON * np.sqrt(squares)
     return coarse if np.isfinite(coarse) else 0.0
 
@@ -395,15 +396,42 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool,
     lanes : int
         How many lanes hold a problem.
     """
-    last = t.shared + t.local
-    clear(m, room.after, (last + 1) ** 2, lanes)
-    for packet in range(t.packets):
-        measure(t, c.common, m, r, room, packet, room.trial, lanes)
-        for group in range(t.table[t.packet + packet, FIRST], t.table[t.packet + packet + 1, FIRST]):
-            add_group(t, c.common, c.place, m, room, group, lanes)
-    for i in range(t.groups, c.place.shape[0] if priors else t.groups):
-        start = c.place[i, PRIOR_START] + (t.shared if c.place[i, PRIOR_LOCAL] else 0)
-        add_prior(c.common, c.place[i, AT], c.place[i, PRIOR_SIZE], m, room, room.trial + start, start, last, lanes)
+    clear(m, room.after, (t.shared + t.local + 1) ** 2, lanes)
+    add_groups(t, c, m, r, room, room.trial, ALL, 0, 0, lanes)
+    if priors:
+        add_priors(t, c, m, room, room.trial, False, 0, lanes)
+        add_priors(t, c, m, room, room.trial, True, 0, lanes)
+
+
+ALL = -1
+"""In the place of an epoch: the groups of all of them."""
+
+
+@compiled
+def add_groups(
+    t: Tables, c: Numbers, m: Array, r: Array, room: Cells, x: int, epoch: int, group: int, packet: int, lanes: Constant
+) -> tuple[int, int]:
+    """Add the rows of an epoch at the vectors of cell x on to `room.after`; return the next group and packet.
+
+    Groups come in the order of their epochs, packets in that of their groups: one pass goes through all.
+    """
+    while group < t.groups and (epoch == ALL or t.table[t.group + group, GROUP_EPOCH] == epoch):
+        if packet < t.packets and t.table[t.packet + packet, FIRST] == group:
+            measure(t, c.common, m, r, room, packet, x, lanes)
+            packet += 1
+        add_group(t, c.common, c.place, m, room, group, lanes)
+        group += 1
+    return group, packet
+
+
+@compiled
+def add_priors(t: Tables, c: Numbers, m: Array, room: Cells, x: int, local: bool, epoch: int, lanes: Constant) -> None:
+    """Add the priors of the shared unknowns, or of those of an epoch, to the equations in `room.after`."""
+    for i in range(t.groups, c.place.shape[0]):
+        if (c.place[i, PRIOR_LOCAL] == 1) == local:
+            start = c.place[i, PRIOR_START] + (t.shared if local else 0)
+            at = x + start + (epoch * t.local if local else 0)
+            _add_prior(c.common, c.place[i, AT], c.place[i, PRIOR_SIZE], m, room, at, start, t.shared + t.local, lanes)
 
 
 @compiled
@@ -504,7 +532,7 @@ def _square(
 
 
 @compiled
-def add_prior(
+def _add_prior(
     common: Array, place: int, size: int, m: Array, room: Cells, x: int, start: int, last: int, lanes: Constant
 ) -> None:
     """Add a Gaussian prior of the `size` unknowns at cell x on, whose first column is `start`."""

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.solvers.refine`, lane by lane.
+"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.compute.least_squares`, lane by lane.
 
 A lane whose problem is finished takes the next one, so that the lanes are full until the problems run out.
 """
@@ -12,13 +12,13 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
 from optloc.compute.equations import chunks, normal_at
 from optloc.compute.jit import compiled
 from optloc.compute.lanes import (
     Cells,
-    add_group,
-    add_prior,
+    add_groups,
+    add_priors,
     arrange,
     blocks,
     blur_of,
@@ -29,22 +29,14 @@ from optloc.compute.lanes import (
     memory,
     whiten_group,
 )
-from optloc.compute.pack import AT, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
+from optloc.compute.pack import Numbers, Packed
 from optloc.compute.systems import backward, complete, eliminate, factor, factor_local, forward, step
-from optloc.compute.tables import FIRST, GROUP_EPOCH, GROUP_ROWS, Tables
+from optloc.compute.tables import FIRST, GROUP_ROWS, Tables
 from optloc.linear.normal import OPEN, Normal
 
 _OK, LIMIT, _STALLED, NUMERICAL = (
     int(status) for status in (Status.OK, Status.MAX_ITERATIONS, Status.STALLED, Status.NUMERICAL)
 )
-
-
-class Rules(NamedTuple):
-    """When a refinement ends; see `optloc.solvers.refine.refine`, whose defaults these are."""
-
-    tolerance: float = 1e-7
-    limit: int = 60
-    damped: bool = True
 
 
 class Answers(NamedTuple):
@@ -59,7 +51,7 @@ class Answers(NamedTuple):
 
 
 # Cells that a refinement keeps of every problem, from `room.state` on; `room.STATE` of them.
-DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, TRIED, CLOSED = range(9)
+DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, CLOSED = range(8)
 # What it keeps beside them: which start it is, 1 while nothing but the start is
 # known and 2 before it is there, steps tried, status.
 START, FRESH, STEPS, STATUS = range(4)
@@ -81,6 +73,10 @@ def answers(start: Array, kept: int | None = None) -> Answers:
     )
 
 
+LEFT_OPEN = -1
+"""Status of a start on whose way an epoch left its own unknowns open: what then holds is left to numpy."""
+
+
 @compiled
 def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rules, out: Answers) -> None:
     """Refine the starts first <= i < last; several threads may work on one set of answers.
@@ -88,7 +84,7 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     Parameters
     ----------
     packed : Packed
-        N problems of one epoch, or without unknowns local to the epochs.
+        N problems.
     item : int64 array (M,)
         Problem of each start.
     first, last : int
@@ -96,10 +92,11 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     rules : Rules
         When to stop.
     out : Answers
-        Starts; they become the answers. Status: ok, max iterations, stalled, numerical.
+        Starts; they become the answers. Status: ok, max iterations, stalled, numerical, `LEFT_OPEN`. Neither
+        information nor vector is written of runs whose epochs have unknowns of their own.
     """
     t, c = packed
-    size = out.x.shape[1]
+    size, runs = out.x.shape[1], is_run(t)
     lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
     m, r = memory(t, room, lanes)
     tag, used, following = np.zeros((_TAGS, lanes), np.int64), lanes, first + lanes
@@ -107,13 +104,25 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
         tag[START, b], tag[FRESH, b] = first + b, EMPTY
     while used > 0:
         begin(c, m, room, tag, used, item, out.x)
-        gather(t, c, m, r, room, True, used)
-        _judge(m, room, size, tag, rules, used)
+        if runs:
+            _price(t, c, m, r, room, used)
+        else:
+            gather(t, c, m, r, room, True, used)
+        _judge(m, room, size, runs, t.shared + t.local + 1, tag, rules, used)
         for b in range(used):
             if is_over(tag, b, rules.limit):
                 _finish(m, room, tag, b, out)
         used, following = refill(m, room.cells, tag, used, following, last, rules.limit)
-        _advance(m, room, t.shared, t.local, tag, rules.damped, used)
+        if runs:
+            _advance_run(t, c, m, r, room, tag, rules.damped, used)
+        else:
+            _advance(m, room, t.shared, t.local, tag, rules.damped, used)
+
+
+@compiled
+def is_run(t: Tables) -> bool:
+    """Return whether problems have several epochs with unknowns of their own, which are eliminated one by one."""
+    return t.local > 0 and t.epochs > 1
 
 
 @compiled
@@ -163,21 +172,24 @@ def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
 
 
 @compiled
-def _judge(m: Array, room: Cells, size: int, tag: Array, rules: Rules, used: int) -> None:
+def _judge(m: Array, room: Cells, size: int, runs: bool, line: int, tag: Array, rules: Rules, used: int) -> None:
     """Take the places tried that are better, and set damping and status."""
-    line = size + 1
-    better, cost = room.state + BETTER, line * line - 1
+    state, total = room.state, room.after + line * line - 1
+    better, cost = state + BETTER, state + COST
     for b in range(used):
         if tag[FRESH, b]:
-            m[better, b], tag[FRESH, b] = 1.0, 0
-            if not np.isfinite(m[room.after + cost, b]):
+            m[better, b], m[state + CLOSED, b], tag[FRESH, b] = 1.0, 1.0, 0
+            if not np.isfinite(m[total, b]):
                 tag[STATUS, b] = NUMERICAL
+        elif runs and m[state + CLOSED, b] == 0.0:
+            m[better, b], tag[STATUS, b] = 0.0, LEFT_OPEN
         else:
-            tag[STATUS, b] = judge_trial(m, room, room.now + cost, room.after + cost, rules, b)
+            tag[STATUS, b] = judge_trial(m, room, cost, total, rules, b)
+        m[cost, b] = m[total, b] if m[better, b] != 0.0 else m[cost, b]
     for i in range(size):
         for b in range(used):
             m[room.best + i, b] = m[room.trial + i, b] if m[better, b] != 0.0 else m[room.best + i, b]
-    for i in range(line):
+    for i in range(0 if runs else line):
         for cell in range(i * line, i * line + i + 1):
             for b in range(used):
                 m[room.now + cell, b] = m[room.after + cell, b] if m[better, b] != 0.0 else m[room.now + cell, b]
@@ -207,12 +219,14 @@ def judge_trial(m: Array, room: Cells, now: int, after: int, rules: Rules, b: in
 @compiled
 def _finish(m: Array, room: Cells, tag: Array, lane: int, out: Answers) -> None:
     """Write the answer of a lane."""
-    start, size = tag[START, lane], out.x.shape[1]
+    start, size = tag[START, lane], out.matrix.shape[-1]
     last = room.now + size * (size + 1)
-    out.cost[start], out.iterations[start] = m[last + size, lane], tag[STEPS, lane]
+    out.cost[start], out.iterations[start] = m[room.state + COST, lane], tag[STEPS, lane]
     out.status[start] = tag[STATUS, lane]
+    for i in range(out.x.shape[1]):
+        out.x[start, i] = m[room.best + i, lane]
     for i in range(size):
-        out.x[start, i], out.vector[start, i] = m[room.best + i, lane], m[last + i, lane]
+        out.vector[start, i] = m[last + i, lane]
         for j in range(i + 1):
             entry = m[room.now + i * (size + 1) + j, lane]
             out.matrix[start, i, j], out.matrix[start, j, i] = entry, entry
@@ -235,44 +249,16 @@ def _advance(m: Array, room: Cells, n: int, local: int, tag: Array, damped: bool
         tag[STEPS, b] += 1 - tag[FRESH, b]
 
 
-# Damped Gauss-Newton for runs whose epochs have unknowns of their own: eliminated epoch by epoch, nothing is kept.
+# Runs whose epochs have unknowns of their own: these are eliminated epoch by epoch, and nothing of an epoch is kept.
 #
-# The rules are those of `optloc.compute.refine`. A step takes two passes over the epochs: one sums up what they say
-# about the shared unknowns, one works out their own; a third one finds the cost of the place tried.
-
-LEFT_OPEN = -1
-"""Status of a start on whose way an epoch left its own unknowns open: what then holds is left to numpy."""
-
-
-@compiled
-def refine_runs(packed: Packed, item: Array, first: int, last: int, rules: Rules, out: Answers) -> None:
-    """Refine the starts first <= i < last of runs; see `optloc.compute.refine.refine_block`.
-
-    Neither information nor vector are written.
-    """
-    t, c = packed
-    size = out.x.shape[1]
-    lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
-    m, r = memory(t, room, lanes)
-    tag, used, following = np.zeros((_TAGS, lanes), np.int64), lanes, first + lanes
-    for b in range(lanes):
-        tag[START, b], tag[FRESH, b] = first + b, EMPTY
-    while used > 0:
-        begin(c, m, room, tag, used, item, out.x)
-        _price(t, c, m, r, room, used)
-        _judge_run(m, room, size, tag, rules, used)
-        for b in range(used):
-            if is_over(tag, b, rules.limit):
-                _finish_run(m, room, tag, b, out)
-        used, following = refill(m, room.cells, tag, used, following, last, rules.limit)
-        _advance_run(t, c, m, r, room, tag, rules.damped, used)
+# A step takes two passes over the epochs: one sums up what they say about the shared unknowns, one works out their own;
+# a third one finds the cost of the place tried.
 
 
 @compiled
 def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, lanes: int) -> None:
     """Write the cost at `room.trial`."""
-    cost, last = room.state + TRIED, t.shared + t.local
-    total = room.after + (last + 1) ** 2 - 1
+    total = room.after + (t.shared + t.local + 1) ** 2 - 1
     for b in range(lanes):
         m[total, b] = 0.0
     for packet in range(t.packets):
@@ -282,50 +268,9 @@ def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, lanes: int) -
             for i in range(t.table[t.group + group, GROUP_ROWS]):
                 for b in range(lanes):
                     m[total, b] += m[residual + i * t.width, b] * m[residual + i * t.width, b]
-    _priors(t, c, m, room, room.trial, False, 0, lanes)
+    add_priors(t, c, m, room, room.trial, False, 0, lanes)
     for epoch in range(t.epochs):
-        _priors(t, c, m, room, room.trial, True, epoch, lanes)
-    for b in range(lanes):
-        m[cost, b] = m[total, b]
-
-
-@compiled
-def _priors(t: Tables, c: Numbers, m: Array, room: Cells, x: int, local: bool, epoch: int, lanes: int) -> None:
-    """Add the priors of the shared unknowns, or of those of an epoch, to the equations in `room.after`."""
-    for i in range(t.groups, c.place.shape[0]):
-        if (c.place[i, PRIOR_LOCAL] == 1) == local:
-            start = c.place[i, PRIOR_START] + (t.shared if local else 0)
-            at = x + start + (epoch * t.local if local else 0)
-            add_prior(c.common, c.place[i, AT], c.place[i, PRIOR_SIZE], m, room, at, start, t.shared + t.local, lanes)
-
-
-@compiled
-def _judge_run(m: Array, room: Cells, size: int, tag: Array, rules: Rules, used: int) -> None:
-    """Take the places tried that are better, and set damping and status."""
-    better, cost, tried = room.state + BETTER, room.state + COST, room.state + TRIED
-    for b in range(used):
-        if tag[FRESH, b]:
-            m[better, b], m[room.state + CLOSED, b], tag[FRESH, b] = 1.0, 1.0, 0
-            if not np.isfinite(m[tried, b]):
-                tag[STATUS, b] = NUMERICAL
-        elif m[room.state + CLOSED, b] == 0.0:
-            m[better, b], tag[STATUS, b] = 0.0, LEFT_OPEN
-        else:
-            tag[STATUS, b] = judge_trial(m, room, cost, tried, rules, b)
-        m[cost, b] = m[tried, b] if m[better, b] != 0.0 else m[cost, b]
-    for i in range(size):
-        for b in range(used):
-            m[room.best + i, b] = m[room.trial + i, b] if m[better, b] != 0.0 else m[room.best + i, b]
-
-
-@compiled
-def _finish_run(m: Array, room: Cells, tag: Array, lane: int, out: Answers) -> None:
-    """Write the answer of a lane."""
-    start = tag[START, lane]
-    out.cost[start], out.iterations[start] = m[room.state + COST, lane], tag[STEPS, lane]
-    out.status[start] = tag[STATUS, lane]
-    for i in range(out.x.shape[1]):
-        out.x[start, i] = m[room.best + i, lane]
+        add_priors(t, c, m, room, room.trial, True, epoch, lanes)
 
 
 @compiled
@@ -365,14 +310,9 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, tag: Array, su
             m[room.state + SOLVABLE, b], m[room.state + CLOSED, b] = 1.0, 1.0
     for epoch in range(t.epochs + 1):
         clear(m, room.after, line * line, lanes)
-        while group < t.groups and t.table[t.group + group, GROUP_EPOCH] == epoch:
-            if packet < t.packets and t.table[t.packet + packet, FIRST] == group:
-                measure(t, c.common, m, r, room, packet, room.best, lanes)
-                packet += 1
-            add_group(t, c.common, c.place, m, room, group, lanes)
-            group += 1
         whole = epoch == t.epochs  # behind the last epoch come the priors of what lasts the run
-        _priors(t, c, m, room, room.best, not whole, epoch, lanes)
+        group, packet = add_groups(t, c, m, r, room, room.best, epoch, group, packet, lanes)
+        add_priors(t, c, m, room, room.best, not whole, epoch, lanes)
         if not whole:
             closed = room.state + CLOSED
             factor_local(m, room, room.after, n, local, room.state + DAMPING, closed, OPEN, lanes)
@@ -429,10 +369,9 @@ def refined(packed: Packed, item: Array, start: Array, rules: Rules) -> tuple[An
     rules : Rules
         When to stop.
     """
-    of_epochs = packed.tables.local > 0 and packed.tables.epochs > 1
-    out, kernel = answers(start, 0 if of_epochs else None), refine_runs if of_epochs else refine_block
+    out = answers(start, 0 if is_run(packed.tables) else None)
     item = np.ascontiguousarray(item)  # machine code would be made anew for entries that lie apart
-    mapped(lambda part: kernel(packed, item, part[0], part[1], rules, out), chunks(len(start)))
+    mapped(lambda part: refine_block(packed, item, part[0], part[1], rules, out), chunks(len(start)))
     return out, np.asarray(out.status == LEFT_OPEN)
 
 

@@ -84,7 +84,7 @@ def serves(problem: Problem, starts: int) -> bool:
     if not starts or problem.count > _LONGEST or not enabled() or walks(problem):
         return False
     from optloc.compute.equations import normal_block
-    from optloc.compute.refine import refine_block, refine_runs
+    from optloc.compute.refine import refine_block
 
     count = prod(problem.batch_shape)
-    return all(usable(kernel, count) for kernel in (normal_block, refine_block, refine_runs))
+    return all(usable(kernel, count) for kernel in (normal_block, refine_block))

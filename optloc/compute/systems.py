@@ -400,13 +400,13 @@ def inverse(a: float, b: float, c: float, d: float, e: float, f: float, out: Arr
 
 
 @compiled
-def invert(matrix: Array, size: int, least: float) -> bool:
-    """Replace the leading block of a positive definite matrix by its inverse; return False where it is singular.
+def cholesky(matrix: Array, size: int, least: float) -> bool:
+    """Replace the lower triangle of a leading block by its factor; return whether the block is positive definite.
 
     Parameters
     ----------
     matrix : array (n, n)
-        Symmetric; its lower triangle is read, both are written.
+        Symmetric; its lower triangle is read and written.
     size : int
         How many rows and columns count.
     least : float
@@ -425,6 +425,43 @@ def invert(matrix: Array, size: int, least: float) -> bool:
             for k in range(j):
                 total -= matrix[i, k] * matrix[j, k]
             matrix[i, j] = total / root
+    return True
+
+
+@compiled
+def substitute(lower: Array, right: Array) -> None:
+    """Replace a vector (n,) by the inverse of a lower triangular matrix times it."""
+    for i in range(len(right)):
+        for k in range(i):
+            right[i] -= lower[i, k] * right[k]
+        right[i] /= lower[i, i]
+
+
+@compiled
+def solve_factored(lower: Array, right: Array) -> None:
+    """Replace a vector (n,) by the solution of the system of which `cholesky` returned the factor."""
+    substitute(lower, right)
+    for i in range(len(right) - 1, -1, -1):
+        for k in range(i + 1, len(right)):
+            right[i] -= lower[k, i] * right[k]
+        right[i] /= lower[i, i]
+
+
+@compiled
+def invert(matrix: Array, size: int, least: float) -> bool:
+    """Replace the leading block of a positive definite matrix by its inverse; return False where it is singular.
+
+    Parameters
+    ----------
+    matrix : array (n, n)
+        Symmetric; its lower triangle is read, both are written.
+    size : int
+        How many rows and columns count.
+    least : float
+        Share of its diagonal that a pivot must exceed.
+    """
+    if not cholesky(matrix, size, least):
+        return False
     for j in range(size):  # the lower factor by its own inverse
         matrix[j, j] = 1.0 / matrix[j, j]
         for i in range(j + 1, size):

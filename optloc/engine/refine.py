@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton of many problems side by side: the rules of `optloc.solvers.refine`, lane by lane."""
+"""Damped Gauss-Newton of many problems side by side: the rules of `optloc.compute.least_squares`, lane by lane."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.linalg import Tangent, tangent
+from optloc.base.linalg import tangent
 from optloc.base.types import Array, Band, Motion, Polygon
 from optloc.linear.courses import course_at, elapsed, height_at, to_ecef
 from optloc.models.primitives import Jet, Point
@@ -363,9 +363,9 @@ def restore(problem: Problem, face: Face, x: Array) -> Array:
     return x
 
 
-def tangent_at(problem: Problem, face: Face, x: Array) -> Tangent:
-    """Return the tangent space of a face at vectors (N, size)."""
-    return tangent(levels(problem, face, x)[1], np.ones((len(x), problem.layout.n_shared)))
+def tangent_at(problem: Problem, face: Face, x: Array) -> Array:
+    """Return a basis (N, n, n - c) of the tangent space of a face at vectors (N, size)."""
+    return tangent(levels(problem, face, x)[1], np.ones((len(x), problem.layout.n_shared))).along
 
 
 def _band(constraint: Band | Polygon, side: str | int) -> Band:

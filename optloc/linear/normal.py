@@ -10,7 +10,6 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.arrays import as_number, eye, gather, library, placed
-from optloc.base.linalg import Tangent
 from optloc.base.types import Array, Rows
 from optloc.linear import chain
 from optloc.linear.evaluate import differentiate
@@ -399,7 +398,7 @@ def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
     return np.where(good[..., None, None], full, np.nan)[..., :size, :size]
 
 
-def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tuple[Array, Array]:
+def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple[Array, Array]:
     """Return the damped step (..., size) of the full parameter vector, and where it exists (...).
 
     Parameters
@@ -408,16 +407,16 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         Information and right-hand side.
     damping : array (...)
         Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``.
-    space : Tangent, optional
-        Tangent space of equalities that the step keeps to first order.
+    along : array (..., n, q), optional
+        Basis of the shared part of the step, for instance of the tangent space of equalities; None: all unknowns move.
     """
     damped = _damp(equations, damping)
     information, vector, ok, held = _eliminate(damped)
     if equations.link is not None:
         # Beside walks, which follow whatever is shared, little of what rows say of it is left: that is what is scaled.
         information = _grow(information, damping)
-    if space is not None:
-        shared, good = linalg.solve_within(information, vector, space)
+    if along is not None:
+        shared, good = linalg.solve_within(information, vector, along)
         ok = ok & good
     elif information.shape[-1]:
         shared, good = linalg.solve(information, vector[..., None])
@@ -447,13 +446,10 @@ def _grow(matrix: Array, factor: Array) -> Array:
     return grown
 
 
-def covariance(equations: Normal, space: Tangent | None = None) -> tuple[Array, Array]:
-    """Return the covariance (..., n, n) of the shared unknowns, NaN where singular, and where it exists (...).
-
-    With equalities it is the covariance on their tangent space.
-    """
+def covariance(equations: Normal) -> tuple[Array, Array]:
+    """Return the covariance (..., n, n) of the shared unknowns, NaN where singular, and where it exists (...)."""
     information, _, ok = marginal(equations)
-    inverse, good = linalg.inverse(information) if space is None else linalg.inverse_within(information, space)
+    inverse, good = linalg.inverse(information)
     xp = library(inverse)
     return xp.where((ok & good)[..., None, None], inverse, xp.nan), ok & good
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, put
+from optloc.compute.systems import cholesky, solve_factored
 from optloc.placement.criteria import VOLUME, add_square, derive, evaluate
 
 # Multipliers below this share of the largest are left out: they cost as much as the others, and move the bound by less.
@@ -118,32 +119,6 @@ def cheapest(cost: Array, size: Array, most: float, at: Array) -> tuple[float, f
 
 
 @compiled
-def solve(matrix: Array, right: Array) -> bool:
-    """Solve a positive definite system in place, given by its lower triangle; return whether it is definite."""
-    n = matrix.shape[0]
-    for j in range(n):
-        for k in range(j):
-            x = matrix[j, k]
-            if x != 0.0:
-                for i in range(j, n):
-                    matrix[i, j] -= matrix[i, k] * x
-        if not matrix[j, j] > 0.0:
-            return False
-        root = np.sqrt(matrix[j, j])
-        for i in range(j, n):
-            matrix[i, j] /= root
-    for i in range(n):
-        for k in range(i):
-            right[i] -= matrix[i, k] * right[k]
-        right[i] /= matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            right[i] -= matrix[k, i] * right[k]
-        right[i] /= matrix[i, i]
-    return True
-
-
-@compiled
 def step(
     w: Array,
     left: Array,
@@ -188,8 +163,9 @@ def step(
         for j in range(n):
             move[j] -= rules[i, j] * (mu / left[i] - pull * gain[i])
         add_square(rules[i], pull, hessian)
-    if not solve(hessian, move):
+    if not cholesky(hessian, len(move), 0.0):
         return 0.0
+    solve_factored(hessian, move)
     reach = 1.0
     for i in range(count):
         for j in range(n):

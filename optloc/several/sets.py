@@ -9,12 +9,12 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
+from optloc.compute.least_squares import refine
 from optloc.linear.evaluate import differentiate
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
-from optloc.solvers.refine import refine
 from optloc.track.associate import Clutter, offsets
 from optloc.track.several_targets import candidates, channels_of
 from optloc.track.track import State

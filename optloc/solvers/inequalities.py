@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.engine.admission import GRAZE, GROUND, SATELLITE
 from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_held, violation
@@ -19,7 +20,6 @@ from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
-from optloc.solvers.refine import refine
 
 
 def is_hidden(problem: Problem, x: Array) -> Array:

@@ -99,9 +99,9 @@ def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
         items = np.flatnonzero(face == number)
         part, here = problem.take(items), x[items]
         with np.errstate(all="ignore"):
-            space = tangent_at(part, sides[number], here) if sides[number] else None
+            along = tangent_at(part, sides[number], here) if sides[number] else None
             equations = equations_at(part, here, whiten(part.noise, part.weight))
-            move, solvable = step(equations, np.zeros(len(here)), space)
+            move, solvable = step(equations, np.zeros(len(here)), along)
             small = solvable & (np.abs(decrement(equations, move, problem.layout.n_shared)) < _STATIONARY)
         out[items[small]] = Status.OK
     return out

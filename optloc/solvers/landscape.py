@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.linalg import tangent
-from optloc.base.types import Array, Status
-from optloc.compute.sums import equations_at
-from optloc.linear.normal import eliminated, step
+from optloc.base.types import Array, Band, Status
+from optloc.compute.least_squares import refine
+from optloc.linear.constraints import exact
 from optloc.linear.vectors import vectors
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers.refine import refine
 
-# Steps at most: places far from any fit take their time, and a picture does not wait for the last of them.
-_STEPS = 40
-# Marquardt's factor: almost a Gauss-Newton step at first, tenfold less after a step that lowers the cost and tenfold
-# more after one that does not; given up where it leaves no step.
-_FIRST, _STUCK = 1e-3, 1e9
-# Relative drop of the cost that ends the steps: far below what a contour or colour shows.
-_SETTLED = 1e-9
+# Steps at most: places far from any fit take their time, most others a dozen.
+_STEPS = 100
+# Length of the last step, standard deviations: it changes the cost by far less than a contour or colour shows.
+_SETTLED = 1e-4
 # Standard deviations within which an iteration has reached a fix.
 _SAME = 0.1
 
@@ -58,28 +53,10 @@ def profile_cost(problem: Problem, x: Array, places: Array, held: Array) -> Arra
     slot, _ = layout.find("position")
     vectors = np.tile(np.asarray(x, dtype=float), (len(places), 1))
     vectors[:, slot.start : slot.start + slot.size] = places
-    # steps stay in the space across what is held; the scales decide nothing, as its basis is all that is used
-    gradients = np.zeros((1, len(held), layout.n_shared))
-    gradients[0, :, slot.start : slot.start + slot.size] = held
-    space = tangent(gradients, np.ones((1, layout.n_shared)))
-    with np.errstate(all="ignore"):
-        cost = np.asarray(eliminated(equations_at(problem, vectors)).cost)
-        if layout.n_shared > len(held):
-            active, damping = np.arange(len(places)), np.full(len(places), _FIRST)
-            for _ in range(_STEPS):
-                before = cost[active]
-                move, ok = step(equations_at(problem, vectors[active]), damping[active], space)
-                tried = vectors[active] + np.where(ok[:, None], move, 0.0)
-                after = np.asarray(eliminated(equations_at(problem, tried)).cost)
-                better = ok & (after < before)
-                vectors[active[better]], cost[active[better]] = tried[better], after[better]
-                damping[active] *= np.where(better, 0.1, 10.0)
-                # settled, or no damping helps: such a place keeps the least cost that was found
-                done = better & (before - after < _SETTLED * (1.0 + after)) | (damping[active] > _STUCK)
-                active = active[~done]
-                if not len(active):
-                    break
-    return cost
+    many = problem.take(np.zeros(len(places), dtype=int))
+    planes = tuple(Band("plane", at, at, axis, "place") for axis, at in zip(held, held @ places.T, strict=True))
+    many = replace(many, constraints=planes)
+    return refine(many, vectors, tolerance=_SETTLED, limit=_STEPS, face=exact(many)).cost
 
 
 # Where iterations from many starts end: reached, at another minimum, or nowhere.

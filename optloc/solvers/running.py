@@ -10,6 +10,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import summed
 from optloc.linear.normal import Normal, covariance, eliminated, with_priors
 from optloc.linear.vectors import complete
@@ -19,7 +20,6 @@ from optloc.problem.fix import Fix
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import begin
-from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import verdict
 

@@ -14,6 +14,7 @@ from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.normal import decrement, step
@@ -25,7 +26,6 @@ from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, offer, pack
-from optloc.solvers.refine import refine
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.position import (
@@ -109,11 +109,6 @@ gtrs, roots = start_with("gtrs"), start_with("roots")
 
 # Squared length of the undamped step, in standard deviations, below which a refinement has arrived: a hundredth of one.
 _ARRIVED = 1e-4
-
-
-def gtrs_lsr(problem: Problem, pool: Pool | None) -> Pool:
-    """Return what the method "gtrs+lsr" returns: the start and its mirror image, refined."""
-    return lsr_with_mirror(problem, gtrs(problem, pool))
 
 
 def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:

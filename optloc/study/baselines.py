@@ -22,6 +22,7 @@ from optloc.base.types import Array, Status
 from optloc.calibration.likelihood import Estimate, likelihood
 from optloc.calibration.network import Network
 from optloc.calibration.rounds import starts_of
+from optloc.compute.least_squares import WEIGHINGS
 from optloc.compute.sums import equations_at
 from optloc.linear.evaluate import differentiate
 from optloc.linear.normal import depends_on_place, prior_parts, step, weighed
@@ -33,7 +34,6 @@ from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import given, judge_points
 from optloc.solvers.pool import offer
-from optloc.solvers.refine import WEIGHINGS
 from optloc.solvers.starts.position import one_position, spread_of
 from optloc.solvers.verdict.judge import judge
 from optloc.study.draws import Drawn

@@ -18,6 +18,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.files import read
 from optloc.linear.normal import depends_on_place
@@ -27,7 +28,6 @@ from optloc.solvers import FORMULATIONS, SOLVERS, solve
 from optloc.solvers import Method as Pipeline
 from optloc.solvers.methods import Choice, counting, shortcut, using
 from optloc.solvers.pool import Pool, begin
-from optloc.solvers.refine import refine
 from optloc.study.baselines import Baseline, heard, start_of
 from optloc.study.draws import Case, Drawn, draw
 from optloc.study.folder import design_of_manifest, read_frame, read_manifest

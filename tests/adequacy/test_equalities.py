@@ -5,11 +5,11 @@ import pytest
 from typer.testing import CliRunner
 
 import optloc
-from optloc.adequacy.equalities import Equalities, spare_rows
 from optloc.adequacy.score import descend, explain_misfit
 from optloc.base.frames import Frame
 from optloc.cli import app
 from optloc.linear.constraints import box, height, violation
+from optloc.linear.equalities import Equalities, spare_rows
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.problem.epochs import by_epoch
 
@@ -61,7 +61,7 @@ def joined(problem, places):
 def test_a_run_is_refined_as_its_epochs_are(kind, axis, seed, more):
     problem, places = run(kind, axis, seed, **more)
     start = joined(problem, places) + 0.2 * np.random.default_rng(9).standard_normal((1, problem.layout.size))
-    x, cost = descend(problem.flat(), start, steps=80)
+    x, cost = descend(problem.flat(), start)
     batch = by_epoch(problem).flat()
     layout, local = problem.layout, problem.layout.split(x)[1][0]
     alone = np.zeros((problem.epochs, batch.layout.size))
@@ -70,7 +70,7 @@ def test_a_run_is_refined_as_its_epochs_are(kind, axis, seed, more):
         start_at = there.start + (0 if shared else batch.layout.n_shared)
         alone[:, start_at : start_at + slot.size] = local[:, slot.start : slot.start + slot.size]
     assert violation(batch, alone).max() < 1e-9
-    _, each = descend(batch, alone, steps=80)
+    _, each = descend(batch, alone)
     assert cost[0] == pytest.approx(each.sum(), rel=1e-6)
     assert spare_rows(problem.flat())[0] == degrees_of_freedom(batch).sum()
 

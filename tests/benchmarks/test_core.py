@@ -10,12 +10,13 @@ from benchmarks.speed import SCENES, batch
 from monte_carlo.tables import write
 from runs import drawn, estimated, run, truth
 
+from optloc.compute.damping import Rules
 from optloc.compute.jit import enabled
+from optloc.compute.least_squares import refine
 from optloc.compute.pack import pack
-from optloc.compute.refine import Rules, answers, refine_block, refine_runs
+from optloc.compute.refine import answers, refine_block
 from optloc.linear.normal import weighed
 from optloc.problem.noise import whiten
-from optloc.solvers.refine import refine
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="kernels are not compiled")
 ROUNDS, EPOCHS, RUNS = 9, 700, 64
@@ -62,7 +63,7 @@ def iteration(scene):
 def by_numpy(scene, monkeypatch):
     """Microseconds of a fix by numpy."""
     problem, start = array(scene)
-    monkeypatch.setattr(import_module("optloc.solvers.refine"), "serves", lambda problem, starts: False)
+    monkeypatch.setattr(import_module("optloc.compute.least_squares"), "serves", lambda problem, starts: False)
     many = problem.take(np.arange(1000)), start[:1000]
     return 1e6 * quickest(lambda: refine(*many), 3) / 1000
 
@@ -80,10 +81,10 @@ def registration(eliminated):
     problem = drawn(estimated(problem) if eliminated else problem, 1, RUNS).flat()
     start = np.tile(truth(problem), (RUNS, 1)) + 20.0
     ours, item = ready(problem), np.arange(RUNS)
-    kernel, kept = (refine_runs, 0) if eliminated else (refine_block, None)
+    kept = 0 if eliminated else None
     out = answers(start, kept)
-    kernel(ours, item, 0, RUNS, Rules(), out)
-    seconds = quickest(lambda: kernel(ours, item, 0, RUNS, Rules(), answers(start, kept)), 3)
+    refine_block(ours, item, 0, RUNS, Rules(), out)
+    seconds = quickest(lambda: refine_block(ours, item, 0, RUNS, Rules(), answers(start, kept)), 3)
     each = 1e6 * seconds / (int(out.iterations.sum()) + RUNS)
     return each, each / problem.count
 

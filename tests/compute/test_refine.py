@@ -16,8 +16,8 @@ from optloc.compute.damping import judge, judge_lane
 from optloc.compute.jit import enabled
 from optloc.linear.normal import marginal
 
-hooks = import_module("optloc.solvers.refine")
-choice = import_module("optloc.solvers.refine")
+hooks = import_module("optloc.compute.least_squares")
+choice = import_module("optloc.compute.least_squares")
 COUNT = 100 if enabled() else 3
 
 

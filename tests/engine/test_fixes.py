@@ -12,7 +12,7 @@ from optloc.compute.jit import enabled
 from optloc.engine.plan import plan_of
 from optloc.problem.chart import basis
 from optloc.solvers import policy
-from optloc.solvers.stages import gtrs_lsr
+from optloc.solvers.stages import gtrs, lsr_with_mirror
 from optloc.solvers.verdict.judge import verdict
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
@@ -211,7 +211,7 @@ def test_wrong_fixes_have_a_rival(kind, s, height, caught):
 def test_the_stages_find_the_same_rivals():
     made = flat("tdoa", 6, 100, 200)
     problem = made.problem
-    fix, other = solve(problem, "gtrs+lsr"), verdict(problem, gtrs_lsr(problem, None))
+    fix, other = solve(problem, "gtrs+lsr"), verdict(problem, lsr_with_mirror(problem, gtrs(problem, None)))
     apart = fix.code != other.code
     assert apart.sum() <= 2
     assert (fix.code == Status.AMBIGUOUS).sum() >= 1

@@ -14,8 +14,8 @@ from verdict.test_gate import digest
 
 from optloc import Fix, Status, reliability, solve
 from optloc.adequacy.groups import ROW_PRICE as PRICE
+from optloc.compute.least_squares import refine
 from optloc.solvers.policy import AMBIGUOUS_GAP
-from optloc.solvers.refine import refine
 
 DEFAULT, FULL, MANY = 100, 200, 2000
 DIMENSION = {"tdoa": 3, "toa": 3, "range": 3, "azimuth": 2}

@@ -15,10 +15,10 @@ from proof.test_targets_over_ground import drawn as over_ground
 
 from optloc import Problem, Status, simulate, solve
 from optloc.compute.jit import enabled
+from optloc.compute.least_squares import refine
 from optloc.linear.constraints import exact, restore
 from optloc.linear.vectors import vectors
 from optloc.solvers.certify.position_cost import state_columns
-from optloc.solvers.refine import refine
 
 Array = np.ndarray
 SEED, STARTS, BATCH = 20261123, 20, 4

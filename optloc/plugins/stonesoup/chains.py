@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from optloc.base.types import Array, Motion, Prior, Status
+from optloc.compute.least_squares import Refined, refine
 from optloc.linear.normal import covariance, linearise
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.plugins.stonesoup.models import problem_of, rows_by_kind, values_of
@@ -23,7 +24,6 @@ from optloc.problem.fix import Fix, tail_probability
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.prepared import prepare
-from optloc.solvers.refine import Refined, refine
 
 # A fix is trusted as a Gaussian where no other minimum costs less than this more: five standard deviations.
 GAP = 25.0

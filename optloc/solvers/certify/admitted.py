@@ -16,6 +16,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import Axes, overwrite, take
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.linear.constraints import (
     Face,
     exact,
@@ -63,7 +64,6 @@ from optloc.solvers.inequalities import is_minimum
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, in_parts, offer, pack, where
-from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import failed, fill, judge, verdict
 from optloc.solvers.verdict.minima import settle

@@ -12,6 +12,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.records import change, overwrite, present, take
 from optloc.base.types import Array, Certificate
 from optloc.compute.jit import enabled
+from optloc.compute.least_squares import refine
 from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
 from optloc.linear.vectors import vectors
 from optloc.problem.chart import quantile
@@ -39,7 +40,6 @@ from optloc.solvers.certify.position_cost import (
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, TriedBefore, offer, pack
-from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import judge, standing
 

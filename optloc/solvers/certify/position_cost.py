@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from optloc.base import linalg
 from optloc.base.types import Array, Band
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact, is_exact
-from optloc.linear.normal import Normal, eliminated, step
+from optloc.linear.normal import eliminated, step
 from optloc.models.primitives import geodetic_normal
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -242,15 +243,9 @@ def _places(problem: Problem, fix: Fix) -> Array:
     own = state_columns(problem)
     position, covariance = fix.x[..., own], fix.cov[..., own, own]
     d = position.shape[-1]
-    with np.errstate(all="ignore"):
-        root, variance = np.zeros_like(covariance), np.where(np.isfinite(covariance), covariance, 0.0)
-        for k in range(d):  # by Cholesky's rule, less what is not determined
-            pivot = variance[:, k, k] - (root[:, k, :k] ** 2).sum(-1)
-            root[:, k, k] = np.sqrt(np.maximum(pivot, 0.0))
-            rest = variance[:, k + 1 :, k] - (root[:, k + 1 :, :k] @ root[:, k, :k, None])[..., 0]
-            root[:, k + 1 :, k] = np.where(pivot[:, None] > 0.0, rest / root[:, k, k, None], 0.0)
+    root = linalg.factor_semidefinite(np.where(np.isfinite(covariance), covariance, 0.0))
     way = np.random.default_rng(1).standard_normal((_BESIDE, d))
-    beside = np.where(np.isfinite(root), root, 0.0)[:, None] @ way[..., None]
+    beside = root[:, None] @ way[..., None]
     return np.concatenate([position[:, None], position[:, None] + beside[..., 0]], axis=1)
 
 
@@ -258,43 +253,24 @@ def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
     """Return the costs (N, P) of the problems at states (N, P, n), all other unknowns at their best values."""
     count, several = places.shape[:2]
     own = state_columns(problem)
-    start, size = own.start, own.stop - own.start
     part = problem.take(np.repeat(np.arange(count), several)) if count > 1 else problem
     x = np.repeat(fix.x, several, axis=0)
-    x[:, own] = places.reshape(-1, size)
+    x[:, own] = places.reshape(len(x), -1)
+    others = np.delete(np.arange(problem.layout.n_shared), own)
     with np.errstate(all="ignore"):
         equations = equations_at(part, x)
         if problem.stations.estimated:
             for _ in range(_STEPS):
-                move, ok = step(_without(equations, start, size), np.zeros(len(x)))
-                x = x + np.where(ok[:, None], _spread(move, start, size), 0.0)
+                move, ok = step(equations, np.zeros(len(x)), np.eye(problem.layout.n_shared)[:, others])
+                x = x + np.where(ok[:, None], move, 0.0)
                 equations = equations_at(part, x)
-        rest = eliminated(_without(equations, start, size))
-        cost = np.asarray(rest.cost)
-        if rest.shared.shape[-1]:
+        rest = eliminated(equations)
+        information, vector, cost = rest.shared[:, others[:, None], others], rest.shared_vector[:, others], rest.cost
+        if len(others):
             # Scaled, and by its pseudo-inverse: a combination that no row feels changes nothing.
-            size = np.sqrt(np.diagonal(rest.shared, axis1=-2, axis2=-1))
+            size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
             size = np.where(size > 0.0, size, 1.0)
-            turned = np.linalg.pinv(rest.shared / size[..., :, None] / size[..., None, :], _OPEN, hermitian=True)
-            vector = rest.shared_vector / size
+            turned = np.linalg.pinv(information / size[..., :, None] / size[..., None, :], _OPEN, hermitian=True)
+            vector = vector / size
             cost = cost - ((turned @ vector[..., None])[..., 0] * vector).sum(-1)
     return cost.reshape(count, several)
-
-
-def _without(equations: Normal, start: int, size: int) -> Normal:
-    """Return normal equations without the target's state: it is held."""
-    keep = np.delete(np.arange(equations.shared.shape[-1]), slice(start, start + size))
-    return Normal(
-        equations.shared[..., keep[:, None], keep],
-        equations.local,
-        equations.cross[..., keep, :],
-        equations.shared_vector[..., keep],
-        equations.local_vector,
-        equations.cost,
-        equations.link,
-    )
-
-
-def _spread(move: Array, start: int, size: int) -> Array:
-    """Return a step (N, n) of all unknowns but the state as one of all, which leaves the state as it is."""
-    return np.insert(move, np.full(size, start), 0.0, axis=-1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at, summed
 from optloc.linear.constraints import Face
 from optloc.linear.evaluate import predict
@@ -15,7 +16,6 @@ from optloc.models import MODELS, wrap
 from optloc.problem.loss import LATE, Loss
 from optloc.problem.noise import Noise, variances, whiten
 from optloc.problem.problem import Problem
-from optloc.solvers.refine import refine
 
 # Rows of a correlated group are never quite absent while their weights are sought: their partners still foretell them.
 # At a millionth of its weight a row no longer counts in the sums, and one over it is far from overflow.
@@ -30,6 +30,8 @@ _PATIENCE, _OFTEN, _SLOWEST = 8, 3, 0.98
 _HALVINGS = 8
 # Rounding of a robust cost, relative: what a step may raise it by.
 _ROUNDING = 1e-12
+# Standard deviations: a shorter step ends the iteration, for a millionth of one is beyond what anybody reads.
+_TOLERANCE = 1e-6
 # Length of a step that was not finished: longer than any tolerance, and finite, since what is not finite is a failure.
 _LONG = 1e300
 
@@ -173,7 +175,6 @@ def reweight(
     doubt: Doubt,
     *,
     limit: int = 50,
-    tolerance: float = 1e-6,
     face: Face = (),
 ) -> Minima:
     """Return the minima of a robust cost next to starts.
@@ -194,13 +195,10 @@ def reweight(
         Of the same problems.
     limit : int
         Weighings at most.
-    tolerance : float
-        Finished when a step is shorter than this many standard deviations.
     face : Face
         Constraints that hold with equality.
     """
-    # The defaults: a millionth of a sigma is beyond what anybody reads; what takes more than fifty weighings creeps
-    # along a flat valley, and its status says so.
+    # A refinement of more than fifty weighings creeps along a flat valley, and its status shows it.
     x, weight = np.array(start), np.ones(doubt.base.shape)
     last = np.zeros(x.shape)
     status = np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
@@ -222,7 +220,7 @@ def reweight(
             x[active], weight[active], last[active] = moved, now, step.x - here
             # settled: neither weights nor place move; stalled: no step lowers the cost, though one was wanted
             same = np.abs(now - before).max(-1, initial=0.0) <= _SETTLED
-            settled = same & (step.length <= tolerance)
+            settled = same & (step.length <= _TOLERANCE)
             status[active[settled]] = step.status[settled]
             status[active[same & ~settled & (moved == here).all(-1)]] = Status.STALLED
             status[active[~np.isfinite(step.length)]] = Status.NUMERICAL

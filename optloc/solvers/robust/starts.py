@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
 from optloc.linear.constraints import exact
 from optloc.linear.courses import elapsed
 from optloc.linear.normal import depends_on_place, weighed
@@ -17,7 +18,6 @@ from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import independent, variances
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, pack
-from optloc.solvers.refine import refine
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
 from optloc.solvers.starts.position import one_position, registrable, rows_of_stations

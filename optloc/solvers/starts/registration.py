@@ -11,6 +11,7 @@ import numpy as np
 from formulations.registration import Course, candidates
 from optloc.base import linalg
 from optloc.base.types import Array, Bias, Status
+from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.linear.courses import elapsed
 from optloc.linear.evaluate import block_links
@@ -23,7 +24,6 @@ from optloc.problem.clocks import greville, rate_name
 from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
-from optloc.solvers.refine import refine
 from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.position import distance_of, spread_of
 

@@ -48,10 +48,10 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
             continue
         items = np.flatnonzero(face == number)
         part = problem.take(items)
-        space = tangent_at(part, sides[number], x[items])
-        covariance[items], regular[items] = linalg.inverse_within(information[items], space)
+        along = tangent_at(part, sides[number], x[items])
+        covariance[items], regular[items] = linalg.inverse_within(information[items], along)
         # what constraints hold is not open: the pivots are those along the face
-        inner = np.swapaxes(space.along, -1, -2) @ information[items] @ space.along
+        inner = np.swapaxes(along, -1, -2) @ information[items] @ along
         weakest[items] = _smallest_pivot(inner) if inner.shape[-1] else 1.0
         active[items] = _multipliers(part, sides[number], x[items], vector[items])
     regular = ok & regular

@@ -10,10 +10,11 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge
 from optloc.compute.pack import coarseness, pack
 from optloc.compute.sums import equations_at, serves
-from optloc.linear.constraints import Face, is_height, restore, tangent_at
+from optloc.linear.constraints import Face, is_height
+from optloc.linear.equalities import Equalities
 from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
 from optloc.models.primitives import WGS84_A
 from optloc.problem.epochs import whole, windows
@@ -54,31 +55,6 @@ class Refined:
         return self.make()
 
 
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """What does not change during an iteration: see `optloc.solvers.refine.refine`.
-
-    Parameters
-    ----------
-    n : int
-        Number of shared unknowns.
-    tolerance : float
-        Length of the last step in its own standard deviations.
-    limit : int
-        Steps tried at most.
-    damped : bool
-        Whether steps are damped and refused.
-    face : Face
-        Constraints that hold with equality.
-    """
-
-    n: int
-    tolerance: float
-    limit: int
-    damped: bool
-    face: Face
-
-
 def refine(
     problem: Problem,
     start: Array,
@@ -109,7 +85,8 @@ def refine(
     damped : bool
         False: plain Taylor iteration, every step is taken whatever it does to the cost.
     face : Face
-        Constraints that hold with equality: steps follow their tangent space and are put back onto them.
+        Constraints that hold with equality, also in every epoch of a run: steps follow their tangent space and are put
+        back onto them.
 
     Returns
     -------
@@ -118,8 +95,8 @@ def refine(
     """
     # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost; sixty steps are ten
     # times what fixes near their stations take.
-    rules = Rules(problem.layout.n_shared, tolerance, limit, damped, face)
-    quick = by_machine_code(problem, start, item, rules, _remade)
+    rules = Rules(float(tolerance), int(limit), bool(damped))
+    quick = None if face else _by_machine_code(problem, start, item, rules)
     if quick is not None:
         return quick
     weights = None
@@ -130,9 +107,9 @@ def refine(
     if item is not None:
         problem = problem.take(item)
     if weights is not None:
-        return _iterate(problem, start, weights, rules)
+        return _iterate(problem, start, weights, rules, face)
     for _ in range(WEIGHINGS):
-        done = _remade(problem, start, rules)
+        done = _remade(problem, start, rules, face)
         start = done.x
     return done
 
@@ -140,8 +117,8 @@ def refine(
 # By numpy: all problems of a batch side by side, those that are finished leave it.
 
 
-def _remade(problem: Problem, start: Array, rules: Rules) -> Refined:
-    return _iterate(problem, start, _Weights.of(problem, start), rules)
+def _remade(problem: Problem, start: Array, rules: Rules, face: Face = ()) -> Refined:
+    return _iterate(problem, start, _Weights.of(problem, start), rules, face)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,12 +142,12 @@ class _Weights:
         return equations_at(problem, x, self.matrices, at=self.at)
 
 
-def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules) -> Refined:
-    """Return where the iteration ends whose weights stay as they are."""
+def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules, face: Face) -> Refined:
+    """Return the refinement with fixed weights."""
     with np.errstate(all="ignore"):
-        start = restore(problem, rules.face, start) if rules.face else start
+        start = Equalities.of(problem, face).restore(start) if face else start
         state = _State.begin(problem, start, weights)
-        active, part = np.arange(len(start)), _Part(problem, weights, _blur(problem, len(start)))
+        active, part = np.arange(len(start)), _Part(problem, weights, face, _blur(problem, len(start)))
         for iteration in range(rules.limit):
             # The status until another is found: what still moves.
             moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
@@ -216,11 +193,12 @@ class _Part:
 
     problem: Problem
     weights: _Weights
+    face: Face
     blur: Array
 
     def take(self, items: Array) -> _Part:
         """Return some of them."""
-        return _Part(self.problem.take(items), self.weights.take(items), self.blur[items])
+        return _Part(self.problem.take(items), self.weights.take(items), self.face, self.blur[items])
 
 
 # Roundings that lie between a measurement and its residual.
@@ -259,15 +237,16 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     now = state.equations if everything else _at(state.equations, active)
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
-    move, solvable = step(now, damping, tangent_at(part.problem, rules.face, here) if rules.face else None)
-    x = restore(part.problem, rules.face, here + move) if rules.face else here + move
+    held = Equalities.of(part.problem, part.face) if part.face else None
+    move, solvable = step(now, damping) if held is None else held.step(now, damping, here)
+    x = here + move if held is None else held.restore(here + move)
     after = part.weights.equations(part.problem, x)
     found = judge(
         now.cost,
         after.cost,
-        decrement(now, move, rules.n),
+        decrement(now, move, part.problem.layout.n_shared),
         solvable,
-        part.blur + (_blur_of_face(part.problem, rules.face, now) if rules.face else 0.0),
+        part.blur + (_blur_of_face(part.problem, part.face, now) if part.face else 0.0),
         damping,
         state.growth[active],
         rules.tolerance,
@@ -307,70 +286,48 @@ _UNKNOWNS = 40
 # Numbers of the derivatives from which weights that depend on the place are made at a time: 16 MB.
 _WEIGHED = 2**21
 
-Refinement = Callable[[Problem, Array, Rules], Refined]
 
-
-def by_machine_code(
-    problem: Problem, start: Array, item: Array | None, rules: Rules, otherwise: Refinement
-) -> Refined | None:
-    """Return where a refinement by machine code ends, or None where it does not serve the problem.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems.
-    start : array (M, size)
-        Starting vectors.
-    item : int array (M,), optional
-        Problem of each start; None: M = N.
-    rules : Rules
-        When to stop.
-    otherwise : callable
-        Refines what machine code gives up: an epoch of a run left its own unknowns open.
-    """
+def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: Rules) -> Refined | None:
+    """Return the refinement by machine code, or None without machine code for the problem."""
     few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
-    if rules.face or not few or not serves(problem, len(start)):
+    if not few or not serves(problem, len(start)):
         return None
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
     if not depends_on_place(problem):
-        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules, otherwise)
+        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules)
     width = problem.layout.n_shared + offsets_of(problem)
     # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
 
     def work(part: Array) -> Refined | None:
-        return _anew(problem.take(own[part]), start[part], rules, otherwise)
+        return _anew(problem.take(own[part]), start[part], rules)
 
     done = mapped(work, parts) if len(parts) > 1 else [work(parts[0])]
     found = [one for one in done if one is not None]
     return _join(found) if len(found) == len(parts) else None
 
 
-def _at_once(
-    problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules, otherwise: Refinement
-) -> Refined | None:
-    """Return where machine code ends with given weights, or None where it does not serve."""
+def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules) -> Refined | None:
+    """Return the refinement by machine code with given weights, or None without machine code."""
     found = pack(problem, noise)
     if found is None:
         return None
     from optloc.compute import refine
-    from optloc.compute.refine import Rules as Limits
 
-    kernel = Limits(float(rules.tolerance), int(rules.limit), bool(rules.damped))
-    done, lost = refine.refined(found, item, start, kernel)
+    done, lost = refine.refined(found, item, start, rules)
     # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
     if lost.any():
-        more = otherwise(problem.take(item[lost]), start[lost], rules)
+        more = _remade(problem.take(item[lost]), start[lost], rules)
         for name in ("x", "cost", "status", "iterations"):
             getattr(done, name)[lost] = getattr(more, name)
     return Refined(done.x, done.cost, done.status, done.iterations, lambda: refine.equations(found, item, done))
 
 
-def _anew(problem: Problem, start: Array, rules: Rules, otherwise: Refinement) -> Refined | None:
-    """Return where machine code ends for one start of each problem, weighed where they are and once more at the end."""
+def _anew(problem: Problem, start: Array, rules: Rules) -> Refined | None:
+    """Return the refinement of one start of each problem, with weights of the start and then of the end."""
     done = None
     for _ in range(WEIGHINGS):
-        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules, otherwise)
+        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules)
         if done is None:
             return None
         start = done.x

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.linalg import Tangent, tangent
+from optloc.base.linalg import tangent
 from optloc.base.types import Array, Band, Polygon
 from optloc.linear.constraints import Face, exact, levels, restore, tangent_at
 from optloc.linear.normal import Normal, marginal, step
@@ -37,9 +37,9 @@ class Equalities:
     each: Face
 
     @classmethod
-    def of(cls, problem: Problem) -> Equalities:
-        """Return the equalities of a problem."""
-        face = exact(problem)
+    def of(cls, problem: Problem, face: Face | None = None) -> Equalities:
+        """Return the equalities of a problem, by default those that it states, else the levels of a face."""
+        face = exact(problem) if face is None else face
         own = {i for level in face if problem.motions[_target(problem, i := level.constraint)].span == "epoch"}
         lasting = tuple(level for level in face if level.constraint not in own)
         if not own:
@@ -67,11 +67,11 @@ class Equalities:
         x : array (M, size)
             Where the steps begin.
         """
-        space = tangent_at(self.problem, self.lasting, x) if self.lasting else None
+        along = tangent_at(self.problem, self.lasting, x) if self.lasting else None
         if self.single is None:
-            return step(equations, damping, space)
-        basis = self._own_space(x).along
-        move, ok = step(_within(equations, basis), damping, space)
+            return step(equations, damping, along)
+        basis = self._own_space(x)
+        move, ok = step(_within(equations, basis), damping, along)
         n, (m, k, _, free) = self.problem.layout.n_shared, basis.shape
         local = (basis @ move[:, n:].reshape(m, k, free, 1))[..., 0] if free else np.zeros(basis.shape[:-1])
         return np.concatenate([move[:, :n], local.reshape(m, -1)], axis=1), ok
@@ -79,7 +79,7 @@ class Equalities:
     def shared(self, equations: Normal, x: Array) -> tuple[Array, Array]:
         """Return information (M, n, n) and vector (M, n) of shared unknowns; local ones keep their equalities."""
         if self.single is not None:
-            equations = _within(equations, self._own_space(x).along)
+            equations = _within(equations, self._own_space(x))
         information, vector, _ = marginal(equations)
         return information, vector
 
@@ -87,18 +87,17 @@ class Equalities:
         """Return a basis (M, n, n - c) of the shared unknowns along their equalities."""
         if not self.lasting:
             return np.broadcast_to(np.eye(n := self.problem.layout.n_shared), (len(x), n, n))
-        return tangent_at(self.problem, self.lasting, x).along
+        return tangent_at(self.problem, self.lasting, x)
 
-    def _own_space(self, x: Array) -> Tangent:
-        """Return the tangent spaces of the local unknowns (M, k, l, ...) of every epoch."""
+    def _own_space(self, x: Array) -> Array:
+        """Return bases (M, k, l, l - c) of the local unknowns of every epoch along its equalities."""
         layout = self.problem.layout
         _, gradients = levels(self._single(x), self.each, self._states(x))
         local = np.zeros((*gradients.shape[:2], layout.n_local))
         for here, there in self._slots():
             local[..., here] = gradients[..., there]
-        found = tangent(local, np.ones((len(local), layout.n_local)))
-        shape = (len(x), self.problem.epochs)
-        return Tangent(*(part.reshape(*shape, *part.shape[1:]) for part in (found.along, found.across)))
+        along = tangent(local, np.ones((len(local), layout.n_local))).along
+        return along.reshape(len(x), self.problem.epochs, *along.shape[1:])
 
     def _single(self, x: Array) -> Problem:
         """Return the epochs of vectors (M, size) as problems (M k,) of one epoch each."""
