@@ -403,6 +403,24 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool,
         add_priors(t, c, m, room, room.trial, True, 0, lanes)
 
 
+@compiled
+def price(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, lanes: Constant) -> None:
+    """Write the cost at `room.trial`, the last cell of `room.after`."""
+    total = room.after + (t.shared + t.local + 1) ** 2 - 1
+    for b in range(lanes):
+        m[total, b] = 0.0
+    for packet in range(t.packets):
+        measure(t, c.common, m, r, room, packet, room.trial, lanes)
+        for group in range(t.table[t.packet + packet, FIRST], t.table[t.packet + packet + 1, FIRST]):
+            residual = whiten_group(t, c.common, c.place, m, room, group, True, lanes)
+            for i in range(t.table[t.group + group, GROUP_ROWS]):
+                for b in range(lanes):
+                    m[total, b] += m[residual + i * t.width, b] * m[residual + i * t.width, b]
+    add_priors(t, c, m, room, room.trial, False, 0, lanes)
+    for epoch in range(t.epochs):
+        add_priors(t, c, m, room, room.trial, True, epoch, lanes)
+
+
 ALL = -1
 """In the place of an epoch: the groups of all of them."""
 

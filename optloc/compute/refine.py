@@ -25,13 +25,12 @@ from optloc.compute.lanes import (
     clear,
     gather,
     load,
-    measure,
     memory,
-    whiten_group,
+    price,
 )
 from optloc.compute.pack import Numbers, Packed
 from optloc.compute.systems import backward, complete, eliminate, factor, factor_local, forward, step
-from optloc.compute.tables import FIRST, GROUP_ROWS, Tables
+from optloc.compute.tables import Tables
 from optloc.linear.normal import OPEN, Normal
 
 _OK, LIMIT, _STALLED, NUMERICAL = (
@@ -105,7 +104,7 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     while used > 0:
         begin(c, m, room, tag, used, item, out.x)
         if runs:
-            _price(t, c, m, r, room, used)
+            price(t, c, m, r, room, used)
         else:
             gather(t, c, m, r, room, True, used)
         _judge(m, room, size, runs, t.shared + t.local + 1, tag, rules, used)
@@ -253,24 +252,6 @@ def _advance(m: Array, room: Cells, n: int, local: int, tag: Array, damped: bool
 #
 # A step takes two passes over the epochs: one sums up what they say about the shared unknowns, one works out their own;
 # a third one finds the cost of the place tried.
-
-
-@compiled
-def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, lanes: int) -> None:
-    """Write the cost at `room.trial`."""
-    total = room.after + (t.shared + t.local + 1) ** 2 - 1
-    for b in range(lanes):
-        m[total, b] = 0.0
-    for packet in range(t.packets):
-        measure(t, c.common, m, r, room, packet, room.trial, lanes)
-        for group in range(t.table[t.packet + packet, FIRST], t.table[t.packet + packet + 1, FIRST]):
-            residual = whiten_group(t, c.common, c.place, m, room, group, True, lanes)
-            for i in range(t.table[t.group + group, GROUP_ROWS]):
-                for b in range(lanes):
-                    m[total, b] += m[residual + i * t.width, b] * m[residual + i * t.width, b]
-    add_priors(t, c, m, room, room.trial, False, 0, lanes)
-    for epoch in range(t.epochs):
-        add_priors(t, c, m, room, room.trial, True, epoch, lanes)
 
 
 @compiled

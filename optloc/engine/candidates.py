@@ -153,7 +153,7 @@ def _is_apart(room: Room, spot: Array, row: int, lane: int) -> bool:
 # The cheapest of many places.
 
 # Distances of places in spreads of the stations: from among them to where wave fronts are nearly flat.
-_RADII = (0.3, 0.8, 2.0, 5.0, 15.0)
+_RADII = (0.4, 1.0, 2.5, 8.0)
 RINGS = len(_RADII)
 """Rings of places."""
 

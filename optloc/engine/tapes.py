@@ -9,7 +9,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.gtrs import minimise
 from optloc.compute.jit import compiled
-from optloc.compute.lanes import Cells, arrange, blur_of, gather, memory
+from optloc.compute.lanes import Cells, arrange, blur_of, gather, memory, price
 from optloc.compute.lanes import load as load_lane
 from optloc.compute.pack import Numbers
 from optloc.compute.polynomial import DEGREE
@@ -277,11 +277,18 @@ def equations(rows: TapeRows, room: Room, shift: int) -> None:
 @compiled
 def _evaluate(rows: TapeRows, room: Room, shift: int) -> Any:
     """Write the equations at row X, or at TRIAL with shift 1, into the memory of the lanes, which is returned."""
+    m = _enter_place(room, shift)
+    gather(rows.tables, rows.numbers, m, room.own.r, room.own.at, True, LANES)
+    return m
+
+
+@compiled
+def _enter_place(room: Room, shift: int) -> Any:
+    """Write row X, or TRIAL with shift 1, into the memory of the lanes, which is returned."""
     own, x, origin = room.own, room.vector[X + shift], room.vector[ORIGIN]
     for i in range(room.vector.shape[1]):
         for lane in range(LANES):
             own.m[own.at.trial + i, lane] = x[i, lane] + origin[i, lane]
-    gather(rows.tables, rows.numbers, own.m, own.r, own.at, True, LANES)
     return own.m
 
 
@@ -289,7 +296,11 @@ def _evaluate(rows: TapeRows, room: Room, shift: int) -> Any:
 def costs(rows: TapeRows, room: Room) -> None:
     """Write the cost at TRIAL, the least over the other unknowns, to COST_TRIAL."""
     p, d, at = room.vector.shape[1], room.d, room.own.at.after
-    m = _evaluate(rows, room, 1)
+    if p == d:
+        m = _enter_place(room, 1)
+        price(rows.tables, rows.numbers, m, room.own.r, room.own.at, LANES)
+    else:
+        m = _evaluate(rows, room, 1)
     for lane in range(LANES):
         room.scalar[COST_TRIAL, lane] = m[at + p * (p + 2), lane]
     if p == d:
