@@ -9,6 +9,7 @@ import numpy as np
 
 from optloc.calibration.blocks import MOVED, Block, blocks, elsewhere, moved
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.calibration.motions import bent
 from optloc.calibration.network import CLOCKED, Network
 from optloc.calibration.rounds import Ends, joined, rounds, starts_of
 from optloc.problem.fix import tail_probability
@@ -148,6 +149,7 @@ def proven(lik: Likelihood, at: Estimate) -> tuple[Estimate, tuple[Block, ...], 
     """
     cost, others = float(lik.cost(at)[0]), list[tuple[str, Estimate]]()
     for _ in range(_SWEEPS):
+        at, cost, beside = _straightened(lik, at, cost)
         found = blocks(lik, at)
         places = [
             (block, place)
@@ -156,14 +158,29 @@ def proven(lik: Likelihood, at: Estimate) -> tuple[Estimate, tuple[Block, ...], 
             if gap <= MOVED
         ]
         if not places:
-            return at, found, []
+            return at, found, beside
         ends, costs = lik.refine(together(*(moved(lik, at, block, place) for block, place in places)))
         others = [(f"{block.name} elsewhere", ends.take(np.array([n]))) for n, (block, _) in enumerate(places)]
         i = int(np.argmin(costs))
         if costs[i] >= cost - _SAME - equal_cost(cost):
             break
         at, cost = ends.take(np.array([i])), float(costs[i])
-    return at, found, others
+    return at, found, others + beside
+
+
+def _straightened(lik: Likelihood, at: Estimate, cost: float) -> tuple[Estimate, float, list[tuple[str, Estimate]]]:
+    """Return the cheapest network that joint moves lead to, its cost, and the other ends of these moves."""
+    for _ in range(_SWEEPS):
+        made = bent(lik, at)
+        if made is None:
+            return at, cost, []
+        ends, costs = made
+        i = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+        others = [("the network bent", ends.take(np.array([n]))) for n in np.flatnonzero(costs > cost + _SAME)]
+        if not costs[i] < cost - _SAME - equal_cost(cost):
+            return at, cost, others
+        at, cost = ends.take(np.array([i])), float(costs[i])
+    return at, cost, others
 
 
 def _fits(net: Network, cost: float) -> bool:
