@@ -209,8 +209,10 @@ class Single:
     def _proves(self, affine: Affine, answer: Answer, found: list[Found], room: _Room) -> bool:
         """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
         asked, answered, d = room.asked, room.answered, self.load.place.shape[-1]
-        asked.known[:] = answer.rival_cost < np.inf
-        asked.others[:, 0] = np.where(asked.known[:, None] > 0, answer.rival[:, :d], 0.0)
+        asked.known.fill(0)
+        for i, one in enumerate(found):
+            if one.rival_cost < inf:
+                asked.known[i], asked.others[i, 0] = 1, answer.rival[i, :d]
         if self.upward is not None:
             normal = answer.normal[:, self.upward]
             asked.surface[:, UP:] = normal / np.sqrt((normal * normal).sum(-1, keepdims=True))
