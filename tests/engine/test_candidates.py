@@ -13,7 +13,7 @@ from optloc.engine.plan import plan_of
 from optloc.engine.shape import STRAIGHT
 from optloc.models.primitives import WGS84_A
 from optloc.solvers.inequalities import is_hidden
-from optloc.solvers.stages import gtrs_lsr
+from optloc.solvers.stages import gtrs, lsr_with_mirror
 from optloc.solvers.starts.position import height_starts
 from optloc.solvers.verdict.judge import verdict
 
@@ -110,7 +110,7 @@ def test_pairs_by_rates_find_the_minima_of_the_stages():
     problem, _ = pair(150)
     plan = plan_of(problem)
     assert plan.model.start == BY_PLACES
-    fix, other = solve(problem, "gtrs+lsr"), verdict(problem, gtrs_lsr(problem, None))
+    fix, other = solve(problem, "gtrs+lsr"), verdict(problem, lsr_with_mirror(problem, gtrs(problem, None)))
     both = fix.answered & other.answered
     assert both.mean() > 0.95
     # what the stages found is never cheaper
