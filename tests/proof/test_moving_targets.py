@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from descent import levenberg
 from proof.sampling import many
-from scipy.optimize import least_squares
 
 from optloc import Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
 from optloc.compute.jit import enabled
@@ -182,14 +182,40 @@ def residuals(problem, state: Array) -> Array:
     return np.concatenate(out)
 
 
+def slopes(problem, state: Array) -> Array:
+    """Return the derivatives (m, 4) of the residuals."""
+    out = []
+    since = problem.times - problem.motions[0].reference
+    place = state[:2] + since[:, None] * state[2:]
+    stations = np.broadcast_to(problem.stations.position, (problem.epochs, *problem.stations.position.shape[1:]))
+    for rows in problem.rows:
+        away = place[rows.epoch] - stations[rows.epoch, rows.a]
+        reach = np.hypot(*away.T)[:, None]
+        line = away / reach
+        if rows.kind == "azimuth":
+            line = np.stack([-away[:, 1], away[:, 0]], axis=-1) / reach**2
+        elif rows.kind != "range":
+            across = place[rows.epoch] - stations[rows.epoch, rows.b]
+            other = np.hypot(*across.T)[:, None]
+            line = line - across / other if rows.kind == "tdoa" else (line - reach * across / other**2) / other
+        line = -line * (np.sqrt(rows.weight) / SIZE[rows.kind])[:, None]
+        out.append(np.concatenate([line, since[rows.epoch, None] * line], axis=1))
+    return np.concatenate(out)
+
+
 def minima(problem, rng: np.random.Generator, near: Array, starts: int) -> list[tuple[float, Array]]:
     """Return the minima within the limits that SciPy finds, costs and states."""
     scale, found = np.array([1e3, 1e3, 10.0, 10.0]), []
     draws = rng.uniform(-1.0, 1.0, (starts, 4)) * [REACH, REACH, FAST, FAST] * rng.choice([0.2, 1.0], (starts, 1))
     for state in [near, *draws]:
-        done = least_squares(lambda s: residuals(problem, s * scale), state / scale, max_nfev=300)
+        start = state / scale
+        done = levenberg(lambda s: residuals(problem, s * scale), start, lambda s: slopes(problem, s * scale) * scale)
         x = done.x * scale
-        if np.isfinite(done.cost) and done.optimality < 1e-3 and (np.abs(x) <= [REACH, REACH, FAST, FAST]).all():
+        if (
+            np.isfinite(done.cost)
+            and np.abs(done.fun @ done.jac).max() < 1e-3
+            and (np.abs(x) <= [REACH, REACH, FAST, FAST]).all()
+        ):
             found.append((2.0 * done.cost, x))
     return found
 

@@ -24,6 +24,14 @@ class Scene:
         model = distance if self.kind == "range" else distance[1:] - distance[0]
         return float(np.sum(((self.z - model) / self.sigma) ** 2))
 
+    def slope(self, x):
+        away = x - self.stations
+        distance = np.linalg.norm(away, axis=1)
+        line = away / distance[:, None]
+        if self.kind == "tdoa":
+            distance, line = distance[1:] - distance[0], line[1:] - line[0]
+        return -2.0 * (self.z - distance) @ line / self.sigma**2
+
     def problem(self):
         number = np.arange(len(self.stations))
         of = {"a": number} if self.kind == "range" else {"a": number[1:], "b": 0}
@@ -38,7 +46,10 @@ class Scene:
         for start in self.lower + unit[:, : len(span)] * span:
             # in units of the box, so that the same steps suit every direction
             done = minimize(
-                lambda u: self.cost(self.lower + u * span), (start - self.lower) / span, bounds=[(0.0, 1.0)] * len(span)
+                lambda u: self.cost(self.lower + u * span),
+                (start - self.lower) / span,
+                jac=lambda u: self.slope(self.lower + u * span) * span,
+                bounds=[(0.0, 1.0)] * len(span),
             )
             found.append((done.fun, self.lower + done.x * span))
         return sorted(found, key=lambda each: each[0])
