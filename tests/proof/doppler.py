@@ -8,9 +8,9 @@ from functools import cached_property
 from zlib import crc32
 
 import numpy as np
+from descent import EXACT, levenberg
 from proof.layouts import SEED
 from scipy.ndimage import minimum_filter
-from descent import EXACT, levenberg
 from scipy.optimize import least_squares
 
 from optloc import ECEF, Frame, Problem, Stations, assemble, measured, with_bias

@@ -8,7 +8,6 @@ from descent import levenberg
 from often import few
 from proof.sampling import many
 
-
 from optloc import Frame, Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import exact, levels, restore
