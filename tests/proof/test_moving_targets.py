@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from descent import levenberg
+from often import few
 from proof.sampling import many
 
 from optloc import Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
@@ -93,9 +94,10 @@ def inside(rng: np.random.Generator, axes: Axes, table, count: int) -> Array:
 
 
 @pytest.mark.usefixtures("form")
-def test_no_point_costs_less_than_its_box(seed):
+@pytest.mark.parametrize("count", few([42, 140], 1))
+def test_no_point_costs_less_than_its_box(seed, count):
     rng, told = np.random.default_rng([1, seed]), 0
-    for course, axes, table in boxes(rng, many(140, 14)):
+    for course, axes, table in boxes(rng, many(count, 14)):
         here = residual_at(course.rows, table.nodes, table.sheet)
         noise = blur_of(course.rows, 1.0, table.nodes)
         set_lines(course, table)
@@ -105,13 +107,14 @@ def test_no_point_costs_less_than_its_box(seed):
         cost = min(cost_of_state(course, state)[0] for state in inside(rng, axes, table, many(100, 20)))
         assert low <= np.sqrt(cost) * (1.0 + 1e-9) + 1e-9
         told += low > 0.0
-    assert told > many(40, 4)
+    assert told > many(count // 4, 4)
 
 
 @pytest.mark.usefixtures("form")
-def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
+@pytest.mark.parametrize("count", few([42, 140], 1))
+def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed, count):
     rng, convex, empty = np.random.default_rng([2, seed]), 0, 0
-    for course, axes, table in boxes(rng, many(140, 8)):
+    for course, axes, table in boxes(rng, many(count, 8)):
         residual_at(course.rows, table.nodes, table.sheet)
         set_lines(course, table)
         set_bends(course, axes, table)
@@ -127,8 +130,8 @@ def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
             empty += 1
             for state in states[:5]:
                 assert not descends_inside(course, axes, table.half, state)
-    assert convex > many(20, 1)
-    assert empty > many(20, 1)
+    assert convex > many(count // 7, 1)
+    assert empty > many(count // 7, 1)
 
 
 def descends_inside(course, axes: Axes, half: Array, state: Array) -> bool:
