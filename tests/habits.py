@@ -12,6 +12,8 @@ import tokenize
 from collections import Counter
 from pathlib import Path
 
+from sources import nodes
+
 ROOT = Path(__file__).resolve().parents[1]
 STORED = Path(__file__).with_name("habits.json")
 # A sentence of more words needs a second reading.
@@ -41,8 +43,8 @@ def texts(path: Path) -> list[str]:
     if path.suffix == ".md":
         prose = re.sub(r"```.*?```|^\|.*$", "", source, flags=re.DOTALL | re.MULTILINE)  # without code and tables
         return prose.split("\n\n")
-    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant)]
-    found = [node.value for node in nodes if isinstance(node.value, str) and node.value.count(" ") >= SPACES]
+    constants = [node for node in nodes(path) if isinstance(node, ast.Constant)]
+    found = [node.value for node in constants if isinstance(node.value, str) and node.value.count(" ") >= SPACES]
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     return found + [token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT]
 

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from sources import parsed
+from sources import nodes
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -49,7 +49,7 @@ def modules(root: Path) -> dict[str, Path]:
 def imports(name: str, path: Path, known: Mapping[str, Path]) -> Iterator[tuple[int, str]]:
     """Yield line and module of everything imported anywhere in a file; a name of a module counts for the module."""
     package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
-    for node in ast.walk(parsed(path)):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -157,7 +157,7 @@ def test_files_and_functions_are_of_a_size_to_be_read():
     assert not [name for name, path in known.items() if path.read_text(encoding="utf-8").count("\n") > LINES]
     long = []
     for name, path in known.items():
-        for node in ast.walk(parsed(path)):
+        for node in nodes(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 words = ast.get_docstring(node, clean=False)
                 body = node.end_lineno - node.lineno + 1 - (words.count("\n") + 1 if words else 0)
@@ -181,7 +181,7 @@ def test_reserved_words_are_defined_in_one_place():
     found = [
         (module, node.name)
         for module, path in modules(ROOT).items()
-        for node in ast.walk(parsed(path))
+        for node in nodes(path)
         if isinstance(node, kinds) and node.name in RESERVED
     ]
     wrong = [(module, name) for module, name in found if not module.startswith(RESERVED[name])]

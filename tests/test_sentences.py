@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from habits import HABITS, STORED, counts, risen
-from sources import parsed
+from sources import nodes, walked
 
 from optloc.base.types import Status
 
@@ -38,12 +38,12 @@ def text(node: ast.AST | None, known: dict[str, list[ast.expr]], depth: int = 0)
 
 def sentences(path: Path) -> Iterator[tuple[int, str]]:
     """Yield line and text of all that a module says."""
-    tree = parsed(path)
-    for scope in ast.walk(tree):
+    for scope in nodes(path):
         if not isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         known: dict[str, list[ast.expr]] = {}
-        for node in ast.walk(scope):
+        own = walked(scope)
+        for node in own:
             if isinstance(node, ast.Assign):
                 for target in node.targets:
                     pairs = [(target, node.value)]
@@ -54,7 +54,7 @@ def sentences(path: Path) -> Iterator[tuple[int, str]]:
                             known.setdefault(one.id, []).append(value)
                         elif isinstance(one, ast.Subscript) and getattr(one.value, "id", "") == "reason":
                             yield node.lineno, text(value, known)
-        for node in ast.walk(scope):
+        for node in own:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 parts = [text(part, known) for part in (*node.args, *(word.value for word in node.keywords))]
                 if node.func.id in JOINED:
@@ -83,7 +83,7 @@ def test_every_error_names_a_place_and_a_step():
     """Lines of a stream have no names: who reads them says which line it was, and the key that is wrong."""
     lacking, count = [], 0
     for path in sorted(ROOT.rglob("*.py")):
-        for node in ast.walk(parsed(path)):
+        for node in nodes(path):
             if not isinstance(node, ast.Call) or getattr(node.func, "id", "") != "InvalidProblem":
                 continue
             count += 1

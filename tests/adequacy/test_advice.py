@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from often import few
+from scipy.stats import binom
 
 import optloc
 from optloc.adequacy.advice import advise_at
@@ -202,9 +203,7 @@ def test_a_constraint_that_the_data_contradict_is_named():
 # Nobody is accused without reason.
 
 
-@pytest.mark.parametrize(
-    ("kind", "trials"), few([("tdoa", 100), ("tdoa", 200), ("range", 200), ("azimuth", 200)], 1, 2)
-)
+@pytest.mark.parametrize(("kind", "trials"), few([("tdoa", 40), ("tdoa", 200), ("range", 200), ("azimuth", 200)], 1, 2))
 def test_clean_data_are_not_accused(kind, trials):
     pairs = optloc.MODELS[kind].stations == 2
     rows = optloc.measured(kind, a=np.arange(int(pairs), 7), b=0 if pairs else None, sigma=NOISE[kind])
@@ -212,8 +211,7 @@ def test_clean_data_are_not_accused(kind, trials):
     truths = rng.uniform(-2e3, 9e3, (trials, 2))
     problem = optloc.simulate(optloc.assemble(PLACE, rows), truth=truths, seed=8)
     told = [one for i in range(trials) for one in advise_at(problem.take(np.array([i])), truths[i])]
-    # at FALSE_ALARM a trial, three of 200 happen once in a thousand runs
-    assert len(told) <= 2, told
+    assert len(told) <= binom.isf(1e-3, trials, FALSE_ALARM), told
 
 
 def test_the_statistic_is_chi_square_for_clean_data():

@@ -4,6 +4,8 @@ import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -31,64 +33,96 @@ from optloc.compute.jit import compiled
 def level(x):
     return x + {step}
 """
+# Each answer comes from a fork, which has imported neither file: what takes seconds, numba, is begun once for all.
 ASK = """
-import caller
+import os
+import sys
+
+import numba
 from numba.core import event
 
-with event.install_recorder("numba:compile") as made:
-    said = caller.answer(0)
-print(said, len(made.buffer) // 2, caller.answer.machine._cache.cache_path)
+import optloc.compute.jit
+
+numba.njit(lambda x: x + 1)(0)
+for line in sys.stdin:
+    child = os.fork()
+    if not child:
+        try:
+            import caller
+
+            with event.install_recorder("numba:compile") as made:
+                said = caller.answer(0)
+            print(said, len(made.buffer) // 2, caller.answer.machine._cache.cache_path, flush=True)
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
 """
+forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 
 
-def asked(folder: Path, **environment: str) -> tuple[int, int, Path]:
-    """Return the answer of a small package, how many functions were compiled for it, and where they are kept."""
+@contextmanager
+def asking(folder: Path, **environment: str) -> Iterator[Callable[[], tuple[int, int, Path]]]:
+    """Yield a function with the answer of a small package, how much was compiled for it, and where it is kept."""
     # Without bytecode: a file that is written twice in a second would be taken for what was read before.
     path = {"PYTHONPATH": f"{folder}{os.pathsep}{Path(kept.__file__).parents[2]}", "PYTHONDONTWRITEBYTECODE": "1"}
-    everything = {**os.environ, **path, **environment}
-    done = subprocess.run([sys.executable, "-c", ASK], env=everything, capture_output=True, text=True, check=True)
-    said, count, place = done.stdout.split()
-    return int(said), int(count), Path(place)
+    everything, pipe = {**os.environ, **path, **environment}, subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", ASK], env=everything, stdin=pipe, stdout=pipe, text=True) as process:
+
+        def asked() -> tuple[int, int, Path]:
+            process.stdin.write("\n")
+            process.stdin.flush()
+            said, count, place = process.stdout.readline().split()
+            return int(said), int(count), Path(place)
+
+        try:
+            yield asked
+        finally:
+            process.kill()
 
 
+@forks
 def test_an_edited_callee_renews_its_callers_and_damage_is_made_good(tmp_path):
     (tmp_path / "caller.py").write_text(CALLER)
     cache, callees = tmp_path / "cache", tmp_path / "callees"
     place = cache / manifest.of_this_process().name
-    for text, damaged, answer, compiled in (
-        (CALLEE.format(step=1), False, 2, 2),
-        (CALLEE.format(step=1), False, 2, 0),
-        (CALLEE.format(step=1), True, 2, 1),  # the callee is kept, too
-        (f"# A comment moves all lines.\n{CALLEE.format(step=1)}\n\ndef unused():\n    return 1\n", False, 2, 0),
-        (CALLEE.format(step=2), False, 3, 2),
-        (CALLEE.format(step=1), False, 2, 0),  # the version before is kept
-    ):
-        (tmp_path / "callee.py").write_text(text)
-        for file in place.glob("caller.answer-*.nbc") if damaged else ():
-            file.write_bytes(file.read_bytes()[:100])
-        asked_here = asked(tmp_path, NUMBA_CACHE_DIR=str(cache), OPTLOC_CALLEES=str(callees))
-        assert asked_here == (answer, compiled, place)
+    with asking(tmp_path, NUMBA_CACHE_DIR=str(cache), OPTLOC_CALLEES=str(callees)) as asked:
+        for text, damaged, answer, compiled in (
+            (CALLEE.format(step=1), False, 2, 2),
+            (CALLEE.format(step=1), False, 2, 0),
+            (CALLEE.format(step=1), True, 2, 1),  # the callee is kept, too
+            (f"# A comment moves all lines.\n{CALLEE.format(step=1)}\n\ndef unused():\n    return 1\n", False, 2, 0),
+            (CALLEE.format(step=2), False, 3, 2),
+            (CALLEE.format(step=1), False, 2, 0),  # the version before is kept
+        ):
+            (tmp_path / "callee.py").write_text(text)
+            for file in place.glob("caller.answer-*.nbc") if damaged else ():
+                file.write_bytes(file.read_bytes()[:100])
+            assert asked() == (answer, compiled, place)
     assert len(list(callees.glob("callee.level-*.nbi"))) == 2
     assert not list(place.glob("*level*"))
 
 
+@forks
 def test_a_damaged_index_is_made_again(tmp_path):
     """As one that names a class under the name of a module that it no longer has."""
     (tmp_path / "caller.py").write_text(CALLER)
     (tmp_path / "callee.py").write_text(CALLEE.format(step=1))
     more = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "OPTLOC_CALLEES": str(tmp_path / "callees")}
-    _, _, place = asked(tmp_path, **more)
-    index = next(place.glob("caller.answer-*.nbi"))
-    version = pickle.dumps(pickle.load(index.open("rb")))
-    index.write_bytes(version + b"cno_such_module\nNoSuchClass\n.")
-    assert asked(tmp_path, **more)[:2] == (2, 1)
-    assert asked(tmp_path, **more)[:2] == (2, 0)
+    with asking(tmp_path, **more) as asked:
+        _, _, place = asked()
+        index = next(place.glob("caller.answer-*.nbi"))
+        version = pickle.dumps(pickle.load(index.open("rb")))
+        index.write_bytes(version + b"cno_such_module\nNoSuchClass\n.")
+        assert asked()[:2] == (2, 1)
+        assert asked()[:2] == (2, 0)
 
 
+@forks
 def test_users_keep_no_callees(tmp_path):
     (tmp_path / "caller.py").write_text(CALLER)
     (tmp_path / "callee.py").write_text(CALLEE.format(step=1))
-    _, _, place = asked(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"), OPTLOC_CALLEES="")
+    with asking(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"), OPTLOC_CALLEES="") as asked:
+        _, _, place = asked()
     assert bool(list(place.rglob("callee.*.nbi"))) == kept.is_checkout()
     assert list(place.glob("caller.answer-*.nbi"))
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from zlib import crc32
 
 import numpy as np
+from descent import EXACT, levenberg
 from proof.layouts import SEED
 from scipy.ndimage import minimum_filter
 from scipy.optimize import least_squares
@@ -215,16 +216,12 @@ class Trial:
     def descended(self, start: Array) -> tuple[Array, float, float]:
         """Return the minimum next to a start, its cost and how many sigma a step along its slope would still change."""
         with np.errstate(all="ignore"):
-            done = least_squares(
+            steps = (
                 lambda y: np.nan_to_num(self.residual(self.to_place(y)), nan=1e9),
                 start,
-                jac=lambda y: np.nan_to_num(self.slope(self.to_place(y)) @ self.stretch(y)),
-                method="lm" if len(self.z) >= len(start) else "trf",
-                xtol=1e-15,
-                ftol=1e-15,
-                gtol=1e-15,
-                max_nfev=300,
+                lambda y: np.nan_to_num(self.slope(self.to_place(y)) @ self.stretch(y)),
             )
+            done = levenberg(*steps) if len(self.z) >= len(start) else least_squares(*steps, **EXACT)
             x = self.to_place(done.x)
             if not (np.isfinite(done.jac).all() and np.isfinite(self.cost(x))):
                 return x, np.inf, np.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from descent import EXACT, levenberg
 from scipy.optimize import least_squares
 
 from optloc import Problem
@@ -74,17 +75,13 @@ class Trial:
         scale = np.abs(self.place - self.place.mean(0)).max()
         middle = self.place.mean(0)
         with np.errstate(all="ignore"):
-            done = least_squares(
+            steps = (
                 lambda y: self.residual(middle + scale * y),
                 (start - middle) / scale,
-                jac=lambda y: self.slope(middle + scale * y) * scale,
-                # Levenberg's method is not for fewer rows than unknowns
-                method="lm" if len(self.white) >= len(start) else "trf",
-                xtol=1e-15,
-                ftol=1e-15,
-                gtol=1e-15,
-                max_nfev=300,
+                lambda y: self.slope(middle + scale * y) * scale,
             )
+            # Levenberg's method is not for fewer rows than unknowns
+            done = levenberg(*steps) if len(self.white) >= len(start) else least_squares(*steps, **EXACT)
             J = done.jac
             if not (np.isfinite(J).all() and np.isfinite(done.fun).all()):  # on a station, or far out
                 return middle + scale * done.x, np.inf, np.inf

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import CASES, ENU, STATIONS, TARGET
+from descent import levenberg
 from proof.plain import node_values
-from scipy.optimize import least_squares
 
 from optloc import Motion, Stations, assemble, certify, measured, simulate, solve
 from optloc.base.types import Band
@@ -28,25 +28,36 @@ HORIZON = -0.1
 
 
 def on_plane(rng):
-    """Return the constraint, and positions (n, 3) on it from coordinates (n, 2)."""
+    """Return the constraint, positions (n, 3) on it from coordinates (n, 2), and derivatives (3, 2) at one (2,)."""
     normal = rng.standard_normal(3) * [0.5, 0.5, 1.0]
     normal /= np.linalg.norm(normal)
     value, axes = float(rng.uniform(-2e3, 2e3)), np.linalg.qr(np.column_stack([normal, np.eye(3)[:, :2]]))[0][:, 1:]
     band = Band("plane", np.array(value), np.array(value), normal, "slope", 0)
-    return (band,), lambda y: value * normal + y @ axes.T
+    return (band,), lambda y: value * normal + y @ axes.T, lambda y: axes
 
 
 def on_height(rng):
-    value = float(rng.uniform(0.0, 4e3))
+    value, e2 = float(rng.uniform(0.0, 4e3)), WGS84_F * (2.0 - WGS84_F)
 
-    def place(y):  # coordinates are metres of latitude and longitude
-        lat, lon = np.radians(47.3) + y[:, 1] / 6.37e6, np.radians(8.5) + y[:, 0] / 4.32e6
-        e2, across = WGS84_F * (2.0 - WGS84_F), np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon)])
+    def angles(y):  # coordinates are metres of latitude and longitude
+        return np.radians(47.3) + y[..., 1] / 6.37e6, np.radians(8.5) + y[..., 0] / 4.32e6
+
+    def place(y):
+        lat, lon = angles(y)
+        across = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon)])
         prime = WGS84_A / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
         ecef = np.stack([*((prime + value) * across), ((1.0 - e2) * prime + value) * np.sin(lat)], axis=-1)
         return (ecef - ENU.origin_ecef()) @ ENU.rotation_to_ecef()
 
-    return height(exactly=value), place
+    def along(y):
+        lat, lon = angles(y)
+        bent = 1.0 - e2 * np.sin(lat) ** 2
+        east = np.array([-np.sin(lon), np.cos(lon), 0.0]) * np.cos(lat) * (WGS84_A / np.sqrt(bent) + value)
+        north = np.array([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
+        north *= WGS84_A * (1.0 - e2) / bent**1.5 + value
+        return ENU.rotation_to_ecef().T @ np.stack([east / 4.32e6, north / 6.37e6], axis=-1)
+
+    return height(exactly=value), place, along
 
 
 def on_height_from_space(rng):
@@ -71,20 +82,28 @@ def residuals(kind, S, z, x, sigma):
     return (np.arctan2(np.sin(off), np.cos(off)) if kind == "azimuth" else off) / sigma
 
 
-def least_on(place, kind, S, z, sigma, rng, reach):
+def slope_of(kind, S, x, sigma):
+    """Return the derivatives of whitened residuals by the place."""
+    if kind == "azimuth":
+        way = x - S
+        return np.stack([-way[:, 1], way[:, 0], 0.0 * way[:, 0]], axis=-1) / (way[:, :2] ** 2).sum(1)[:, None] / sigma
+    line = (x - S) / np.linalg.norm(x - S, axis=1)[:, None]
+    if kind == "tdoa":
+        line = np.linalg.solve(np.linalg.cholesky(np.eye(len(S) - 1) + 1.0), line[1:] - line[0])
+    return line / sigma
+
+
+def least_on(place, along, kind, S, z, sigma, rng, reach):
     """Return the distinct minima (cost, position) that SciPy reaches on a surface from places up to a distance."""
     found = []
     for start in rng.uniform(-1.0, 1.0, (STARTS, 2)) * 10.0 ** rng.uniform(3.0, reach, (STARTS, 1)):
-        done = least_squares(
+        done = levenberg(
             lambda y: residuals(kind, S, z, place(1e4 * y[None])[0], sigma),
             1e-4 * start,
-            method="lm",
-            xtol=1e-12,
-            ftol=1e-14,
-            gtol=1e-12,
+            lambda y: 1e4 * slope_of(kind, S, place(1e4 * y[None])[0], sigma) @ along(1e4 * y),
         )
-        bend = done.jac.T @ done.jac
-        slope = np.sqrt(max(done.grad @ np.linalg.pinv(bend) @ done.grad, 0.0))
+        bend, grad = done.jac.T @ done.jac, done.jac.T @ done.fun
+        slope = np.sqrt(max(grad @ np.linalg.pinv(bend) @ grad, 0.0))
         x = place(1e4 * done.x[None])[0]
         if slope < 1e-3 and all(np.linalg.norm(x - other) > 1.0 for _, other in found):
             found.append((2.0 * done.cost, x))
@@ -121,14 +140,14 @@ def elevations(S, x):
 
 def check_surface(surface, rng):
     """Compare one certificate on a surface with minima by other means; return whether it claims a gap."""
-    constraint, place = surface(rng)
+    constraint, place, along = surface(rng)
     kind, S, z, sigma, rows = drawn_on(surface, place, rng)
     problem = assemble(S, rows, frame=ENU, constraints=constraint)
     fix = solve(problem)
     proof = fix.certificate
     if not fix.answered or proof.proof not in ("global", "region"):
         return False
-    minima = least_on(place, kind, S, z, sigma, rng, REACH[surface])
+    minima = least_on(place, along, kind, S, z, sigma, rng, REACH[surface])
     cost, slack = float(fix.cost), 1e-5 * (1.0 + float(fix.cost))
     inside = np.ones(len(minima), dtype=bool)
     if proof.region is not None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from descent import levenberg
 from proof.costs import WIDTH, beside, down_from, no_rivals
 from proof.sampling import many
 from scipy.optimize import least_squares, minimize_scalar
@@ -44,8 +45,7 @@ def minima_of(S, K, w, starts):
 
     found = []
     for start in starts:
-        fit = least_squares(residual, start, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=300)
-        p = fit.x
+        p = levenberg(residual, start, jacobian).x
         for _ in range(8):  # Newton, to vanishing slope
             line = p - S
             r = np.linalg.norm(line, axis=1)

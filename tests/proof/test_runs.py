@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from often import few
 from proof.doppler import scenes_of
 from proof.layouts import SEED
 from proof.sampling import many
@@ -140,13 +141,14 @@ def test_few_rows_cost_nowhere_more_than_all():
 
 
 @pytest.mark.usefixtures("form")
-def test_no_point_of_a_box_costs_less_than_its_bound(seed):
+@pytest.mark.parametrize("count", few([20, 60], 1))
+def test_no_point_of_a_box_costs_less_than_its_bound(seed, count):
     rng, good = np.random.default_rng([SEED, seed, 2]), 0
     for problem, x in runs_of(rng):
         run = run_costs(problem).runs[0]
         for space, tables in spaces(problem, run, x):
             floor, box, sheet = floor_of(space, run.cost), tables.box, tables.sheet
-            for _ in range(many(60, 4)):
+            for _ in range(many(count, 4)):
                 at, half, piece = put(space, tables, rng, len(x))
                 if not place(space, tables, run.cost, at, half, piece):
                     continue
@@ -162,11 +164,12 @@ def test_no_point_of_a_box_costs_less_than_its_bound(seed):
                     if place(space, tables, run.cost, inside, np.zeros(3), piece):
                         cost = residual_at(run.rows, box.nodes, sheet)
                         assert np.sqrt(cost) >= max(lows) - noise, (problem.rows[0].kind, space.far, half)
-    assert good > many(100, 8)
+    assert good > many(100 * count // 60, 8)
 
 
 @pytest.mark.usefixtures("form")
-def test_no_point_of_a_box_has_a_hessian_beyond_its_bounds(seed):
+@pytest.mark.parametrize("count", few([15, 40], 1))
+def test_no_point_of_a_box_has_a_hessian_beyond_its_bounds(seed, count):
     rng, good = np.random.default_rng([SEED, seed, 3]), 0
     for problem, x in runs_of(rng):
         run = run_costs(problem).runs[0]
@@ -182,7 +185,7 @@ def test_no_point_of_a_box_has_a_hessian_beyond_its_bounds(seed):
                 whole = np.array([[sums[entry(k, m)] for m in range(3)] for k in range(3)])
                 return whole, np.array([[sums[C00 + entry(k, m)] for m in range(3)] for k in range(3)]), ball
 
-            for _ in range(many(40, 2)):
+            for _ in range(many(count, 2)):
                 at, half, piece = put(space, tables, rng, len(x))
                 centre, change, ball = hessian_at(at, half, piece)
                 if not ball < np.inf:
@@ -195,4 +198,4 @@ def test_no_point_of_a_box_has_a_hessian_beyond_its_bounds(seed):
                         moved = (there - centre)[:free, :free]
                         beyond = np.maximum(np.abs(moved) - change[:free, :free], 0.0)
                         assert np.linalg.norm(beyond, 2) <= ball * (1.0 + 1e-6) + 1e-9 * np.abs(centre).max()
-    assert good > many(100, 8)
+    assert good > many(100 * count // 40, 8)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from descent import levenberg
 from often import few
 from proof.sampling import many
-from scipy.optimize import least_squares
 
 from optloc import Frame, Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve
 from optloc.compute.jit import enabled
@@ -281,10 +281,6 @@ def residuals(problem, state: Array) -> Array:
     return np.concatenate(out)
 
 
-# So that a point far along a valley is no minimum.
-EXACT = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-7, "max_nfev": 300}
-
-
 def minima(problem, rng: np.random.Generator, near: Array, starts: int) -> list[tuple[float, Array]]:
     """Return the minima within the limits that SciPy finds, costs and states (4,) on the surface."""
     ground, found = course_costs(problem.flat()).courses[0][0].ground, []
@@ -292,9 +288,9 @@ def minima(problem, rng: np.random.Generator, near: Array, starts: int) -> list[
     draws = rng.uniform(-1.0, 1.0, (starts, 4)) * most * rng.choice([0.2, 1.0], (starts, 1))
     for state in [near, *draws]:
         with np.errstate(all="ignore"):
-            done = least_squares(lambda s: residuals(problem, state_off(ground, s * SPREAD)), state / SPREAD, **EXACT)
+            done = levenberg(lambda s: residuals(problem, state_off(ground, s * SPREAD)), state / SPREAD, most=1500)
         x = done.x * SPREAD
-        if np.isfinite(done.cost) and done.optimality < 1e-3 and (np.abs(x) <= most).all():
+        if np.isfinite(done.cost) and np.abs(done.fun @ done.jac).max() < 1e-3 and (np.abs(x) <= most).all():
             found.append((2.0 * done.cost, x))
     return found
 

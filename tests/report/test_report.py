@@ -29,7 +29,7 @@ format = 1
 name = "site"
 title = 'A site <b>on Earth</b> & "elsewhere"'
 seed = 5
-trials = 20
+trials = 6
 
 [[scenario]]
 name = "our site"
@@ -85,7 +85,7 @@ def test_tables_hold_the_numbers_of_the_study(site, made):
             (frame["scenario"] == row["case"]) & (frame["method"] == row["method"])
             & (frame["noise_label"] == row["noise_label"])
         ]  # fmt: skip
-        assert int(row["trials"]) == len(part) == 20
+        assert int(row["trials"]) == len(part) == 6
         assert int(row["answered"]) == part["answered"].sum()
     with (site / "report" / "tables" / "statuses.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

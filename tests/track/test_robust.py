@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from often import few
 from robust_cases import wild_run
 from scipy.optimize import minimize
 
@@ -79,7 +80,7 @@ def test_wild_rows_do_a_track_no_harm():
     assert errors["robust"] < 6.0
 
 
-@pytest.mark.parametrize("trials", [3, pytest.param(20, marks=pytest.mark.full)])
+@pytest.mark.parametrize("trials", few([1, 20], 1))
 def test_tracks_begin_among_wild_rows(trials):
     update, rules = reweighted("iekf", "cauchy"), Rules(starts="robust")
     for seed in range(100, 100 + trials):

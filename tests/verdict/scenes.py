@@ -72,11 +72,18 @@ class Scene:
         miss = self.z - model(self.rows, self.stations, x)
         angular = np.array([kind in ANGLES for kind, _, _ in self.rows])
         miss[angular] = np.arctan2(np.sin(miss[angular]), np.cos(miss[angular]))
-        white = self.root @ miss
-        if self.late.any():
-            own = self.root @ self.late.astype(float)
-            white = white - own * (own @ white) / (own @ own)
-        return white
+        return self._without_time(self.root @ miss)
+
+    def slope(self, x: Array) -> Array:
+        """Return the derivatives (m, d) of the whitened residuals."""
+        return self._without_time(-self.root @ derivatives(self.rows, self.stations, x))
+
+    def _without_time(self, white: Array) -> Array:
+        """Return whitened rows (m, ...) less what the emission time explains."""
+        if not self.late.any():
+            return white
+        own = self.root @ self.late.astype(float)
+        return white - np.multiply.outer(own, own @ white) / (own @ own)
 
     def cost(self, x: Array) -> float:
         return float((self.residual(x) ** 2).sum())
@@ -100,6 +107,24 @@ def model(rows: tuple[tuple[str, int, int], ...], stations: Array, x: Array) -> 
         }[kind]
         out.append(value)
     return np.array(out)
+
+
+def derivatives(rows: tuple[tuple[str, int, int], ...], stations: Array, x: Array) -> Array:
+    """Return the derivatives (m, d) of what the rows measure by the position, row by row."""
+    away = x - stations
+    reach = np.sqrt((away**2).sum(1))
+    line, out = away / reach[:, None], np.zeros((len(rows), len(x)))
+    for i, (kind, a, b) in enumerate(rows):
+        if kind == "azimuth":
+            out[i, :2] = np.array([-away[a, 1], away[a, 0]]) / (away[a, :2] @ away[a, :2])
+        elif kind == "elevation":
+            level = np.hypot(away[a, 0], away[a, 1])
+            out[i] = np.array([*(-away[a, 2] * away[a, :2] / level), level]) / reach[a] ** 2
+        elif kind == "groa":
+            out[i] = (line[a] - reach[a] / reach[b] * line[b]) / reach[b]
+        else:
+            out[i] = line[a] + {"tdoa": -1.0, "range_sum": 1.0}.get(kind, 0.0) * line[b]
+    return out
 
 
 def draw(rng: np.random.Generator) -> Scene:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from descent import EXACT, levenberg
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 from verdict.scenes import Scene
@@ -91,20 +92,24 @@ def _descend(scene: Scene, place: Array) -> Found | None:
     def residual(y: Array) -> Array:
         return scene.residual(at(np.append(y, 0.0) if free < d else y))
 
-    start, bounds = ((place - scene.centre) / unit)[:free], (-np.inf, np.inf)
+    def slope(y: Array) -> Array:
+        return unit * scene.slope(at(np.append(y, 0.0) if free < d else y))[:, :free]
+
+    start, bounds = ((place - scene.centre) / unit)[:free], None
     if scene.corners is not None:
         bounds = tuple((scene.corners - scene.centre) / unit)
         start = np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9)
     with np.errstate(all="ignore"):
         try:
-            end = least_squares(
-                residual, start, bounds=bounds, x_scale="jac", jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14
-            )
+            if bounds is None and len(scene.rows) >= free:
+                end = levenberg(residual, start, slope)
+            else:
+                end = least_squares(residual, start, slope, bounds or (-np.inf, np.inf), x_scale="jac", **EXACT)
         except (ValueError, np.linalg.LinAlgError):  # it ran off to where nothing is finite
             return None
         information = end.jac.T @ end.jac
         step = np.linalg.pinv(information) @ (end.jac.T @ end.fun)
-        inside = scene.corners is None or (np.abs(end.active_mask) == 0).all()
+        inside = bounds is None or (np.abs(end.active_mask) == 0).all()
         if inside and not step @ information @ step < FINISHED**2:
             return None
     x = at(np.append(end.x, 0.0) if free < d else end.x)
