@@ -121,7 +121,8 @@ def _choose(model: Model, room: Room, spot: Array) -> None:
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
-        found, least = scalar[FIX_COST, lane] <= model.limit, scalar[FIX_COST, lane] + LISTED
+        least = scalar[FIX_COST, lane] + LISTED
+        found = least < np.inf and scalar[FIX_COST, lane] <= model.limit
         scalar[GOOD, lane], scalar[SECOND, lane] = 1.0 if found else 0.0, 0.0
         if not found:
             continue

@@ -89,6 +89,18 @@ def test_satellites_and_a_height_meet_where_the_closed_form_says(told):
     assert ambiguous > 0
 
 
+@compiled
+def test_ranges_that_miss_the_earth_have_no_start():
+    """Differences longer than the stations are apart, beside a problem that has its place."""
+    problem, _ = satellites(np.random.default_rng(7), told=False)
+    good = problem.flat()
+    z = np.concatenate([good.z, good.z + 1e7, good.z])
+    plan = plan_of(good)
+    found = plan.run(plan.load(good), z)[0]
+    assert found.settled.tolist() == [True, False, True]
+    assert np.array_equal(found.x[0], found.x[2])
+
+
 def pair(count):
     """Two aircraft that measure differences of range and of its rate at three epochs, and emitters about them."""
     times, velocity = np.array([0.0, 10.0, 20.0]), np.array([[120.0, 20.0], [110.0, -30.0]])
