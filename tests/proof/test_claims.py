@@ -101,6 +101,8 @@ def least_on(place, along, kind, S, z, sigma, rng, reach):
             lambda y: residuals(kind, S, z, place(1e4 * y[None])[0], sigma),
             1e-4 * start,
             lambda y: 1e4 * slope_of(kind, S, place(1e4 * y[None])[0], sigma) @ along(1e4 * y),
+            most=200,
+            fine=1e-12,
         )
         bend, grad = done.jac.T @ done.jac, done.jac.T @ done.fun
         slope = np.sqrt(max(grad @ np.linalg.pinv(bend) @ grad, 0.0))
