@@ -28,15 +28,16 @@ def levenberg(
     jacobian: Callable[[Array], Array] | None = None,
     scale: Array | None = None,
     most: int = 300,
+    fine: float = 1e-15,
 ) -> Descent:
-    """Return where a descent from a start ends, to the last digits; all unknowns count alike unless scaled.
+    """Return where a descent from a start ends, to `fine`; all unknowns count alike unless scaled.
 
     Without derivatives MINPACK takes differences, and those of the end are central ones, a millionth apart.
     """
     start = np.asarray(start, dtype=float)
     diag = np.ones(len(start)) if scale is None else 1.0 / scale
     x, _, told, *_ = leastsq(
-        residual, start, (), jacobian, full_output=True, xtol=1e-15, ftol=1e-15, gtol=1e-15, maxfev=most, diag=diag
+        residual, start, (), jacobian, full_output=True, xtol=fine, ftol=fine, gtol=fine, maxfev=most, diag=diag
     )
     jac = jacobian(x) if jacobian is not None else _slope(residual, x)
     return Descent(x, told["fvec"], jac, 0.5 * float(told["fvec"] @ told["fvec"]))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from cases import STATIONS
+from often import few
 
 from optloc import (
     ECEF,
@@ -207,10 +208,11 @@ def test_a_time_moves_ranges_and_rates_as_the_orbit_does():
     np.testing.assert_allclose(differentiate(problem, x)[1][:, 3:], slopes, atol=1e-4)
 
 
-def test_a_time_and_its_covariance_are_those_of_draws():
+@pytest.mark.parametrize("count", few([150, 300], 1))
+def test_a_time_and_its_covariance_are_those_of_draws(count):
     problem = with_bias(passing("range_rate"), "ahead", form="time", sigma=AHEAD)
     problem = with_bias(problem, "frequency", per="kind", kind="range_rate")
-    count, rng = 300, np.random.default_rng(7)
+    rng = np.random.default_rng(7)
     truth = np.zeros((count, 6))
     truth[:, :3], truth[:, 3:5] = EMITTER, AHEAD * rng.standard_normal((count, 2))
     fixes = solve(simulate(problem, truth=truth, seed=8), start=truth)

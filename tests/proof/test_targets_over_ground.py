@@ -239,9 +239,10 @@ def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
 
 
 @pytest.mark.usefixtures("form")
-def test_hessians_are_those_of_the_cost(seed):
+@pytest.mark.parametrize("count", few([4, 10], 1))
+def test_hessians_are_those_of_the_cost(seed, count):
     rng = np.random.default_rng([7, seed])
-    for number in range(10):
+    for number in range(count):
         made, truth = drawn(rng, KINDS[number % 4])
         course = course_costs(simulate(made, truth=truth, seed=number).flat()).courses[0][0]
         state = state_on(course.ground, truth[:6]) + rng.normal(size=4) * [3e3, 3e3, 20.0, 20.0]

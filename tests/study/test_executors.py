@@ -160,7 +160,7 @@ BASELINES["mine"] = Baseline(same, "what is known", guess=False)
 def test_a_plugin_of_the_command_line_is_known_to_the_processes_of_a_study(tmp_path):
     (tmp_path / "mine.py").write_text(PLUGIN)
     (tmp_path / "study.toml").write_text(
-        QUICK.replace("trials = 60", "trials = 10") + '\n[[method]]\nbaseline = "mine"\n'
+        QUICK.replace("trials = 60", "trials = 2") + '\n[[method]]\nbaseline = "mine"\n'
     )
     ask = [
         sys.executable,

@@ -5,6 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 from often import few
+from scipy.stats import chi2
 
 import optloc
 from optloc.base.errors import InvalidProblem
@@ -197,14 +198,18 @@ def test_a_gated_filter_leaves_out_an_outlier_and_nothing_else():
     assert (shut.mean == start.mean).all()
 
 
-def test_innovations_have_the_covariance_that_they_claim():
+# The elements of a covariance of 200 samples are known to a tenth of the largest variance.
+@pytest.mark.parametrize(("trials", "within"), few([(200, 0.4), (4000, 0.04)], 1, 2))
+def test_innovations_have_the_covariance_that_they_claim(trials, within):
     scan = next(iter(scans(channels(), 0)))[1]
-    rng = np.random.default_rng(7)
-    many = simulate(scan, TARGETS[0], 7, trials=4000)
-    mean = TARGETS[0] + rng.normal(0.0, 60.0, (4000, 2))
-    found = innovation(many, mean, np.broadcast_to(3600.0 * np.eye(2), (4000, 2, 2)))
+    rng = np.random.default_rng(8)  # other numbers than those of the noise
+    many = simulate(scan, TARGETS[0], 7, trials=trials)
+    mean = TARGETS[0] + rng.normal(0.0, 60.0, (trials, 2))
+    found = innovation(many, mean, np.broadcast_to(3600.0 * np.eye(2), (trials, 2, 2)))
     S = found.covariance.mean(0)
-    assert np.cov(found.value.T) == pytest.approx(S, abs=0.04 * S.max())
+    assert np.cov(found.value.T) == pytest.approx(S, abs=within * S.max())
+    squares = (found.value * np.linalg.solve(found.covariance, found.value[..., None])[..., 0]).sum()
+    assert chi2.ppf(1e-3, found.value.size) < squares < chi2.isf(1e-3, found.value.size)
 
 
 def test_rows_without_names_become_candidates():
