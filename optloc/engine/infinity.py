@@ -11,6 +11,7 @@ from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES
 from optloc.engine.admission import restore
 from optloc.engine.candidates import look_around
+from optloc.engine.images import keep_fix
 from optloc.engine.memory import (
     BEYOND,
     COST,
@@ -40,7 +41,7 @@ def search_sphere(model: Model, rows: Any, room: Room, spot: Array) -> None:
     The direction of the fix is refined, and the cheapest of each sector.
     """
     scalar, vector, d = room.scalar, room.vector, room.d
-    _keep(room)
+    keep_fix(room)
     for lane in range(LANES):
         scalar[BEYOND, lane] = np.inf
         scalar[RADIUS, lane] = _INFINITE * scalar[SPREAD, lane]
@@ -54,28 +55,15 @@ def search_sphere(model: Model, rows: Any, room: Room, spot: Array) -> None:
         restore(model, room, 0)
         refine(model, rows, room, _TOLERANCE, _STEPS)
         for lane in range(LANES):
-            cost = min(np.inf, scalar[COST, lane])
-            scalar[BEYOND, lane] = min(scalar[BEYOND, lane], cost)
+            scalar[BEYOND, lane] = min(scalar[BEYOND, lane], scalar[COST, lane])
     for lane in range(LANES):
         scalar[RADIUS, lane] = 0.0
     _bring_back(room)
 
 
 @compiled
-def _keep(room: Room) -> None:
-    """Copy row X and its information to row FIX and its own."""
-    vector, matrix = room.vector, room.matrix
-    for i in range(vector.shape[1]):
-        for lane in range(LANES):
-            vector[FIX, i, lane] = vector[X, i, lane]
-        for j in range(i + 1):
-            for lane in range(LANES):
-                matrix[FIX_H, i, j, lane] = matrix[H, i, j, lane]
-
-
-@compiled
 def _bring_back(room: Room) -> None:
-    """Copy row FIX and its information to row X and its own."""
+    """Copy row FIX and its information to row X."""
     vector, matrix = room.vector, room.matrix
     for i in range(vector.shape[1]):
         for lane in range(LANES):
