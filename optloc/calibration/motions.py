@@ -12,7 +12,7 @@ from optloc.calibration.likelihood import Estimate, Likelihood
 
 # Directions of largest variance, and standard deviations to either side: other minima were 5 to 20 deviations away, in
 # a valley that is curved.
-_WEAK, _STEPS = 4, (4.0, 8.0, 16.0)
+_WEAK, _STEPS = 3, (6.0, 14.0)
 # Share of the largest variance below which a direction is exact.
 _EXACT = 1e-9
 
