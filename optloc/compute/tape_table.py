@@ -1,4 +1,4 @@
-"""Several tapes below each other, as machine code takes them: every array that is handed on takes time."""
+"""Several tapes in one table, because every array that a kernel takes costs time."""
 
 from __future__ import annotations
 

@@ -162,10 +162,10 @@ class Answer(NamedTuple):
 
     @property
     def settled(self) -> Array:
-        """Whether a fix (N,) is a good one.
+        """Whether a fix (N,) is good.
 
-        A finite input, an exact start, a finished refinement, a regular covariance, a place that is not far away. The
-        others need a closer look, and nothing else is known of them.
+        A good fix has a finite input, an exact start, a finished refinement, a regular covariance and a place that is
+        not far away. The others need a closer look, and their other numbers mean nothing.
         """
         return np.asarray(self.number[:, SETTLED] != 0.0)
 

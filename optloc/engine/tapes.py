@@ -16,7 +16,8 @@ from optloc.compute.polynomial import DEGREE
 from optloc.compute.systems import LANES, eliminate_last, factor_plain, solve_plain
 from optloc.compute.tables import Tables
 from optloc.compute.tape_table import INPUT, OUTPUT, run_tape
-from optloc.engine.candidates import CANDIDATES, RINGS, VECTORS, look_around, meet_ellipsoid, refine_candidates
+from optloc.engine.candidates import CANDIDATES, RINGS, look_around, refine_candidates
+from optloc.engine.heights import VECTORS, meet_ellipsoid
 from optloc.engine.infinity import search_sphere
 from optloc.engine.lifts import NUMBER, OFFSET, SEEN, STATION, Lifts
 from optloc.engine.memory import (
