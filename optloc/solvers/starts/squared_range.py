@@ -27,7 +27,7 @@ Factor = Callable[[Array | None], Array]
 # has to be right.
 _NEAR = 1e-3
 
-# Share of the right sides' squares below which a cost is rounding.
+# Share of the right sides' squares by which equal costs differ: rounding.
 _ALIKE = 1e-12
 
 Pick = Callable[[Array, Array, Quadric], tuple[Array, Array]]
@@ -114,9 +114,8 @@ def minimum(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
         return y[:, None], ok[:, None]
     both, valid = np.stack([y, np.full_like(y, np.nan)], axis=1), np.stack([ok, np.zeros_like(ok)], axis=1)
     points, cost, real = stationary(rows[few], right[few], quadric, positive=positive)
-    fits = real & (cost <= _ALIKE * (1.0 + (right[few] ** 2).sum(-1, keepdims=True)))
-    both[few], valid[few] = points[:, :2], fits[:, :2]
-    both[few, 0], valid[few, 0] = np.where(fits[:, :1], points[:, 0], y[few]), fits[:, 0] | ok[few]
+    more = _ALIKE * (1.0 + (right[few] ** 2).sum(-1, keepdims=True))
+    both[few], valid[few] = points[:, :2], real[:, :2] & (cost[:, :2] <= cost[:, :1] + more)
     return both, valid
 
 
