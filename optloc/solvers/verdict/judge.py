@@ -174,7 +174,8 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
         items = np.setdiff1d(items, told)
     if not len(items):
         return
-    barred = items[code[items] == Status.INFEASIBLE]
+    barred = items[(code[items] == Status.INFEASIBLE) | _has_hidden(pool)[items]]
+    code[barred] = Status.INFEASIBLE
     for i in barred:
         bounds = violation_names(problem)
         missed = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides all that was found"
