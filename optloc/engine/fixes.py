@@ -523,8 +523,8 @@ def _invert(room: Room) -> None:
 
 fix_ranges = evaluated_by(fixes, ranges, "ranges")
 fix_tapes = evaluated_by(fixes, tapes, "tapes")
-# A block works out all of its lanes, empty or not: one problem takes twice as long in 64 lanes as in one. A block of one
-# lane waits for no other, so it takes all steps at once: a thousand is more than any refinement may.
+# A block works out all of its lanes, empty or not: one problem takes twice as long in 64 lanes as in one.
+# A block of one lane waits for no other, so it takes all steps at once: a thousand is more than any refinement may.
 _ONE: dict[str, int] = {"LANES": 1, "_WORTH": 1, "_FEW": 1000}
 fix_one_by_ranges = evaluated_by(fixes, ranges, "one_by_ranges", **_ONE)
 fix_one_by_tapes = evaluated_by(fixes, tapes, "one_by_tapes", **_ONE)
