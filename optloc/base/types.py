@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 Array = np.ndarray[Any, np.dtype[Any]]
+FormName = Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"]
+"""Names of the forms of a `Bias`, for type checkers: the keys of `optloc.problem.forms.FORMS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +201,7 @@ class Bias:
     row: Array
     member: Array
     coefficient: Array
-    form: Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"] = "offset"
+    form: FormName = "offset"
     # One zero stands for all members; an array of its own for each bias, for arrays can be written into.
     mean: Array = field(default_factory=lambda: np.zeros(1))
     sigma: Array | None = None

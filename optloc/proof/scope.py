@@ -11,6 +11,7 @@ from optloc.compute.jit import enabled
 from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
+from optloc.problem.forms import FORMS
 from optloc.problem.problem import Problem
 from optloc.proof.position_costs import own_epochs
 
@@ -126,11 +127,8 @@ def _nodes(problem: Problem) -> int:
 def _beyond_biases(problem: Problem) -> Iterator[str]:
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
-        if bias.form == "walk":
-            yield f"the walk {bias.name!r} is another unknown at each epoch, and the proof takes those of the run"
-        elif bias.form not in ("offset", "drift", "spline"):
-            does = "moves stations" if bias.form == "time" else "multiplies what it touches"
-            yield f"the {bias.form} {bias.name!r} {does}, and the proof takes what is added"
+        if why := FORMS[bias.form].beyond_proof:
+            yield f"the {bias.form} {bias.name!r} {why}"
         elif bias.sigma is None and angular[bias.row].any():
             yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
 
