@@ -144,8 +144,12 @@ def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
     local = out[..., layout.n_shared :].reshape(*x.shape[:2], layout.epochs, layout.n_local)
     since = (problem.times - problem.origin)[:, None]
     for bias in walks(problem):
-        value, *rate = (straight.layout.take(x, name)[:, :, None] for name in state_of(bias))
+        parts = [straight.layout.take(x, name) for name in state_of(bias)]
         place = places(layout, bias)
+        if not straight.layout.shares(bias.name):  # only splines are straight
+            local[..., place] = np.stack(parts, axis=-1)
+            continue
+        value, *rate = (part[:, :, None] for part in parts)
         local[..., place[:, 0]] = value + (rate[0] * since if rate else 0.0)
         for each in rate:
             local[..., place[:, 1]] = each
