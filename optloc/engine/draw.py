@@ -56,9 +56,9 @@ class Drawn(NamedTuple):
 def draw_ranges(one: Problem, admission: Admission) -> Drawn | None:
     """Return rows that are sums of ranges; None where they lack rows for a start, or links between stations."""
     offset = None
-    if one.stations.estimated:  # along the lines to the target, they are noise
+    if one.stations.unknown_for:  # along the lines to the target, they are noise
         offset = columns(one.layout, "stations", np.zeros(1, dtype=int))[0]
-        one = replace(one, stations=replace(one.stations, span="noise"))
+        one = replace(one, stations=one.stations.with_noise())
     found = _find_ranges(one)
     # Stations that no row links would have ranges that nothing relates.
     if found is None or len(found.groups[0]) != 1:

@@ -211,7 +211,7 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
     # Errors that are noise are no unknowns: `optloc.linear.normal` puts them into the covariance of rows.
     d, feeds = problem.dimension, []
-    for name, _, _ in problem.stations.errors if problem.stations.estimated else ():
+    for name, _, _ in problem.stations.errors if problem.stations.unknown_for else ():
         rates = name == "station velocities"
         if rates and not model.velocity:
             continue

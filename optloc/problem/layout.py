@@ -160,8 +160,8 @@ def layout(
         room.extend((name, size, own, members) for name, own in entries)
     # Emission times last one epoch by their nature; station errors where their span says so.
     local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
-    if stations.estimated:
-        room = shared if stations.span == "run" else local
+    if stations.unknown_for:
+        room = shared if stations.unknown_for == "run" else local
         size = stations.count * stations.dimension
         room.extend((name, size, unit, stations.names) for name, unit, _ in stations.errors)
     return Layout(_slots(shared), _slots(local), epochs)

@@ -134,18 +134,16 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
 
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:
-    covariance = problem.stations.covariance
     if problem.stations.velocity_covariance is not None:
         rates = [rows.kind for rows in problem.rows if MODELS[rows.kind].velocity]
         if rates:
             yield f"errors of the stations' velocities enter {rates[0]} rows in a way that depends on the place"
-    if covariance is None:
+    if problem.stations.covariance is None:
         return
     # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
-    same = np.eye(problem.dimension) * covariance[..., :1, :1]
-    if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
+    if not problem.stations.isotropic:
         yield "the station errors differ from axis to axis"
-    if problem.stations.span == "run" and _move(problem):
+    if problem.stations.unknown_for == "run" and _move(problem):
         yield "station errors last the whole run while stations move, and the proof takes one line of sight for each"
     bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
     if bent:
