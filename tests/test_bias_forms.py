@@ -2,6 +2,7 @@
 
 import ast
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -120,3 +121,10 @@ def test_one_entry_adds_a_form(monkeypatch):
     moving = with_bias(run_of(Motion(1)), "clock", form="bend", members=["B"])
     with pytest.raises(InvalidProblem, match="the bend 'clock' changes in time"):
         begun_with_constants(moving, polynomial(1, 1.0), 3)
+
+
+def test_an_unknown_form_of_a_bias_made_by_hand_is_named():
+    made = with_bias(run_of(), "clock", members=["B"])
+    strange = replace(made, biases=(replace(made.biases[0], form="ofset"),))
+    with pytest.raises(InvalidProblem, match=r"bias 'clock': unknown form 'ofset'; use offset, scale"):
+        predict(strange, np.zeros(3))

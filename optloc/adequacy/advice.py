@@ -15,7 +15,7 @@ from optloc.base.types import Array, Bias
 from optloc.problem.bias import family
 from optloc.problem.epochs import by_epoch, separable, thinned, tied
 from optloc.problem.fix import Fix
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 
 # Explanations of a misfit that are told where several do as well.
@@ -206,7 +206,7 @@ def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
 
 def _noun(one: Candidate) -> str:
     """Return the noun of a candidate with its article."""
-    return {"step": "a step", "burst": "a burst of errors"}.get(one.form) or FORMS[one.bias.form].noun
+    return {"step": "a step", "burst": "a burst of errors"}.get(one.form) or form_of(one.bias).noun
 
 
 def _tell(problem: Problem, one: Explained) -> Advice:
@@ -231,7 +231,7 @@ def _size(problem: Problem, one: Explained) -> tuple[str, str]:
     """Return the estimate with its standard deviation, and its unit; angles in degrees."""
     slot = _unit(problem, one)
     unit, scale = (slot.replace("rad", "deg"), np.degrees(1.0)) if "rad" in slot else (slot, 1.0)
-    if FORMS[one.candidate.bias.form].enters == "scales":
+    if form_of(one.candidate.bias).enters == "scales":
         unit, scale = "%", 100.0
     pairs = [f"{scale * v:+.4g} ± {scale * s:.2g}" for v, s in zip(one.value, one.sigma, strict=True)]
     return ", ".join(pairs), unit

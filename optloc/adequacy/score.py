@@ -20,7 +20,7 @@ from optloc.models import MODELS
 from optloc.problem.bias import Per, family
 from optloc.problem.chart import quantile
 from optloc.problem.fix import tail_probability
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import FORMS, form_of
 from optloc.problem.problem import Problem
 
 FALSE_ALARM = 1e-3
@@ -79,7 +79,7 @@ class Candidate:
     @property
     def is_channel_offset(self) -> bool:
         """Return whether it adds a constant to one station's rows of a kind, all the time."""
-        form = FORMS[self.bias.form]
+        form = form_of(self.bias)
         return self.per == "station" and form.enters == "adds" and not (form.changes or np.isfinite(self.since))
 
     @property
@@ -190,7 +190,7 @@ def _stands_for(other: Explained, one: Explained) -> bool:
 
 def _is_stretched(one: Explained) -> bool:
     """Return whether an explanation is a scale of times."""
-    form, kind = FORMS[one.candidate.bias.form], one.candidate.kind
+    form, kind = form_of(one.candidate.bias), one.candidate.kind
     return form.enters == "scales" and kind != "" and _is_of_arrivals(kind)
 
 

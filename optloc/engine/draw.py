@@ -34,7 +34,7 @@ from optloc.linear.normal import weighed
 from optloc.linear.redundancy import degrees_of_freedom, largest
 from optloc.linear.vectors import hold_still, vectors
 from optloc.models import MODELS
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 
@@ -272,7 +272,7 @@ def _is_bounded(one: Problem) -> bool:
 
     Ranges that add up do, but for a scale or an offset without a prior; so do heights, and a prior on the position.
     """
-    free = {bias.name for bias in one.biases if bias.sigma is None or FORMS[bias.form].enters == "scales"}
+    free = {bias.name for bias in one.biases if bias.sigma is None or form_of(bias).enters == "scales"}
     touched = np.zeros(one.count, dtype=bool)
     for bias in one.biases:
         touched[bias.row] |= bias.name in free

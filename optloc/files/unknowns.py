@@ -31,7 +31,7 @@ from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, reported, speed, visible
 from optloc.problem.bias import family
 from optloc.problem.clocks import clock_densities
-from optloc.problem.forms import FORMS, BiasForm, complete
+from optloc.problem.forms import FORMS, BiasForm, complete, form_of
 from optloc.problem.validation import check_polygon, like
 
 # Derivatives of the position that a motion estimates.
@@ -207,7 +207,7 @@ def bias_of(
     }
     # epochs without times are refused where the problem is made
     bias = complete(bias, epochs.clock, where, **_change(table, [units for units, _ in spelled], where))
-    form = FORMS[table.form]
+    form = form_of(bias)
     mean, sigma = _prior(table, form, [units for units, _ in spelled], form.shape(bias, dimension), where)
     return replace(bias, mean=mean, sigma=sigma), _unit_to_read(form, spelled, where)
 
@@ -217,12 +217,12 @@ def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array
     ends = np.cumsum([block.count for block in rows])
     touched = {int(i) for i in np.unique(np.searchsorted(ends, bias.row, side="right"))}
     senses = {rows[i].sense for i in touched if rows[i].kind == "azimuth"}
-    if len(senses) > 1 and FORMS[bias.form].of_readings:
+    if len(senses) > 1 and form_of(bias).of_readings:
         what = "it touches azimuths that are counted clockwise and others that are counted anticlockwise"
         advice = "count all of them one way, or name with members who is read which way"
         raise InvalidProblem(what, where, advice)
     north = any(units.convention != "east-counterclockwise" for n, units, _ in written if np.isin(bias.row, n).any())
-    if FORMS[bias.form].enters == "scales" and north:
+    if form_of(bias).enters == "scales" and north:
         what = "a scale of bearings would count from the x axis, not from north"
         raise InvalidProblem(what, where, 'use the form "offset", or azimuth = "east-counterclockwise"')
 

@@ -17,7 +17,7 @@ from optloc.models import MODELS, Model, Point
 from optloc.models.medium import Atmosphere
 from optloc.models.primitives import Jet, geodetic_normal, rotate, wrap
 from optloc.problem.bias import course
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, emission_name, state_names
 from optloc.problem.problem import Problem
 
@@ -171,7 +171,7 @@ def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
         inside = (bias.row >= start) & (bias.row < start + block.count)
         rows, epoch = bias.row[inside] - start, block.epoch[bias.row[inside] - start]
         own = replace(bias, member=bias.member[inside], coefficient=bias.coefficient[inside])
-        entry, factor = FORMS[bias.form].effects(own, problem.times, problem.origin, epoch)
+        entry, factor = form_of(bias).effects(own, problem.times, problem.origin, epoch)
         column = np.take_along_axis(columns(problem.layout, bias.name, epoch), entry, axis=1)
         parts.append(Terms(np.repeat(rows, entry.shape[1]), column.ravel(), factor.ravel()))
     return _append(parts)
@@ -179,7 +179,7 @@ def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
 
 def _entering(problem: Problem, enters: str) -> list[Bias]:
     """Return the biases that enter rows in a way, see `BiasForm.enters`."""
-    return [bias for bias in problem.biases if FORMS[bias.form].enters == enters]
+    return [bias for bias in problem.biases if form_of(bias).enters == enters]
 
 
 def _append(parts: list[Terms]) -> Terms:

@@ -15,7 +15,7 @@ from optloc.linear import chain
 from optloc.linear.evaluate import differentiate
 from optloc.linear.walks import chain_at, walks
 from optloc.models import MODELS
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, together, whiten
 from optloc.problem.problem import Problem
 
@@ -530,7 +530,7 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
         parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
     for bias in problem.biases:
         # what is known of walks ties epochs: `chain_at`
-        if bias.sigma is not None and FORMS[bias.form].steps is None:
+        if bias.sigma is not None and form_of(bias).steps is None:
             sigma = np.ravel(bias.sigma)
             # Members of a bias are independent of each other a priori.
             parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))

@@ -10,14 +10,14 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.types import Array, Bias
 from optloc.problem.clocks import state_of
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
 
 def walks(problem: Problem) -> tuple[Bias, ...]:
     """Return the biases of a problem that walk from epoch to epoch."""
-    return tuple(bias for bias in problem.biases if FORMS[bias.form].steps is not None)
+    return tuple(bias for bias in problem.biases if form_of(bias).steps is not None)
 
 
 def walk_names(problem: Problem) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ def chain_at(problem: Problem, x: Array) -> Chain:
 def _steps(problem: Problem) -> Iterator[tuple[Bias, Array, Array, Array]]:
     """Yield each walk, the local columns (q, o) of its states, and the transitions and covariances of its steps."""
     for bias in problem.biases:
-        steps = FORMS[bias.form].steps
+        steps = form_of(bias).steps
         if steps is not None:
             yield bias, places(problem.layout, bias), *steps(bias, problem.times)
 

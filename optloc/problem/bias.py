@@ -13,7 +13,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Bias, FormName, Rows
 from optloc.models import MODELS
 from optloc.models.primitives import rotate
-from optloc.problem.forms import FORMS, BiasForm, complete
+from optloc.problem.forms import FORMS, BiasForm, complete, form_of
 from optloc.problem.problem import Problem
 from optloc.problem.validation import check_unknowns
 
@@ -321,23 +321,17 @@ def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
     if name not in names:
         raise InvalidProblem(f"there is no bias {name!r}", "name", nearest(name, names) if names else "there are none")
     bias = problem.biases[names.index(name)]
-    known = _order(bias, values, _shape_of(problem, bias))
-    rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
-    change = {"turns": _turn, "moves": _move}.get(FORMS[bias.form].enters, _correct)
-    return change(rest, bias, known)
-
-
-def _shape_of(problem: Problem, bias: Bias) -> tuple[int, ...]:
-    """Return the shape of the values of a bias: members, and what each has several of; of a walk epochs, members."""
-    form = FORMS[bias.form]
+    form = form_of(bias)
     shape = form.shape(bias, problem.dimension)
-    return shape if form.steps is None else (problem.epochs, *shape)
+    known = _order(bias, values, shape if form.steps is None else (problem.epochs, *shape))
+    rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
+    return {"turns": _turn, "moves": _move}.get(form.enters, _correct)(rest, bias, known)
 
 
 def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
     """Return values of a shape in the order of the members."""
     where = f"values of {bias.name!r}"
-    if isinstance(values, Mapping) and FORMS[bias.form].steps is not None:
+    if isinstance(values, Mapping) and form_of(bias).steps is not None:
         raise InvalidProblem("a walk has values at every epoch", where, f"give an array of shape {shape}")
     if isinstance(values, Mapping):
         strange = [member for member in values if member not in bias.members]
@@ -354,7 +348,7 @@ def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
 
 def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
     """Return the problem with offsets, drifts or scales in the known corrections of its rows."""
-    form, amount, epoch = FORMS[bias.form], np.zeros(problem.count), problem.epoch[bias.row]
+    form, amount, epoch = form_of(bias), np.zeros(problem.count), problem.epoch[bias.row]
     entry, factor = form.effects(bias, problem.times, problem.origin, epoch)
     values = known.ravel()[entry] if form.steps is None else known[epoch[:, None], entry]
     np.add.at(amount, bias.row, (factor * values).sum(1))

@@ -173,6 +173,13 @@ FORMS: dict[str, BiasForm] = {
 """The forms by the names that arguments and files use, the simplest first."""
 
 
+def form_of(bias: Bias) -> BiasForm:
+    """Return the form of a bias; raise InvalidProblem for an unknown one."""
+    if bias.form not in FORMS:
+        raise InvalidProblem(f"unknown form {bias.form!r}", f"bias {bias.name!r}", f"use {', '.join(FORMS)}")
+    return FORMS[bias.form]
+
+
 def complete(bias: Bias, times: Array, where: str, **given: Any) -> Bias:
     """Return a bias with the arguments that its form needs; refuse others that are not None.
 
@@ -187,7 +194,7 @@ def complete(bias: Bias, times: Array, where: str, **given: Any) -> Bias:
     **given
         Arguments of `optloc.with_bias` by name.
     """
-    form = FORMS[bias.form]
+    form = form_of(bias)
     for name, value in given.items():
         if value is not None and name not in form.needs:
             other = next(other for other in FORMS if name in FORMS[other].needs)

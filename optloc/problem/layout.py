@@ -10,7 +10,7 @@ from optloc.base.arrays import library
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias, Motion, Stations
 from optloc.problem.clocks import state_of
-from optloc.problem.forms import FORMS, per_second
+from optloc.problem.forms import form_of, per_second
 
 # Units are those of reports: inside all is SI.
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
@@ -153,7 +153,7 @@ def layout(
             names = state_names(i, len(motions), motion.order)
             room.extend((name, stations.dimension, unit, ()) for name, unit in zip(names, units, strict=False))
     for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
-        form = FORMS[bias.form]
+        form = form_of(bias)
         room = shared if form.steps is None else local
         size, members = prod(form.shape(bias, stations.dimension)), form.members(bias)
         entries = zip(state_of(bias), (form.unit(unit), per_second(unit)), strict=False)

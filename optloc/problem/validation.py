@@ -15,7 +15,7 @@ from optloc.base.units import LARGEST
 from optloc.models import MODELS
 from optloc.models.surfaces import SURFACES
 from optloc.problem.epochs import separable, tied, untied
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem, at_rest, check_medium
 
@@ -341,9 +341,7 @@ def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
 
 
 def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
-    form = FORMS.get(bias.form)
-    if form is None:
-        raise InvalidProblem(f"unknown form {bias.form!r}", where, f"use {', '.join(FORMS)}")
+    form = form_of(bias)
     sizes = [len(bias.row), len(bias.member), len(bias.coefficient)]
     if len(set(sizes)) > 1:
         raise InvalidProblem(

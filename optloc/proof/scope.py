@@ -11,7 +11,7 @@ from optloc.compute.jit import enabled
 from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.position_costs import own_epochs
 
@@ -127,7 +127,7 @@ def _nodes(problem: Problem) -> int:
 def _beyond_biases(problem: Problem) -> Iterator[str]:
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
-        if why := FORMS[bias.form].beyond_proof:
+        if why := form_of(bias).beyond_proof:
             yield f"the {bias.form} {bias.name!r} {why}"
         elif bias.sigma is None and angular[bias.row].any():
             yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"

@@ -22,7 +22,7 @@ from optloc.linear.vectors import complete, vectors
 from optloc.linear.walks import places, walks
 from optloc.problem.clocks import rate_name, state_of
 from optloc.problem.epochs import by_epoch, untied
-from optloc.problem.forms import FORMS
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.starts.block_averages import average_blocks
@@ -123,7 +123,7 @@ def _straighten(problem: Problem, local: bool) -> Problem:
     """
     biases: list[Bias] = []
     for bias in problem.biases:
-        form = FORMS[bias.form]
+        form = form_of(bias)
         lines = form.straight if (form.steps is not None) == local else None
         biases += [bias] if lines is None else lines(bias)
     same = all(one is two for one, two in zip(biases, problem.biases, strict=False))
@@ -133,7 +133,7 @@ def _straighten(problem: Problem, local: bool) -> Problem:
 def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
     """Return vectors (N, C, size) of a problem from those of the same with straight biases; NaN stay NaN."""
     layout, out = problem.layout, np.zeros((*x.shape[:2], problem.layout.size))
-    moments = {bias.name: at(bias) for bias in problem.biases if (at := FORMS[bias.form].values_at) is not None}
+    moments = {bias.name: at(bias) for bias in problem.biases if (at := form_of(bias).values_at) is not None}
     for slot in layout.shared:
         part, own = slice(slot.start, slot.start + slot.size), straight.layout.take(x, slot.name)
         if slot.name in moments and own.shape[-1] != slot.size:
