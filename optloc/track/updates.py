@@ -257,7 +257,7 @@ def _is_plain(scan: Problem) -> bool:
         and motion.known is None
         and motion.reference in (None, scan.times[0])
         and not (scan.biases or scan.priors or scan.constraints)
-        and not scan.stations.estimated
+        and not scan.stations.unknown_for
     )
 
 
