@@ -23,9 +23,9 @@ from optloc.solvers.pool import Pool, begin, in_parts, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
 from optloc.solvers.verdict.judge import judge, standing, verdict
 
-# Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and numbers of a
-# batch at a time, some ten megabytes an array.
-_MOST, _CHUNK = 100_000, 1_000_000
+# Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and rows of all
+# subsets that are fixed together, at 2.5 kB a row.
+_MOST, _CHUNK = 100_000, 2**16
 # The same from which sets are looked at to first order before they are tried: fewer take less time than is saved.
 _FEW = 2_000
 # Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them. The cheapest
