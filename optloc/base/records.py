@@ -204,7 +204,8 @@ def _parts(record: Any) -> Iterator[tuple[str, Any]]:
     kind: Any = type(record)
     for name in _others(kind):
         value = getattr(record, name)
-        if _is_record(type(value)):
+        own: Any = type(value)
+        if _is_record(own):
             yield name, value
 
 
@@ -216,7 +217,8 @@ def _others(kind: Any) -> tuple[str, ...]:
 
 @cache
 def _is_record(kind: Any) -> bool:
-    return is_dataclass(kind) and bool(_layouts(kind))
+    own: Any = kind
+    return is_dataclass(kind) and bool(_layouts(own))
 
 
 def _count(record: Any) -> int:
