@@ -315,8 +315,10 @@ def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener,
     from optloc.compute import refine
     from optloc.compute.runs import refined_runs
 
-    runs = isinstance(found, PackedRuns)
-    done, lost = (refined_runs if runs else refine.refined)(found, item, start, rules)
+    if isinstance(found, PackedRuns):
+        done, lost = refined_runs(found, item, start, rules)
+    else:
+        done, lost = refine.refined(found, item, start, rules)
     # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
     if lost.any():
         more = _remade(problem.take(item[lost]), start[lost], rules)
@@ -324,7 +326,9 @@ def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener,
             getattr(done, name)[lost] = getattr(more, name)
 
     def make() -> Normal:
-        return sums_at(found, done.x, item, priors=True) if runs else refine.equations(found, item, done)
+        if isinstance(found, PackedRuns):
+            return sums_at(found, done.x, item, priors=True)
+        return refine.equations(found, item, done)
 
     return Refined(done.x, done.cost, done.status, done.iterations, make)
 
