@@ -26,7 +26,7 @@ from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED
-from optloc.solvers.pool import Pool, begin, in_parts, offer
+from optloc.solvers.pool import Pool, begin, crowd_of, in_parts, offer
 from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.suspects.subsets import (
@@ -134,8 +134,12 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     found, refuted = _weigh(problem, judge(problem, pool), asked, together)
     pool = replace(pool, asked=True, refuted=refuted)
     fix, conclusion = judge(problem, pool), fill(len(pool), None)
+    step = crowd_of(problem)
     for items, groups, findings in found:
-        conclusion[items] = _conclude(problem.take(items), fix[items], groups, findings, refuted)
+        for first in range(0, len(items), step):
+            part = slice(first, first + step)
+            own = items[part]
+            conclusion[own] = _conclude(problem.take(own), fix[own], groups, findings[part], refuted)
     count = sum(len(items) for items, _, _ in found)
     stage = Stage("suspects", f"{count} of {len(fix)} contradict themselves", perf_counter() - began)
     return replace(pool, conclusion=conclusion, stages=(*before, stage))
