@@ -1,6 +1,7 @@
 """Robust fixes: nothing that the truth leads to is better, gross errors are named, and sigma means what it says."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 from importlib.resources import files
 
@@ -16,6 +17,7 @@ from optloc import Motion, Status, assemble, measured, rejected, simulate, solve
 from optloc.cli import app
 from optloc.problem.loss import LOSSES
 from optloc.problem.noise import Block, Noise
+from optloc.solvers import pool
 from optloc.solvers.robust.reweighting import Doubt, reweight
 
 REDESCENDING = ("cauchy", "truncated")
@@ -240,3 +242,18 @@ def test_one_problem_gives_the_same_as_many():
     one = solve(case.problem.take(np.array([7])), "cauchy")
     np.testing.assert_allclose(one.x[0], many.x[7], atol=1e-3)
     np.testing.assert_allclose(one.weights[0], many.weights[7], atol=1e-5)
+
+
+def test_a_large_batch_is_worked_on_in_parts_that_need_less_memory(monkeypatch):
+    problem = spoilt("toa", 12, 8, bad=1).problem
+    solve(problem.take(np.arange(2)), "cauchy")  # what a structure keeps is made
+    fixes, most = [], []
+    for rows in (8 * 12, 8 * 3):
+        monkeypatch.setattr(pool, "_ROWS", rows)
+        tracemalloc.start()
+        fixes.append(solve(problem, "cauchy"))
+        most.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    np.testing.assert_allclose(fixes[1].x, fixes[0].x, atol=1e-3)
+    np.testing.assert_array_equal(fixes[1].code, fixes[0].code)
+    assert most[1] < 0.8 * most[0]

@@ -201,10 +201,24 @@ def _arrays(record: Any) -> Iterator[tuple[str, Array | None, Axes]]:
 
 def _parts(record: Any) -> Iterator[tuple[str, Any]]:
     """Yield the fields that are records themselves."""
-    for each in fields(record):
-        value = getattr(record, each.name)
-        if is_dataclass(value) and not isinstance(value, type) and _layouts(type(value)):
-            yield each.name, value
+    kind: Any = type(record)
+    for name in _others(kind):
+        value = getattr(record, name)
+        own: Any = type(value)
+        if _is_record(own):
+            yield name, value
+
+
+@cache
+def _others(kind: Any) -> tuple[str, ...]:
+    """Return the fields of a record that hold no arrays."""
+    return tuple(each.name for each in fields(kind) if each.name not in _layouts(kind))
+
+
+@cache
+def _is_record(kind: Any) -> bool:
+    own: Any = kind
+    return is_dataclass(kind) and bool(_layouts(own))
 
 
 def _count(record: Any) -> int:

@@ -186,6 +186,7 @@ PARTS: Mapping[str, Part] = {
             "optloc.compute.filter.absorb",
             "optloc.compute.refine.refine_block",
             "optloc.compute.equations.normal_block",
+            *(f"optloc.compute.runs.{name}" for name in ("refine_runs", "sum_runs")),
         ),
     ),
     "runs": Part(

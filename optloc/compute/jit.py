@@ -330,7 +330,7 @@ def put_rows(values: Array, out: Array) -> None:
             out[i, k] = values[i, k]
 
 
-# Copies of kernels with other constants, by what tells their names apart.
+# Copies of kernels with other constants, by the ends of their names.
 _COPIES: dict[tuple[_Kernel, str], _Kernel] = {}
 
 
@@ -350,8 +350,8 @@ def with_constants(
     kernel : callable
         As `compiled` returns it.
     mark : str
-        Tells the names of what calls replaced kernels apart; what has other constants alone is named by these, and is
-        the same for all.
+        Ends the names of kernels that call replaced ones. Kernels that differ by constants alone have these in their
+        names, and are the same for all.
     replaced : dict, optional
         Kernels that are called in the place of others.
     constants : object

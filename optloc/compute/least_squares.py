@@ -11,8 +11,8 @@ import numpy as np
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge
-from optloc.compute.pack import coarseness, pack
-from optloc.compute.sums import equations_at, serves
+from optloc.compute.pack import PackedRuns, coarseness
+from optloc.compute.sums import equations_at, packed, serves, sums_at
 from optloc.linear.constraints import Face, is_height
 from optloc.linear.equalities import Equalities
 from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
@@ -309,18 +309,28 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
 
 def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules) -> Refined | None:
     """Return the refinement by machine code with given weights, or None without machine code."""
-    found = pack(problem, noise)
+    found = packed(problem, noise)
     if found is None:
         return None
     from optloc.compute import refine
+    from optloc.compute.runs import refined_runs
 
-    done, lost = refine.refined(found, item, start, rules)
+    if isinstance(found, PackedRuns):
+        done, lost = refined_runs(found, item, start, rules)
+    else:
+        done, lost = refine.refined(found, item, start, rules)
     # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
     if lost.any():
         more = _remade(problem.take(item[lost]), start[lost], rules)
         for name in ("x", "cost", "status", "iterations"):
             getattr(done, name)[lost] = getattr(more, name)
-    return Refined(done.x, done.cost, done.status, done.iterations, lambda: refine.equations(found, item, done))
+
+    def make() -> Normal:
+        if isinstance(found, PackedRuns):
+            return sums_at(found, done.x, item, priors=True)
+        return refine.equations(found, item, done)
+
+    return Refined(done.x, done.cost, done.status, done.iterations, make)
 
 
 def _anew(problem: Problem, start: Array, rules: Rules) -> Refined | None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.types import Array
+from optloc.base.cache import Cache
+from optloc.base.types import Array, Bias, Rows
 from optloc.compute.tables import Sources, Tables, tables
 from optloc.linear.courses import over_ground
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A
-from optloc.problem.noise import Whitener, variances
+from optloc.problem.forms import form_of
+from optloc.problem.noise import Block, Noise, Whitener, variances
 from optloc.problem.problem import Problem
 
 # Columns of `Numbers.place`. Of a group: place of its whitening matrix, and whether that is not lower triangular. Of a
@@ -91,6 +93,32 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
             coarseness(problem),
         ),
     )
+
+
+class PackedRuns(NamedTuple):
+    """Runs as machine code takes them: their epochs, and how many each has."""
+
+    packed: Packed
+    epochs: int
+
+
+def pack_runs(problem: Problem, noise: tuple[Whitener, ...]) -> PackedRuns | None:
+    """Return a flat batch of N runs, or None where their epochs differ in more than numbers.
+
+    Parameters
+    ----------
+    problem : Problem
+        N runs, whose epochs have local unknowns.
+    noise : tuple of Whitener
+        Whitening matrices of their rows.
+    """
+    found = folding(problem)
+    if found is None:
+        return None
+    flat = problem.flat()
+    own = fold_whiteners(noise, found, flat.batch_shape[0])
+    packed = None if own is None else pack(fold(flat, found), own)
+    return None if packed is None else PackedRuns(packed, problem.epochs)
 
 
 def coarseness(problem: Problem) -> Array:
@@ -176,3 +204,184 @@ def _priors(problem: Problem) -> _Divided:
 def _single(values: Array, core: int) -> Array:
     """Return values of an epoch without their epoch axis of length one, where they have one."""
     return np.take(values, 0, axis=-1 - core) if values.ndim > core else values
+
+
+# Epochs that have equal rows, as a flat batch of problems of one epoch: lanes are epochs then.
+
+
+@dataclass(frozen=True, slots=True)
+class Folding:
+    """The common rows of the epochs of a run.
+
+    Parameters
+    ----------
+    rows : tuple of int array (k, r)
+        Rows of each epoch, for each kind and within it.
+    local : int array (m,)
+        Number of each row of the run within its epoch.
+    epoch : int array (m,)
+        Epoch of each row of the run.
+    biases : tuple of Bias
+        Biases of one epoch.
+    """
+
+    rows: tuple[Array, ...]
+    local: Array
+    epoch: Array
+    biases: tuple[Bias, ...]
+
+    @property
+    def epochs(self) -> int:
+        """Return the number of epochs."""
+        return len(self.rows[0])
+
+    def groups(self, row: Array) -> tuple[Array, Array] | None:
+        """Return the groups (q, r) of one epoch and their numbers (k, q) in each epoch, from groups of rows (g, r).
+
+        None where groups have rows of several epochs, or epochs differ in their groups.
+        """
+        epoch, local = self.epoch[row], self.local[row]
+        own = _alike(epoch[:, 0], self.epochs, local)
+        return None if own is None or (epoch != epoch[:, :1]).any() else (local[own[0]], own)
+
+
+def _alike(epoch: Array, epochs: int, *values: Array) -> Array | None:
+    """Return the entries (k, q) of each epoch, or None where epochs differ in values (n, ...) of their entries."""
+    if not len(epoch) or len(epoch) % epochs:
+        return np.zeros((epochs, 0), dtype=np.int64) if not len(epoch) else None
+    own = np.argsort(epoch, kind="stable").reshape(epochs, -1)
+    same = (epoch[own] == np.arange(epochs)[:, None]).all() and all((v[own] == v[own[:1]]).all() for v in values)
+    return own if same else None
+
+
+_KEPT = Cache["Folding | None"](2**19, lambda folding: 1 if folding is None else len(folding.local))
+
+
+def folding(problem: Problem) -> Folding | None:
+    """Return the common rows of the epochs of a run; None where epochs differ in more than numbers.
+
+    Local unknowns, targets at rest and biases that do not depend on the time enter each epoch in the same way.
+    """
+    if problem.epochs == 1 or any(m.order or m.known is not None or m.rise is not None for m in problem.motions):
+        return None
+    return _KEPT.find(("folding", problem.structure), lambda: _fold(problem))
+
+
+def _fold(problem: Problem) -> Folding | None:
+    k, rows, local, start = problem.epochs, [], np.zeros(problem.count, dtype=np.int64), 0
+    for block, first in zip(problem.rows, problem.starts, strict=True):
+        own = _alike(block.epoch, k, block.a, block.b, block.target)
+        if own is None:
+            return None
+        rows.append(own)
+        local[first + own] = start + np.arange(own.shape[1])
+        start += own.shape[1]
+    epoch, biases = problem.epoch, []
+    for bias in problem.biases:
+        own = _alike(epoch[bias.row], k, local[bias.row], bias.member, bias.coefficient)
+        form = form_of(bias)
+        # Errors that depend on the time are another function of their members in each epoch.
+        if own is None or form.changes or form.enters == "moves":
+            return None
+        one = own[0]
+        biases.append(
+            replace(bias, row=local[bias.row[one]], member=bias.member[one], coefficient=bias.coefficient[one])
+        )
+    found = Folding(tuple(rows), local, epoch, tuple(biases))
+    return found if all(found.groups(block.row) is not None for block in problem.noise.blocks) else None
+
+
+def fold(problem: Problem, found: Folding) -> Problem:
+    """Return the epochs of a flat batch of N runs as a flat batch of N k problems, epoch by epoch of each run.
+
+    Unknowns that the epochs share are unknowns of each problem, and have the priors of the run.
+
+    Parameters
+    ----------
+    problem : Problem
+        N runs of k epochs.
+    found : Folding
+        Of their structure.
+    """
+    count, k = problem.batch_shape[0], problem.epochs
+
+    def spread(array: Array | None, core: int) -> Array | None:
+        # numbers of each epoch, with an axis of epochs of length 1 or k
+        if array is None or (array.ndim == core and array.shape[0] == 1):
+            return array
+        whole = np.broadcast_to(array, (count, k, *array.shape[array.ndim - core + 1 :]))
+        return whole.reshape(count * k, 1, *whole.shape[2:])
+
+    def repeat(array: Array | None, core: int) -> Array | None:
+        return array if array is None or array.ndim == core or len(array) == 1 else np.repeat(array, k, axis=0)
+
+    s = problem.stations
+    position = spread(s.position, 3)
+    assert position is not None
+    stations = replace(
+        s,
+        position=position,
+        velocity=spread(s.velocity, 3),
+        axes=spread(s.axes, 4),
+        covariance=repeat(s.covariance, 3),
+        velocity_covariance=repeat(s.velocity_covariance, 3),
+    )
+    blocks = [Block(*_fold_groups(block.row, block.covariance, found, count)) for block in problem.noise.blocks]
+    priors = tuple(
+        replace(p, mean=np.asarray(repeat(p.mean, 1)), covariance=np.asarray(repeat(p.covariance, 2)))
+        for p in problem.priors
+    )
+    return replace(
+        problem,
+        stations=stations,
+        rows=tuple(_fold_rows(rows, own, count) for rows, own in zip(problem.rows, found.rows, strict=True)),
+        noise=Noise(tuple(blocks)),
+        times=problem.times[:1],
+        biases=found.biases,
+        priors=priors,
+        constraints=(),
+    )
+
+
+def fold_whiteners(noise: tuple[Whitener, ...], found: Folding, count: int) -> tuple[Whitener, ...] | None:
+    """Return whitening matrices of N runs for the batch of `fold`; None where epochs differ in their groups."""
+    if any(found.groups(whitener.row) is None for whitener in noise):
+        return None
+    return tuple(Whitener(*_fold_groups(whitener.row, whitener.matrix, found, count)) for whitener in noise)
+
+
+def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
+    first = own[0]
+    return replace(
+        rows,
+        z=_fold_values(rows.z, own, count),
+        weight=_fold_values(rows.weight, own, count),
+        correction=_fold_values(rows.correction, own, count),
+        a=rows.a[first],
+        b=rows.b[first],
+        epoch=np.zeros(len(first), dtype=np.int64),
+        target=rows.target[first],
+    )
+
+
+def _fold_values(values: Array, own: Array, count: int) -> Array:
+    """Return values (N or none, m) of rows as (N k, r), or (r,) where all have the same."""
+    picked = values[..., own]
+    if values.ndim == 1 and (picked == picked[:1]).all():
+        return np.asarray(picked[0])
+    return np.broadcast_to(picked, (count, *own.shape)).reshape(-1, own.shape[1])
+
+
+def _fold_groups(row: Array, matrix: Array, found: Folding, count: int) -> tuple[Array, Array]:
+    """Return groups (g, r) and matrices (N or none, g or 1, r, r) for the batch of epochs."""
+    groups = found.groups(row)
+    assert groups is not None
+    local, own = groups
+    if matrix.shape[-3] == 1:
+        shared = matrix.ndim == 3 or len(matrix) == 1
+        return local, matrix.reshape(matrix.shape[-3:]) if shared else np.repeat(matrix, len(own), axis=0)
+    picked = matrix[..., own, :, :]
+    if matrix.ndim == 3 and (picked == picked[:1]).all():
+        return local, picked[0]
+    whole = np.broadcast_to(picked, (count, *own.shape, *matrix.shape[-2:]))
+    return local, whole.reshape(-1, own.shape[1], *matrix.shape[-2:])

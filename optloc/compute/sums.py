@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.compute.jit import enabled, usable
-from optloc.compute.pack import pack
+from optloc.compute.pack import Packed, PackedRuns, folding, pack, pack_runs
 from optloc.linear.evaluate import fitting
 from optloc.linear.normal import Normal, depends_on_place, linearise, normal, total, whitener_at, with_priors
 from optloc.linear.walks import walks
@@ -18,7 +18,8 @@ from optloc.problem.epochs import windows
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
 
-# Rows of a problem up to which there is machine code: tables of longer runs would not be constant in memory.
+# Rows of a problem up to which there is machine code, but for runs of equal epochs: longer tables would not be constant
+# in memory.
 _LONGEST = 2**13
 
 
@@ -68,23 +69,45 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
     alike = problem.batch_shape in {(), (1,), (count,)} if x.ndim == 2 else problem.batch_shape == shape[-1:]
     if not alike or not serves(problem, count) or (noise is None and depends_on_place(problem)):
         return None
-    found = pack(problem, whitener_at(problem, x) if noise is None else noise)
+    found = packed(problem, whitener_at(problem, x) if noise is None else noise)
     if found is None:
         return None
-    from optloc.compute.equations import normal_at
-
-    sums = normal_at(found, x.reshape(count, x.shape[-1]), np.arange(count) % max(1, *problem.batch_shape, 1))
+    sums = sums_at(found, x.reshape(count, x.shape[-1]), np.arange(count) % max(1, *problem.batch_shape, 1))
     if x.ndim == 2:
         return sums
     return Normal(*(part.reshape((*shape, *part.shape[1:])) for part in sums.parts))
 
 
+def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | PackedRuns | None:
+    """Return problems for machine code, or None where it does not serve them; arguments as of `pack`."""
+    runs = pack_runs(problem, noise) if is_run(problem) else None
+    return pack(problem, noise) if runs is None and problem.count <= _LONGEST else runs
+
+
+def sums_at(found: Packed | PackedRuns, x: Array, item: Array, *, priors: bool = False) -> Normal:
+    """Return the normal equations of problems at vectors x (M, size) of given problems (M,), by machine code."""
+    from optloc.compute.equations import normal_at
+    from optloc.compute.runs import sums_of_runs
+
+    if isinstance(found, PackedRuns):
+        return sums_of_runs(found, x, item, priors=priors)
+    return normal_at(found, x, item, priors=priors)
+
+
+def is_run(problem: Problem) -> bool:
+    """Return whether problems have several epochs with local unknowns."""
+    return problem.epochs > 1 and problem.layout.n_local > 0
+
+
 def serves(problem: Problem, starts: int) -> bool:
     """Return whether machine code is at hand, or may be waited for, for a number of vectors of a problem."""
-    if not starts or problem.count > _LONGEST or not enabled() or walks(problem):
+    if not starts or not enabled() or walks(problem):
         return False
     from optloc.compute.equations import normal_block
     from optloc.compute.refine import refine_block
+    from optloc.compute.runs import refine_runs, sum_runs
 
     count = prod(problem.batch_shape)
-    return all(usable(kernel, count) for kernel in (normal_block, refine_block))
+    if is_run(problem) and folding(problem) is not None:
+        return all(usable(kernel, count * problem.epochs) for kernel in (sum_runs, refine_runs))
+    return problem.count <= _LONGEST and all(usable(kernel, count) for kernel in (normal_block, refine_block))

@@ -184,7 +184,7 @@ class Load(NamedTuple):
 # Problems that a thread takes at a time: some milliseconds, against which handing them out is nothing. From 1 000 to
 # 16 000 no difference was measured.
 _CHUNK = 4096
-# Narrow and wide blocks, and problems up to which narrow ones are quicker: those of ranges take a fifth of a wide one.
+# Narrow and wide blocks, and problems up to which narrow ones are quicker: one of ranges takes a fifth of a wide block.
 # Narrow blocks have one lane. Four lanes would fix eight problems in half of the time, but more code would be made.
 _BY_RANGES = (fix_one_by_ranges, fix_ranges, 5)
 _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)

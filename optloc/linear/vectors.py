@@ -57,10 +57,12 @@ def _fit_emission_times(problem: Problem, x: Array) -> Array:
     for links, start in zip(block_links(problem), problem.starts, strict=True):
         own = np.isin(links.adds.column, emissions) & links.model.emission
         column, rows = links.adds.column[own], start + links.adds.row[own]
-        heard, total = np.zeros(out.shape), np.zeros(out.shape)
-        np.add.at(heard, (..., column), present[:, rows])  # type: ignore[arg-type]
-        np.add.at(total, (..., column), np.where(present[:, rows], left[:, rows], 0.0))  # type: ignore[arg-type]
-        out += np.where(usable[:, None], total / np.maximum(heard, 1.0), 0.0)
+        if len(column):
+            order = np.argsort(column, kind="stable")
+            columns_of_rows, first = np.unique(column[order], return_index=True)
+            heard = np.add.reduceat(1.0 * present[:, rows[order]], first, axis=-1)
+            total = np.add.reduceat(np.where(present, left, 0.0)[:, rows[order]], first, axis=-1)
+            out[:, columns_of_rows] += np.where(usable[:, None], total / np.maximum(heard, 1.0), 0.0)
     return out.reshape(size, q, -1)
 
 

@@ -90,7 +90,7 @@ class Problem:
     def emitting(self) -> tuple[int, ...]:
         """Return the targets whose emission times are unknown."""
         # An unlabelled row (-1) has an emission time of a target that is found later.
-        found = {int(t) for block in self.rows if MODELS[block.kind].emission for t in block.target}
+        found = {t for block in self.rows if MODELS[block.kind].emission for t in set(block.target.tolist())}
         return tuple(sorted(found))
 
     @cached_property

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import prod
 from time import perf_counter
 
 import numpy as np
 
+from optloc.base.cache import Cache
 from optloc.base.records import take
-from optloc.base.types import Array, Status
-from optloc.compute.sums import equations_at
+from optloc.base.types import Array, Motion, Status
+from optloc.compute.damping import Rules
+from optloc.compute.jit import enabled
+from optloc.compute.pack import PackedRuns, fold, folding, pack_runs
+from optloc.compute.sums import equations_at, serves
 from optloc.engine.memory import COST_OF_FIX, COST_OF_RIVAL, KAPPA, Answer
-from optloc.engine.plan import Load, Plan, plan_of
+from optloc.engine.plan import LIMIT, TOLERANCE, Load, Plan, key_of, plan_of
+from optloc.linear.evaluate import block_links
+from optloc.linear.normal import depends_on_place, weighed
+from optloc.linear.redundancy import degrees_of_freedom
+from optloc.linear.vectors import vectors, without_biases
 from optloc.problem.fix import Active, Stage
+from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import equal_cost
-from optloc.solvers.pool import Curvature, Pool, in_parts
+from optloc.solvers.policy import WEAK, equal_cost
+from optloc.solvers.pool import PART, Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
 from optloc.solvers.verdict.minima import likelihood_of, measure_curvature
 
@@ -40,11 +50,14 @@ class Quick:
         plan = plan_of(problem) if pool is None else None
         refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
         if plan is None or not plan.at_hand(count):
+            run = run_plan_of(problem) if start is None else None
 
             def work(some: Problem, part: slice) -> Pool:
+                if run is not None:
+                    return run.settle(some, lambda few: refinement(few, gtrs(few, None)))
                 return refinement(some, gtrs(some, None if start is None else take(start, part)))
 
-            return in_parts(problem, work)
+            return in_parts(problem, work, PART if run is None else max(1, PART // problem.epochs))
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         z = z if z.ndim == 2 and len(z) == count else np.broadcast_to(z, (count, problem.count))
         return settle_directly(plan, plan.load(problem), z, problem.take, refinement)
@@ -160,3 +173,135 @@ _STARTED = Stage("gtrs", "1 candidates at most", 0.0)
 def direct_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
     """Return the stages that so many fixes went through at once, and the most steps that one took."""
     return _STARTED, Stage("lsr", f"{count} candidates, {steps} steps at most", seconds)
+
+
+# Runs of targets that are free at each epoch: the plan of an epoch starts them, and one call refines them together.
+
+
+@dataclass(frozen=True, slots=True)
+class RunPlan:
+    """Everything that fixes of runs of one structure need, except measurements.
+
+    Parameters
+    ----------
+    rows : int array (k, r)
+        Rows of each epoch.
+    epoch : Plan
+        Of an epoch without biases.
+    load : Load
+        Of this plan.
+    added, gain : array (r,)
+        Known biases and corrections of the rows of an epoch, and scales.
+    columns : int array (l,)
+        Entry of an epoch's fix for each unknown of an epoch; -1 for none.
+    x : array (size,)
+        Start of all other unknowns.
+    runs : PackedRuns
+        The epochs, without measurements.
+    correction : array (r,)
+        Known amount by which each measurement exceeds the model.
+    dof : int
+        Degrees of freedom.
+    """
+
+    rows: Array
+    epoch: Plan
+    load: Load
+    added: Array
+    gain: Array
+    columns: Array
+    x: Array
+    runs: PackedRuns
+    correction: Array
+    dof: int
+
+    def settle(self, problem: Problem, otherwise: Callable[[Problem], Pool]) -> Pool:
+        """Return the settled pools of a flat batch of N runs; those that are not plainly good take another way."""
+        from optloc.compute.runs import fixed_runs
+
+        began, count = perf_counter(), problem.batch_shape[0]
+        z = np.broadcast_to(problem.z, (count, problem.count))[:, self.rows].reshape(-1, self.rows.shape[1])
+        answer, _ = self.epoch.run(self.load, (z - self.added) / self.gain)
+        start, n = np.tile(self.x, (count, 1)), problem.layout.n_shared
+        own = start[:, n:].reshape(len(z), len(self.columns))
+        own[:, self.columns >= 0] = answer.x[:, self.columns[self.columns >= 0]]
+        start[:, n:] = own.reshape(count, -1)
+        packed, item = self.runs.packed, np.arange(count)
+        observed = packed.numbers._replace(observed=np.require(z - self.correction, requirements=["C", "W"]))
+        runs = self.runs._replace(packed=packed._replace(numbers=observed))
+        done, found = fixed_runs(runs, item, start, Rules(TOLERANCE, LIMIT), problem.dimension)
+        curvature = Curvature(found.covariance, found.information, found.regular, found.weakest, local=found.local)
+        good = (done.status == Status.OK) & np.isfinite(done.cost) & found.regular & (found.weakest >= WEAK)
+        plain = answer.settled.reshape(count, -1).all(1) & good
+        seconds = perf_counter() - began
+        pool = Pool(
+            done.x[:, None],
+            done.cost[:, None],
+            done.status[:, None],
+            np.broadcast_to(0, (count, 1)),
+            np.broadcast_to(problem.weight, (count, problem.count)),
+            np.broadcast_to(np.int32(self.dof), count),
+            direct_stages(count, int(done.iterations.max(initial=0)), seconds),
+            refined=True,
+            curvature=curvature,
+            plain=plain,
+        )
+        lost = np.flatnonzero(~plain)
+        return pool.merge(lost, otherwise(problem.take(lost))) if len(lost) else pool
+
+
+_RUNS = Cache["RunPlan | None"](64)
+
+
+def run_plan_of(problem: Problem) -> RunPlan | None:
+    """Return the plan of runs of one target that is free at each epoch, or None where they have none.
+
+    Stations stay, and a batch differs in measurements alone.
+    """
+    motion = problem.motions[0]
+    free = len(problem.motions) == 1 and (motion.order, motion.span) == (0, "epoch") and motion.known is None
+    place = problem.stations.position
+    if not free or problem.epochs == 1 or problem.constraints or place.size != prod(place.shape[-2:]):
+        return None
+    found = _RUNS.find((*key_of(problem), place.tobytes()), lambda: _plan_run(problem))
+    return found if found is not None and found.epoch.at_hand(problem.epochs) and serves(problem, 1) else None
+
+
+def _plan_run(problem: Problem) -> RunPlan | None:
+    found = folding(problem)
+    if found is None or not enabled():
+        return None
+    one = problem.take(np.zeros(1, dtype=int)).with_rows(z=np.zeros((1, problem.count)))
+    epoch = fold(one, found).take(np.zeros(1, dtype=int))
+    still = replace(without_biases(epoch), motions=(Motion(),))
+    plan = plan_of(still)
+    dof = int(degrees_of_freedom(one)[0])
+    if plan is None or dof < 0 or epoch.weight.ndim > 1 or depends_on_place(one):
+        return None
+    runs = pack_runs(one, whiten(weighed(one).noise, one.weight))
+    if runs is None or len(runs.packed.numbers.source) > 1:
+        return None
+    base, links = vectors(epoch, None)[0], block_links(epoch)
+    gain, added = (
+        np.concatenate([getattr(link, name).total(base, link.block.count) for link in links])
+        for name in ("gains", "adds")
+    )
+    columns = np.full(problem.layout.n_local, -1)
+    slots = {slot.name: slot for slot in plan.layout.shared}
+    slots |= {slot.name: replace(slot, start=slot.start + plan.layout.n_shared) for slot in plan.layout.local}
+    for slot in problem.layout.local:
+        if slot.name in slots:
+            columns[slot.start : slot.start + slot.size] = slots[slot.name].start + np.arange(slot.size)
+    rows = np.concatenate([start + own for start, own in zip(problem.starts, found.rows, strict=True)], axis=1)
+    return RunPlan(
+        rows,
+        plan,
+        plan.load(still),
+        added + epoch.correction,
+        1.0 + gain,
+        columns,
+        vectors(one, None)[0],
+        runs,
+        epoch.correction,
+        dof,
+    )

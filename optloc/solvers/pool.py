@@ -24,6 +24,10 @@ from optloc.problem.problem import Problem
 PART = 2**15
 """Problems that are worked on at a time: beyond it arrays of a part no longer fit the caches and memory grows."""
 
+# Rows that are worked on at a time where each problem has dozens of candidates: a row takes some 20 kB, so that each
+# thread takes 80 MB. Parts of twice the size are not faster.
+_ROWS = 2**12
+
 Answer = TypeVar("Answer", "Pool", Fix)
 
 
@@ -271,6 +275,11 @@ def pack(points: Array) -> Array:
     order = np.argsort(~finite, axis=1, kind="stable")
     keep = max(1, int(finite.sum(1).max(initial=0)))
     return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
+
+
+def crowd_of(problem: Problem) -> int:
+    """Return the number of problems that are worked on at a time, where each has dozens of candidates."""
+    return max(1, _ROWS // max(problem.count, 1))
 
 
 def in_parts(

@@ -25,7 +25,7 @@ from optloc.proof.scope import unsupported
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
 from optloc.solvers.policy import DOUBT
-from optloc.solvers.pool import Pool, offer, pack
+from optloc.solvers.pool import Pool, crowd_of, in_parts, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.position import (
@@ -164,14 +164,18 @@ def widen(problem: Problem, pool: Pool | None) -> Pool:
     """Return a refined pool with mirror images beside it, and where the verdict is not clean starts of sub-arrays."""
     if pool is None:
         raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
-    began = perf_counter()
     if registrable(problem):
-        fix = judge(problem, pool)
+        began, fix = perf_counter(), judge(problem, pool)
         around = step_beside(problem, fix.x, fix.covariance())
         return _beside(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
     if not one_position(problem):
         return pool
-    fix, alone = judge(problem, pool), hold_still(problem.straightened())
+    return in_parts(problem, lambda part, own: _widen(part, take(pool, own)), crowd_of(problem))
+
+
+def _widen(problem: Problem, pool: Pool) -> Pool:
+    """Return the candidates of a refined pool of problems of one position, and more."""
+    began, fix, alone = perf_counter(), judge(problem, pool), hold_still(problem.straightened())
     seen = problem.layout.take(standing(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
     # the mirror image is one start and always tried; the others are many: where the verdict is not clean

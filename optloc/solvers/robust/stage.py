@@ -19,7 +19,7 @@ from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import bound_pool, least_finished
 from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
-from optloc.solvers.pool import Pool, pack
+from optloc.solvers.pool import Pool, crowd_of, in_parts, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
 from optloc.solvers.robust.starts import flip_rows, robust_starts
 from optloc.solvers.verdict.judge import judge, standing
@@ -108,7 +108,12 @@ class Robust:
         """Return the settled minima for a flat batch of problems; their weights are those of the loss."""
         start = None if pool is None else pack(standing(pool, judge(problem, pool)))
         stages = () if pool is None else pool.stages
-        return by_arrivals(problem, start, lambda some, x: _minimise(some, self.loss, x, stages))
+
+        def work(some: Problem, part: slice) -> Pool:
+            own = None if start is None else start[part]
+            return by_arrivals(some, own, lambda one, x: _minimise(one, self.loss, x, stages))
+
+        return in_parts(problem, work, crowd_of(problem))
 
 
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:

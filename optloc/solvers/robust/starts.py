@@ -186,17 +186,18 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
         some = usable[first : first + step]
         x[some], cost[some], u[some] = _anneal(problem.take(item[some]), x[some], loss, _HALVINGS if anneal else 0)
     chosen = np.full((size, most, x.shape[1]), np.nan)
-    for slot in range(most if count else 0):
-        # by problem, the cheapest of each first
-        order = np.lexsort((cost, item))
-        first = order[np.searchsorted(item[order], np.arange(size), side="left").clip(max=count - 1)]
-        found = (item[first] == np.arange(size)) & np.isfinite(cost[first])
-        if not found.any():
+    # by problem, the cheapest of each first
+    order = np.lexsort((cost, item))
+    order = order[np.isfinite(cost[order])]
+    x, u, item = x[order], u[order], item[order]
+    for slot in range(most):
+        if not len(item):
             return chosen[:, :slot]
-        chosen[found, slot] = x[first[found]]
-        left = np.flatnonzero(np.isfinite(cost) & found[item])
-        same = np.abs(u[left] - u[first[item[left]]]).max(-1) < _SAME
-        cost[left[same]] = np.inf
+        begins = np.append(True, item[1:] != item[:-1])
+        best = np.flatnonzero(begins)
+        chosen[item[best], slot] = x[best]
+        left = np.abs(u - u[best[np.cumsum(begins) - 1]]).max(-1) >= _SAME
+        x, u, item = x[left], u[left], item[left]
     return chosen
 
 

@@ -26,7 +26,7 @@ from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED
-from optloc.solvers.pool import Pool, begin, in_parts, offer
+from optloc.solvers.pool import Pool, begin, crowd_of, in_parts, offer
 from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.suspects.subsets import (
@@ -40,7 +40,7 @@ from optloc.solvers.suspects.subsets import (
     grow,
     joined,
     leave_out_of,
-    prove_rest,
+    prove_rests,
     rest_of,
 )
 from optloc.solvers.verdict.conclusion import Conclusion, list_names
@@ -134,8 +134,12 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     found, refuted = _weigh(problem, judge(problem, pool), asked, together)
     pool = replace(pool, asked=True, refuted=refuted)
     fix, conclusion = judge(problem, pool), fill(len(pool), None)
+    step = crowd_of(problem)
     for items, groups, findings in found:
-        conclusion[items] = _conclude(problem.take(items), fix[items], groups, findings, refuted)
+        for first in range(0, len(items), step):
+            part = slice(first, first + step)
+            own = items[part]
+            conclusion[own] = _conclude(problem.take(own), fix[own], groups, findings[part], refuted)
     count = sum(len(items) for items, _, _ in found)
     stage = Stage("suspects", f"{count} of {len(fix)} contradict themselves", perf_counter() - began)
     return replace(pool, conclusion=conclusion, stages=(*before, stage))
@@ -230,10 +234,25 @@ def _conclude(
 ) -> Array:
     """Return what is concluded of problems (N,) in which the same rows are present, None where nothing is."""
     arrivals, out = as_arrivals(problem), fill(len(findings), None)
+    cases: list[Case] = []
+    chosen: dict[int, Rest] = {}
     for i, finding in enumerate(findings):
         item = np.array([i])
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(item))
-        out[i] = conclude_case(Case(problem.take(item), one, groups, fix[i], refuted), finding)
+        cases.append(Case(problem.take(item), one, groups, fix[i], refuted))
+        if not finding.rests:
+            out[i] = _unexplained(cases[i], finding)
+        elif (best := _best_rest(cases[i], finding)) is not None:
+            chosen[i] = best
+    # fixes of the problem as given have other unknowns than fixes of its arrivals
+    for given in (True, False):
+        items = [i for i, best in chosen.items() if (best.fix.layout == problem.layout) == given]
+        if items:
+            work = problem if given or arrivals is None else arrivals.problem
+            proven = prove_rests(work.take(np.array(items)), groups, [chosen[i] for i in items])
+            chosen |= dict(zip(items, proven, strict=True))
+    for i, best in chosen.items():
+        out[i] = _explained(cases[i], findings[i], best)
     return out
 
 
@@ -307,22 +326,29 @@ class Case:
         return tuple(sorted({int(i) for row in group.rows for i in self.arrivals.origin[row]}))
 
 
-def conclude_case(case: Case, finding: Finding) -> Conclusion | None:
-    """Return what a finding means for its problem; None where the fix of all the data stands."""
-    if not finding.rests:
-        # no set was tried and nothing stood out: a run whose noise is larger than stated keeps its fix
-        if case.whole.answered and set(finding.p_value) == {()} and not finding.note:
-            return None
-        return Conclusion((), case.whole, case.whole.alternatives, tried=_name_closest(case, finding))
-    best, *others = finding.rests
-    elsewhere = [rest for rest in others if not _same_place(best.fix, rest.fix)]
-    if not best.left and not elsewhere:
+def _unexplained(case: Case, finding: Finding) -> Conclusion | None:
+    """Return the conclusion of a problem that nothing explains; None where the fix of all data is kept."""
+    # no set was tried and nothing stood out: a run whose noise is larger than stated keeps its fix
+    if case.whole.answered and set(finding.p_value) == {()} and not finding.note:
         return None
-    # of nobody left out the fix may be that of the problem as given, or of its arrivals
-    work = case.problem if best.fix.layout == case.problem.layout else case.work
+    return Conclusion((), case.whole, case.whole.alternatives, tried=_name_closest(case, finding))
+
+
+def _best_rest(case: Case, finding: Finding) -> Rest | None:
+    """Return the rest that explains a problem best, to be proven; None where the fix of all data is kept."""
+    best, *others = finding.rests
+    if not best.left and all(_same_place(best.fix, rest.fix) for rest in others):
+        return None
     if case.refuted:  # it was found by other noise than is stated
-        best = rest_of(case.groups, best.left, fix_without(work, case.groups, best.left, best.fix.x))
-    best = prove_rest(work, case.groups, best)
+        work = case.problem if best.fix.layout == case.problem.layout else case.work
+        return rest_of(case.groups, best.left, fix_without(work, case.groups, best.left, best.fix.x))
+    return best
+
+
+def _explained(case: Case, finding: Finding, best: Rest) -> Conclusion:
+    """Return the conclusion of a problem whose best rest is proven."""
+    first, *others = finding.rests
+    elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
     explanations = tuple(_explanation(case, rest, finding) for rest in (best, *others))
     spent, fix = int(case.whole.dof) - int(best.fix.dof), _in_layout(case, best.fix)
     return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere), case.refuted)

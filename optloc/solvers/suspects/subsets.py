@@ -12,7 +12,7 @@ import numpy as np
 
 from optloc.adequacy.evidence import Influence, drops, embed, errors, influence, significance
 from optloc.adequacy.groups import ROW_PRICE, Group, leave_out, mark_rows
-from optloc.base.records import take
+from optloc.base.records import join, take
 from optloc.base.types import Array
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
@@ -23,9 +23,9 @@ from optloc.solvers.pool import Pool, begin, in_parts, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
 from optloc.solvers.verdict.judge import judge, standing, verdict
 
-# Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and numbers of a
-# batch at a time, some ten megabytes an array.
-_MOST, _CHUNK = 100_000, 1_000_000
+# Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and rows of all
+# subsets that are fixed together, at 2.5 kB a row.
+_MOST, _CHUNK = 100_000, 2**16
 # The same from which sets are looked at to first order before they are tried: fewer take less time than is saved.
 _FEW = 2_000
 # Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them. The cheapest
@@ -372,12 +372,21 @@ def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], 
     return fix_by(part, lambda one: begin(one, x[None]))[0]
 
 
-def prove_rest(problem: Problem, groups: Sequence[Group], rest: Rest) -> Rest:
-    """Return what one problem is without some groups, after all that an `ok` promises has been looked at."""
-    if not bool(rest.fix.answered):
-        return rest
-    part = leave_out_of(problem, groups, rest.left)
-    return rest_of(groups, rest.left, verdict(part, certified(part, accept(part, rest.fix.flat())))[0])
+def prove_rests(problem: Problem, groups: Sequence[Group], rests: Sequence[Rest]) -> list[Rest]:
+    """Return the rests of problems (N,), one each, after all tests that `ok` needs; unanswered ones stay."""
+    out, alike = list(rests), dict[tuple[int, ...], list[int]]()
+    for i, rest in enumerate(rests):
+        if bool(rest.fix.answered):
+            alike.setdefault(tuple(j for j in rest.left if not groups[j].rows), []).append(i)
+    # problems with the same offsets have the same unknowns: they are proven together
+    for others, items in alike.items():
+        rows = np.stack([mark_rows([groups[j] for j in rests[i].left], problem.count) for i in items])
+        part = leave_out(problem.take(np.array(items)), rows, [groups[j] for j in others])
+        fixes = join([rests[i].fix.flat() for i in items], len(items))
+        proven = verdict(part, certified(part, accept(part, fixes)))
+        for place, i in enumerate(items):
+            out[i] = rest_of(groups, rests[i].left, proven[place])
+    return out
 
 
 def leave_out_of(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:

@@ -1,4 +1,4 @@
-"""What stands against a finished answer: the definition of `ok`, for every method."""
+"""Findings against finished answers: the definition of `ok`, for every method."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ BENT_SENTENCE = {
     INVERSE_RANGE: "Gaussian in inverse range, not in metres",
     CURVED: "Gaussian neither in metres nor in inverse range",
 }
-"""What is said of a fix that is `curved`, by the kind of its chart."""
+"""Sentences on a fix that is `curved`, by the kind of its chart."""
 _ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
 # Gaps to infinity below this come from rounding: the fix itself is as far away as counts.
 _NONE = 1e-6
 
 
 class Evidence(NamedTuple):
-    """What numbers say about one finished answer, or about many (N,); NaN says nothing.
+    """The numbers that decide about one finished answer, or about many (N,); NaN decides nothing.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ class Answers:
     problem, pool : Problem, Pool
         N problems and their settled pools.
     gap : array (N, r)
-        Costs of the other minima less that of the best; infinite where there is none.
+        Costs of the other minima less the cost of the best; infinite in empty slots.
     proven : Claims
-        What is proven.
+        Claims of the proofs.
     """
 
     problem: Problem
@@ -96,12 +96,12 @@ class Answers:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What stands against finished answers.
+    """An objection to finished answers.
 
     Parameters
     ----------
     status : Status
-        What an answer is against which nothing else stands; its sentence is the advice.
+        The status of an answer without other findings that precede it; its sentence is the advice.
     test : callable
         Maps evidence to where it applies: by operators alone, so that numbers and arrays take the same rules.
     sentence : callable
@@ -114,7 +114,7 @@ class Finding:
 
 
 def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
-    """Return the marks (N,) of all that stands against settled answers that are finished; zero where nothing does.
+    """Return the marks (N,) of all findings against settled answers that are finished; zero without one.
 
     An answer is `ok` where the data do not reject the model, no other minimum within `AMBIGUOUS_GAP` is left (which is
     proven), infinity lies outside the likelihood region, and the covariance covers.
@@ -124,7 +124,7 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
     problem : Problem
         N problems.
     pool : Pool
-        Settled; what has not been looked at stands against nothing, but for a proof of uniqueness.
+        Settled. Numbers that were not computed decide nothing; a missing proof of uniqueness is a finding.
     gap : array (N, r)
         Costs of the other minima less that of the best; infinite where there is none.
     """
@@ -149,7 +149,7 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
 
 
 def marks_of(*numbers: Any) -> Any:
-    """Return the marks of all that stands against one answer, or against many (N,); the numbers are an `Evidence`."""
+    """Return the marks of all findings against one answer, or against many (N,); the numbers are an `Evidence`."""
     evidence, marks = Evidence(*numbers), 0
     for status_mark, test in _TESTS:
         marks = marks | test(evidence) * status_mark
@@ -316,7 +316,7 @@ def chart_kind(metres: Any, inverse: Any) -> Any:
     return bent * 1 + (bent & ((inverse <= BENT) ^ True)) * 1
 
 
-# What applies, in sentences.
+# Findings in sentences.
 
 
 def explain(answers: Answers, code: Array, reason: Array) -> None:
@@ -343,7 +343,7 @@ def explain(answers: Answers, code: Array, reason: Array) -> None:
 
 
 def _name_residuals(answers: Answers, items: Array) -> Any:
-    """Return what refutes the noise: of all fixes of a problem, or of each."""
+    """Return the sentences on residuals: one for all fixes of a problem, or one for each."""
     pool = answers.pool
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], DOUBT)
     told = tail_probability(pool.cost[items, 0], pool.dof[items])
@@ -381,7 +381,7 @@ def _name_shape(answers: Answers, items: Array) -> Any:
 
 
 def _is_unsafe(evidence: Evidence) -> Any:
-    """Return where the start was not safe, and no proof makes up for it."""
+    """Return the answers whose start was not safe, without a proof that makes up for it."""
     return evidence.searched & (evidence.unique ^ True)
 
 
@@ -393,7 +393,7 @@ FINDINGS = (
     Finding(Status.UNPROVEN, lambda e: (_is_unsafe(e) ^ True) & ((e.unique ^ True) | e.blind), _name_proof),
     Finding(Status.CURVED, lambda e: e.kappa > BENT, _name_shape),
 )
-"""All that may stand against a finished answer: when, and what is said then. What helps is `Status.sentence`."""
+"""All findings against finished answers; the advice of each is `Status.sentence`."""
 _TESTS = tuple((finding.status.mark, finding.test) for finding in FINDINGS)
 
 

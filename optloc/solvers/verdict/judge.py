@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import chdtrc
@@ -391,8 +392,13 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
 def _claims(pool: Pool) -> Claims:
     """Return the claims (N,) of refined answers: what was proven of them, or that they are minima."""
     if pool.proven is None:
-        return alike(NO_PROOF, len(pool))
+        return _without_proof(len(pool))
     return choose(pool.proven.tried, pool.proven, NO_PROOF)
+
+
+@lru_cache(maxsize=64)  # read-only views
+def _without_proof(count: int) -> Claims:
+    return alike(NO_PROOF, count)
 
 
 def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
