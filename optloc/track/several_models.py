@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
-from optloc.track.track import State, Track, check_state, collect, followed, predicted, scans, take_scan
+from optloc.track.scan_rows import Scans
+from optloc.track.track import State, Track, check_state, check_trackable, collect, followed, step
 from optloc.track.updates import Update, Updated, filter_of
 
 # Side by side from one start: the data say which model is right.
@@ -174,13 +175,15 @@ def imm(
     # Before the first scan nothing speaks for one model.
     weight = np.full((*start.mean.shape[:-1], len(models)), 1.0 / len(models))
     steps, times, weights = [], [], []
-    for time, scan in scans(problem, max(model.order for model in models)):
+    check_trackable(problem)
+    given = {order: Scans.of(problem, order) for order in {model.order for model in models}}
+    for k, time in enumerate(problem.times.tolist()):
         if time <= start.time:
             continue
         # Mixing comes before prediction: each model starts from what all of them believe.
         states, coming = mixed(states, weight, chain)
-        ahead = [predicted(state, model, time, d) for state, model in zip(states, models, strict=True)]
-        done = [take_scan(_of_order(scan, model), state, rule) for state, model in zip(ahead, models, strict=True)]
+        both = zip(states, models, strict=True)
+        done = [step(given[model.order], k, state, model, rule) for state, model in both]
         states = [State(time, each.mean, each.cov) for each, _ in done]
         weight, total = _weigh(done, coming)
         steps.append(_combine(done, weight, total))
@@ -231,10 +234,6 @@ def _transition(transition: Array, count: int) -> Array:
             f"the transition is no {count} x {count} table of probabilities", "transition", "let each row add up to one"
         )
     return chain
-
-
-def _of_order(scan: Problem, model: Dynamics) -> Problem:
-    return replace(scan, motions=(replace(scan.motions[0], order=model.order),))
 
 
 def _lend(state: State, own: State) -> State:
