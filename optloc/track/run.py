@@ -11,7 +11,6 @@ from typing import Literal
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Status
 from optloc.compute.filter import CODE, GENERAL, INNOVATION, PRESENT, REJECTED_ROWS, SPREAD, Filtering
 from optloc.problem.epochs import joined
@@ -31,7 +30,7 @@ from optloc.track.track import (
     scan_at,
     take_scan,
 )
-from optloc.track.updates import Filter, Update, Updated, filter_of, gated, innovation, read, weights_within
+from optloc.track.updates import Filter, Update, Updated, filter_of, innovation, read, weights_within
 
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
@@ -189,7 +188,7 @@ class _Run:
     how : Filtering or None
         The filter with the gate, as machine code takes it.
     near : float
-        Squared spread of the stations, of which a prediction with a smaller total variance is followed.
+        Total variance below which a prediction is followed: it is nearer than the stations are spread, squared.
     """
 
     problem: Problem
@@ -207,10 +206,12 @@ class _Run:
         bad = np.bincount(problem.epoch[broken], minlength=problem.epochs).tolist()
         problem = with_height_rows(problem)
         # An infinite gate refuses NaN: the largest number does what infinity does for innovations.
-        gate = min(rules.gate, np.finfo(float).max)
-        how = gated(rule, gate).how(problem.dimension, rules.most) if isinstance(rule, Filter) else None
-        _, spread = centre_and_spread(problem.stations.places.reshape(-1, problem.dimension))
-        return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, float(spread) ** 2)
+        gate, how = min(rules.gate, float(np.finfo(float).max)), None
+        if isinstance(rule, Filter):
+            how = replace(rule, gate=min(gate, rule.gate)).how(problem.dimension, rules.most)
+        # From any centre, a station is at least half of the largest extent away.
+        near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
+        return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
     def entries(self, course: _Course, *, ends: bool = True) -> Iterator[Entry]:
         """Yield all entries, one for each scan, from where a track stands; `ends` as of `begin`."""
@@ -262,8 +263,8 @@ class _Run:
         if self.how is not None and self.scans.rows[k] is not None:
             move = move_of(state, self.dynamics, time, self.problem.dimension)
             found = self.scans.filtered(k, state.mean, state.cov, self.how, move)
-            values = None if found is None else found.values.tolist()
-            if values is not None and values[CODE] != GENERAL:
+            if found is not None and found.values[CODE] != GENERAL:
+                values = found.values.tolist()
                 if values[SPREAD] > self.near and self.rules.gap is None:
                     why = self._unbridged(predicted(state, self.dynamics, time, self.problem.dimension), silence)
                     if why:

@@ -93,12 +93,15 @@ class Scans:
         if rows is None or type(mean) is not np.ndarray or rows.tables.shared != n:
             return None
         item, shape = self.item[k], mean.shape[:-1]
+        if cov.ndim > 2:
+            shape = np.broadcast_shapes(shape, cov.shape[:-2])
         if more is not None or shape or self.problem.batch_shape:
             rows, shape = self._spread(rows, item, more, shape)
             mean, cov = np.broadcast_to(mean, (*shape, n)), np.broadcast_to(cov, (*shape, n, n))
         count, move = math.prod(shape), move or _stay(n)
+        ahead = Move(owned(move.F), _each(move.Q, 2, shape), _each(move.drive, 1, shape))
         out = Filtered(np.empty((count, n)), np.empty((count, n, n)), np.empty((count, VALUES)))
-        filter_scan(rows, item, move, owned(mean.reshape(count, n)), owned(cov.reshape(count, n, n)), how, out)
+        filter_scan(rows, item, ahead, _each(mean, 1, shape), _each(cov, 2, shape), how, out)
         if not shape:
             return Filtered(out.mean[0], out.cov[0], out.values[0])
         return Filtered(*(part.reshape(*shape, *part.shape[1:]) for part in out))
@@ -113,11 +116,8 @@ class Scans:
             more = tuple(part[0] if len(part) == 1 else part.reshape(*batch, m) for part in own)
             shape = np.broadcast_shapes(shape, batch)
         shape = np.broadcast_shapes(shape, *(part.shape[:-1] for part in more))
-        spread = (
-            owned(part.reshape(1, 1, m) if part.ndim == 1 else np.broadcast_to(part, (*shape, m)).reshape(1, -1, m))
-            for part in more
-        )
-        return rows._replace(**dict(zip(("z", "weight"), spread, strict=True))), shape
+        z, weight = (_each(part, 1, shape)[None] for part in more)
+        return rows._replace(z=z, weight=weight), shape
 
 
 def owned(values: Array) -> Array:
@@ -125,9 +125,17 @@ def owned(values: Array) -> Array:
     return values if values.flags.carray and values.dtype == float else np.array(values, dtype=float, order="C")
 
 
+def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
+    """Return values (..., core axes) of states (...) as (N, core axes), or as (1, core axes) where they are shared."""
+    if values.ndim == core:
+        return owned(values)[None]
+    inner = values.shape[values.ndim - core :]
+    return owned(np.broadcast_to(values, (*shape, *inner)).reshape(-1, *inner))
+
+
 @cache
 def _stay(n: int) -> Move:
-    return Move(np.eye(n), np.zeros((1, n, n)), np.zeros((1, n)))
+    return Move(np.eye(n), np.zeros((n, n)), np.zeros(n))
 
 
 def _is_plain(problem: Problem) -> bool:

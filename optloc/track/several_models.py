@@ -266,19 +266,24 @@ def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array,
 def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
     """Return the update over all models, and its status: the best one of the models."""
     n = max(each.mean.shape[-1] for each, _ in done)
-    means, covs = [], []
-    for each, _ in done:
-        # A model without velocity or acceleration says that they are zero, and is sure of it.
-        pad = n - each.mean.shape[-1]
-        means.append(np.pad(each.mean, [(0, 0)] * (each.mean.ndim - 1) + [(0, pad)]))
-        covs.append(np.pad(each.cov, [(0, 0)] * (each.cov.ndim - 2) + [(0, pad)] * 2))
-    mean, cov = moments(means, covs, weight)
+    both = [_widened(each, n) for each, _ in done]
+    mean, cov = moments([one for one, _ in both], [around for _, around in both], weight)
     nis = np.stack([each.nis for each, _ in done], axis=-1)
     used = np.where(weight > 0.0, nis, 0.0)
     count = np.max([np.broadcast_to(each.count, total.shape) for each, _ in done], axis=0)
     # Ok is the least code: one model that follows the target is enough.
     code = np.min([code for _, code in done], axis=0).astype(np.int8)
     return Updated(mean, cov, (weight * used).sum(-1), total, count), code
+
+
+def _widened(done: Updated, n: int) -> tuple[Array, Array]:
+    """Return mean (..., n) and covariance: a model without velocity or acceleration is sure that they are zero."""
+    held = done.mean.shape[-1]
+    if held == n:
+        return done.mean, done.cov
+    mean, cov = np.zeros((*done.mean.shape[:-1], n)), np.zeros((*done.cov.shape[:-2], n, n))
+    mean[..., :held], cov[..., :held, :held] = done.mean, done.cov
+    return mean, cov
 
 
 # What both are made of.
@@ -361,9 +366,8 @@ def moments(means: Sequence[Array], covs: Sequence[Array], weight: Array) -> tup
     weight : array (..., q)
         Their probabilities.
     """
-    mean = np.asarray(sum(weight[..., i, None] * one for i, one in enumerate(means)))
-    cov = np.zeros((*mean.shape, mean.shape[-1]))
-    for i, (one, around) in enumerate(zip(means, covs, strict=True)):
-        away = one - mean
-        cov = cov + weight[..., i, None, None] * (around + away[..., :, None] * away[..., None, :])
+    centre, each = np.stack(means, axis=-2), np.stack(covs, axis=-3)
+    mean = (weight[..., None, :] @ centre)[..., 0, :]
+    away = centre - mean[..., None, :]
+    cov = (weight[..., None, None] * (each + away[..., :, None] * away[..., None, :])).sum(-3)
     return mean, cov

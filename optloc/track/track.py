@@ -15,7 +15,7 @@ from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
-from optloc.track.scan_rows import Scans, owned
+from optloc.track.scan_rows import Scans
 from optloc.track.updates import Filter, Update, Updated, filter_of, read
 
 # Eigenvalue below zero, as a share of the largest entry, that rounding makes of a covariance which is singular.
@@ -168,13 +168,11 @@ def step(
 
 
 def move_of(state: State, dynamics: Dynamics, time: float, dimension: int) -> Move | None:
-    """Return the prediction of a state for a later time as machine code takes it; None where no time passes."""
+    """Return the prediction of a state (...) for a later time, or None where no time passes."""
     dt = _elapsed(state, time)
     if dt == 0.0:
         return None
-    F, Q, drive = dynamics.step(dt, state.mean, dimension)
-    n = len(F)
-    return Move(owned(F), owned(Q.reshape(-1, n, n)), owned(drive.reshape(-1, n)))
+    return Move(*dynamics.step(dt, state.mean, dimension))
 
 
 def _elapsed(state: State, time: float) -> float:

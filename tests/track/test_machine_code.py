@@ -10,7 +10,18 @@ from cases import ENU
 from optloc import Motion, Stations, Status, assemble, measured
 from optloc.compute.filter import CODE, GENERAL, NIS
 from optloc.compute.jit import enabled
-from optloc.track import UPDATES, Rules, State, collected, followed, gated, polynomial, scan_rows, tracked
+from optloc.track import (
+    UPDATES,
+    Rules,
+    State,
+    collected,
+    current_statistical,
+    followed,
+    gated,
+    polynomial,
+    scan_rows,
+    tracked,
+)
 from optloc.track.scan_rows import Scans
 from optloc.track.track import scan_at
 
@@ -167,10 +178,12 @@ def test_what_is_not_one_run_of_states_takes_numpy(at_hand):
 
 def test_a_scan_without_rows_is_the_prediction_whatever_memory_holds(at_hand, monkeypatch):
     scan = scan_at(CASES["tdoa"](), 0, 1)
-    monkeypatch.setattr(np, "empty", lambda shape: np.full(shape, np.nan))
     mean, cov = np.r_[TRUTH, SPEED], predictions(6, 3)["good"]
     for silent in (scan.with_rows(weight=np.zeros(5)), scan.with_rows(z=scan.z + 1e6)):
-        found = by_machine_code(gated("iekf", 5.0), silent, mean, cov)
+        given = Scans.of(silent, 1)
+        with monkeypatch.context() as memory:
+            memory.setattr(np, "empty", lambda shape: np.full(shape, np.nan))
+            found = given.filtered(0, mean, cov, gated("iekf", 5.0).how(3))
         assert found.values[CODE] == Status.TOO_FEW_ROWS
         assert np.isnan(found.values[NIS])
         assert np.array_equal(found.mean, mean)
@@ -189,6 +202,22 @@ def test_a_batch_is_its_states(at_hand):
             one = filtering(scan.with_rows(z=z[i, 0]), mean[i, j], cov)
             for name in ("mean", "cov", "nis", "loglikelihood", "count"):
                 assert np.array_equal(getattr(many, name)[i, j], getattr(one, name))
+
+
+def test_runs_targets_and_noise_of_their_own_meet_in_one_batch(at_hand):
+    """Two runs, three targets: measurements have one axis, states and their process noise the other."""
+    problem, rng = CASES["correlated"](), np.random.default_rng(4)
+    z = problem.z + rng.normal(0.0, 5.0, (2, 1, problem.count))
+    mean = np.r_[TRUTH - SPEED, SPEED, np.zeros(3)] + rng.normal(0.0, [50.0] * 3 + [3.0] * 3 + [0.5] * 3, (3, 9))
+    start, dynamics = State(-1.0, mean, predictions(9, 3)["good"]), current_statistical(5.0, 20.0)
+    many = followed(problem.with_rows(z=z), start, dynamics, "ekf")
+    assert many.mean.shape == (2, 3, EPOCHS, 9)
+    for i, j in np.ndindex(2, 3):
+        one = followed(problem.with_rows(z=z[i, 0]), replace(start, mean=mean[j]), dynamics, "ekf")
+        np.testing.assert_allclose(many.mean[i, j], one.mean, rtol=1e-12)
+        np.testing.assert_allclose(many.cov[i, j], one.cov, rtol=1e-12)
+    shared = replace(start, mean=mean[0], cov=np.tile(start.cov, (2, 1, 1)))
+    assert np.array_equal(*followed(problem, shared, dynamics, "ekf").mean)
 
 
 @pytest.mark.parametrize("name", ["moving", "absent", "correlated"])
