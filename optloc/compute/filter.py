@@ -91,11 +91,11 @@ class Filtering(NamedTuple):
     """
 
     form: int
-    limit: int
-    tolerance: float
-    gate: float
-    most: float
-    d: int
+    limit: int = 1
+    tolerance: float = 0.0
+    gate: float = np.inf
+    most: float = np.inf
+    d: int = 0
 
 
 class Filtered(NamedTuple):

@@ -208,7 +208,8 @@ class _Run:
         # An infinite gate refuses NaN: the largest number does what infinity does for innovations.
         gate, how = min(rules.gate, float(np.finfo(float).max)), None
         if isinstance(rule, Filter):
-            how = replace(rule, gate=min(gate, rule.gate)).how(problem.dimension, rules.most)
+            own = min(gate, rule.how.gate)
+            how = rule.how._replace(gate=float(own), most=rules.most, d=problem.dimension)
         # From any centre, a station is at least half of the largest extent away.
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)

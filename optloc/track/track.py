@@ -158,7 +158,9 @@ def step(
     problem = given.problem
     time, d = float(problem.times[k]), problem.dimension
     if isinstance(rule, Filter) and given.rows[k] is not None:
-        found = given.filtered(k, state.mean, state.cov, rule.how(d), move_of(state, dynamics, time, d), more)
+        found = given.filtered(
+            k, state.mean, state.cov, rule.how._replace(d=d), move_of(state, dynamics, time, d), more
+        )
         if found is not None and not (found.values[..., CODE] == GENERAL).any():
             return read(found), found.values[..., CODE].astype(np.int8)
     scan = scan_at(problem, k, given.order)

@@ -86,14 +86,10 @@ class Filter:
 
     Parameters
     ----------
-    form : int
-        `EKF`, `IEKF`, `MGEKF` or `MVEKF` of `optloc.compute.filter`.
-    limit : int
-        Steps, at most.
-    tolerance : float
-        Length of a step that ends them, in standard deviations of the prediction.
-    gate : float
-        Rows whose innovation is larger than this many of its standard deviations are left out.
+    summary : str
+        One line.
+    how : Filtering
+        Form, steps and gate.
 
     References
     ----------
@@ -104,50 +100,47 @@ class Filter:
        to estimation with bearings only measurements", IEEE Trans. Autom. Control 30 (1985), eq. 9 to 13.
     """
 
-    form: int
-    limit: int = 1
-    tolerance: float = 0.0
-    gate: float = np.inf
-
-    def how(self, dimension: int, most: float = np.inf) -> Filtering:
-        """Return the filter as machine code takes it; a squared innovation counts as `most` at most."""
-        return Filtering(self.form, self.limit, self.tolerance, self.gate, most, dimension)
+    summary: str
+    how: Filtering
 
     def __call__(self, scan: Problem, mean: Array, cov: Array) -> Updated:
         """Return the update of states (..., n) that hold at the time of a scan."""
         motion = scan.motions[0]
         if scan.epochs == 1 and motion.known is None and motion.reference in (None, scan.times[0]):
-            found = Scans.of(scan, motion.order).filtered(0, mean, cov, self.how(scan.dimension))
+            found = Scans.of(scan, motion.order).filtered(0, mean, cov, self.how._replace(d=scan.dimension))
             if found is not None and not (found.values[..., CODE] == GENERAL).any():
                 return read(found)
         return self._general(scan, mean, cov)
 
     def _general(self, scan: Problem, mean: Array, cov: Array) -> Updated:
         """Return the update in NumPy: for what `optloc.track.scan_rows.Scans` does not serve."""
-        if np.isfinite(self.gate):
-            scan = scan.with_rows(weight=weights_within(scan, mean, cov, self.gate))
+        form, gate = self.how.form, self.how.gate
+        if np.isfinite(gate):
+            scan = scan.with_rows(weight=weights_within(scan, mean, cov, gate))
         white = whitened(scan, mean)
         slope, gain = white.H, _gain(white.H, cov)
         x = mean + (gain @ white.residual[..., None])[..., 0]
-        if self.form == IEKF:
-            x = _converged(scan, mean, cov, white, self)
-        if self.form in (IEKF, MVEKF):
+        if form == IEKF:
+            x = _converged(scan, mean, cov, white, self.how)
+        if form in (IEKF, MVEKF):
             slope = whitened(scan, x).H
             gain = _gain(slope, cov)
-        if self.form == MGEKF:
+        if form == MGEKF:
             parts = [w * whitened(scan, mean + node * (x - mean)).H for node, w in zip(NODES, SHARES, strict=True)]
             slope = np.sum(parts, axis=0)
         return _finish(white, cov, x, joseph(slope, gain, cov))
 
 
-ekf = Filter(EKF)
+ekf = Filter("the extended Kalman filter: one linearisation at the prediction", Filtering(EKF))
 """The extended Kalman filter."""
 # Gauss-Newton converges in two to four steps near its answer; a step of a millionth of a sigma is none.
-iekf = Filter(IEKF, limit=20, tolerance=1e-6)
+iekf = Filter(
+    "the iterated extended Kalman filter: Gauss-Newton to the maximum a posteriori point", Filtering(IEKF, 20, 1e-6)
+)
 """The iterated extended Kalman filter."""
-mgekf = Filter(MGEKF)
+mgekf = Filter("the modified-gain extended Kalman filter", Filtering(MGEKF))
 """The modified-gain extended Kalman filter."""
-mvekf = Filter(MVEKF)
+mvekf = Filter("the modified-covariance extended Kalman filter: linearised after the step", Filtering(MVEKF))
 """The modified-covariance extended Kalman filter."""
 
 UPDATES: Table[Update] = Table("optloc.trackers", callable, {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf})
@@ -186,7 +179,7 @@ def gated(update: Update | str, width: float = 5.0) -> Update:
     rule = filter_of(update)
     check_width(width)
     if isinstance(rule, Filter):
-        return replace(rule, gate=min(width, rule.gate))
+        return replace(rule, how=rule.how._replace(gate=min(float(width), rule.how.gate)))
     return lambda scan, mean, cov: rule(scan.with_rows(weight=weights_within(scan, mean, cov, width)), mean, cov)
 
 
@@ -320,7 +313,7 @@ def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
     return Updated(mean, after, nis, -0.5 * (nis + logdet), white.count)
 
 
-def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filter) -> Array:
+def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
     """Return the maximum a posteriori states by Gauss-Newton, from the rows at the predictions on."""
     # The prior is one more whitened row block: the cost that steps may not raise is that of rows and prior together.
     prior = linalg.whitening(cov)

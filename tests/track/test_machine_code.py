@@ -125,7 +125,7 @@ def same(found, told, within):
 
 def by_machine_code(rule, scan, mean, cov):
     """The update, or None where machine code leaves it to the general form."""
-    found = Scans.of(scan, scan.motions[0].order).filtered(0, mean, cov, rule.how(scan.dimension))
+    found = Scans.of(scan, scan.motions[0].order).filtered(0, mean, cov, rule.how._replace(d=scan.dimension))
     return None if found is None or found.values[CODE] == GENERAL else found
 
 
@@ -183,7 +183,7 @@ def test_a_scan_without_rows_is_the_prediction_whatever_memory_holds(at_hand, mo
         given = Scans.of(silent, 1)
         with monkeypatch.context() as memory:
             memory.setattr(np, "empty", lambda shape: np.full(shape, np.nan))
-            found = given.filtered(0, mean, cov, gated("iekf", 5.0).how(3))
+            found = given.filtered(0, mean, cov, gated("iekf", 5.0).how._replace(d=3))
         assert found.values[CODE] == Status.TOO_FEW_ROWS
         assert np.isnan(found.values[NIS])
         assert np.array_equal(found.mean, mean)
