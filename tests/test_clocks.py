@@ -223,6 +223,20 @@ def test_allan_deviations_become_densities_and_walks_have_these_deviations():
 # Splines.
 
 
+def test_a_walk_and_a_spline_begin_together_on_both_sides_of_a_line_of_stations():
+    k, x = 40, np.array([-900.0, -300.0, 100.0, 500.0, 1000.0])
+    rows = optloc.measured("tdoa", a=np.tile([1, 2, 3, 4], k), b=0, epoch=np.repeat(np.arange(k), 4), sigma=3.0)
+    place = np.stack([x, np.zeros(5)], axis=-1)
+    problem = optloc.assemble(place, rows, times=2.0 * np.arange(k), motions=(optloc.Motion(1),))
+    problem = with_bias(problem, "walk", members=["S2"], form="walk", density=0.5, rate_density=0.01, sigma=5.0)
+    problem = with_bias(problem, "spline", members=["S3"], form="spline", knots=3)
+    truth = np.zeros(problem.layout.size)
+    truth[:4] = 300.0, 400.0, 1.0, -2.0
+    fix = optloc.solve(optloc.simulate(problem, optloc.wander(problem, truth, 1), 2))
+    assert fix.status == optloc.Status.AMBIGUOUS
+    np.testing.assert_allclose(fix.x[:4] * [1.0, -1.0, 1.0, -1.0], fix.alternatives.x[0, :4], rtol=1e-5)
+
+
 def test_a_spline_is_one_and_a_straight_line_where_its_coefficients_are():
     problem = with_bias(run(30), "clock", members=["S2"], form="spline", knots=[-5.0, 20.0, 100.0, 200.0, 300.0])
     bias = problem.biases[0]

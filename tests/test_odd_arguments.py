@@ -5,6 +5,7 @@ import random
 import signal
 import sys
 import traceback
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -153,6 +154,16 @@ def arguments(where, option, value):
     return [*words, f"{flag}={value}"]
 
 
+# Memory that a command may take: above what any takes in earnest, and far below what absurd numbers ask for.
+_MORE = 3 << 29
+
+
+def _data():
+    """Return the bytes of data that this process has, and its fork begins with: the tests before have left some."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[5]) * resource.getpagesize() if statm.exists() else _MORE
+
+
 def run(words, place):
     """Run a command in a fork of this process with limits; return exit code, standard output and standard error."""
     child = os.fork()
@@ -166,7 +177,8 @@ def run(words, place):
         for stream in (sys.stdout, sys.stderr):
             stream.reconfigure(errors="replace")
         resource.setrlimit(resource.RLIMIT_AS, (1 << 34, 1 << 34))
-        resource.setrlimit(resource.RLIMIT_DATA, (3 << 30, 3 << 30))
+        limit = _data() + _MORE
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         signal.alarm(60)
         code = 70
         try:

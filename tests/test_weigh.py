@@ -86,6 +86,34 @@ def test_isotropic_errors_are_arrival_errors():
     assert weighed(problem).stations.covariance is None
 
 
+def test_stations_say_whether_errors_are_noise_or_unknowns():
+    place, equal = np.zeros((1, 2, 3)), np.broadcast_to(np.eye(3) * 4.0, (2, 3, 3))
+    for span, unknown in (("epoch", "epoch"), ("run", "run"), ("noise", None)):
+        exact = optloc.Stations(place, ("A", "B"), span=span)
+        assert (exact.unknown_for, exact.weighed, exact.isotropic) == (None, False, True)
+        assert exact.with_noise() is exact
+        for name in ("covariance", "velocity_covariance"):
+            stations = replace(exact, **{name: equal})
+            assert (stations.unknown_for, stations.weighed, stations.isotropic) == (unknown, span == "noise", True)
+            assert stations.with_noise().span == ("run" if span == "run" else "noise")
+    assert replace(exact, covariance=equal * (1.0 + 1e-12 * np.eye(3)[0])).isotropic
+    assert not replace(exact, covariance=equal * (1.0 + 1e-6 * np.eye(3)[0])).isotropic
+
+
+def test_errors_of_a_run_of_one_epoch_have_the_covariance_of_their_information():
+    rng = np.random.default_rng(3)
+    place, variance = rng.uniform(-1e3, 1e3, (6, 2)), np.linspace(4.0, 9.0, 6)
+    z = np.linalg.norm(place - [300.0, -200.0], axis=1) + 3.0 * rng.standard_normal(6)
+    stations = optloc.Stations(place[None], tuple("ABCDEF"), covariance=np.eye(2) * variance[:, None, None], span="run")
+    fix = optloc.solve(optloc.assemble(stations, optloc.measured("range", z, a=np.arange(6), sigma=3.0)))
+    assert fix.status == optloc.Status.OK
+    line = fix.x[:2] - place - fix.x[2:].reshape(6, 2)
+    unit = line / np.linalg.norm(line, axis=1)[:, None]
+    J = np.hstack([unit, -(np.eye(6)[:, :, None] * unit[:, None]).reshape(6, 12)])
+    information = J.T @ J / 9.0 + np.diag([0.0, 0.0, *np.repeat(1.0 / variance, 2)])
+    np.testing.assert_allclose(fix.cov, np.linalg.inv(information), rtol=1e-6, atol=1e-9)
+
+
 def test_what_has_no_such_errors_stays():
     problem = run(3, station=0)
     assert weighed(problem) is problem

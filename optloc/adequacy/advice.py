@@ -15,6 +15,7 @@ from optloc.base.types import Array, Bias
 from optloc.problem.bias import family
 from optloc.problem.epochs import by_epoch, separable, thinned, tied
 from optloc.problem.fix import Fix
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 
 # Explanations of a misfit that are told where several do as well.
@@ -141,7 +142,7 @@ def misfit_of(problem: Problem, x: Array) -> str:
     if not told:
         return "no error of a single station explains the misfit"
     (value, unit), one = _size(part, told[0]), told[0]
-    article = "an" if one.candidate.form == "offset" else "a"
+    article = _noun(one.candidate).split()[0]
     return f"{article} {one.candidate.name}, {value} {unit}, would explain it (p = {one.p_after:.2g})"
 
 
@@ -202,14 +203,10 @@ def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
 
 # What a score test has found, in words.
 
-_NAMED = {
-    "offset": "an offset",
-    "scale": "a scale error",
-    "drift": "a drift",
-    "rotation": "a turn of its axes",
-    "step": "a step",
-    "burst": "a burst of errors",
-}
+
+def _noun(one: Candidate) -> str:
+    """Return the noun of a candidate with its article."""
+    return {"step": "a step", "burst": "a burst of errors"}.get(one.form) or form_of(one.bias).noun
 
 
 def _tell(problem: Problem, one: Explained) -> Advice:
@@ -218,7 +215,7 @@ def _tell(problem: Problem, one: Explained) -> Advice:
     station = bias.members[0]
     whose = f"station {station}" if who.per == "station" else f"all {station} rows"
     rows = f" in its {who.kind} rows" if who.per == "station" and who.kind and len(problem.rows) > 1 else ""
-    kind, what = who.form, _NAMED[who.form]
+    kind, what = who.form, _noun(who)
     when = f" from t = {who.since:.6g} s " if np.isfinite(who.since) else ""
     when += {"step": "on", "burst": f"to {who.until:.6g} s"}.get(kind, "")
     seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain the misfit: p = {one.p_after:.2g}"
@@ -234,7 +231,7 @@ def _size(problem: Problem, one: Explained) -> tuple[str, str]:
     """Return the estimate with its standard deviation, and its unit; angles in degrees."""
     slot = _unit(problem, one)
     unit, scale = (slot.replace("rad", "deg"), np.degrees(1.0)) if "rad" in slot else (slot, 1.0)
-    if one.candidate.bias.form == "scale":
+    if form_of(one.candidate.bias).enters == "scales":
         unit, scale = "%", 100.0
     pairs = [f"{scale * v:+.4g} ± {scale * s:.2g}" for v, s in zip(one.value, one.sigma, strict=True)]
     return ", ".join(pairs), unit

@@ -89,10 +89,7 @@ def batch_of(problem: Problem) -> Problem:
     InvalidProblem
         Where more rows than can be handled share unknowns.
     """
-    stations = problem.stations
-    if stations.estimated and stations.span == "epoch":
-        # An offset of each epoch that nothing else shares is noise of that epoch, and needs no unknown.
-        problem = replace(problem, stations=replace(stations, span="noise"))
+    problem = replace(problem, stations=problem.stations.with_noise())
     flat = (by_epoch(problem) if separable(problem) else problem).flat()
     if flat.count > _LARGEST and flat.epochs > 1:
         what = f"{flat.count} rows share unknowns"

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import prod
 
 import numpy as np
 
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
-from optloc.base.types import Array, Bias
+from optloc.base.types import Array, Bias, FormName
 from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.equalities import Equalities, spare_rows
 from optloc.models import MODELS
-from optloc.problem.bias import Form, Per, family
+from optloc.problem.bias import Per, family
 from optloc.problem.chart import quantile
 from optloc.problem.fix import tail_probability
+from optloc.problem.forms import FORMS, form_of
 from optloc.problem.problem import Problem
 
 FALSE_ALARM = 1e-3
@@ -35,8 +37,7 @@ _RIVAL = 9.0
 # Costs that differ by less decide nothing between two forms of an error of one station: the simpler one is told.
 _SAME = 2.0
 # The simplest first.
-_FORMS: tuple[Form, ...] = ("offset", "scale", "drift", "rotation")
-_ORDER = (*_FORMS, "step", "burst")
+_ORDER = (*FORMS, "step", "burst")
 # What a scale of arrival times has against it beside a drift: a clock that is fast is a drift, and seconds are as long
 # for all, so the odds are a hundred to one. Where a run looks alike in both, noise alone decides between them.
 _STRETCHED_TIME = 9.0
@@ -74,6 +75,12 @@ class Candidate:
         if not np.isfinite(self.since):
             return self.bias.form
         return "burst" if np.isfinite(self.until) else "step"
+
+    @property
+    def is_channel_offset(self) -> bool:
+        """Return whether it adds a constant to one station's rows of a kind, all the time."""
+        form = form_of(self.bias)
+        return self.per == "station" and form.enters == "adds" and not (form.changes or np.isfinite(self.since))
 
     @property
     def name(self) -> str:
@@ -137,7 +144,7 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
     before = float(tail_probability(cost, np.array([dof]))[0])
     # a search for the ends of steps and bursts picks the best of all that it could have reached: those of every channel
     # that begin at any epoch, and end at any of so many
-    channels = sum(one.form == "offset" and one.per == "station" for one in found)
+    channels = sum(one.is_channel_offset for one in found)
     more = channels * problem.epochs * (2 * _around(problem) + 2) if any(o.form == "step" for o in found) else 0
     level = 1.0 - FALSE_ALARM / (len(found) + more)
     # a statistic is the square of a projection of the residual: none is larger than the cost
@@ -183,7 +190,8 @@ def _stands_for(other: Explained, one: Explained) -> bool:
 
 def _is_stretched(one: Explained) -> bool:
     """Return whether an explanation is a scale of times."""
-    return one.candidate.bias.form == "scale" and one.candidate.kind != "" and _is_of_arrivals(one.candidate.kind)
+    form, kind = form_of(one.candidate.bias), one.candidate.kind
+    return form.enters == "scales" and kind != "" and _is_of_arrivals(kind)
 
 
 def _is_of_arrivals(kind: str) -> bool:
@@ -210,7 +218,7 @@ def candidates(problem: Problem) -> tuple[Candidate, ...]:
     return (*out, *_steps(problem, out))
 
 
-def _forms(problem: Problem, kind: str) -> Iterator[Form]:
+def _forms(problem: Problem, kind: str) -> Iterator[FormName]:
     yield "offset"
     if MODELS[kind].period is None:  # an angle has no scale
         yield "scale"
@@ -219,7 +227,7 @@ def _forms(problem: Problem, kind: str) -> Iterator[Form]:
         yield "drift"
 
 
-def _candidate(problem: Problem, form: Form, per: Per, kind: str | None, station: str | None) -> Candidate:
+def _candidate(problem: Problem, form: FormName, per: Per, kind: str | None, station: str | None) -> Candidate:
     members = None if station is None else (station,)
     names = problem.stations.names
     bias = family(problem.rows, names, f"{form} that is tested", per=per, form=form, kind=kind, members=members)
@@ -249,7 +257,7 @@ def _steps(problem: Problem, found: list[Candidate]) -> Iterator[Candidate]:
     cuts = np.unique(np.linspace(1, k - 1, min(k - 1, _STEP_TIMES)).round().astype(int)).tolist()
     # a burst before the first cut is a step there, and after the last one too
     spans = [*((first, k) for first in cuts), *pairwise(cuts)]
-    stations = [one for one in found if one.bias.form == "offset" and one.per == "station"]
+    stations = [one for one in found if one.is_channel_offset]
     for first, last in spans:
         yield from (made for one in stations for made in _lasting(problem, one, first, last))
 
@@ -278,7 +286,7 @@ def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: A
         whole = next(
             one
             for one in found
-            if one.form == "offset" and (one.kind, one.bias.members) == (best.kind, best.bias.members)
+            if one.is_channel_offset and (one.kind, one.bias.members) == (best.kind, best.bias.members)
         )
         for end in range(1 if form == "step" else 2):
             ends = _ends(problem, best)
@@ -366,7 +374,7 @@ def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Prob
     for form in dict.fromkeys(one.bias.form for one in found):
         own = [i for i, one in enumerate(found) if one.bias.form == form]
         parts = [found[i].bias for i in own]
-        name, size = f"{form} that is tested", 3 if form == "rotation" and problem.dimension == 3 else 1
+        name, size = f"{form} that is tested", prod(FORMS[form].shape(parts[0], problem.dimension)[1:])
         member = np.concatenate([np.full(len(part.row), j) for j, part in enumerate(parts)])
         row, coefficient = (np.concatenate([getattr(part, key) for part in parts]) for key in ("row", "coefficient"))
         more.append(replace(parts[0], name=name, members=tuple(map(str, own)), row=row, member=member))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from typing import Any, Literal
 
 import numpy as np
 
 Array = np.ndarray[Any, np.dtype[Any]]
+FormName = Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"]
+"""Names of the forms of a `Bias`, for type checkers: the keys of `optloc.problem.forms.FORMS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +52,27 @@ class Stations:
         return tuple((name, unit, covariance) for name, unit, covariance in both if covariance is not None)
 
     @property
-    def estimated(self) -> bool:
-        """Return whether errors of positions or velocities are unknowns."""
-        return self.span != "noise" and bool(self.errors)
+    def unknown_for(self) -> Literal["epoch", "run"] | None:
+        """Return the span of errors that are unknowns; None for noise, and for stations without errors."""
+        return self.span if self.span != "noise" and self.errors else None
 
     @property
     def weighed(self) -> bool:
         """Return whether errors of positions or velocities are noise of each epoch."""
         return self.span == "noise" and bool(self.errors)
+
+    @property
+    def isotropic(self) -> bool:
+        """Return whether the errors of each position are equally large in all directions."""
+        if self.covariance is None:
+            return True
+        # Nine digits: variances may come from conversions of units.
+        equal = np.eye(self.dimension) * self.covariance[..., :1, :1]
+        return bool((np.abs(self.covariance - equal) <= 1e-9 * equal).all())
+
+    def with_noise(self) -> Stations:
+        """Return the stations with errors of each epoch as noise of its rows: no other epoch shares them."""
+        return replace(self, span="noise") if self.unknown_for == "epoch" else self
 
     @property
     def dimension(self) -> int:
@@ -199,7 +214,7 @@ class Bias:
     row: Array
     member: Array
     coefficient: Array
-    form: Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"] = "offset"
+    form: FormName = "offset"
     # One zero stands for all members; an array of its own for each bias, for arrays can be written into.
     mean: Array = field(default_factory=lambda: np.zeros(1))
     sigma: Array | None = None

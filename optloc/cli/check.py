@@ -170,12 +170,12 @@ def _count_moving(stations: Stations) -> int:
 
 def _errors(problem: Problem) -> str:
     """Return the size of the errors of station positions and velocities, and how long they last."""
-    sizes, span = [], problem.stations.span
+    sizes, span = [], problem.stations.unknown_for
     for _, unit, covariance in problem.stations.errors:
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         low, high = sigma.min(), sigma.max()
         sizes.append(f"{low:.4g} {unit}" if low == high else f"{low:.4g} to {high:.4g} {unit}")
-    lasts = "noise of each epoch" if span == "noise" else f"unknown for each {span}"
+    lasts = f"unknown for each {span}" if span else "noise of each epoch"
     return f"{' and '.join(sizes)}, {lasts}" if sizes else "none"
 
 

@@ -176,7 +176,7 @@ PARTS: Mapping[str, Part] = {
         "fixes from ranges",
         "optloc.engine",
         (_fix_ranges,),
-        tuple(f"optloc.engine.fixes.fixes_{mark}" for mark in ("ranges", "few_ranges")),
+        tuple(f"optloc.engine.fixes.fixes_{mark}" for mark in ("ranges", "one_by_ranges")),
     ),
     "refinements": Part(
         "refinements and filters",

@@ -330,6 +330,10 @@ def put_rows(values: Array, out: Array) -> None:
             out[i, k] = values[i, k]
 
 
+# Copies of kernels with other constants, by what tells their names apart.
+_COPIES: dict[tuple[_Kernel, str], _Kernel] = {}
+
+
 def with_constants(
     kernel: _Function,
     mark: str,
@@ -346,35 +350,45 @@ def with_constants(
     kernel : callable
         As `compiled` returns it.
     mark : str
-        Tells the names of its machine code from those of the kernels as they are.
+        Tells the names of what calls replaced kernels apart; what has other constants alone is named by these, and is
+        the same for all.
     replaced : dict, optional
         Kernels that are called in the place of others.
     constants : object
         New values by name; kernels that use none of them, nor call one that does, stay as they are.
     """
-    made, others = dict[_Kernel, _Kernel](), replaced or {}
+    others = cast(Mapping[_Kernel, _Kernel], replaced or {})
+    made = dict[_Kernel, tuple[_Kernel, frozenset[tuple[str, Any]], bool]]()
 
-    def copy(one: _Kernel) -> _Kernel:
-        one = cast(_Kernel, others.get(one, one))
+    def copy(one: _Kernel) -> tuple[_Kernel, frozenset[tuple[str, Any]], bool]:
+        """Return a copy, the constants that differ in it or below, and whether it reaches what is replaced."""
+        one, other = others.get(one, one), one in others
         if one in made:
-            return made[one]
-        old, changed = one.function, dict[str, Any]()
+            return made[one][0], made[one][1], made[one][2] or other
+        old, changed, differ, reaches = one.function, dict[str, Any](), frozenset[tuple[str, Any]](), other
         assert isinstance(old, FunctionType)
         for name in set(old.__code__.co_names) & old.__globals__.keys():
             value = old.__globals__[name]
-            new = copy(value) if isinstance(value, _Kernel) else constants.get(name, value)
+            if isinstance(value, _Kernel):
+                new, below, replaces = copy(value)
+                differ, reaches = differ | below, reaches or replaces
+            else:
+                new = constants.get(name, value)
+                differ |= {(name, new)} if new is not value else set()
             changed |= {} if new is value else {name: new}
-        made[one] = one
-        if changed:
+        # what only differs by constants is the same for all that call it
+        key = one, mark if reaches else "_".join(f"{name}_{value}" for name, value in sorted(differ)).replace(".", "_")
+        if changed and key not in _COPIES:
             own = FunctionType(old.__code__, {**old.__globals__, **changed}, old.__name__, old.__defaults__)
-            own.__qualname__, own.__doc__ = f"{old.__qualname__}_{mark}", old.__doc__
+            own.__qualname__, own.__doc__ = f"{old.__qualname__}_{key[1]}", old.__doc__
             own.__annotations__ = old.__annotations__
-            made[one] = _Kernel(own, taken_in=one.taken_in)
+            _COPIES[key] = _Kernel(own, taken_in=one.taken_in)
+        made[one] = _COPIES[key] if changed else one, differ, reaches
         return made[one]
 
     assert isinstance(kernel, _Kernel)
-    out = copy(kernel)
+    out = copy(kernel)[0]
     for one in {*made, *others}:
-        if one in _KERNELS and not closure(one).isdisjoint(cast(Iterable[_Kernel], others)):
+        if one in _KERNELS and not closure(one).isdisjoint(others):
             _KERNELS.remove(one)  # a pattern, of which there will be no machine code
     return cast(_Function, out)

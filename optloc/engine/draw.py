@@ -34,6 +34,7 @@ from optloc.linear.normal import weighed
 from optloc.linear.redundancy import degrees_of_freedom, largest
 from optloc.linear.vectors import hold_still, vectors
 from optloc.models import MODELS
+from optloc.problem.forms import form_of
 from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 
@@ -55,9 +56,9 @@ class Drawn(NamedTuple):
 def draw_ranges(one: Problem, admission: Admission) -> Drawn | None:
     """Return rows that are sums of ranges; None where they lack rows for a start, or links between stations."""
     offset = None
-    if one.stations.estimated:  # along the lines to the target, they are noise
+    if one.stations.unknown_for:  # along the lines to the target, they are noise
         offset = columns(one.layout, "stations", np.zeros(1, dtype=int))[0]
-        one = replace(one, stations=replace(one.stations, span="noise"))
+        one = replace(one, stations=one.stations.with_noise())
     found = _find_ranges(one)
     # Stations that no row links would have ranges that nothing relates.
     if found is None or len(found.groups[0]) != 1:
@@ -271,7 +272,7 @@ def _is_bounded(one: Problem) -> bool:
 
     Ranges that add up do, but for a scale or an offset without a prior; so do heights, and a prior on the position.
     """
-    free = {bias.name for bias in one.biases if bias.sigma is None or bias.form == "scale"}
+    free = {bias.name for bias in one.biases if bias.sigma is None or form_of(bias).enters == "scales"}
     touched = np.zeros(one.count, dtype=bool)
     for bias in one.biases:
         touched[bias.row] |= bias.name in free

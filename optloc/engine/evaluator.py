@@ -32,7 +32,7 @@ def count_lifted(rows: Any) -> int:
 
 @compiled
 def keep(model: Model, rows: Any, stations: int, d: int, size: int) -> Any:
-    """Return the memory that an evaluator keeps for a block."""
+    """Return the rows with the memory that an evaluator keeps for a block: what the kernels below take."""
     raise NotImplementedError
 
 
@@ -79,7 +79,7 @@ def bow_of(rows: Any, room: Room) -> float:
 
 
 @compiled
-def note_nearest(room: Room, least: Array) -> None:
+def note_nearest(rows: Any, room: Room, least: Array) -> None:
     """Write the range to the nearest station (W,) where the equations were written last."""
     raise NotImplementedError
 

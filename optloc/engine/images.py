@@ -153,7 +153,7 @@ def follow(model: Model, rows: Any, room: Room, tolerance: float, fewest: int, e
     nearest = room.scalar[SHARE]
     evaluate(model, rows, room, 0)
     coarsen(model, room)
-    _note_nearest(room, nearest, True)
+    _note_nearest(rows, room, nearest, True)
     bow = bow_of(rows, room)
     while True:
         propose(model, room)
@@ -161,16 +161,16 @@ def follow(model: Model, rows: Any, room: Room, tolerance: float, fewest: int, e
             return
         evaluate(model, rows, room, 1)
         going = decide(room, tolerance)
-        _note_nearest(room, nearest, False)
+        _note_nearest(rows, room, nearest, False)
         if not going:
             return
 
 
 @compiled
-def _note_nearest(room: Room, nearest: Array, every: bool) -> None:
+def _note_nearest(rows: Any, room: Room, nearest: Array, every: bool) -> None:
     """Write the range to the nearest station, where the last step was kept."""
     kept, least = room.scalar[SPARE], room.scalar[LOW]
-    note_nearest(room, least)
+    note_nearest(rows, room, least)
     for lane in range(LANES):
         nearest[lane] = least[lane] if every or kept[lane] != 0.0 else nearest[lane]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -228,8 +228,6 @@ class Room(NamedTuple):
         Lower and upper bounds, and what they bound.
     registers : array (r, W)
         Scratch.
-    own : named tuple
-        What the evaluator of the rows keeps.
     """
 
     d: int
@@ -253,11 +251,10 @@ class Room(NamedTuple):
     pivot: Array
     side: Array
     registers: Array
-    own: Any
 
 
 @compiled
-def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, others: int) -> Room:
+def make_room(model: Model, stations: int, d: int, unknowns: int, others: int) -> Room:
     """Return the memory of a block of problems, for numbers of stations, coordinates, unknowns and linear rows."""
     s, p, m = stations, unknowns, model.row.shape[1]
     c, k = model.admission.exact, model.admission.level.shape[1]
@@ -283,5 +280,4 @@ def make_room(model: Model, own: Any, stations: int, d: int, unknowns: int, othe
         np.zeros((2, c, LANES)),
         np.zeros((3, k, LANES)),
         np.zeros((model.admission.tapes.registers, LANES)),
-        own,
     )

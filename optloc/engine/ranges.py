@@ -72,11 +72,13 @@ class RangeRows(NamedTuple):
     offset: Array
 
 
-class RangeRoom(NamedTuple):
-    """Memory for a block of problems of s stations.
+class RangeBlock(NamedTuple):
+    """Rows with the memory for a block of problems of s stations.
 
     Parameters
     ----------
+    rows : RangeRows
+        Rows of all problems.
     r, unit : array (s, W), (s, d, W)
         Ranges, and unit vectors from the stations.
     residual : array (q, W)
@@ -89,6 +91,7 @@ class RangeRoom(NamedTuple):
         Eigenvalues of that map's square.
     """
 
+    rows: RangeRows
     r: Array
     unit: Array
     residual: Array
@@ -110,10 +113,11 @@ def count_lifted(rows: RangeRows) -> int:
 
 
 @compiled
-def keep(model: Model, rows: RangeRows, stations: int, d: int, size: int) -> RangeRoom:
-    """Return the memory for a block of problems."""
+def keep(model: Model, rows: RangeRows, stations: int, d: int, size: int) -> RangeBlock:
+    """Return the rows with the memory for a block of problems."""
     q = len(rows.K)
-    return RangeRoom(
+    return RangeBlock(
+        rows,
         np.zeros((stations, LANES)),
         np.zeros((stations, d, LANES)),
         np.zeros((q, LANES)),
@@ -124,44 +128,44 @@ def keep(model: Model, rows: RangeRows, stations: int, d: int, size: int) -> Ran
 
 
 @compiled
-def load(rows: RangeRows, z: Array, room: Room, anew: bool) -> None:
+def load(block: RangeBlock, z: Array, room: Room, anew: bool) -> None:
     """Write the cost of the loops; of new stations what they say of infinity."""
-    first, loop = len(room.place) + len(rows.K) + len(rows.start), room.scalar[LOOP]
+    first, loop = len(room.place) + len(block.rows.K) + len(block.rows.start), room.scalar[LOOP]
     for lane in range(LANES):
         loop[lane] = 0.0
     for i in range(first, len(room.value)):
         for lane in range(LANES):
             loop[lane] += room.value[i, lane] * room.value[i, lane]
-    if anew and rows.level:
-        _see_far(rows, room)
+    if anew and block.rows.level:
+        _see_far(block, room)
 
 
 @compiled
-def minimise_start(model: Model, rows: RangeRows, room: Room, first: bool) -> None:
+def minimise_start(model: Model, block: RangeBlock, room: Room, first: bool) -> None:
     """Write the minimiser of the weighed squared-range rows."""
     minimise(room.rows, model.reference >= 0, room.y, room.scalar[SOLVABLE], room.work)
 
 
 @compiled
-def scout(model: Model, rows: RangeRows, room: Room) -> None:
+def scout(model: Model, block: RangeBlock, room: Room) -> None:
     """Do nothing: sums of ranges that lack rows are run as tapes."""
 
 
 @compiled
-def complete(rows: RangeRows, room: Room) -> None:
+def complete(block: RangeBlock, room: Room) -> None:
     """Do nothing: the position is all that is refined."""
 
 
 @compiled
-def equations(rows: RangeRows, room: Room, shift: int) -> None:
+def equations(block: RangeBlock, room: Room, shift: int) -> None:
     """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
     s, vector, scalar = len(room.place), room.vector, room.scalar
     _equations(
-        rows.K,
-        room.value[s : s + len(rows.K)],
+        block.rows.K,
+        room.value[s : s + len(block.rows.K)],
         room.place,
-        room.own.r,
-        room.own.unit,
+        block.r,
+        block.unit,
         vector[X + shift],
         vector[ROW],
         scalar[SPARE],
@@ -173,27 +177,27 @@ def equations(rows: RangeRows, room: Room, shift: int) -> None:
 
 
 @compiled
-def costs(rows: RangeRows, room: Room) -> None:
+def costs(block: RangeBlock, room: Room) -> None:
     """Write the cost at TRIAL to COST_TRIAL: a third of the work of `equations`."""
     s, scalar = len(room.place), room.scalar
-    u, trial = room.value[s : s + len(rows.K)], room.vector[TRIAL]
-    _costs(rows.K, u, room.place, trial, room.own.r, scalar[SPARE], scalar[LOOP], scalar[COST_TRIAL])
+    u, trial = room.value[s : s + len(block.rows.K)], room.vector[TRIAL]
+    _costs(block.rows.K, u, room.place, trial, block.r, scalar[SPARE], scalar[LOOP], scalar[COST_TRIAL])
 
 
 @compiled
-def bow_of(rows: RangeRows, room: Room) -> float:
+def bow_of(block: RangeBlock, room: Room) -> float:
     """Return the curvature b of all residuals: over a step D at range r they change by up to b D^2 / r more.
 
     A range exceeds its linear prediction by 0 to ``D^2 / 2 r``. All residuals together are off by
     ``norm(K) sqrt(s) D^2 / 2 r`` at most. Where a common error of all ranges has no effect, half of it is the limit.
     """
-    return float(rows.norm * np.sqrt(len(room.own.r)) * (0.25 if rows.level else 0.5))
+    return float(block.rows.norm * np.sqrt(len(block.r)) * (0.25 if block.rows.level else 0.5))
 
 
 @compiled
-def note_nearest(room: Room, least: Array) -> None:
+def note_nearest(block: RangeBlock, room: Room, least: Array) -> None:
     """Write the range to the nearest station (W,)."""
-    r = room.own.r
+    r = block.r
     for lane in range(LANES):
         least[lane] = np.inf
     for i in range(len(r)):
@@ -202,38 +206,38 @@ def note_nearest(room: Room, least: Array) -> None:
 
 
 @compiled
-def search_infinity(model: Model, rows: RangeRows, room: Room) -> None:
+def search_infinity(model: Model, block: RangeBlock, room: Room) -> None:
     """Write what infinity costs: that is known in closed form."""
-    measure_infinity(rows, room)
+    measure_infinity(block, room)
 
 
 @compiled
-def finish(rows: RangeRows, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+def finish(block: RangeBlock, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Write emission times and station errors at row X."""
-    if not len(rows.start) and not len(rows.wander):
+    if not len(block.rows.start) and not len(block.rows.wander):
         return
-    ranges(room.place, room.vector[X], room.own.r, room.own.unit, room.scalar[SPARE])
-    _emit(rows, z, room, size, mark, marked, x)
-    if len(rows.wander):
-        _write_residuals(rows, room)
-        for i in range(len(rows.offset)):
-            if rows.offset[i] >= 0:
-                _shift(rows, room, i, size, mark, marked, x)
+    ranges(room.place, room.vector[X], block.r, block.unit, room.scalar[SPARE])
+    _emit(block, z, room, size, mark, marked, x)
+    if len(block.rows.wander):
+        _write_residuals(block, room)
+        for i in range(len(block.rows.offset)):
+            if block.rows.offset[i] >= 0:
+                _shift(block, room, i, size, mark, marked, x)
 
 
 @compiled
-def _emit(rows: RangeRows, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+def _emit(block: RangeBlock, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Write the emission times: less the ranges' share, plus the measurement that they count from."""
-    item, r, sent, start, d = room.item, room.own.r, room.own.sent, rows.start, room.d
-    first = len(room.place) + len(rows.K)
+    item, r, sent, start, d = room.item, block.r, block.sent, block.rows.start, room.d
+    first = len(room.place) + len(block.rows.K)
     for j in range(len(start)):
         at = start[j]
         for lane in range(LANES):
-            since = z[item[lane], at] - rows.correction[at] if at >= 0 else 0.0
+            since = z[item[lane], at] - block.rows.correction[at] if at >= 0 else 0.0
             sent[j, lane] = room.value[first + j, lane] + since
         for k in range(len(r)):
             for lane in range(LANES):
-                sent[j, lane] -= rows.travel[j, k] * r[k, lane]
+                sent[j, lane] -= block.rows.travel[j, k] * r[k, lane]
     for lane in range(size):
         if not marked or mark[lane] != 0.0:
             for j in range(len(start)):
@@ -241,9 +245,9 @@ def _emit(rows: RangeRows, z: Array, room: Room, size: int, mark: Array, marked:
 
 
 @compiled
-def _write_residuals(rows: RangeRows, room: Room) -> None:
+def _write_residuals(block: RangeBlock, room: Room) -> None:
     """Write the whitened residuals of ranges that are at hand."""
-    K, residual, r, s = rows.K, room.own.residual, room.own.r, len(room.place)
+    K, residual, r, s = block.rows.K, block.residual, block.r, len(room.place)
     for k in range(len(K)):
         for lane in range(LANES):
             residual[k, lane] = room.value[s + k, lane]
@@ -255,9 +259,9 @@ def _write_residuals(rows: RangeRows, room: Room) -> None:
 
 
 @compiled
-def _shift(rows: RangeRows, room: Room, station: int, size: int, mark: Array, marked: bool, x: Array) -> None:
+def _shift(block: RangeBlock, room: Room, station: int, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Write the error of a station: along the line to the target, by what the residuals say of its range."""
-    K, residual, unit, first = rows.K, room.own.residual, room.own.unit, rows.offset[station]
+    K, residual, unit, first = block.rows.K, block.residual, block.unit, block.rows.offset[station]
     for lane in range(size):
         if not marked or mark[lane] != 0.0:
             longer = 0.0
@@ -265,7 +269,7 @@ def _shift(rows: RangeRows, room: Room, station: int, size: int, mark: Array, ma
                 longer += K[k, station] * residual[k, lane]
             for j in range(room.d):
                 # a step towards the target makes the range shorter
-                x[room.item[lane], first + j] = -rows.wander[station] * longer * unit[station, j, lane]
+                x[room.item[lane], first + j] = -block.rows.wander[station] * longer * unit[station, j, lane]
 
 
 @compiled
@@ -374,14 +378,14 @@ def _costs(K: Array, u: Array, place: Array, x: Array, r: Array, left: Array, lo
 
 
 @compiled
-def bend(rows: RangeRows, room: Room) -> None:
+def bend(block: RangeBlock, room: Room) -> None:
     """Write half the second derivatives of the cost to H_TRIAL: the information, less what bent fronts do to it."""
-    vector, matrix, scalar, K = room.vector, room.matrix, room.scalar, rows.K
+    vector, matrix, scalar, K = room.vector, room.matrix, room.scalar, block.rows.K
     s, d = room.place.shape[:2]
     left, pull = scalar[SPARE], scalar[HIGH]
-    out, residual, r, unit = matrix[H_TRIAL], room.own.residual, room.own.r, room.own.unit
+    out, residual, r, unit = matrix[H_TRIAL], block.residual, block.r, block.unit
     ranges(room.place, vector[X], r, unit, left)
-    _write_residuals(rows, room)
+    _write_residuals(block, room)
     for i in range(d):
         for j in range(i + 1):
             for lane in range(LANES):
@@ -414,26 +418,26 @@ _UNIT = 1e-12
 
 
 @compiled
-def _see_far(rows: RangeRows, room: Room) -> None:
+def _see_far(block: RangeBlock, room: Room) -> None:
     """Write the map from directions to whitened rows, turned to its principal axes, and its squared singular values."""
     s, d = room.place.shape[:2]
-    flat = room.own.flat
+    flat = block.flat
     for k in range(len(flat)):
         for j in range(d):
             for lane in range(LANES):
                 flat[k, j, lane] = 0.0
             for i in range(s):
-                part = rows.K[k, i]
+                part = block.rows.K[k, i]
                 if part != 0.0:
                     for lane in range(LANES):
                         flat[k, j, lane] += part * room.place[i, j, lane]
-    _turn_to_axes(room)
+    _turn_to_axes(block, room)
 
 
 @compiled
-def _turn_to_axes(room: Room) -> None:
+def _turn_to_axes(block: RangeBlock, room: Room) -> None:
     """Turn the map to the principal axes of its square."""
-    flat, stiff, row = room.own.flat, room.own.stiff, room.vector[MOVE]
+    flat, stiff, row = block.flat, block.stiff, room.vector[MOVE]
     work, axes, d = room.axes[EIGEN], room.axes[AXES], room.d
     for i in range(d):
         for j in range(i + 1):
@@ -459,28 +463,28 @@ def _turn_to_axes(room: Room) -> None:
 
 
 @compiled
-def measure_infinity(rows: RangeRows, room: Room) -> None:
+def measure_infinity(block: RangeBlock, room: Room) -> None:
     """Write the least cost at infinity to BEYOND: exact where it is within `BEYOND_DOUBT` of FIX_COST, else a bound.
 
     Parameters
     ----------
-    rows : RangeRows
-        Of all problems.
+    block : RangeBlock
+        Rows and memory.
     room : Room
         LOOP, FIX_COST and what `_see_far` wrote in; rows of scratch are overwritten.
     """
     scalar, vector = room.scalar, room.vector
     out = scalar[BEYOND]
-    if not rows.level:
+    if not block.rows.level:
         for lane in range(LANES):
             out[lane] = np.inf
         return
     s = len(room.place)
-    u = room.value[s : s + len(rows.K)]
+    u = room.value[s : s + len(block.rows.K)]
     total, least, more, todo = scalar[HIGH], scalar[LOW], scalar[SHARE], scalar[COST_TRIAL]
     g, gap = vector[TRIAL], vector[DIAGONAL]
     d = len(g)
-    _begin(u, room, g, gap, total, least, more)
+    _begin(u, block, room, g, gap, total, least, more)
     for _ in range(_STEPS):
         if not _step(scalar, g, gap, total, least, more, out, todo):
             break
@@ -495,13 +499,15 @@ def measure_infinity(rows: RangeRows, room: Room) -> None:
                 # a direction of no pull along an axis of no stiffness stays zero: what length is missing comes below
                 y[j, lane] = g[j, lane] / (gap[j, lane] + more[lane]) if g[j, lane] != 0.0 else 0.0
         _lengthen(y, gap, scalar[SPARE])
-        _weigh(u, room, y, scalar[SPARE], scalar[HIGH])
+        _weigh(u, block, room, y, scalar[SPARE], scalar[HIGH])
         for lane in range(LANES):
             out[lane] = scalar[HIGH, lane] if todo[lane] != 0.0 else out[lane]
 
 
 @compiled
-def _begin(u: Array, room: Room, g: Array, gap: Array, total: Array, least: Array, more: Array) -> None:
+def _begin(
+    u: Array, block: RangeBlock, room: Room, g: Array, gap: Array, total: Array, least: Array, more: Array
+) -> None:
     """Write g, gaps of the eigenvalues, the cost without ranges, the least eigenvalue, and the first multiplier.
 
     Multipliers are counted from minus the least eigenvalue: there nothing cancels. The first is as large as the longest
@@ -512,17 +518,17 @@ def _begin(u: Array, room: Room, g: Array, gap: Array, total: Array, least: Arra
         total[lane], least[lane], more[lane] = room.scalar[LOOP, lane], np.inf, 0.0
     for j in range(d):
         for lane in range(LANES):
-            least[lane] = min(least[lane], room.own.stiff[j, lane])
+            least[lane] = min(least[lane], block.stiff[j, lane])
             g[j, lane] = 0.0
     for k in range(q):
         for lane in range(LANES):
             total[lane] += u[k, lane] * u[k, lane]
         for j in range(d):
             for lane in range(LANES):
-                g[j, lane] -= room.own.flat[k, j, lane] * u[k, lane]
+                g[j, lane] -= block.flat[k, j, lane] * u[k, lane]
     for j in range(d):
         for lane in range(LANES):
-            gap[j, lane] = room.own.stiff[j, lane] - least[lane]
+            gap[j, lane] = block.stiff[j, lane] - least[lane]
             more[lane] = max(more[lane], abs(g[j, lane]) - gap[j, lane])
 
 
@@ -574,7 +580,7 @@ def _lengthen(y: Array, gap: Array, spare: Array) -> None:
 
 
 @compiled
-def _weigh(u: Array, room: Room, y: Array, left: Array, cost: Array) -> None:
+def _weigh(u: Array, block: RangeBlock, room: Room, y: Array, left: Array, cost: Array) -> None:
     """Write the cost of remote emitters in directions y (d, W): from residuals, which cancel less than the bound."""
     for lane in range(LANES):
         cost[lane] = room.scalar[LOOP, lane]
@@ -583,6 +589,6 @@ def _weigh(u: Array, room: Room, y: Array, left: Array, cost: Array) -> None:
             left[lane] = u[k, lane]
         for j in range(len(y)):
             for lane in range(LANES):
-                left[lane] += room.own.flat[k, j, lane] * y[j, lane]
+                left[lane] += block.flat[k, j, lane] * y[j, lane]
         for lane in range(LANES):
             cost[lane] += left[lane] * left[lane]

@@ -71,9 +71,22 @@ class TapeRows(NamedTuple):
     bounded: bool
 
 
-class TapeRoom(NamedTuple):
-    """Memory of a block: addresses in the memory of lanes, this memory, registers, candidates and their scratch."""
+class TapeBlock(NamedTuple):
+    """Rows with the memory of a block.
 
+    Parameters
+    ----------
+    rows : TapeRows
+        Rows of all problems.
+    at, m : Cells, array
+        Addresses in the memory of lanes, and this memory.
+    r : array
+        Registers.
+    spot, w : array
+        Candidates, and scratch for them.
+    """
+
+    rows: TapeRows
     at: Cells
     m: Array
     r: Array
@@ -94,42 +107,43 @@ def count_lifted(rows: TapeRows) -> int:
 
 
 @compiled
-def keep(model: Model, rows: TapeRows, stations: int, d: int, size: int) -> TapeRoom:
-    """Return the memory for a block of problems."""
+def keep(model: Model, rows: TapeRows, stations: int, d: int, size: int) -> TapeBlock:
+    """Return the rows with the memory for a block of problems."""
     at = arrange(rows.tables, rows.numbers, size)
     m, r = memory(rows.tables, at, LANES)
     if rows.lifts.tapes.registers > len(r):
         r = np.empty((rows.lifts.tapes.registers, r.shape[1]))
     spot, w = np.zeros((CANDIDATES, d + 1, LANES)), np.zeros((VECTORS, DEGREE + 2))
-    return TapeRoom(at, m, r, spot, w)
+    return TapeBlock(rows, at, m, r, spot, w)
 
 
 @compiled
-def load(rows: TapeRows, z: Array, room: Room, anew: bool) -> None:
+def load(block: TapeBlock, z: Array, room: Room, anew: bool) -> None:
     """Bring the numbers of a block into its lanes."""
-    c, at, m = rows.numbers, room.own.at, room.own.m
+    c, at, m = block.rows.numbers, block.at, block.m
     for lane in range(LANES):
         i = room.item[lane]
         load_lane(m, lane, i, c.source, c.white, c.prior, c.observed, c.present)
         for j in range(z.shape[1]):
-            m[at.observed + j, lane] = z[i, j] - rows.correction[j]
+            m[at.observed + j, lane] = z[i, j] - block.rows.correction[j]
         room.scalar[BLUR, lane] = blur_of(c.sigma, c.size, m, at, lane, i)
 
 
 @compiled
-def minimise_start(model: Model, rows: TapeRows, room: Room, first: bool) -> None:
+def minimise_start(model: Model, block: TapeBlock, room: Room, first: bool) -> None:
     """Write the minimiser of the weighed squared-range rows, and of the other linear rows."""
-    _lift(rows.lifts, room, first)
-    if rows.lifts.flat:
+    _lift(block, room, first)
+    if block.rows.lifts.flat:
         _minimise_flat(room)
     else:
         minimise(room.rows, model.reference >= 0, room.y, room.scalar[SOLVABLE], room.work)
 
 
 @compiled
-def _lift(lifts: Lifts, room: Room, first: bool) -> None:
+def _lift(block: TapeBlock, room: Room, first: bool) -> None:
     """Write the linear rows behind the range rows, weighed by their error at the last answer."""
-    s, r, scale, spare = len(room.place), room.own.r, room.scalar[SCALE], room.scalar[SPARE]
+    lifts, r = block.rows.lifts, block.r
+    s, scale, spare = len(room.place), room.scalar[SCALE], room.scalar[SPARE]
     together = max(1, r.shape[1] // LANES)
     for lane in range(LANES):
         spare[lane] = 1.0 / scale[lane]
@@ -211,28 +225,28 @@ _MOST = 1e13
 
 
 @compiled
-def scout(model: Model, rows: TapeRows, room: Room) -> None:
+def scout(model: Model, block: TapeBlock, room: Room) -> None:
     """Write the best candidates to rows X and OTHER."""
     for k in range(room.d, room.vector.shape[1]):
         for lane in range(LANES):
-            room.vector[X, k, lane] = rows.base[k]
+            room.vector[X, k, lane] = block.rows.base[k]
     if model.start == BY_HEIGHT:
-        meet_ellipsoid(model, room, room.own.w, room.own.spot)
+        meet_ellipsoid(model, room, block.w, block.spot)
     else:
-        look_around(model, rows, room, room.own.spot, RINGS)
-    refine_candidates(model, rows, room, room.own.spot)
+        look_around(model, block, room, block.spot, RINGS)
+    refine_candidates(model, block, room, block.spot)
 
 
 @compiled
-def complete(rows: TapeRows, room: Room) -> None:
+def complete(block: TapeBlock, room: Room) -> None:
     """Write the other unknowns that fit the position best: exact where rows are linear in them."""
     vector, d, p = room.vector, room.d, room.vector.shape[1]
     if p == d:
         return
     for k in range(d, p):
         for lane in range(LANES):
-            vector[X, k, lane] = rows.base[k]
-    equations(rows, room, 0)
+            vector[X, k, lane] = block.rows.base[k]
+    equations(block, room, 0)
     _copy(room, 0)
     left, right = room.matrix[REST], vector[MOVE]
     eliminate_last(left, right, room.scalar[SPARE], vector[DIAGONAL], d)
@@ -260,10 +274,10 @@ def _copy(room: Room, shift: int) -> None:
 
 
 @compiled
-def equations(rows: TapeRows, room: Room, shift: int) -> None:
+def equations(block: TapeBlock, room: Room, shift: int) -> None:
     """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
-    m = _evaluate(rows, room, shift)
-    p, last = room.vector.shape[1], room.own.at.after
+    m = _evaluate(block, room, shift)
+    p, last = room.vector.shape[1], block.at.after
     matrix, vector = room.matrix[H + shift], room.vector[G + shift]
     for i in range(p):
         for j in range(i + 1):
@@ -276,32 +290,32 @@ def equations(rows: TapeRows, room: Room, shift: int) -> None:
 
 
 @compiled
-def _evaluate(rows: TapeRows, room: Room, shift: int) -> Any:
+def _evaluate(block: TapeBlock, room: Room, shift: int) -> Any:
     """Write the equations at row X, or at TRIAL with shift 1, into the memory of the lanes, which is returned."""
-    m = _enter_place(room, shift)
-    gather(rows.tables, rows.numbers, m, room.own.r, room.own.at, True, LANES)
+    m = _enter_place(block, room, shift)
+    gather(block.rows.tables, block.rows.numbers, m, block.r, block.at, True, LANES)
     return m
 
 
 @compiled
-def _enter_place(room: Room, shift: int) -> Any:
+def _enter_place(block: TapeBlock, room: Room, shift: int) -> Any:
     """Write row X, or TRIAL with shift 1, into the memory of the lanes, which is returned."""
-    own, x, origin = room.own, room.vector[X + shift], room.vector[ORIGIN]
+    x, origin = room.vector[X + shift], room.vector[ORIGIN]
     for i in range(room.vector.shape[1]):
         for lane in range(LANES):
-            own.m[own.at.trial + i, lane] = x[i, lane] + origin[i, lane]
-    return own.m
+            block.m[block.at.trial + i, lane] = x[i, lane] + origin[i, lane]
+    return block.m
 
 
 @compiled
-def costs(rows: TapeRows, room: Room) -> None:
+def costs(block: TapeBlock, room: Room) -> None:
     """Write the cost at TRIAL, the least over the other unknowns, to COST_TRIAL."""
-    p, d, at = room.vector.shape[1], room.d, room.own.at.after
+    p, d, at = room.vector.shape[1], room.d, block.at.after
     if p == d:
-        m = _enter_place(room, 1)
-        price(rows.tables, rows.numbers, m, room.own.r, room.own.at, LANES)
+        m = _enter_place(block, room, 1)
+        price(block.rows.tables, block.rows.numbers, m, block.r, block.at, LANES)
     else:
-        m = _evaluate(rows, room, 1)
+        m = _evaluate(block, room, 1)
     for lane in range(LANES):
         room.scalar[COST_TRIAL, lane] = m[at + p * (p + 2), lane]
     if p == d:
@@ -317,20 +331,20 @@ def costs(rows: TapeRows, room: Room) -> None:
 
 
 @compiled
-def bow_of(rows: TapeRows, room: Room) -> float:
+def bow_of(block: TapeBlock, room: Room) -> float:
     """Return infinity: tapes have no bound of their curvature."""
     return np.inf
 
 
 @compiled
-def note_nearest(room: Room, least: Array) -> None:
+def note_nearest(block: TapeBlock, room: Room, least: Array) -> None:
     """Write that no station is near."""
     for lane in range(LANES):
         least[lane] = np.inf
 
 
 @compiled
-def bend(rows: TapeRows, room: Room) -> None:
+def bend(block: TapeBlock, room: Room) -> None:
     """Write the information to H_TRIAL: tapes have first derivatives only."""
     p = room.vector.shape[1]
     for i in range(p):
@@ -340,21 +354,21 @@ def bend(rows: TapeRows, room: Room) -> None:
 
 
 @compiled
-def measure_infinity(rows: TapeRows, room: Room) -> None:
+def measure_infinity(block: TapeBlock, room: Room) -> None:
     """Write infinity where no far position fits, else NaN: not measured."""
     for lane in range(LANES):
-        room.scalar[BEYOND, lane] = np.inf if rows.bounded else np.nan
+        room.scalar[BEYOND, lane] = np.inf if block.rows.bounded else np.nan
 
 
 @compiled
-def search_infinity(model: Model, rows: TapeRows, room: Room) -> None:
+def search_infinity(model: Model, block: TapeBlock, room: Room) -> None:
     """Write to BEYOND what infinity costs: a search, for fixes that are bent."""
-    if rows.bounded:
-        measure_infinity(rows, room)
+    if block.rows.bounded:
+        measure_infinity(block, room)
     else:
-        search_sphere(model, rows, room, room.own.spot)
+        search_sphere(model, block, room, block.spot)
 
 
 @compiled
-def finish(rows: TapeRows, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+def finish(block: TapeBlock, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Do nothing: all unknowns are refined."""

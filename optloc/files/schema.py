@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
+from optloc.base.types import FormName
 from optloc.base.units import (
     LARGEST,
     SI_UNIT,
@@ -319,7 +320,7 @@ class BiasTable(_Table):
 
     name: str = Field(min_length=1)
     """Its name."""
-    form: Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"] = "offset"
+    form: FormName = "offset"
     """Added; times the measured quantity; times the seconds of the run; a turn of the station's axes; the seconds by
     which the station is further along its course; or added, and another at each epoch: a random walk, as of a clock, or
     a smooth function of time."""

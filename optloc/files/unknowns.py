@@ -29,8 +29,9 @@ from optloc.files.schema import (
 from optloc.files.stations import spread, survey
 from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, reported, speed, visible
-from optloc.problem.bias import changing, family, prior_shape
+from optloc.problem.bias import family
 from optloc.problem.clocks import clock_densities
+from optloc.problem.forms import FORMS, BiasForm, complete, form_of
 from optloc.problem.validation import check_polygon, like
 
 # Derivatives of the position that a motion estimates.
@@ -82,7 +83,7 @@ def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str |
     """Return why the times of the epochs matter, or None."""
     if any(motion.order > 0 and motion.span == "run" and motion.known is None for motion in motions):
         return "a moving target"
-    return next((f"a {bias.form}" for bias in biases if bias.form in ("drift", "walk", "spline")), None)
+    return next((form.noun for bias in biases if (form := FORMS[bias.form]).changes), None)
 
 
 # Targets whose positions are given, for calibration: their tables are read like those of stations.
@@ -205,9 +206,10 @@ def bias_of(
         if np.isin(bias.row, numbers).any()
     }
     # epochs without times are refused where the problem is made
-    bias = changing(bias, epochs.clock, where, **_change(table, [units for units, _ in spelled], where))
-    mean, sigma = _prior(table, [units for units, _ in spelled], prior_shape(bias, dimension), where)
-    return replace(bias, mean=mean, sigma=sigma), _unit_to_read(table.form, spelled, where)
+    bias = complete(bias, epochs.clock, where, **_change(table, [units for units, _ in spelled], where))
+    form = form_of(bias)
+    mean, sigma = _prior(table, form, [units for units, _ in spelled], form.shape(bias, dimension), where)
+    return replace(bias, mean=mean, sigma=sigma), _unit_to_read(form, spelled, where)
 
 
 def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array, Units, str]], where: str) -> None:
@@ -215,12 +217,12 @@ def _check_sense(bias: Bias, rows: Sequence[Rows], written: Sequence[tuple[Array
     ends = np.cumsum([block.count for block in rows])
     touched = {int(i) for i in np.unique(np.searchsorted(ends, bias.row, side="right"))}
     senses = {rows[i].sense for i in touched if rows[i].kind == "azimuth"}
-    if len(senses) > 1 and bias.form != "time":
+    if len(senses) > 1 and form_of(bias).of_readings:
         what = "it touches azimuths that are counted clockwise and others that are counted anticlockwise"
         advice = "count all of them one way, or name with members who is read which way"
         raise InvalidProblem(what, where, advice)
     north = any(units.convention != "east-counterclockwise" for n, units, _ in written if np.isin(bias.row, n).any())
-    if bias.form == "scale" and north:
+    if form_of(bias).enters == "scales" and north:
         what = "a scale of bearings would count from the x axis, not from north"
         raise InvalidProblem(what, where, 'use the form "offset", or azimuth = "east-counterclockwise"')
 
@@ -259,27 +261,27 @@ def _density(text: str, power: int, units: Units, where: str) -> float:
     return float(value) * size.factor**2
 
 
-def _unit_to_read(form: str, spelled: Iterable[tuple[Units, str]], where: str) -> tuple[str, float]:
+def _unit_to_read(form: BiasForm, spelled: Iterable[tuple[Units, str]], where: str) -> tuple[str, float]:
     """Return the unit of an offset or drift of rows that are written in one unit, and its SI size; else empty."""
     sizes = {(name, units.conversion(name, where)) for units, name in spelled}
     (name, size), *more = sizes
-    if more or form not in ("offset", "drift", "walk", "spline") or size.logarithmic or size.factor == 1.0:
+    if more or form.quantity is not None or size.logarithmic or size.factor == 1.0:
         return "", 1.0
-    return f"{name}/s" if form == "drift" else name, size.factor
+    return f"{name}/s" if form.rate else name, size.factor
 
 
-def _prior(table: BiasTable, rows: Sequence[Units], shape: tuple[int, ...], where: str) -> tuple[Array, Array | None]:
-    # A scale is a number whatever the rows measure, a rotation an angle.
-    own: dict[str, Quantity] = {"scale": "plain", "rotation": "angle", "time": "time"}
+def _prior(
+    table: BiasTable, form: BiasForm, rows: Sequence[Units], shape: tuple[int, ...], where: str
+) -> tuple[Array, Array | None]:
     # All rows of a bias are of one quantity; carriers may differ from table to table.
     carriers = {units.carrier for units in rows}
-    units = replace(rows[0], quantity=own.get(table.form, rows[0].quantity))
+    units = replace(rows[0], quantity=form.quantity or rows[0].quantity)
 
     def si(value: float | str, key: str) -> tuple[float, Conversion]:
         place, text = join(where, f"key {key!r}"), value
-        bare = "1" if units.quantity in {"plain", "ratio"} and table.form != "drift" else None
+        bare = "1" if units.quantity in {"plain", "ratio"} and not form.rate else None
         # A drift has the unit of its rows per second, or per second squared of a drift of a rate.
-        if table.form == "drift":
+        if form.rate:
             number, _, unit = str(value).strip().partition(" ")
             amount, slash, _ = unit.replace("^2", "/s").rpartition("/s")
             if not slash:

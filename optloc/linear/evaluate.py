@@ -11,13 +11,13 @@ import numpy as np
 from optloc.base.arrays import Portable, foreign, gather, library, placed
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Rows
+from optloc.base.types import Array, Bias, Rows
 from optloc.linear.courses import carried, elapsed, over_ground, to_ecef, turned_back
 from optloc.models import MODELS, Model, Point
 from optloc.models.medium import Atmosphere
 from optloc.models.primitives import Jet, geodetic_normal, rotate, wrap
 from optloc.problem.bias import course
-from optloc.problem.clocks import effects
+from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, emission_name, state_names
 from optloc.problem.problem import Problem
 
@@ -152,13 +152,12 @@ def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
         raise InvalidProblem("the row names no target", where, "give the index of its target")
     feeds = [*_motion_feeds(problem, block, model), *_station_feeds(problem, block, model)]
     feeds += [*_turn_feeds(problem, block, start), *_course_feeds(problem, block, model, start)]
-    return BlockLinks(
-        block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start)
-    )
+    gains, adds = _terms(problem, block, start, "scales"), _adds(problem, block, start)
+    return BlockLinks(block, model, tuple(feeds), gains, adds)
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
-    parts = [_terms(problem, block, start, ("offset", "drift", "spline", "walk"))]
+    parts = [_terms(problem, block, start, "adds")]
     for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)
         column = columns(problem.layout, emission_name(target, len(problem.motions)), block.epoch[rows])
@@ -166,18 +165,21 @@ def _adds(problem: Problem, block: Rows, start: int) -> Terms:
     return _append(parts)
 
 
-def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) -> Terms:
+def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
     parts = [Terms(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
-    for bias in problem.biases:
-        if bias.form not in forms:
-            continue
+    for bias in _entering(problem, enters):
         inside = (bias.row >= start) & (bias.row < start + block.count)
         rows, epoch = bias.row[inside] - start, block.epoch[bias.row[inside] - start]
         own = replace(bias, member=bias.member[inside], coefficient=bias.coefficient[inside])
-        entry, factor = effects(own, problem.times, problem.origin, epoch)
+        entry, factor = form_of(bias).effects(own, problem.times, problem.origin, epoch)
         column = np.take_along_axis(columns(problem.layout, bias.name, epoch), entry, axis=1)
         parts.append(Terms(np.repeat(rows, entry.shape[1]), column.ravel(), factor.ravel()))
     return _append(parts)
+
+
+def _entering(problem: Problem, enters: str) -> list[Bias]:
+    """Return the biases that enter rows in a way, see `BiasForm.enters`."""
+    return [bias for bias in problem.biases if form_of(bias).enters == enters]
 
 
 def _append(parts: list[Terms]) -> Terms:
@@ -209,7 +211,7 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
     # Errors that are noise are no unknowns: `optloc.linear.normal` puts them into the covariance of rows.
     d, feeds = problem.dimension, []
-    for name, _, _ in problem.stations.errors if problem.stations.estimated else ():
+    for name, _, _ in problem.stations.errors if problem.stations.unknown_for else ():
         rates = name == "station velocities"
         if rates and not model.velocity:
             continue
@@ -224,9 +226,7 @@ def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
     feeds = []
-    for bias in problem.biases:
-        if bias.form != "rotation":
-            continue
+    for bias in _entering(problem, "turns"):
         left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
         turns = 1 if problem.dimension == 2 else 3
         while left.size:  # a row turned by several members takes one pass for each: a feed holds a row once
@@ -242,9 +242,7 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
 def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> list[Feed]:
     """Return what seconds along a course add to places and rates of stations, to first order."""
     feeds: list[Feed] = []
-    for bias in problem.biases:
-        if bias.form != "time":
-            continue
+    for bias in _entering(problem, "moves"):
         rates = course(problem)
         inside = (bias.row >= start) & (bias.row < start + block.count)
         for side, station, place, rate in ((1.0, block.a, A, RATE_A), (-1.0, block.b, B, RATE_B)):

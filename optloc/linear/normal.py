@@ -15,6 +15,7 @@ from optloc.linear import chain
 from optloc.linear.evaluate import differentiate
 from optloc.linear.walks import chain_at, walks
 from optloc.models import MODELS
+from optloc.problem.forms import form_of
 from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, together, whiten
 from optloc.problem.problem import Problem
 
@@ -68,9 +69,7 @@ def depends_on_place(problem: Problem) -> bool:
     if not problem.stations.weighed:
         return False
     # Isotropic errors of ranges project to the same variance along every line of sight.
-    own = [c for name, _, c in problem.stations.errors if name == "stations"]
-    same = all(np.array_equal(c, np.eye(problem.dimension) * c[..., :1, :1]) for c in own)
-    return not same or any(MODELS[rows.kind].ranges is None for rows in problem.rows)
+    return not problem.stations.isotropic or any(MODELS[rows.kind].ranges is None for rows in problem.rows)
 
 
 def whitener_at(problem: Problem, x: Array) -> tuple[Whitener, ...]:
@@ -531,14 +530,14 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
         parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
     for bias in problem.biases:
         # what is known of walks ties epochs: `chain_at`
-        if bias.sigma is not None and bias.form != "walk":
+        if bias.sigma is not None and form_of(bias).steps is None:
             sigma = np.ravel(bias.sigma)
             # Members of a bias are independent of each other a priori.
             parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
     stations = problem.stations
-    for name, _, covariance in stations.errors if stations.estimated else ():
+    for name, _, covariance in stations.errors if stations.unknown_for else ():
         precision = _block_diagonal(linalg.inverse(covariance)[0])
-        if stations.span == "epoch":
+        if stations.unknown_for == "epoch":
             precision = precision[..., None, :, :]
         parts.append((name, np.zeros(precision.shape[-1]), precision))
     return parts

@@ -50,7 +50,8 @@ def present_unknowns(problem: Problem) -> Array:
     """Return the number of unknowns (...) that the rows present depend on; shared unknowns and walks all count."""
     layout = problem.layout
     states, emissions = _sizes(problem, set())
-    own = {name for name, _, _ in problem.stations.errors if problem.stations.span == "epoch"} | {*walk_names(problem)}
+    local = problem.stations.errors if problem.stations.unknown_for == "epoch" else ()
+    own = {name for name, _, _ in local} | {*walk_names(problem)}
     walked = problem.epochs * sum(slot.size for slot in layout.local if slot.name in own)
     return np.asarray(layout.n_shared + walked + _local_unknowns(problem, states, emissions))
 

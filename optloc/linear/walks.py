@@ -9,25 +9,20 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Bias
-from optloc.problem.clocks import process, rate_name
+from optloc.problem.clocks import state_of
+from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
 
 def walks(problem: Problem) -> tuple[Bias, ...]:
     """Return the biases of a problem that walk from epoch to epoch."""
-    return tuple(bias for bias in problem.biases if bias.form == "walk")
+    return tuple(bias for bias in problem.biases if form_of(bias).steps is not None)
 
 
 def walk_names(problem: Problem) -> tuple[str, ...]:
     """Return the names of the unknowns of epochs that walk: values, and rates."""
     return tuple(name for bias in walks(problem) for name in state_of(bias))
-
-
-def state_of(bias: Bias) -> tuple[str, ...]:
-    """Return the names of the values of a walk, and of its rates where it has some."""
-    assert bias.density is not None
-    return (bias.name, rate_name(bias.name))[: bias.density.shape[1]]
 
 
 def free_of(problem: Problem) -> int:
@@ -67,7 +62,8 @@ def chain_at(problem: Problem, x: Array) -> Chain:
     local = layout.split(x)[1]
     block, link = np.zeros((k, layout.n_local, layout.n_local)), np.zeros((k - 1, layout.n_local, layout.n_local))
     vector, cost = np.zeros(local.shape), np.zeros(x.shape[:-1])
-    for bias, place, F, W in _steps(problem):
+    for bias, place, F, Q in _steps(problem):
+        W = linalg.inverse(Q, 0.0)[0]
         state = local[..., place]  # (..., k, q, o)
         error = state[..., 1:, :, :] - (F[:, None] @ state[..., :-1, :, :, None])[..., 0]
         pull = (W @ error[..., None])[..., 0]
@@ -89,10 +85,11 @@ def chain_at(problem: Problem, x: Array) -> Chain:
 
 
 def _steps(problem: Problem) -> Iterator[tuple[Bias, Array, Array, Array]]:
-    """Yield each walk, the local columns (q, o) of its states, its transitions and the precisions of its steps."""
-    for bias in walks(problem):
-        F, Q = process(bias, problem.times)
-        yield bias, places(problem.layout, bias), F, linalg.inverse(Q, 0.0)[0]
+    """Yield each walk, the local columns (q, o) of its states, and the transitions and covariances of its steps."""
+    for bias in problem.biases:
+        steps = form_of(bias).steps
+        if steps is not None:
+            yield bias, places(problem.layout, bias), *steps(bias, problem.times)
 
 
 def places(layout: Layout, bias: Bias) -> Array:
@@ -124,8 +121,7 @@ def wander(problem: Problem, truth: Array, seed: int | np.random.SeedSequence, t
     shape = truth.shape if trials is None else (trials, *truth.shape)
     out = np.array(np.broadcast_to(truth, shape))
     local = out[..., problem.layout.n_shared :].reshape(*shape[:-1], problem.epochs, problem.layout.n_local)
-    for bias in walks(problem):
-        (F, Q), place = process(bias, problem.times), places(problem.layout, bias)
+    for _, place, F, Q in _steps(problem):
         # not by eigenvectors, as `optloc.linear.simulate.samples` says
         root = linalg.factor_semidefinite(Q)
         noise = (root @ rng.standard_normal((*shape[:-1], *Q.shape[:-1], 1)))[..., 0]

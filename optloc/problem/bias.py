@@ -10,14 +10,13 @@ import numpy as np
 
 from optloc.base.arrays import numbers
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array, Bias, Rows
-from optloc.models import MODELS, Model
+from optloc.base.types import Array, Bias, FormName, Rows
+from optloc.models import MODELS
 from optloc.models.primitives import rotate
-from optloc.problem.clocks import coefficients, density_of, effects, knots_over
+from optloc.problem.forms import FORMS, BiasForm, complete, form_of
 from optloc.problem.problem import Problem
 from optloc.problem.validation import check_unknowns
 
-Form = Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"]
 Per = Literal["station", "pair", "kind", "target"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
@@ -30,7 +29,7 @@ def with_bias(
     name: str,
     *,
     per: Per = "station",
-    form: Form = "offset",
+    form: FormName = "offset",
     kind: str | None = None,
     members: Members = None,
     mean: Any = 0.0,
@@ -83,37 +82,13 @@ def with_bias(
     """
     where = f"bias {name!r}"
     bias = family(problem.rows, problem.stations.names, name, per=per, form=form, kind=kind, members=members)
-    bias = changing(bias, problem.times, where, density=density, rate_density=rate_density, knots=knots)
-    shape = prior_shape(bias, problem.dimension)
+    bias = complete(bias, problem.times, where, density=density, rate_density=rate_density, knots=knots)
+    shape = FORMS[form].shape(bias, problem.dimension)
     centre = _each(0.0 if mean is None else mean, shape, where, "mean")
     spread = None if sigma is None else _each(sigma, shape, where, "sigma")
     made = replace(problem, biases=(*problem.biases, replace(bias, mean=centre, sigma=spread)))
     check_unknowns(made)
     return made
-
-
-def prior_shape(bias: Bias, dimension: int) -> tuple[int, ...]:
-    """Return the shape of the prior mean of a bias: one value a member, or one for each of its angles or knots."""
-    if bias.form == "spline":
-        assert bias.knots is not None
-        return (len(bias.members), coefficients(bias.knots))
-    return (len(bias.members), *((3,) if bias.form == "rotation" and dimension == 3 else ()))
-
-
-def changing(
-    bias: Bias, times: Array, where: str, *, density: Any = None, rate_density: Any = None, knots: Any = None
-) -> Bias:
-    """Return a bias with what its form needs to change in time; refuse what it does not need."""
-    needed = {"walk": ("density", "rate_density"), "spline": ("knots",)}.get(bias.form, ())
-    for name, value in (("density", density), ("rate_density", rate_density), ("knots", knots)):
-        if value is not None and name not in needed:
-            what = f"the form {bias.form} has no {name}"
-            raise InvalidProblem(
-                what, where, f"leave it out, or use the form {'spline' if name == 'knots' else 'walk'}"
-            )
-    if bias.form == "walk":
-        return replace(bias, density=density_of(density, rate_density, len(bias.members), where))
-    return replace(bias, knots=knots_over(times, knots, where)) if bias.form == "spline" else bias
 
 
 def family(
@@ -122,7 +97,7 @@ def family(
     name: str,
     *,
     per: Per = "station",
-    form: Form = "offset",
+    form: FormName = "offset",
     kind: str | None = None,
     members: Members = None,
     targets: Sequence[str] | None = None,
@@ -148,15 +123,13 @@ def family(
     if not name or name.partition("[")[0] in _TAKEN:
         advice = f"other unknowns are called {', '.join(_TAKEN)}"
         raise InvalidProblem(f"the name {name!r} is taken" if name else "the name is empty", where, advice)
-    for value, known, what in (
-        (per, get_args(Per), "per"),
-        (form, get_args(Form), "form"),
-    ):
+    for value, known, what in ((per, get_args(Per), "per"), (form, tuple(FORMS), "form")):
         if value not in known:
             raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
     # Who has an error decides how members are named, and with which sign a row feels it.
-    touched = _select_rows(rows, form, kind, where)
-    if form == "time" and per != "station":
+    found = FORMS[form]
+    touched = _select_rows(rows, found, kind, where)
+    if not found.of_readings and per != "station":
         raise InvalidProblem("a time along a course is one of a station", where, "use per = 'station', or groups")
     if per == "kind":
         if members is not None:
@@ -167,13 +140,13 @@ def family(
     elif per == "target":
         names, touches = _by_target(touched, targets, members, where)
     else:
-        names, touches = _by_station(touched, form, stations, members, where)
+        names, touches = _by_station(touched, found, stations, members, where)
     row, member, coefficient = (np.concatenate(parts) for parts in zip(*touches, strict=True))
     # A member without a row would be an unknown that nothing determines.
     idle = sorted(set(range(len(names))) - set(member.tolist()))
     if idle:
         raise InvalidProblem(f"{names[idle[0]]} touches no row", f"{where}, members", "leave it out")
-    if form != "time":
+    if found.of_readings:
         coefficient = coefficient * _sense(rows, row)
     return Bias(name, names, row, member, coefficient, form, np.zeros(1))
 
@@ -189,7 +162,7 @@ def _sense(rows: Sequence[Rows], touched: Array) -> float:
     return senses.pop() if len(senses) == 1 else 1.0
 
 
-def _select_rows(rows: Sequence[Rows], form: Form, kind: str | None, where: str) -> list[tuple[Rows, int]]:
+def _select_rows(rows: Sequence[Rows], form: BiasForm, kind: str | None, where: str) -> list[tuple[Rows, int]]:
     """Return the blocks of rows that a bias may touch, each with the global number of its first row."""
     starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
     kinds = [block.kind for block in rows]
@@ -198,21 +171,17 @@ def _select_rows(rows: Sequence[Rows], form: Form, kind: str | None, where: str)
     chosen = [
         (block, start)
         for block, start in zip(rows, starts, strict=False)
-        if kind == block.kind or (kind is None and _may_touch(MODELS[block.kind], form))
+        if kind == block.kind or (kind is None and form.touches(MODELS[block.kind]))
     ]
     if not chosen:
-        of = "axes of stations" if form == "rotation" else "stations"
+        of = "axes of stations" if form.enters == "turns" else "stations"
         raise InvalidProblem(f"no rows depend on the {of}", where, "leave the bias out")
-    if form == "rotation" and not MODELS[chosen[0][0].kind].axes:
+    if form.enters == "turns" and not MODELS[chosen[0][0].kind].axes:
         raise InvalidProblem(f"{kind} has no axes that could be turned", where, "use the form offset")
     # One number cannot be metres for one row and radians for another.
-    if form != "time" and len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
+    if form.of_readings and len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
         raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
     return chosen
-
-
-def _may_touch(model: Model, form: Form) -> bool:
-    return model.axes if form == "rotation" else model.stations > 0 if form == "time" else True
 
 
 def _touch(row: Array, member: Array, sign: float) -> _Touch:
@@ -263,7 +232,7 @@ def _by_target(
 
 
 def _by_station(
-    touched: list[tuple[Rows, int]], form: Form, stations: Sequence[str], members: Members, where: str
+    touched: list[tuple[Rows, int]], form: BiasForm, stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Touch]]:
     measuring = np.unique(np.concatenate([index for block, _ in touched for index in (block.a, block.b)]))
     if isinstance(members, Mapping):
@@ -277,7 +246,7 @@ def _by_station(
     return names, [
         _touch(start + np.arange(block.count), place[index], float(sign))
         for block, start in touched
-        for index, sign in zip((block.a, block.b), _signs(block.kind, form), strict=True)
+        for index, sign in zip((block.a, block.b), form.signs(MODELS[block.kind]), strict=True)
         if sign
     ]
 
@@ -304,18 +273,6 @@ def _check_names(given: Sequence[str], known: Sequence[str], what: str, where: s
         twice = next((name for name in names if names.count(name) > 1), None)
         raise InvalidProblem("no one is named" if twice is None else f"{twice} is named twice", place, "name each once")
     return names
-
-
-def _signs(kind: str, form: Form) -> tuple[int, int]:
-    """Return how a station's error enters as first and as second station of a row."""
-    model = MODELS[kind]
-    if form == "rotation" or model.stations == 1:
-        return (1, 0)
-    # Which of the two stations is further along its course.
-    if form == "time":
-        return (1, -1)
-    # Of two stations in a kind that is no sum, a difference is meant: gains.
-    return model.signs or (1, -1)
 
 
 def _each(values: Any, shape: tuple[int, ...], where: str, what: str) -> Array:
@@ -364,24 +321,17 @@ def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
     if name not in names:
         raise InvalidProblem(f"there is no bias {name!r}", "name", nearest(name, names) if names else "there are none")
     bias = problem.biases[names.index(name)]
-    known = _order(bias, values, _shape_of(problem, bias))
+    form = form_of(bias)
+    shape = form.shape(bias, problem.dimension)
+    known = _order(bias, values, shape if form.steps is None else (problem.epochs, *shape))
     rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
-    change = {"rotation": _turn, "time": _move}.get(bias.form, _correct)
-    return change(rest, bias, known)
-
-
-def _shape_of(problem: Problem, bias: Bias) -> tuple[int, ...]:
-    """Return the shape of the values of a bias: members, and what each has several of; of a walk epochs, members."""
-    if bias.form == "walk":
-        return (problem.epochs, len(bias.members))
-    several = problem.layout.find(bias.name)[0].size // len(bias.members)
-    return (len(bias.members), *((several,) if several > 1 else ()))
+    return {"turns": _turn, "moves": _move}.get(form.enters, _correct)(rest, bias, known)
 
 
 def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
     """Return values of a shape in the order of the members."""
     where = f"values of {bias.name!r}"
-    if isinstance(values, Mapping) and bias.form == "walk":
+    if isinstance(values, Mapping) and form_of(bias).steps is not None:
         raise InvalidProblem("a walk has values at every epoch", where, f"give an array of shape {shape}")
     if isinstance(values, Mapping):
         strange = [member for member in values if member not in bias.members]
@@ -398,15 +348,15 @@ def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
 
 def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
     """Return the problem with offsets, drifts or scales in the known corrections of its rows."""
-    amount, epoch = np.zeros(problem.count), problem.epoch[bias.row]
-    entry, factor = effects(bias, problem.times, problem.origin, epoch)
-    values = known[epoch[:, None], entry] if bias.form == "walk" else known.ravel()[entry]
+    form, amount, epoch = form_of(bias), np.zeros(problem.count), problem.epoch[bias.row]
+    entry, factor = form.effects(bias, problem.times, problem.origin, epoch)
+    values = known.ravel()[entry] if form.steps is None else known[epoch[:, None], entry]
     np.add.at(amount, bias.row, (factor * values).sum(1))
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
         # What the measurement exceeds the model by; for a scale it depends on the measurement: z = h (1 + s).
         own: Any = amount[start : start + block.count]
-        if bias.form == "scale":
+        if form.enters == "scales":
             own = (block.z - block.correction) * own / (1.0 + own)
         rows.append(replace(block, correction=block.correction + own))
     return replace(problem, rows=tuple(rows))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,17 +19,11 @@ DEGREE = 3
 # Splines: an error that is a smooth function of time.
 
 
-def spline_members(bias: Bias) -> tuple[str, ...]:
-    """Return what the coefficients of a spline are called: a member, and the time that its coefficient says most of.
-
-    The times are the averages of the knots under each piece (Greville's abscissae), where a coefficient is about the
-    value of the spline.
-    """
-    return tuple(f"{member} at {time:.6g} s" for member in bias.members for time in greville(bias))
-
-
 def greville(bias: Bias) -> Array:
-    """Return the times (c,) that the coefficients of each member of a spline say most of, seconds."""
+    """Return the times (c,) at which the coefficients of a spline are about its values, seconds.
+
+    They are the averages of the knots under each piece (Greville's abscissae).
+    """
     assert bias.knots is not None
     full = _padded(bias.knots)
     return np.array([full[i + 1 : i + 1 + DEGREE].mean() for i in range(coefficients(bias.knots))])
@@ -63,8 +58,8 @@ def _padded(knots: Array) -> Array:
     return np.concatenate([np.full(DEGREE, knots[0]), knots, np.full(DEGREE, knots[-1])])
 
 
-def knots_over(times: Array, knots: Any, where: str) -> Array:
-    """Return knots (p,) of a spline over a run: those given, or so many evenly spaced ones.
+def with_knots(bias: Bias, times: Array, where: str, knots: Any) -> Bias:
+    """Return a bias with the knots of a spline over a run: those given, or so many evenly spaced ones.
 
     Raises
     ------
@@ -78,13 +73,25 @@ def knots_over(times: Array, knots: Any, where: str) -> Array:
     if array.ndim == 0 and (array < 2 or array != round(float(array))):
         raise InvalidProblem(f"{knots} knots", place, "give two or more: the first and the last time are knots")
     if array.ndim == 0:
-        return np.linspace(times[0], times[-1], int(array))
+        return replace(bias, knots=np.linspace(times[0], times[-1], int(array)))
     if array.ndim != 1 or len(array) < 2 or not (np.diff(array) > 0.0).all():
         raise InvalidProblem("the knots are not two or more increasing times", place, "sort them")
-    if times[0] < array[0] or times[-1] > array[-1]:
+    _check_knots(array, times, place)
+    return replace(bias, knots=array)
+
+
+def check_spline(bias: Bias, times: Array, where: str) -> None:
+    """Refuse a spline without increasing knots, or over times (k,) beyond them."""
+    knots = bias.knots
+    if knots is None or knots.ndim != 1 or len(knots) < 2 or not (np.diff(knots) > 0.0).all():
+        raise InvalidProblem("a spline has no increasing knots", where, "give two times or more")
+    _check_knots(knots, times, f"{where}, knots")
+
+
+def _check_knots(knots: Array, times: Array, place: str) -> None:
+    if times[0] < knots[0] or times[-1] > knots[-1]:
         what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, and the knots do not"
         raise InvalidProblem(what, place, "let the first and the last knot enclose it")
-    return array
 
 
 # Walks: an error that is the sum of independent steps, or whose rate is.
@@ -93,6 +100,11 @@ def knots_over(times: Array, knots: Any, where: str) -> Array:
 def rate_name(name: str) -> str:
     """Return what the rates of a walk are called, where it has some."""
     return f"{name} rate"
+
+
+def state_of(bias: Bias) -> tuple[str, ...]:
+    """Return the names of the unknowns of a bias: its values, and the rates of a walk that has some."""
+    return (bias.name, rate_name(bias.name))[: 1 if bias.density is None else bias.density.shape[1]]
 
 
 def process(bias: Bias, times: Array) -> tuple[Array, Array]:
@@ -136,19 +148,22 @@ def process(bias: Bias, times: Array) -> tuple[Array, Array]:
     return transition, covariance
 
 
-def density_of(density: Any, rate_density: Any, members: int, where: str) -> Array:
-    """Return the spectral densities (q, 1 or 2) of a walk, one line for each member.
+def with_densities(bias: Bias, times: Array, where: str, density: Any, rate_density: Any) -> Bias:
+    """Return a bias with the spectral densities (q, 1 or 2) of a walk, one line for each member.
 
     Parameters
     ----------
+    bias : Bias
+        Of q members.
+    times : array (k,)
+        Seconds of the epochs.
+    where : str
+        Place to name.
     density, rate_density : float or array (q,), optional
         Of the noise that the error is the sum of, unit squared per second, and of that which its rate is the sum of,
         unit squared per second cubed; None: none.
-    members : int
-        Their number q.
-    where : str
-        Place to name.
     """
+    members = len(bias.members)
     if density is None and rate_density is None:
         advice = "give density, rate_density or both, for instance by optloc.clock_densities"
         raise InvalidProblem("a walk needs a spectral density", where, advice)
@@ -164,7 +179,7 @@ def density_of(density: Any, rate_density: Any, members: int, where: str) -> Arr
         if not (np.isfinite(array) & (array >= low)).all():
             raise InvalidProblem(f"{name} is not positive", where, "an error that stays has the form 'offset'")
         columns.append(np.broadcast_to(array, (members,)))
-    return np.stack(columns, axis=1)
+    return replace(bias, density=np.stack(columns, axis=1))
 
 
 def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> tuple[float, float]:
@@ -216,47 +231,13 @@ def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> 
     return speed**2 * white, speed**2 * wander
 
 
-def effects(bias: Bias, times: Array, origin: float, epoch: Array) -> tuple[Array, Array]:
-    """Return which of its entries each touch of a bias adds to its row, and with which factor, each (n, c).
-
-    Parameters
-    ----------
-    bias : Bias
-        What is added: an offset, a drift, a spline or a walk. Scales have the same entries, of which times the value is
-        added.
-    times : array (k,)
-        Seconds of the epochs.
-    origin : float
-        Time from which drifts count.
-    epoch : int array (n,)
-        Epoch of the row of each touch.
-    """
-    if bias.form == "spline":
-        assert bias.knots is not None
-        entry, factor = pieces(bias.knots, times)
-        return bias.member[:, None] * coefficients(bias.knots) + entry[epoch], bias.coefficient[:, None] * factor[epoch]
-    # A drift is an offset that grows: here is where seconds enter, nowhere else.
-    since = (times - origin)[epoch] if bias.form == "drift" else 1.0
-    return bias.member[:, None], (bias.coefficient * since)[:, None]
-
-
-def check_changing(bias: Bias, times: Array, where: str) -> None:
-    """Refuse walks without densities and splines without knots, and what runs (times (k,)) of one epoch cannot tell."""
-    if bias.form == "walk":
-        density = bias.density
-        if density is None or density.shape not in {(len(bias.members), 1), (len(bias.members), 2)}:
-            advice = f"give an array ({len(bias.members)}, 1), or with rates ({len(bias.members)}, 2)"
-            raise InvalidProblem("a walk has no spectral densities", where, advice)
-        if not (np.isfinite(density) & (density >= 0.0)).all() or not (density[:, -1:] > 0.0).all():
-            raise InvalidProblem(
-                "a spectral density is not positive", where, "an error that stays has the form 'offset'"
-            )
-        if len(times) == 1:
-            raise InvalidProblem("a walk needs several epochs", where, "use the form offset")
-    if bias.form == "spline":
-        knots = bias.knots
-        if knots is None or knots.ndim != 1 or len(knots) < 2 or not (np.diff(knots) > 0.0).all():
-            raise InvalidProblem("a spline has no increasing knots", where, "give two times or more")
-        if times[0] < knots[0] or times[-1] > knots[-1]:
-            what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, and the knots do not"
-            raise InvalidProblem(what, f"{where}, knots", "let the first and the last knot enclose it")
+def check_walk(bias: Bias, times: Array, where: str) -> None:
+    """Refuse a walk without densities, or over times (k,) of one epoch."""
+    density = bias.density
+    if density is None or density.shape not in {(len(bias.members), 1), (len(bias.members), 2)}:
+        advice = f"give an array ({len(bias.members)}, 1), or with rates ({len(bias.members)}, 2)"
+        raise InvalidProblem("a walk has no spectral densities", where, advice)
+    if not (np.isfinite(density) & (density >= 0.0)).all() or not (density[:, -1:] > 0.0).all():
+        raise InvalidProblem("a spectral density is not positive", where, "an error that stays has the form 'offset'")
+    if len(times) == 1:
+        raise InvalidProblem("a walk needs several epochs", where, "use the form offset")

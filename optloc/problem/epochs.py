@@ -18,7 +18,7 @@ from optloc.problem.problem import Problem
 
 def separable(problem: Problem) -> bool:
     """Return whether no unknown is shared between the epochs of a problem."""
-    run_long_errors = problem.stations.estimated and problem.stations.span == "run"
+    run_long_errors = problem.stations.unknown_for == "run"
     # A target that is known for the run ties nothing, and counts as free only where its span says so.
     free = all(motion.span == "epoch" for motion in problem.motions)
     return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not tied(problem)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 
 from optloc.base.arrays import library
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias, Motion, Stations
-from optloc.problem.clocks import rate_name, spline_members
+from optloc.problem.clocks import state_of
+from optloc.problem.forms import form_of, per_second
 
 # Units are those of reports: inside all is SI.
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
-_OWN_UNIT = {"scale": "1", "rotation": "rad", "time": "s"}
-# A drift is per second; of a speed that is an acceleration.
-_RATE = {"m/s": "m/s^2"}
 _Part = tuple[str, int, str, tuple[str, ...]]
 
 
@@ -153,38 +152,19 @@ def layout(
             units = (unit for _, unit in _STATE)
             names = state_names(i, len(motions), motion.order)
             room.extend((name, stations.dimension, unit, ()) for name, unit in zip(names, units, strict=False))
-    # Angles of a rotation: one in the plane, a vector in space.
-    turns = 1 if stations.dimension == 2 else 3
     for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
-        if bias.form == "walk":
-            local.extend(_walk(bias, unit))
-            continue
-        members = spline_members(bias) if bias.form == "spline" else bias.members
-        size = len(members) * (turns if bias.form == "rotation" else 1)
-        shared.append((bias.name, size, _bias_unit(bias.form, unit), members))
+        form = form_of(bias)
+        room = shared if form.steps is None else local
+        size, members = prod(form.shape(bias, stations.dimension)), form.members(bias)
+        entries = zip(state_of(bias), (form.unit(unit), per_second(unit)), strict=False)
+        room.extend((name, size, own, members) for name, own in entries)
     # Emission times last one epoch by their nature; station errors where their span says so.
     local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
-    if stations.estimated:
-        room = shared if stations.span == "run" else local
+    if stations.unknown_for:
+        room = shared if stations.unknown_for == "run" else local
         size = stations.count * stations.dimension
         room.extend((name, size, unit, stations.names) for name, unit, _ in stations.errors)
     return Layout(_slots(shared), _slots(local), epochs)
-
-
-def _walk(bias: Bias, unit: str) -> list[_Part]:
-    """Return the parts of a walk at each epoch: its values, and its rates where it has some."""
-    assert bias.density is not None
-    parts = [(bias.name, len(bias.members), unit, bias.members)]
-    if bias.density.shape[1] == 2:
-        parts.append((rate_name(bias.name), len(bias.members), _bias_unit("drift", unit), bias.members))
-    return parts
-
-
-def _bias_unit(form: str, unit: str) -> str:
-    """Return the unit of a bias on rows of a unit: "1" is that of ratios."""
-    if form in _OWN_UNIT:
-        return _OWN_UNIT[form]
-    return _RATE.get(unit, f"{unit}/s" if unit else "") if form == "drift" else unit
 
 
 def _slots(parts: list[_Part]) -> tuple[Slot, ...]:

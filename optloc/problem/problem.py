@@ -15,6 +15,7 @@ from optloc.base.types import Array, Band, Bias, CompassRows, Motion, Polygon, P
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
 from optloc.models.medium import Atmosphere, Medium
+from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
 
@@ -155,7 +156,7 @@ class Problem:
         stations: tuple[Any, ...] = (s.count, self.dimension, s.covariance is None, s.span)
         stations += () if s.velocity_covariance is None else ("velocity errors",)
         # But for courses that a station may be further along: how fast it goes is a factor of an unknown.
-        if any(b.form == "time" for b in self.biases) and s.velocity is not None:
+        if any(form_of(b).enters == "moves" for b in self.biases) and s.velocity is not None:
             stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
         bands = [c for c in self.constraints if isinstance(c, Band)]

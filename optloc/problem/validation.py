@@ -14,8 +14,8 @@ from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, S
 from optloc.base.units import LARGEST
 from optloc.models import MODELS
 from optloc.models.surfaces import SURFACES
-from optloc.problem.clocks import check_changing
 from optloc.problem.epochs import separable, tied, untied
+from optloc.problem.forms import form_of
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem, at_rest, check_medium
 
@@ -258,9 +258,6 @@ def _check_rates(problem: Problem) -> None:
 
 # What cannot be unknown: malformed motions, biases and priors are refused with a sentence that names them.
 
-# As in `optloc.base.types.Bias`, which types alone do not enforce.
-_FORMS = ("offset", "scale", "drift", "rotation", "time", "walk", "spline")
-
 
 def check_unknowns(problem: Problem) -> None:
     """Refuse motions, biases and priors that cannot be what is meant.
@@ -344,8 +341,7 @@ def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
 
 
 def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
-    if bias.form not in _FORMS:
-        raise InvalidProblem(f"unknown form {bias.form!r}", where, f"use {', '.join(_FORMS)}")
+    form = form_of(bias)
     sizes = [len(bias.row), len(bias.member), len(bias.coefficient)]
     if len(set(sizes)) > 1:
         raise InvalidProblem(
@@ -358,11 +354,12 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
     bad, why = _beyond(bias.coefficient)
     if bad.any():
         raise InvalidProblem(f"a coefficient is {why}", where, "give numbers such as 1 and -1")
-    if bias.form == "rotation":
+    if form.enters == "turns":
         _check_rotation(problem, bias, where)
-    if bias.form == "time":
+    if form.enters == "moves":
         _check_course(problem, bias, where)
-    check_changing(bias, problem.times, where)
+    if form.check is not None:
+        form.check(bias, problem.times, where)
     if bias.sigma is None:
         return
     wanted = problem.layout.find(bias.name)[0].size

@@ -11,6 +11,7 @@ from optloc.compute.jit import enabled
 from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.position_costs import own_epochs
 
@@ -126,28 +127,23 @@ def _nodes(problem: Problem) -> int:
 def _beyond_biases(problem: Problem) -> Iterator[str]:
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
-        if bias.form == "walk":
-            yield f"the walk {bias.name!r} is another unknown at each epoch, and the proof takes those of the run"
-        elif bias.form not in ("offset", "drift", "spline"):
-            does = "moves stations" if bias.form == "time" else "multiplies what it touches"
-            yield f"the {bias.form} {bias.name!r} {does}, and the proof takes what is added"
+        if why := form_of(bias).beyond_proof:
+            yield f"the {bias.form} {bias.name!r} {why}"
         elif bias.sigma is None and angular[bias.row].any():
             yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
 
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:
-    covariance = problem.stations.covariance
     if problem.stations.velocity_covariance is not None:
         rates = [rows.kind for rows in problem.rows if MODELS[rows.kind].velocity]
         if rates:
             yield f"errors of the stations' velocities enter {rates[0]} rows in a way that depends on the place"
-    if covariance is None:
+    if problem.stations.covariance is None:
         return
     # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
-    same = np.eye(problem.dimension) * covariance[..., :1, :1]
-    if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
+    if not problem.stations.isotropic:
         yield "the station errors differ from axis to axis"
-    if problem.stations.span == "run" and _move(problem):
+    if problem.stations.unknown_for == "run" and _move(problem):
         yield "station errors last the whole run while stations move, and the proof takes one line of sight for each"
     bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
     if bent:

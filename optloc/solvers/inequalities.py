@@ -182,7 +182,7 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     needy = np.flatnonzero(broken[np.arange(len(first)), first])
     refused = np.where(broken & (pool.code == Status.OK) & _fits(pool, pool.cost), pool.cost, np.inf)
-    kept = replace(_without(pool, broken), hidden=_name_hidden(problem, pool.x, refused))
+    kept = replace(_without(pool, broken), hidden=_first_told(_name_hidden(problem, pool.x, refused), pool.hidden))
     # where the cheapest is feasible it is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
         return kept
@@ -341,7 +341,7 @@ def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
 
 
 def _first_told(one: Array | None, other: Array | None) -> Array | None:
-    """Return the words (N,) of one where it has some, else of the other: a face is left where the inside has minima."""
+    """Return the words (N,) of one where it has some, else of the other."""
     return one if one is None or other is None else np.where(one != "", one, other)
 
 

@@ -237,6 +237,7 @@ def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: flo
         degrees_of_freedom(problem) if before is None else before.dof,
         (*(before.stages if before else ()), stage),
         missing=None if before is None else before.missing,
+        hidden=None if before is None else before.hidden,
     )
 
 

@@ -21,6 +21,7 @@ from optloc.files.schema import Units, join
 from optloc.linear.simulate import simulate
 from optloc.linear.walks import walks, wander
 from optloc.problem.bias import with_bias
+from optloc.problem.forms import form_of
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.study.document import Amount, LayoutTable, ScenarioTable, TruthTable, sigma_of
@@ -468,14 +469,14 @@ def _amount(case: Case, bias: Bias, value: Amount, where: str) -> float:
     """Return a value of a bias in SI units: an offset has the unit of its rows, a boresight is an angle."""
     if isinstance(value, int | float):
         return float(value)
-    if bias.form in ("offset", "walk", "spline"):
+    form = form_of(bias)
+    if form.quantity is None and not form.rate:
         starts = np.array(case.template.starts)
         kind = case.template.rows[int(np.searchsorted(starts, bias.row[0], side="right")) - 1].kind
         text = value.strip()
         sign = -1.0 if text.startswith("-") else 1.0
         return sign * sigma_of(kind, text.lstrip("-"), where)
-    quantity = {"rotation": "angle", "time": "time"}.get(bias.form, "plain")
-    return Units(quantity).plain(value, None, where)  # type: ignore[arg-type]
+    return Units(form.quantity or "plain").plain(value, None, where)
 
 
 @dataclass(frozen=True, slots=True)

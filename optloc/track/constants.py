@@ -9,6 +9,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion
 from optloc.problem.epochs import cut
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.track.dynamics import Dynamics
@@ -84,7 +85,7 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
 def _check(problem: Problem) -> None:
     check_trackable(replace(problem, biases=()))
     # What changes with the seconds of the run is no constant of one scan: its model would need the time.
-    changing = next((bias for bias in problem.biases if bias.form in ("drift", "walk", "spline")), None)
+    changing = next((bias for bias in problem.biases if form_of(bias).changes), None)
     if changing is not None:
         what = f"the {changing.form} {changing.name!r} changes in time"
         raise InvalidProblem(what, "track", "learn it first, then `with_known_bias`")

@@ -148,7 +148,7 @@ def _is_plain(problem: Problem) -> bool:
         problem.count > 0
         and len(problem.motions) == 1
         and all(array is None or (type(array) is np.ndarray and array.ndim == core) for array, core in shared)
-        and not (problem.biases or problem.emitting or stations.estimated)
+        and not (problem.biases or problem.emitting or stations.unknown_for)
         and not depends_on_place(problem)
         and not tied(problem)
     )

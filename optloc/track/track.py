@@ -340,7 +340,7 @@ def check_trackable(problem: Problem) -> None:
         raise InvalidProblem(f"the bias {problem.biases[0].name!r} is unknown", "track", advice)
     if problem.emitting:
         raise InvalidProblem("emission times are unknown", "track", "use differences: `optloc.reduce` makes them")
-    if problem.stations.estimated:
+    if problem.stations.unknown_for:
         raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
 
 

@@ -64,6 +64,24 @@ def test_without_earth_and_constraint_nothing_is_said_to_forbid():
         assert "forbids" not in fix.certificate.reason
 
 
+def test_where_the_earth_hides_all_that_is_found_each_method_says_so():
+    """Three satellites over the other side of the Earth, and a height: both places that fit are hidden."""
+    over, height = np.radians([[-20.0, 0.0], [-10.0, 14.0], [-30.0, 9.0]]), 2e3
+    places = np.array(ECEF.from_geodetic(*over.T, np.full(3, 8e5)))
+    template = optloc.assemble(
+        places,
+        optloc.measured("range", a=np.arange(3), sigma=10.0),
+        frame=ECEF,
+        constraints=optloc.constraints.height(exactly=height),
+    )
+    far = np.array(ECEF.from_geodetic(*np.radians([30.0, -160.0]), height))
+    one = optloc.simulate(template, truth=far, seed=1)
+    for method in ("gtrs+lsr", "auto", "searched"):
+        fix = optloc.solve(one, method)
+        assert fix.status in (Status.INFEASIBLE, Status.MISFIT), method
+        assert "below their horizon" in str(fix.reason) or "below its horizon" in str(fix.reason), method
+
+
 def orbit(longitude, inclination, phase, times):
     """Return places (k, 3) of a satellite on an inclined geosynchronous circle; degrees, hours."""
     along, tilt = 2.0 * np.pi / 23.934 * times + np.radians(phase), np.radians(inclination)

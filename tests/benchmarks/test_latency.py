@@ -14,7 +14,7 @@ from monte_carlo.tables import write
 
 from optloc import assemble, locate, measured, prepare, solve
 from optloc.compute.jit import enabled
-from optloc.engine.fixes import fix_few_ranges
+from optloc.engine.fixes import fix_one_by_ranges
 from optloc.engine.memory import Answer
 from optloc.engine.plan import LIMIT, TOLERANCE
 from optloc.proof.batch import prove_here
@@ -82,7 +82,7 @@ def kernels(place):
 
     def work(i):
         room.z[0] = z[i]
-        fix_few_ranges(short.load.model, short.load.rows, room.z, short.load.place, TOLERANCE, LIMIT, False, answer)
+        fix_one_by_ranges(short.load.model, short.load.rows, room.z, short.load.place, TOLERANCE, LIMIT, False, answer)
         short.map.write(z[i], room.costs, 0)
         room.asked.x[0] = x[0]
         prove_here(room.costs, room.asked, room.answered)

@@ -259,7 +259,7 @@ def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
     others = np.delete(np.arange(problem.layout.n_shared), own)
     with np.errstate(all="ignore"):
         equations = equations_at(part, x)
-        if problem.stations.estimated:
+        if problem.stations.unknown_for:
             for _ in range(_STEPS):
                 move, ok = step(equations, np.zeros(len(x)), np.eye(problem.layout.n_shared)[:, others])
                 x = x + np.where(ok[:, None], move, 0.0)

@@ -117,10 +117,7 @@ class _Mean:
 
 def _with_station_noise(problem: Problem) -> Problem:
     """Return the problem with its station errors of each epoch in the noise."""
-    stations = problem.stations
-    if not stations.errors or stations.span == "run":
-        return problem
-    return weighed(replace(problem, stations=replace(stations, span="noise")))
+    return weighed(replace(problem, stations=problem.stations.with_noise()))
 
 
 def _reference(problem: Problem, reference: float | None) -> float:

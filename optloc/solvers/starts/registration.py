@@ -19,9 +19,10 @@ from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.linear.normal import covariance, prior_parts
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.vectors import complete, vectors
-from optloc.linear.walks import places, state_of, walks
-from optloc.problem.clocks import greville, rate_name
+from optloc.linear.walks import places, walks
+from optloc.problem.clocks import rate_name, state_of
 from optloc.problem.epochs import by_epoch, untied
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.starts.block_averages import average_blocks
@@ -93,7 +94,7 @@ def group_alike(problem: Problem) -> list[Array]:
 def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
     """Return starting vectors (N, C, size) of runs that have the same rows."""
     # every candidate is refined on the averages, where a step costs next to nothing; few are on all epochs
-    straight = _straighten(problem, "spline")
+    straight = _straighten(problem, local=False)
     blocks = average_blocks(straight, BLOCKS)
     x = _begin(blocks, begin)
     x = _around(blocks, _ANYWHERE) if x is None else x
@@ -110,47 +111,45 @@ def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> 
 
 def _begin(blocks: Problem, begin: Callable[[Problem], Array | None]) -> Array | None:
     """Return starting vectors of blocks; those whose biases walk begin as if these were offsets that drift."""
-    steady = _straighten(blocks, "walk")
+    steady = _straighten(blocks, local=True)
     x = begin(steady)
     return x if x is None or steady is blocks else _bend(blocks, steady, x)
 
 
-def _straighten(problem: Problem, form: str) -> Problem:
-    """Return a problem whose walks or splines are offsets, and drifts besides: a few dozen blocks tell no more of them.
+def _straighten(problem: Problem, local: bool) -> Problem:
+    """Return the problem with offsets and drifts for its walks, if `local`, or for its splines.
 
-    Walks without rates are offsets alone; a problem without any is returned as it is.
+    A few dozen blocks determine no more of them. A problem without any is returned as it is.
     """
     biases: list[Bias] = []
     for bias in problem.biases:
-        straight = replace(bias, form="offset", density=None, knots=None, sigma=None, mean=np.zeros(1))
-        if bias.form != form:
-            biases.append(bias)
-        elif form == "spline":
-            biases += [straight, replace(straight, name=rate_name(bias.name), form="drift")]
-        else:
-            known = replace(straight, sigma=bias.sigma, mean=bias.mean)
-            biases += [known, *(replace(straight, name=name, form="drift") for name in state_of(bias)[1:])]
-    return replace(problem, biases=tuple(biases)) if any(b.form == form for b in problem.biases) else problem
+        form = form_of(bias)
+        lines = form.straight if (form.steps is not None) == local else None
+        biases += [bias] if lines is None else lines(bias)
+    same = all(one is two for one, two in zip(biases, problem.biases, strict=False))
+    return problem if same else replace(problem, biases=tuple(biases))
 
 
 def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
     """Return vectors (N, C, size) of a problem from those of the same with straight biases; NaN stay NaN."""
     layout, out = problem.layout, np.zeros((*x.shape[:2], problem.layout.size))
-    changed = {bias.name: bias for bias in problem.biases if bias.form in ("walk", "spline")}
+    moments = {bias.name: at(bias) for bias in problem.biases if (at := form_of(bias).values_at) is not None}
     for slot in layout.shared:
-        part, bias = slice(slot.start, slot.start + slot.size), changed.get(slot.name)
-        own = straight.layout.take(x, slot.name)
-        if bias is not None and own.shape[-1] != slot.size:
+        part, own = slice(slot.start, slot.start + slot.size), straight.layout.take(x, slot.name)
+        if slot.name in moments and own.shape[-1] != slot.size:
             # a coefficient is the value of a straight line at its time
-            own = own[..., None] + straight.layout.take(x, rate_name(slot.name))[..., None] * (
-                greville(bias) - problem.origin
-            )
+            slope = straight.layout.take(x, rate_name(slot.name))[..., None]
+            own = own[..., None] + slope * (moments[slot.name] - problem.origin)
         out[..., part] = own.reshape(*x.shape[:2], -1)
     local = out[..., layout.n_shared :].reshape(*x.shape[:2], layout.epochs, layout.n_local)
     since = (problem.times - problem.origin)[:, None]
     for bias in walks(problem):
-        value, *rate = (straight.layout.take(x, name)[:, :, None] for name in state_of(bias))
+        parts = [straight.layout.take(x, name) for name in state_of(bias)]
         place = places(layout, bias)
+        if not straight.layout.shares(bias.name):  # only splines are straight
+            local[..., place] = np.stack(parts, axis=-1)
+            continue
+        value, *rate = (part[:, :, None] for part in parts)
         local[..., place[:, 0]] = value + (rate[0] * since if rate else 0.0)
         for each in rate:
             local[..., place[:, 1]] = each

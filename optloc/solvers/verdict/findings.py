@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,11 +38,79 @@ BENT_SENTENCE = {
     CURVED: "Gaussian neither in metres nor in inverse range",
 }
 """What is said of a fix that is `curved`, by the kind of its chart."""
-_MISFIT, _UNBOUNDED, _AMBIGUOUS = Status.MISFIT.mark, Status.UNBOUNDED.mark, Status.AMBIGUOUS.mark
-_UNPROVEN, _CURVED = Status.UNPROVEN.mark, Status.CURVED.mark
 _ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
 # Gaps to infinity below this come from rounding: the fix itself is as far away as counts.
 _NONE = 1e-6
+
+
+class Evidence(NamedTuple):
+    """What numbers say about one finished answer, or about many (N,); NaN says nothing.
+
+    Parameters
+    ----------
+    improbable : bool
+        Whether noise so rarely makes such a cost that the model is refuted.
+    infinity, region : float
+        Least cost at infinity less that of the answer, and by how much costs in the likelihood region exceed it.
+    gap : float
+        Cost of the cheapest other minimum less that of the answer.
+    kappa : float
+        Departure from a Gaussian in metres, see `optloc.solvers.pool.Curvature`.
+    unique : bool
+        As of `is_proof_of_one`.
+    searched : bool
+        Whether the start was not safe.
+    blind : bool
+        Whether a search for suspects was asked for, and could not see one or tell which.
+    """
+
+    improbable: Any
+    infinity: Any
+    region: float
+    gap: Any
+    kappa: Any
+    unique: Any
+    searched: Any = False
+    blind: Any = False
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """N finished answers that are to be spoken of.
+
+    Parameters
+    ----------
+    problem, pool : Problem, Pool
+        N problems and their settled pools.
+    gap : array (N, r)
+        Costs of the other minima less that of the best; infinite where there is none.
+    proven : Claims
+        What is proven.
+    """
+
+    problem: Problem
+    pool: Pool
+    gap: Array
+    proven: Claims
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What stands against finished answers.
+
+    Parameters
+    ----------
+    status : Status
+        What an answer is against which nothing else stands; its sentence is the advice.
+    test : callable
+        Maps evidence to where it applies: by operators alone, so that numbers and arrays take the same rules.
+    sentence : callable
+        Maps answers and the indices of some to one sentence for all of these, or to one for each.
+    """
+
+    status: Status
+    test: Callable[[Evidence], Any]
+    sentence: Callable[[Answers, Array], Any]
 
 
 def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
@@ -60,52 +129,31 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
         Costs of the other minima less that of the best; infinite where there is none.
     """
     cost, kappa = pool.cost[:, 0], None if pool.curvature is None else pool.curvature.kappa
+    # a loss bears gross errors: their cost refutes nothing
+    improbable = np.zeros(len(pool), dtype=bool) if pool.loss else is_improbable(cost, pool.dof, REFUTED)
+    blind: Any = False
+    if pool.asked:  # without redundancy a search for suspects sees nothing, and with one it cannot tell who it is
+        blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, NOTICED))
     with np.errstate(invalid="ignore"):
         marks: Array = marks_of(
-            # a loss bears gross errors: their cost refutes nothing
-            np.zeros(len(pool), dtype=bool) if pool.loss else is_improbable(cost, pool.dof, REFUTED),
+            improbable | bool(pool.refuted),
             np.nan if pool.infinity is None else pool.infinity - cost,
             quantile(COVERED, problem.dimension),
             gap.min(1, initial=np.inf),
             np.nan if kappa is None else kappa[:, 0],
             _is_unique(pool),
-        ).astype(np.int32)
-    if pool.refuted:
-        marks |= Status.MISFIT.mark
-    if pool.searched is not None:
-        # a proof makes up for the start that was not safe
-        unsure = pool.searched & (marks & Status.UNPROVEN.mark != 0)
-        marks[unsure] ^= Status.UNPROVEN.mark | Status.SEARCHED.mark
-    if pool.asked:  # without redundancy a search for suspects sees nothing, and with one it cannot tell who it is
-        blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, NOTICED))
-        marks[blind & (marks & Status.SEARCHED.mark == 0)] |= Status.UNPROVEN.mark
+            False if pool.searched is None else pool.searched,
+            blind,
+        )
+    return marks.astype(np.int32)
+
+
+def marks_of(*numbers: Any) -> Any:
+    """Return the marks of all that stands against one answer, or against many (N,); the numbers are an `Evidence`."""
+    evidence, marks = Evidence(*numbers), 0
+    for status_mark, test in _TESTS:
+        marks = marks | test(evidence) * status_mark
     return marks
-
-
-def marks_of(improbable: Any, infinity: Any, region: float, gap: Any, kappa: Any, unique: Any) -> Any:
-    """Return the marks of what numbers say against one finished answer, or against many (N,); NaN says nothing.
-
-    Parameters
-    ----------
-    improbable : bool
-        Whether noise so rarely makes such a cost that the model is refuted.
-    infinity, region : float
-        Least cost at infinity less that of the answer, and by how much costs in the likelihood region exceed it.
-    gap : float
-        Cost of the cheapest other minimum less that of the answer.
-    kappa : float
-        Departure from a Gaussian in metres, see `optloc.solvers.pool.Curvature`.
-    unique : bool
-        As of `is_proof_of_one`.
-    """
-    # operators alone, so that numbers and arrays take the same rules
-    return (
-        (improbable * _MISFIT)
-        | ((infinity <= region) * _UNBOUNDED)
-        | ((gap < AMBIGUOUS_GAP) * _AMBIGUOUS)
-        | ((unique ^ True) * _UNPROVEN)
-        | ((kappa > BENT) * _CURVED)
-    )
 
 
 def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
@@ -271,49 +319,82 @@ def chart_kind(metres: Any, inverse: Any) -> Any:
 # What applies, in sentences.
 
 
-def explain(problem: Problem, pool: Pool, code: Array, gap: Array, proven: Claims, reason: Array) -> None:
+def explain(answers: Answers, code: Array, reason: Array) -> None:
     """Write the reasons (N,) that belong to the statuses of finished answers, where there is none yet.
 
     Parameters
     ----------
-    problem, pool : Problem, Pool
-        N problems and their settled pools.
+    answers : Answers
+        Finished, and others, whose costs are NaN.
     code : int array (N,)
         `Status` numbers.
-    gap : array (N, r)
-        Costs of the other minima less that of the best.
-    proven : Claims
-        What is proven.
     reason : object array (N,)
         Written where it is empty.
     """
-    empty = reason == ""
-    bulk = empty & (code == Status.UNPROVEN)
-    told = proven.reason[bulk]
-    reason[bulk] = NOT_TRIED if pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
-    if pool.refuted:
-        reason[empty & (code == Status.MISFIT)] = pool.refuted
-    cost = pool.cost[:, 0]
-    doubtful = (reason == "") & ((code == Status.OK) | (code == Status.MISFIT)) & is_improbable(cost, pool.dof, DOUBT)
-    for i in np.flatnonzero(doubtful):
-        p_value = tail_probability(cost[i : i + 1], np.array(pool.dof[i : i + 1]))[0]
-        reason[i] = f"the residuals are larger than the noise allows (p = {p_value:.1g})"
-    for i in np.flatnonzero(empty & (code == Status.AMBIGUOUS)):
-        reason[i] = ambiguity(problem, float(gap[i].min()))
-    for i in np.flatnonzero(empty & (code == Status.UNBOUNDED) & np.isfinite(cost)):
-        assert pool.infinity is not None
-        more = float(pool.infinity[i] - cost[i])
-        reason[i] = f"infinity costs {f'only {more:.2g}' if more > _NONE else 'no'} more"
-    curved = empty & (code == Status.CURVED)
-    if curved.any():
-        assert pool.curvature is not None
-        assert pool.curvature.kappa is not None
-        kind = chart_kind(pool.curvature.kappa[:, 0], pool.curvature.kappa[:, 1])
-        for each in (INVERSE_RANGE, CURVED):
-            reason[curved & (kind == each)] = BENT_SENTENCE[each]
-    if pool.searched is not None and pool.remark is not None:
-        told = pool.searched & (code == Status.SEARCHED)
-        reason[told] = pool.remark[told]
+    pool = answers.pool
+    empty = (reason == "") & np.isfinite(pool.cost[:, 0])
+    for finding in FINDINGS:
+        items = np.flatnonzero(empty & (code == finding.status))
+        if len(items):
+            reason[items] = finding.sentence(answers, items)
+    doubtful = np.flatnonzero(empty & (code == Status.OK) & is_improbable(pool.cost[:, 0], pool.dof, DOUBT))
+    if len(doubtful):
+        reason[doubtful] = _name_residuals(answers, doubtful)
+
+
+def _name_residuals(answers: Answers, items: Array) -> Any:
+    """Return what refutes the noise: of all fixes of a problem, or of each."""
+    pool = answers.pool
+    improbable = is_improbable(pool.cost[items, 0], pool.dof[items], DOUBT)
+    told = tail_probability(pool.cost[items, 0], pool.dof[items])
+    said = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in told]
+    return pool.refuted or np.where(improbable, np.array(said, dtype=object), "")
+
+
+def _name_infinity(answers: Answers, items: Array) -> Any:
+    assert answers.pool.infinity is not None
+    more = answers.pool.infinity[items] - answers.pool.cost[items, 0]
+    told = [f"infinity costs {f'only {one:.2g}' if one > _NONE else 'no'} more" for one in more.tolist()]
+    return np.array(told, dtype=object)
+
+
+def _name_rivals(answers: Answers, items: Array) -> Any:
+    gaps = answers.gap[items].min(1).tolist()
+    return np.array([ambiguity(answers.problem, gap) for gap in gaps], dtype=object)
+
+
+def _name_search(answers: Answers, items: Array) -> Any:
+    return "" if answers.pool.remark is None else answers.pool.remark[items]
+
+
+def _name_proof(answers: Answers, items: Array) -> Any:
+    told = answers.proven.reason[items]
+    return NOT_TRIED if answers.pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
+
+
+def _name_shape(answers: Answers, items: Array) -> Any:
+    curvature = answers.pool.curvature
+    assert curvature is not None
+    assert curvature.kappa is not None
+    inverse = chart_kind(*curvature.kappa[items].T) == INVERSE_RANGE
+    return np.where(inverse, np.array(BENT_SENTENCE[INVERSE_RANGE], dtype=object), BENT_SENTENCE[CURVED])
+
+
+def _is_unsafe(evidence: Evidence) -> Any:
+    """Return where the start was not safe, and no proof makes up for it."""
+    return evidence.searched & (evidence.unique ^ True)
+
+
+FINDINGS = (
+    Finding(Status.MISFIT, lambda e: e.improbable, _name_residuals),
+    Finding(Status.UNBOUNDED, lambda e: e.infinity <= e.region, _name_infinity),
+    Finding(Status.AMBIGUOUS, lambda e: e.gap < AMBIGUOUS_GAP, _name_rivals),
+    Finding(Status.SEARCHED, _is_unsafe, _name_search),
+    Finding(Status.UNPROVEN, lambda e: (_is_unsafe(e) ^ True) & ((e.unique ^ True) | e.blind), _name_proof),
+    Finding(Status.CURVED, lambda e: e.kappa > BENT, _name_shape),
+)
+"""All that may stand against a finished answer: when, and what is said then. What helps is `Status.sentence`."""
+_TESTS = tuple((finding.status.mark, finding.test) for finding in FINDINGS)
 
 
 def ambiguity(problem: Problem, gap: float) -> str:

@@ -25,6 +25,7 @@ from optloc.solvers.verdict.conclusion import conclude
 from optloc.solvers.verdict.findings import (
     NO_ANSWER,
     NO_PROOF,
+    Answers,
     chart_of,
     examine,
     explain,
@@ -109,7 +110,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     if pool.free is not None:
         _hold_against_constraints(pool, cost, finished, marks, reason)
     code = first_status(marks)
-    explain(problem, pool, code, gap, proven, reason)
+    explain(Answers(problem, pool, gap, proven), code, reason)
     if pool.hidden is not None:
         _name_hidden(pool.hidden, finished & (code == Status.MISFIT), reason)
     if pool.loss:
@@ -173,7 +174,8 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
         items = np.setdiff1d(items, told)
     if not len(items):
         return
-    barred = items[code[items] == Status.INFEASIBLE]
+    barred = items[(code[items] == Status.INFEASIBLE) | _has_hidden(pool)[items]]
+    code[barred] = Status.INFEASIBLE
     for i in barred:
         bounds = violation_names(problem)
         missed = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides all that was found"
@@ -362,7 +364,7 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         marks, chart = mark(problem, pool, gap), chart_of(problem, pool.x[:, 0], curvature.covariance, curvature)
     code = first_status(marks)
     if pool.plain is not None:
-        explain(problem, pool, code, gap, proven, reason)
+        explain(Answers(problem, pool, gap, proven), code, reason)
     return Fix(
         pool.x[:, 0],
         curvature.covariance,
