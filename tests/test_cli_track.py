@@ -202,6 +202,7 @@ def test_rows_are_there_as_they_are_made(tmp_path, monkeypatch, name):
         return UPDATES["ekf"](scan, mean, cov)
 
     monkeypatch.setitem(UPDATES, "looking", looking)
+    monkeypatch.setattr("optloc.cli.track._LATE", 0.0)  # at once, no longer ten times a second
     run(drive(tmp_path), "--filter", "looking", "--out", tmp_path / name)
     assert seen == [["starting", "started", *["ok"] * count] for count in range(10)]
     assert not partial.exists()
@@ -212,11 +213,12 @@ def test_rows_are_there_as_they_are_made(tmp_path, monkeypatch, name):
 def test_a_killed_run_leaves_its_rows(tmp_path):
     """The process ends between two scans, without a word: what was tracked is a readable table."""
     script = (
-        "import os, optloc.track as track\n"
+        "import os, time, optloc.track as track\n"
         "from optloc.cli import app\n"
         "ekf, calls = track.UPDATES['ekf'], []\n"
         "def dying(scan, mean, cov):\n"
         "    calls.append(scan)\n"
+        "    time.sleep(0.12)\n"  # rows are written ten times a second at most
         "    os.kill(os.getpid(), 9) if len(calls) > 6 else None\n"
         "    return ekf(scan, mean, cov)\n"
         "track.UPDATES['dying'] = dying\n"

@@ -29,7 +29,7 @@ from optloc.calibration.descent import descend
 from optloc.calibration.likelihood import Estimate, likelihood
 from optloc.calibration.network import network_of
 from optloc.cli.output import Screen, dumps, meter
-from optloc.compute.filter import absorb
+from optloc.compute.filter import filter_scan
 from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, named, names_in, plain
 from optloc.compute.kept import CALLEES, alone, is_checkout, is_kept, kept_in
 from optloc.compute.manifest import installed
@@ -77,7 +77,7 @@ def _fix_tapes() -> None:
 
 
 def _filter() -> None:
-    insist_on(absorb)
+    insist_on(filter_scan)
     scan = simulate(assemble(_STATIONS, measured("range", a=np.arange(6), sigma=1.0)), _TARGET, 1)
     ekf(scan, _TARGET, np.eye(3))
 
@@ -183,7 +183,7 @@ PARTS: Mapping[str, Part] = {
         "optloc.compute",
         (_refine, _filter),
         (
-            "optloc.compute.filter.absorb",
+            "optloc.compute.filter.filter_scan",
             "optloc.compute.refine.refine_block",
             "optloc.compute.equations.normal_block",
             *(f"optloc.compute.runs.{name}" for name in ("refine_runs", "sum_runs")),

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,8 @@ MOTIONS = {
 """Models of motion by name."""
 
 _CLEAN = {"ok", "started", "starting"}
+# Seconds between two additions to the table of a run that goes on: each takes a millisecond, ten scans' time.
+_LATE = 0.1
 # Scans that are told of one by one; --out has all of them.
 _REASONS = 10
 
@@ -135,11 +138,9 @@ class TargetTrack:
     labels: tuple[str, ...]
     entries: list[Entry]
 
-    @property
-    def last(self) -> TargetTrack:
-        """Return the track of the last scan alone."""
-        count = len(self.entries)
-        return replace(self, labels=self.labels[count - 1 : count], entries=self.entries[-1:])
+    def since(self, first: int) -> TargetTrack:
+        """Return the track from the scan of a number on."""
+        return replace(self, labels=self.labels[first : len(self.entries)], entries=self.entries[first:])
 
 
 def run_track(
@@ -155,8 +156,8 @@ def run_track(
 ) -> int:
     """Track the targets of a file or a table, write what was asked for, and return the exit code.
 
-    Whatever goes wrong on the way, the track up to there is written first; of a run that is killed the rows up to then
-    stand in a CSV file beside `out`, with ``.partial`` behind its name.
+    Whatever goes wrong on the way, the track up to there is written first. A run that is killed leaves a CSV file next
+    to `out`, with ``.partial`` behind its name. It lacks at most the rows of the last tenth of a second.
     """
     dynamics = dynamics_of(wanted)
     # Wrong words are refused before the file is read.
@@ -173,11 +174,11 @@ def run_track(
                 start = _start(one.problem, dynamics, wanted)
                 for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
-                    if growing is not None:
-                        growing.add(track_columns(one.last))
+                    _grow(growing, ones, _LATE)
                     advance(1)
     # Interrupted or refused half way: what is known by then is written.
     finally:
+        _grow(growing, ones)
         columns = (
             join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
         )
@@ -188,6 +189,17 @@ def run_track(
     if not quiet and not as_json:
         _show(loaded, columns, Screen())
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
+
+
+def _grow(table: GrowingTable | None, ones: list[TargetTrack], late: float = 0.0) -> None:
+    """Add the entries that a table lacks, unless it was added to less than some seconds ago."""
+    if table is None or monotonic() - table.when < late:
+        return
+    first = table.rows
+    for one in ones:
+        if len(one.entries) > first:
+            table.add(track_columns(one.since(first)))
+        first = max(0, first - len(one.entries))
 
 
 def _json(loaded: Loaded, columns: Columns) -> dict[str, Any]:

@@ -1,111 +1,263 @@
-"""The update of a predicted state by the rows of a scan, as machine code: one step, or as many as it takes.
+"""One scan of a tracker as machine code: prediction, gate and update of states by rows of every kind.
 
-In units of the prediction's own standard deviations, ``x = mean + L y`` with ``L L' = P``, the prior is ``|y|^2`` and
-the update the least of the rows' cost and that: its equations are ``(I + L' A L) y = L' g``, A and g those of the rows.
-A state that is known exactly in some direction is no exception: L has a column of zeros.
+States are ``x = mean + L y`` with ``L L' = P`` the predicted covariance, so that the prior is ``|y|^2``. The update is
+the minimum of the prior and the rows' cost: ``(I + B' B) y = B' e``. B holds the whitened derivatives of the rows times
+L, and e their whitened residuals. For a state that is known exactly in some direction, L has a
+column of zeros.
 """
 
 from __future__ import annotations
 
-from math import log, sqrt
+from math import isfinite, log, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.jit import compiled, put
-from optloc.compute.lanes import Cells, arrange, gather, load, memory
-from optloc.compute.pack import Packed
+from optloc.compute.lanes import Cells, arrange, load, measure, memory
+from optloc.compute.pack import Numbers
 from optloc.compute.systems import cholesky, solve_factored, substitute
+from optloc.compute.tables import FIRST, GROUP_COLUMN, Tables
 
-# Halvings of a step that raises the cost, and the rise that is rounding: as in `optloc.track.updates`.
-_HALVINGS, _RISE = 8, 1e-9
+EKF, IEKF, MGEKF, MVEKF = range(4)
+"""Forms of an update, see `optloc.track.updates`."""
+
+NIS, LOGLIKELIHOOD, COUNT, CODE, REJECTED_ROWS, INNOVATION, PRESENT, SPREAD = range(8)
+"""Columns of `Filtered.values`: three of `optloc.track.updates.Updated`, and the status.
+
+REJECTED_ROWS counts the rows that did not pass the gate. INNOVATION is the sum of the squared innovations in their
+standard deviations, each at most `Filtering.most`, and PRESENT the number of their rows. SPREAD is the trace of the
+predicted covariance of the position.
+"""
+VALUES = 8
+
+GENERAL = -1.0
+"""In the place of a status: the scan takes the general form of the filter."""
+_OK, _SILENT, _NUMERICAL, _REJECTED = (
+    float(one) for one in (Status.OK, Status.TOO_FEW_ROWS, Status.NUMERICAL, Status.REJECTED)
+)
+
+# Gauss-Legendre nodes along a step from 0 to 1: exact up to degree 9, and derivatives of ranges and angles are smooth.
+NODES = tuple(0.5 + 0.5 * float(node) for node in np.polynomial.legendre.leggauss(5)[0])
+SHARES = tuple(0.5 * float(weight) for weight in np.polynomial.legendre.leggauss(5)[1])
+# Halvings of a step that raises the cost: the last is a 128th, beyond which the point is as good as stationary. And the
+# rise of a cost, as a share of it, that is rounding and no reason to halve.
+HALVINGS, RISE = 8, 1e-9
 # Share of the largest variance below which what is left of one is rounding.
 _NOTHING = 1e-15
+# Share of a variance that other rows must leave of it: as of `optloc.base.linalg.whitening`.
+_LOOP = 1e-12
 
 
-class Absorbed(NamedTuple):
-    """What becomes of a state, in arrays that are written.
+class ScanRows(NamedTuple):
+    """The rows of G scans of one structure; an array (G or 1, ...) has one row where the scans share it."""
+
+    tables: Tables  # all rows are one group
+    common: Array  # what all scans share, see `Numbers`
+    source: Array  # (G or 1, q): what they do not
+    covariance: Array  # (G or 1, m): variances; or (G or 1, m * m) where rows are correlated
+    white: Array  # (G or 1, m * m): whitening matrix of all rows where they are correlated; else (1, 0)
+    total: Array  # (G or 1, 2): rank of the covariance, logarithm of the determinant of 2 pi R
+    z: Array  # (G or 1, N or 1, m): measurements less corrections
+    weight: Array  # (G or 1, N or 1, m)
+
+
+class Move(NamedTuple):
+    """A prediction: transition (n, n), process noise (N or 1, n, n) and drive (N or 1, n)."""
+
+    F: Array
+    Q: Array
+    drive: Array
+
+
+class Filtering(NamedTuple):
+    """How states are updated.
 
     Parameters
     ----------
-    mean, cov : array (n,), array (n, n)
-        The state after the scan.
-    said : array (2,)
-        Normalised innovation squared at the prediction, and the logarithm of the determinant of the innovations'
-        covariance in units of the rows' own noise.
+    form : int
+        One of `EKF` and its like.
+    limit : int
+        Steps of the iterated filter, at most.
+    tolerance : float
+        Length of a step, in standard deviations of the prediction, that ends them.
+    gate : float
+        Rows further than this many standard deviations of their innovation are left out; infinite for none.
+    most : float
+        Squared innovation that a row counts as at most.
+    d : int
+        Coordinates of the position.
     """
+
+    form: int
+    limit: int = 1
+    tolerance: float = 0.0
+    gate: float = np.inf
+    most: float = np.inf
+    d: int = 0
+
+
+class Filtered(NamedTuple):
+    """States after a scan, written: means (N, n), covariances (N, n, n), and numbers (N, VALUES) of each."""
 
     mean: Array
     cov: Array
-    said: Array
+    values: Array
+
+
+class _Space(NamedTuple):
+    """Memory of one state: of `lanes`, matrices (n, n), rows (m, n + 1) that end with the residual, vectors."""
+
+    m: Array
+    r: Array
+    room: Cells
+    P: Array
+    root: Array
+    factor: Array
+    rows: Array  # derivatives times root
+    white: Array  # the same, whitened
+    W: Array  # (m, m): whitening matrix of the rows used
+    used: Array  # (m,): weights, zero for rows that are left out
+    x: Array
+    y: Array
+    move: Array
+    slope: Array
+    at: Array
 
 
 @compiled
-def absorb(packed: Packed, mean: Array, cov: Array, limit: int, tolerance: float, out: Absorbed) -> int:
-    """Update one state by one scan and return the steps taken, -1 where the covariance is none.
+def filter_scan(rows: ScanRows, item: int, move: Move, mean: Array, cov: Array, how: Filtering, out: Filtered) -> None:
+    """Predict N states, leave out the rows that do not pass the gate, and update the states by the others.
 
     Parameters
     ----------
-    packed : Packed
-        One scan, whose only unknown is the state.
-    mean, cov : array (n,), array (n, n)
-        The prediction.
-    limit : int
-        Steps at most; with one the covariance is that of the linearisation at the prediction, and steps are not halved.
-    tolerance : float
-        Length of a step, in standard deviations of the prediction, that ends them.
-    out : Absorbed
-        Written.
+    rows : ScanRows
+        Of scans.
+    item : int
+        Which scan.
+    move : Move
+        From the states to the time of the scan.
+    mean, cov : array (N, n), array (N, n, n)
+        States.
+    how : Filtering
+        The filter and its gate.
+    out : Filtered
+        Written: the prediction where no row is used, or where the update is not finite.
     """
-    t, c = packed
-    n = len(mean)
-    room = arrange(t, c, n)
-    m, r = memory(t, room, 1)
-    load(m, 0, 0, c.source, c.white, c.prior, c.observed, c.present)
-    root, half, factor = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
-    y, move, slope = np.zeros(n), np.zeros(n), np.zeros(n)
-    if not _root(cov, root):
-        return -1
-    put(mean, out.mean)
-    cost = _equations(packed, m, r, room, root, y, out.mean, half, factor, slope)
-    put(slope, move)
-    solve_factored(factor, move)
-    # The innovations' own square is the least of the cost along straight rows: written so that an error of the step
-    # enters squared, since the cost itself may be larger by many digits.
-    out.said[0], out.said[1] = cost, 0.0
-    for i in range(n):
-        along = 0.0
-        for k in range(i, n):
-            along += factor[k, i] * move[k]
-        out.said[0] += along * along - 2.0 * slope[i] * move[i]
-        out.said[1] += 2.0 * log(factor[i, i])
-    steps, share = 0, 1.0
-    if limit == 1:
-        _covariance(root, factor, out.cov)
-        _place(mean, root, y, move, 1.0, out.mean)
-        return 1
-    place = np.empty(n)
-    while steps < limit:
-        steps, share, length = steps + 1, 1.0, 0.0
-        for turn in range(_HALVINGS):
+    n = mean.shape[1]
+    s = _space(rows, item, n)
+    for one in range(mean.shape[0]):
+        values = out.values[one]
+        for k in range(VALUES):
+            values[k] = 0.0
+        _predict(move, one, mean, cov, s)
+        for i in range(how.d):
+            values[SPREAD] += s.P[i, i]
+        values[CODE] = _update(rows, item, one, how, s, out)
+        if values[CODE] != GENERAL and values[COUNT] > 0.0:  # else nothing has been written
             for i in range(n):
-                place[i] = y[i] + share * move[i]
-            _place(mean, root, place, move, 0.0, out.mean)
-            now = _equations(packed, m, r, room, root, place, out.mean, half, factor, slope)
-            if now <= cost + _RISE * (1.0 + abs(cost)):
-                break
-            share = 0.5 * share if turn < _HALVINGS - 1 else share
-        for i in range(n):
-            length += (share * move[i]) ** 2
-        put(place, y)
-        cost = now
-        if not sqrt(length) > tolerance:
-            break
-        put(slope, move)
-        solve_factored(factor, move)
-    _covariance(root, factor, out.cov)
-    return steps
+                if not isfinite(out.mean[one, i]) or not isfinite(out.cov[one, i, i]):
+                    values[CODE] = _NUMERICAL
+        if values[CODE] == _NUMERICAL or values[COUNT] == 0.0:
+            values[NIS], values[LOGLIKELIHOOD] = np.nan, 0.0
+            for i in range(n):
+                out.mean[one, i] = s.x[i]
+                for j in range(n):
+                    out.cov[one, i, j] = s.P[i, j]
+
+
+@compiled
+def _space(rows: ScanRows, item: int, n: int) -> _Space:
+    t, m, none = rows.tables, rows.z.shape[2], np.zeros((1, 0))
+    place, observed = np.zeros((0, 4), np.int64), np.zeros((1, m))
+    c = Numbers(rows.common, place, rows.source, none, none, observed, none, none, none[0])
+    room = arrange(t, c, n)
+    cells, r = memory(t, room, 1)
+    load(cells, 0, item, rows.source, none, none, observed, none)
+    S, A, v = np.zeros((3, n, n)), np.zeros((2, m, n + 1)), np.zeros((5, n))
+    W, used = np.zeros((m, m)), np.zeros(m)
+    return _Space(cells, r, room, S[0], S[1], S[2], A[0], A[1], W, used, v[0], v[1], v[2], v[3], v[4])
+
+
+@compiled
+def _predict(move: Move, one: int, mean: Array, cov: Array, s: _Space) -> None:
+    """Write the predicted state to x and P."""
+    n, F = mean.shape[1], move.F
+    own, half = _of(len(move.Q), one), s.factor
+    for i in range(n):
+        s.x[i] = move.drive[_of(len(move.drive), one), i]
+        for j in range(n):
+            half[i, j] = 0.0
+        for k in range(n):
+            if F[i, k] != 0.0:  # most entries are zero
+                s.x[i] += F[i, k] * mean[one, k]
+                for j in range(n):
+                    half[i, j] += F[i, k] * cov[one, k, j]
+    for i in range(n):
+        for j in range(i + 1):
+            value = 0.5 * (move.Q[own, i, j] + move.Q[own, j, i])
+            for k in range(n):
+                value += half[i, k] * F[j, k]
+            s.P[i, j] = s.P[j, i] = value
+
+
+@compiled
+def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, out: Filtered) -> float:
+    """Write a state after the scan, and return its status."""
+    n, values, mean, cov = len(s.x), out.values[one], out.mean[one], out.cov[one]
+    broken = _take(rows, item, one, s)
+    if not _root(s.P, s.root):
+        return GENERAL
+    _evaluate(rows, s, s.x)
+    _gate(rows, item, how, s, values)
+    count, logdet = _whitener(rows, item, s)
+    if count < 0.0:
+        return GENERAL
+    values[COUNT] = count
+    if count == 0.0:
+        return _REJECTED if broken else _SILENT
+    for i in range(n):
+        s.y[i] = 0.0
+    cost = _equations(s)
+    put(s.slope, s.move)
+    solve_factored(s.factor, s.move)
+    values[NIS] = _least(s)
+    values[LOGLIKELIHOOD] = -0.5 * (values[NIS] + logdet)
+    for i in range(n):
+        values[LOGLIKELIHOOD] -= log(s.factor[i, i])
+    if how.form == IEKF:
+        _iterate(rows, how, s, cost)
+    else:
+        put(s.move, s.y)
+    _place(s, 1.0, mean)
+    if how.form == MGEKF:
+        _modify(rows, s, cov)
+        return _REJECTED if broken else _OK
+    if how.form == MVEKF:
+        _evaluate(rows, s, mean)
+        _equations(s)
+    _covariance(s, cov)
+    return _REJECTED if broken else _OK
+
+
+@compiled
+def _of(count: int, i: int) -> int:
+    """Return the row of item i in an array of a number of rows; a single row is shared by all items."""
+    return i if count > 1 else 0
+
+
+@compiled
+def _take(rows: ScanRows, item: int, one: int, s: _Space) -> bool:
+    """Take the measurements and weights of a state; return whether a row that counts is not finite."""
+    broken = False
+    for i in range(len(s.used)):
+        z = rows.z[_of(rows.z.shape[0], item), _of(rows.z.shape[1], one), i]
+        weight = rows.weight[_of(rows.weight.shape[0], item), _of(rows.weight.shape[1], one), i]
+        broken = broken or (weight > 0.0 and not isfinite(z))
+        s.used[i] = weight if isfinite(z) else 0.0
+        s.m[s.room.observed + i, 0] = z
+    return broken
 
 
 @compiled
@@ -115,6 +267,8 @@ def _root(cov: Array, root: Array) -> bool:
     for i in range(n):
         most = max(most, cov[i, i])
     for j in range(n):
+        for i in range(j, n):
+            root[i, j] = 0.0
         left = cov[j, j]
         for k in range(j):
             left -= root[j, k] * root[j, k]
@@ -133,67 +287,215 @@ def _root(cov: Array, root: Array) -> bool:
 
 
 @compiled
-def _equations(
-    packed: Packed,
-    m: Array,
-    r: Array,
-    room: Cells,
-    root: Array,
-    y: Array,
-    x: Array,
-    half: Array,
-    factor: Array,
-    slope: Array,
-) -> float:
-    """Write the factor of ``I + L' A L`` and the slope ``L' g - y`` at a state; return its cost and the prior's."""
-    t, c = packed
-    n, width = len(x), t.shared + 1
+def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
+    """Write derivatives times root, and residuals, of the rows used at a state."""
+    t, n = rows.tables, len(x)
     for i in range(n):
-        m[room.trial + i, 0] = x[i]
-    gather(t, c, m, r, room, False, 1)
-    last = room.after + n * width
-    cost = m[last + n, 0]
+        s.m[s.room.trial + i, 0] = x[i]
+    measure(t, rows.common, s.m, s.r, s.room, 0, s.room.trial, 1)
+    begin = t.table[t.group, GROUP_COLUMN]
+    columns = t.table[t.group + 1, GROUP_COLUMN] - begin
+    for i in range(len(s.used)):
+        cell = s.room.rows + i * t.width
+        for k in range(n):
+            s.rows[i, k] = 0.0
+        s.rows[i, n] = s.m[cell + columns, 0] if s.used[i] > 0.0 else 0.0
+        if s.used[i] > 0.0:
+            for j in range(columns):
+                column, slope = t.table[t.column + begin + j, FIRST], s.m[cell + j, 0]
+                for k in range(column + 1):
+                    s.rows[i, k] += slope * s.root[column, k]
+
+
+@compiled
+def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -> None:
+    """Leave out the rows whose innovation is outside the gate, and count."""
+    n, own = len(s.x), _of(len(rows.covariance), item)
+    for i in range(len(s.used)):
+        if s.used[i] > 0.0:
+            total = _entry(rows, own, i, i)
+            for k in range(n):
+                total += s.rows[i, k] * s.rows[i, k]
+            square = s.rows[i, n] * s.rows[i, n] / total
+            values[PRESENT] += 1.0
+            # how wild a row is says nothing of the others: none counts further than the gate, nor NaN less
+            values[INNOVATION] += min(how.most, square)
+            if how.gate < np.inf and not sqrt(square) <= how.gate:
+                values[REJECTED_ROWS] += 1.0
+                s.used[i] = 0.0
+
+
+@compiled
+def _whitener(rows: ScanRows, item: int, s: _Space) -> tuple[float, float]:
+    """Write the whitening matrix of the rows used; return how many they are and the log determinant of 2 pi R.
+
+    The number is negative where a row that is left out makes a covariance of those that stay singular.
+    """
+    m, W, own, correlated = len(s.used), s.W, _of(len(rows.covariance), item), rows.white.shape[1] > 0
+    whole, count, logdet = correlated, 0.0, 0.0
+    for i in range(m):
+        whole = whole and s.used[i] == 1.0
+        s.used[i] = s.used[i] if _entry(rows, own, i, i) > 0.0 else 0.0
+    for j in range(m):  # row j less what those before it say of it, in units of what is left
+        for i in range(m):
+            W[j, i] = rows.white[_of(len(rows.white), item), j * m + i] if whole else 0.0
+        if s.used[j] > 0.0 and not whole:
+            variance = _entry(rows, own, j, j) / s.used[j]
+            left = variance
+            for k in range(0 if correlated else j, j):
+                share = 0.0
+                for i in range(k + 1):
+                    share += W[k, i] * _entry(rows, own, j, i)
+                left -= share * share
+                for i in range(k + 1):
+                    W[j, i] -= share * W[k, i]
+            if not left > _LOOP * variance:
+                return -1.0, 0.0
+            W[j, j] = 1.0
+            for i in range(j + 1):
+                W[j, i] /= sqrt(left)
+            count, logdet = count + 1.0, logdet + log(2.0 * pi * left)
+    if whole:
+        count, logdet = rows.total[_of(len(rows.total), item), 0], rows.total[_of(len(rows.total), item), 1]
+    return count, logdet
+
+
+@compiled
+def _entry(rows: ScanRows, own: int, i: int, j: int) -> float:
+    """Return an entry of the covariance of the rows."""
+    m = rows.z.shape[2]
+    if rows.covariance.shape[1] == m:
+        return float(rows.covariance[own, i]) if i == j else 0.0
+    return float(rows.covariance[own, i * m + j])
+
+
+@compiled
+def _equations(s: _Space) -> float:
+    """Whiten the rows, write the factor of ``I + B' B`` and the slope ``B' e - y``; return the cost with the prior."""
+    n, m, W, factor, slope = len(s.x), len(s.used), s.W, s.factor, s.slope
+    for i in range(m):
+        for k in range(n + 1):
+            s.white[i, k] = 0.0
+        for j in range(m):
+            if W[i, j] != 0.0:
+                for k in range(n + 1):
+                    s.white[i, k] += W[i, j] * s.rows[j, k]
+    cost = 0.0
     for i in range(n):
-        cost += y[i] * y[i]
-        slope[i] = -y[i]
-        for j in range(i, n):
-            slope[i] += root[j, i] * m[last + j, 0]
-        for j in range(n):
-            half[i, j] = 0.0
-            for k in range(j, n):
-                a, b = max(i, k), min(i, k)
-                half[i, j] += m[room.after + a * width + b, 0] * root[k, j]
-    for i in range(n):
+        cost += s.y[i] * s.y[i]
+        slope[i] = -s.y[i]
         for j in range(i + 1):
-            value = 1.0 if i == j else 0.0
-            for k in range(i, n):
-                value += root[k, i] * half[k, j]
-            factor[i, j] = value
+            factor[i, j] = 1.0 if i == j else 0.0
+    for r in range(m):
+        cost += s.white[r, n] * s.white[r, n]
+        for i in range(n):
+            slope[i] += s.white[r, i] * s.white[r, n]
+            for j in range(i + 1):
+                factor[i, j] += s.white[r, i] * s.white[r, j]
     cholesky(factor, n, 0.0)  # no less than the unit matrix
-    return float(cost)
+    return cost
 
 
 @compiled
-def _place(mean: Array, root: Array, y: Array, move: Array, share: float, out: Array) -> None:
-    """Write the state at ``y + share move``."""
-    for i in range(len(mean)):
-        out[i] = mean[i]
+def _least(s: _Space) -> float:
+    """Return the least cost along straight rows, the innovations' own square: an error of the step enters squared."""
+    n, total = len(s.x), 0.0
+    for i in range(n):
+        total += s.move[i] * s.move[i]
+    for r in range(len(s.used)):
+        left = s.white[r, n]
+        for i in range(n):
+            left -= s.white[r, i] * s.move[i]
+        total += left * left
+    return total
+
+
+@compiled
+def _iterate(rows: ScanRows, how: Filtering, s: _Space, cost: float) -> None:
+    """Take steps, halved where they would raise the cost, until one is short; y is the least, with its equations."""
+    n, place = len(s.x), np.empty(len(s.x))
+    put(s.y, place)
+    for _ in range(how.limit):
+        share, length, now = 1.0, 0.0, 0.0
+        for turn in range(HALVINGS):
+            for i in range(n):
+                s.y[i] = place[i] + share * s.move[i]
+            _place(s, 1.0, s.at)
+            _evaluate(rows, s, s.at)
+            now = _equations(s)
+            # NaN counts as worse: a step beyond where h is defined is halved, too
+            if now <= cost + RISE * (1.0 + abs(cost)):
+                break
+            share = 0.5 * share if turn < HALVINGS - 1 else share
+        for i in range(n):
+            length += (share * s.move[i]) ** 2
+        put(s.y, place)
+        cost = now
+        if not sqrt(length) > how.tolerance:
+            break
+        put(s.slope, s.move)
+        solve_factored(s.factor, s.move)
+
+
+@compiled
+def _modify(rows: ScanRows, s: _Space, cov: Array) -> None:
+    """Write the covariance of the modified gain: the derivative is the mean over the way from the prediction.
+
+    In units of the prediction it is ``(I - N G)(I - N G)' + N N'``: N = M^-1 B' is the gain, and G that mean.
+    """
+    n, m = len(s.x), len(s.used)
+    gain, mean = np.zeros((m, n)), np.zeros((m, n))
+    for r in range(m):
+        for i in range(n):
+            gain[r, i] = s.white[r, i]
+        solve_factored(s.factor, gain[r])
+    for node in range(len(NODES)):
+        _place(s, NODES[node], s.at)
+        _evaluate(rows, s, s.at)
+        _equations(s)
+        for r in range(m):
+            for i in range(n):
+                mean[r, i] += SHARES[node] * s.white[r, i]
+    parts, out = np.zeros((n, n + m)), np.zeros((n, n + m))  # [I - N G, N], and L times it
+    for i in range(n):
+        parts[i, i] = 1.0
+        for r in range(m):
+            parts[i, n + r] = gain[r, i]
+            for j in range(n):
+                parts[i, j] -= gain[r, i] * mean[r, j]
+    for i in range(n):
         for k in range(i + 1):
-            out[i] += root[i, k] * (y[k] + share * move[k])
+            for j in range(n + m):
+                out[i, j] += s.root[i, k] * parts[k, j]
+    _square(out, cov)
 
 
 @compiled
-def _covariance(root: Array, factor: Array, out: Array) -> None:
-    """Write ``L (C C')^-1 L'``: symmetric and positive, whatever rounding does."""
-    n = len(root)
-    rows = np.zeros((n, n))
+def _place(s: _Space, share: float, out: Array) -> None:
+    """Write the state at a share of y."""
+    for i in range(len(s.x)):
+        out[i] = s.x[i]
+        for k in range(i + 1):
+            out[i] += share * s.root[i, k] * s.y[k]
+
+
+@compiled
+def _covariance(s: _Space, out: Array) -> None:
+    """Write ``L (C C')^-1 L'``, C the factor: symmetric and positive, whatever rounding does."""
+    n, rows = len(s.x), np.zeros((len(s.x), len(s.x)))
     for i in range(n):  # rows of (C^-1 L')'
         for j in range(i + 1):
-            rows[i, j] = root[i, j]
-        substitute(factor, rows[i])
-    for i in range(n):
+            rows[i, j] = s.root[i, j]
+        substitute(s.factor, rows[i])
+    _square(rows, out)
+
+
+@compiled
+def _square(A: Array, out: Array) -> None:
+    """Write ``A A'``."""
+    for i in range(A.shape[0]):
         for j in range(i + 1):
             value = 0.0
-            for k in range(n):
-                value += rows[i, k] * rows[j, k]
+            for k in range(A.shape[1]):
+                value += A[i, k] * A[j, k]
             out[i, j] = out[j, i] = value

@@ -71,7 +71,7 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
     kept = tables(problem, tuple(w.row for w in noise))
     if kept is None:
         return None
-    source, white, prior = _sources(problem), _whiteners(noise), _priors(problem)
+    source, white, prior = sources(problem), _whiteners(noise), _priors(problem)
     # Places count on from one kind of numbers to the next.
     for one, before in ((white, (source,)), (prior, (source, white))):
         shared, own = (sum(part.size(mine) for part in before) for mine in (False, True))
@@ -143,7 +143,7 @@ def _plain(values: Array, core: int) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Divided:
+class Divided:
     """Numbers that are shared (numbers,), those that are not (N or 1, numbers), and where to find them."""
 
     common: Array
@@ -151,10 +151,11 @@ class _Divided:
     place: Array
 
     def size(self, own: bool) -> int:
+        """Return the count of the numbers of each problem, or of the shared ones."""
         return self.own.shape[1] if own else len(self.common)
 
     @classmethod
-    def of(cls, parts: list[Array]) -> _Divided:
+    def of(cls, parts: list[Array]) -> Divided:
         """Return parts (N or 1, numbers) divided; `place` (parts, 4) begins with the place of each."""
         place, lengths = np.zeros((len(parts), _COLUMNS), dtype=np.int64), [0, 0]
         for i, part in enumerate(parts):
@@ -169,14 +170,15 @@ class _Divided:
         return cls(flat, own[0] if own else np.zeros((1, 0)), place)
 
 
-def _sources(problem: Problem) -> _Divided:
+def sources(problem: Problem) -> Divided:
+    """Return the data arrays of a flat batch of problems, see `optloc.compute.tables.Sources`."""
     parts = [_plain(array, core) for array, core in Sources.of(problem).arrays]
-    return _Divided.of([np.zeros((1, 1)), *parts])
+    return Divided.of([np.zeros((1, 1)), *parts])
 
 
-def _whiteners(noise: tuple[Whitener, ...]) -> _Divided:
+def _whiteners(noise: tuple[Whitener, ...]) -> Divided:
     """Return whitening matrices; a line of `place` for each group."""
-    divided, lines = _Divided.of([_plain(w.matrix, 3) for w in noise]), []
+    divided, lines = Divided.of([_plain(w.matrix, 3) for w in noise]), []
     for start, w in zip(divided.place[:, AT], noise, strict=True):
         count, size = w.row.shape
         step = size * size if w.matrix.shape[-3] > 1 else 0
@@ -184,10 +186,10 @@ def _whiteners(noise: tuple[Whitener, ...]) -> _Divided:
         line[:, AT] = start + (step if start >= 0 else -step) * np.arange(count)
         line[:, FULL] = np.triu(w.matrix, 1).reshape(-1, w.matrix.shape[-3], size * size).any((0, 2))
         lines.append(line)
-    return _Divided(divided.common, divided.own, np.concatenate(lines))
+    return Divided(divided.common, divided.own, np.concatenate(lines))
 
 
-def _priors(problem: Problem) -> _Divided:
+def _priors(problem: Problem) -> Divided:
     layout, parts, heads = problem.layout, [], []
     for name, mean, precision in prior_parts(problem):
         slot, shared = layout.find(name)
@@ -196,7 +198,7 @@ def _priors(problem: Problem) -> _Divided:
         count = max(len(part) for part in both)
         parts.append(np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in both], axis=1))
         heads.append((slot.start, slot.size, int(not shared)))
-    divided = _Divided.of(parts)
+    divided = Divided.of(parts)
     divided.place[:, 1:] = np.array(heads, dtype=np.int64).reshape(-1, 3)
     return divided
 

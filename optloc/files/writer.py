@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -84,7 +86,7 @@ def harmless_column(values: Any) -> Any:
 
 
 class GrowingTable:
-    """A CSV file for people that grows row by row: each row is whole as soon as it is added.
+    """A CSV file for people that grows row by row: each row is whole as soon as it is added, last at `when` seconds.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ class GrowingTable:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.file, self.rows = path, Growing(path), 0
+        self.path, self.file, self.rows, self.when = path, Growing(path), 0, -math.inf
 
     def add(self, columns: Mapping[str, Any]) -> None:
         """Add rows, the same columns each time; raise InvalidProblem where that fails."""
@@ -102,7 +104,7 @@ class GrowingTable:
         table, lines = _table(columns, for_people=True), BytesIO()
         csv.write_csv(table, lines, csv.WriteOptions(include_header=not self.rows))
         self.file.append(lines.getvalue())
-        self.rows += table.num_rows
+        self.rows, self.when = self.rows + table.num_rows, monotonic()
 
 
 def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Path]:

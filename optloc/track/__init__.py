@@ -6,13 +6,14 @@ from optloc.track.measurement_space import lines, simplified
 from optloc.track.run import Entry, Rules, collected, tracked
 from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted
-from optloc.track.updates import UPDATES, Updated, ekf, reweighted, whitened
+from optloc.track.updates import UPDATES, Filter, Updated, ekf, gated, reweighted, whitened
 from optloc.track.whole_run import fitted, posterior_bound, smoothed
 
 __all__ = [
     "UPDATES",
     "Dynamics",
     "Entry",
+    "Filter",
     "Rules",
     "State",
     "Track",
@@ -25,6 +26,7 @@ __all__ = [
     "fitted",
     "followed",
     "followed_with_constants",
+    "gated",
     "lines",
     "polynomial",
     "posterior_bound",

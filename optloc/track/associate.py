@@ -10,13 +10,11 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
-from optloc.linear.normal import linearise, weighed
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
-from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
 from optloc.track.track import State
-from optloc.track.updates import Update, filter_of
+from optloc.track.updates import check_width, innovation
 
 Associate = Callable[[Problem, State, Array], Array]
 """Maps a scan of one row a channel, predicted targets (..., t) and candidates (..., m, c) to picks, ints (..., t, m).
@@ -272,90 +270,7 @@ def _keep_best(score: Array) -> Array:
     return np.argsort(key, axis=-1, kind="stable")[..., :_SETS]
 
 
-# Gates: which rows of a scan can be those of a predicted state.
-
-
-@dataclass(frozen=True, slots=True)
-class Innovation:
-    """What a scan measures less what a predicted state lets expect.
-
-    Parameters
-    ----------
-    value : array (..., m)
-        z - h(x) of each row in its SI unit, angles wrapped; zero for absent rows.
-    covariance : array (..., m, m)
-        S = H P H' + R.
-    """
-
-    value: Array
-    covariance: Array
-
-    @property
-    def normalised(self) -> Array:
-        """Return each row's innovation in units of its own standard deviation, (..., m)."""
-        return np.asarray(self.value / np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
-
-
-def innovation(scan: Problem, mean: Array, cov: Array) -> Innovation:
-    """Return the innovation of every row of a scan.
-
-    Parameters
-    ----------
-    scan : Problem
-        A problem of one epoch whose only unknown is the state.
-    mean : array (..., n)
-        Predicted states.
-    cov : array (..., n, n)
-        Their covariances.
-
-    References
-    ----------
-    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
-    5.2.3-9.
-    """
-    linear = linearise(scan, mean, ())  # nothing is whitened here
-    H = linear.shared
-    # Station errors are part of the noise, and grow with the place of the target.
-    R = noises.dense(weighed(scan, mean).noise, np.arange(scan.count))
-    return Innovation(linear.residual, H @ cov @ np.swapaxes(H, -1, -2) + R)
-
-
-def gated(update: Update | str, width: float = 5.0) -> Update:
-    """Return a filter that leaves out the rows whose innovation is too large to be true.
-
-    Parameters
-    ----------
-    update : callable or str
-        The filter, or its name in `UPDATES`.
-    width : float
-        Half width of the gate in standard deviations of each row's innovation, prediction included.
-
-    Returns
-    -------
-    callable
-        A filter; `Updated.count` tells how many rows passed.
-
-    Raises
-    ------
-    InvalidProblem
-        For an unknown filter or a width that is not positive.
-    """
-    rule = filter_of(update)
-    check_width(width)
-    return lambda scan, mean, cov: rule(scan.with_rows(weight=weights_within(scan, mean, cov, width)), mean, cov)
-
-
-def weights_within(scan: Problem, mean: Array, cov: Array, width: float) -> Array:
-    """Return the weights (..., m) of a scan's rows, zero where the innovation is outside a gate."""
-    with np.errstate(invalid="ignore"):  # a state that is lost has no row in its gate
-        inside = np.abs(innovation(scan, mean, cov).normalised) <= width
-    return np.asarray(np.where(inside, scan.weight, 0.0))
-
-
-def check_width(width: float) -> None:
-    """Refuse a gate that is not open; raise InvalidProblem."""
-    if not width > 0.0:
-        raise InvalidProblem(f"the gate is {width} wide", "width", "give a number of standard deviations above 0")
+# Candidates against what is expected of a target.
 
 
 def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.track.dynamics import Dynamics
-from optloc.track.track import State, Track, check_state, check_trackable, follow, scan_at
+from optloc.track.track import State, Track, check_state, check_trackable, follow
 from optloc.track.updates import Update, filter_of
 
 
@@ -79,8 +79,7 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
     # Whatever the layout shares between epochs beside the states of motion is a constant of the run.
     constants = problem.layout.n_shared - sum((motion.order + 1) * d for motion in problem.motions)
     check_state(start, (dynamics.order + 1) * d + constants)
-    given = ((time, scan_at(problem, k, dynamics.order)) for k, time in enumerate(problem.times.tolist()))
-    return follow(given, start, _with_constants(dynamics, constants), filter_of(update), d)
+    return follow(problem, start, _with_constants(dynamics, constants), filter_of(update))
 
 
 def _check(problem: Problem) -> None:

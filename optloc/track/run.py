@@ -12,14 +12,25 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
+from optloc.compute.filter import CODE, GENERAL, INNOVATION, PRESENT, REJECTED_ROWS, SPREAD, Filtering
 from optloc.problem.epochs import joined
 from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
-from optloc.track.associate import innovation, weights_within
 from optloc.track.dynamics import Dynamics
+from optloc.track.scan_rows import Scans
 from optloc.track.start import Beginning, Fit, Undecided, begin, reach, with_height_rows
-from optloc.track.track import State, Track, check_state, check_trackable, collect, predicted, scan_at, take_scan
-from optloc.track.updates import Update, Updated, filter_of
+from optloc.track.track import (
+    State,
+    Track,
+    check_state,
+    check_trackable,
+    collect,
+    move_of,
+    predicted,
+    scan_at,
+    take_scan,
+)
+from optloc.track.updates import Filter, Update, Updated, filter_of, innovation, read, weights_within
 
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
@@ -143,7 +154,7 @@ def tracked(
     rules = rules or Rules()
     course = _Course(start, float(problem.times[0]) if start is None else start.time, _Recent(rules))
     course.fresh = start is not None
-    return _Run(with_height_rows(cleaned), broken, dynamics, rule, rules).entries(course)
+    return _Run.of(cleaned, broken, dynamics, rule, rules).entries(course)
 
 
 def collected(entries: Sequence[Entry], dimension: int) -> Track:
@@ -162,17 +173,50 @@ def collected(entries: Sequence[Entry], dimension: int) -> Track:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """One run, or a stretch of it, with its rules; `broken` says which of its rows (m,) are not finite."""
+    """One run, or a stretch of it, with its rules.
+
+    Parameters
+    ----------
+    problem : Problem
+        The run.
+    scans : Scans
+        Its scans as arrays.
+    bad : list of int
+        Rows of each scan that are not finite.
+    dynamics, rule, rules
+        As of `tracked`.
+    how : Filtering or None
+        The filter with the gate, as machine code takes it.
+    near : float
+        Total variance below which a prediction is followed: it is nearer than the stations are spread, squared.
+    """
 
     problem: Problem
-    broken: Array
+    scans: Scans
+    bad: list[int]
     dynamics: Dynamics
     rule: Update
     rules: Rules
+    how: Filtering | None
+    near: float
+
+    @classmethod
+    def of(cls, problem: Problem, broken: Array, dynamics: Dynamics, rule: Update, rules: Rules) -> _Run:
+        """Return a run whose rows (m,) are `broken` where they are not finite."""
+        bad = np.bincount(problem.epoch[broken], minlength=problem.epochs).tolist()
+        problem = with_height_rows(problem)
+        # An infinite gate refuses NaN: the largest number does what infinity does for innovations.
+        gate, how = min(rules.gate, float(np.finfo(float).max)), None
+        if isinstance(rule, Filter):
+            own = min(gate, rule.how.gate)
+            how = rule.how._replace(gate=float(own), most=rules.most, d=problem.dimension)
+        # From any centre, a station is at least half of the largest extent away.
+        near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
+        return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
     def entries(self, course: _Course, *, ends: bool = True) -> Iterator[Entry]:
         """Yield all entries, one for each scan, from where a track stands; `ends` as of `begin`."""
-        times, k = self.problem.times, 0
+        times, k = self.problem.times.tolist(), 0
         while k < len(times):
             if course.state is None:
                 r = self.rules
@@ -180,18 +224,18 @@ class _Run:
                 yield from self._starting(start_here, k, course.why)
                 k, course.state, course.missed = start_here.last + 1, start_here.state, 0
                 course.recent.begin(start_here)
-                course.heard = float(times[start_here.last])
+                course.heard = times[start_here.last]
                 continue
-            ahead = predicted(course.state, self.dynamics, float(times[k]), self.problem.dimension)
-            course.why = self._unbridged(ahead, times[k] - course.heard)
-            if course.why:
-                course.state = None
+            found = self._update(k, course.state, times[k] - course.heard)
+            if isinstance(found, str):
+                course.why, course.state = found, None
                 continue
-            entry, fit = self._updated(k, ahead)
+            course.why = ""
+            entry, fit = found
             if course.fresh and entry.updated.count + entry.rejected > 0:
                 _check_agrees(entry)
                 course.fresh = False
-            course.take(entry, fit, entry.rejected - self._bad(k))
+            course.take(entry, fit, entry.rejected - self.bad[k])
             k += 1
             yield course.recent.judge(entry)
             course.judge()
@@ -204,31 +248,43 @@ class _Run:
         for i in range(k, begun.last + 1):
             time = float(self.problem.times[i])
             if i < begun.last or begun.state is None:
-                yield Entry(time, none, begun.waiting, self._bad(i), "starting", begun.reason)
+                yield Entry(time, none, begun.waiting, self.bad[i], "starting", begun.reason)
                 continue
             count = np.array(int((self.problem.weight[self.problem.epoch == i] > 0.0).sum()) - begun.left_out)
             done = replace(none, mean=begun.state.mean, cov=begun.state.cov, count=count)
             reason = "; ".join(filter(None, (why, begun.reason)))
-            out = self._bad(i) + begun.left_out
+            out = self.bad[i] + begun.left_out
             yield Entry(time, done, begun.code, out, "restarted" if why else "started", reason)
 
-    def _bad(self, k: int) -> int:
-        """Return how many rows of a scan are not finite."""
-        # Rows of an exact height stand behind those of the file, and are never broken.
-        return int(self.broken[self.problem.epoch[: len(self.broken)] == k].sum())
+    def _update(self, k: int, state: State, silence: float) -> tuple[Entry, Fit] | str:
+        """Return what becomes of a state by a scan and how all rows fit the prediction, or why it is not followed."""
+        if self.rules.gap is not None and silence > self.rules.gap:
+            return f"no valid row for {silence:.6g} s"
+        time = float(self.problem.times[k])
+        if self.how is not None and self.scans.rows[k] is not None:
+            move = move_of(state, self.dynamics, time, self.problem.dimension)
+            found = self.scans.filtered(k, state.mean, state.cov, self.how, move)
+            if found is not None and found.values[CODE] != GENERAL:
+                values = found.values.tolist()
+                if values[SPREAD] > self.near and self.rules.gap is None:
+                    why = self._unbridged(predicted(state, self.dynamics, time, self.problem.dimension), silence)
+                    if why:
+                        return why
+                entry = self._entry(k, read(found), int(values[CODE]), int(values[REJECTED_ROWS]), [])
+                return entry, (values[INNOVATION], int(values[PRESENT]))
+        ahead = predicted(state, self.dynamics, time, self.problem.dimension)
+        return ("" if self.rules.gap is not None else self._unbridged(ahead, silence)) or self._general(k, ahead)
 
     def _unbridged(self, ahead: State, silence: float) -> str:
         """Return why a prediction is not worth following; empty where it is."""
-        if self.rules.gap is not None:
-            return f"no valid row for {silence:.6g} s" if silence > self.rules.gap else ""
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
         # Where a prediction may be anywhere between the stations, a fix without a guess tells more.
         limit = reach(self.problem, ahead.mean[:d])
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
-    def _updated(self, k: int, ahead: State) -> tuple[Entry, Fit]:
-        """Return the update of a prediction by the rows of a scan that pass the gate, and how all of them fit it."""
+    def _general(self, k: int, ahead: State) -> tuple[Entry, Fit]:
+        """Return the update of a prediction by any filter with the rows of a scan that pass the gate."""
         scan = scan_at(self.problem, k, self.dynamics.order)
         # Gate first, update then: an iterated update would be drawn by what it should not believe.
         off = innovation(scan, ahead.mean, ahead.cov).normalised[scan.weight > 0.0] if scan.rows else np.zeros(0)
@@ -240,14 +296,18 @@ class _Run:
         fit = float(np.nan_to_num(np.minimum(off**2, self.rules.most), nan=self.rules.most).sum()), len(off)
         causes: list[str] = []
         done, code = take_scan(used, ahead, self.rule, causes)
-        status, rejected, reason = Status(int(code)), lost + self._bad(k), ""
+        return self._entry(k, done, int(code), lost, causes), fit
+
+    def _entry(self, k: int, done: Updated, code: int, lost: int, causes: list[str]) -> Entry:
+        """Return the entry of an update, of which a number of rows (`lost`) did not pass the gate."""
+        status, rejected, count, reason = Status(code), lost + self.bad[k], int(done.count), ""
         if status == Status.TOO_FEW_ROWS and not rejected:
             reason = "no valid row: the state was only predicted"
-        elif rejected > int(done.count):
-            status, reason = Status.REJECTED, f"{rejected} of {rejected + int(done.count)} rows were left out"
+        elif rejected > count:
+            status, reason = Status.REJECTED, f"{rejected} of {rejected + count} rows were left out"
         elif status == Status.NUMERICAL:
             reason = "; ".join([*causes, "the update failed: the state was only predicted"])
-        return Entry(ahead.time, done, status, rejected, "", reason), fit
+        return Entry(float(self.problem.times[k]), done, status, rejected, "", reason)
 
 
 class _Recent:
@@ -258,6 +318,8 @@ class _Recent:
         # row in ten is wild, ten of twenty are in one window of a million.
         self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
         self.rules, self.most, self.since = rules, rules.most, 0
+        # The mean squared innovation as a share of the squared gate; 0 where the rows are too few to tell.
+        self.share = 0.0
 
     def begin(self, start: Beginning) -> None:
         """Take the rows of a start; what did not fit before is forgotten where they agree, and else still counts."""
@@ -272,13 +334,11 @@ class _Recent:
         if count > 0:
             self.scans.append((min(square, self.most * count), count))
             self.since += 1
-
-    @property
-    def share(self) -> float:
-        """Return the mean squared innovation as a share of the squared gate; 0 where the rows are too few to tell."""
-        rows = sum(count for _, count in self.scans)
+        total, rows = 0.0, 0
+        for square, count in self.scans:
+            total, rows = total + square, rows + count
         assert self.scans.maxlen is not None
-        return sum(square for square, _ in self.scans) / (self.most * rows) if rows >= self.scans.maxlen else 0.0
+        self.share = total / (self.most * rows) if rows >= self.scans.maxlen else 0.0
 
     @property
     def lost(self) -> bool:
@@ -402,7 +462,7 @@ class Follower:
             self._waiting, self.last = run, time
             return []
         cleaned, broken = _clean(reduce(joined, run))
-        stretch = _Run(with_height_rows(cleaned), broken, self._dynamics, self._rule, self._rules)
+        stretch = _Run.of(cleaned, broken, self._dynamics, self._rule, self._rules)
         course = self._course or _Course(None, float(run[0].times[0]), _Recent(self._rules))
         done: list[Entry] = []
         self._needed = 1

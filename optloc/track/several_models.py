@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
-from optloc.track.track import State, Track, check_state, collect, followed, predicted, scans, take_scan
+from optloc.track.scan_rows import Scans
+from optloc.track.track import State, Track, check_state, check_trackable, collect, followed, step
 from optloc.track.updates import Update, Updated, filter_of
 
 # Side by side from one start: the data say which model is right.
@@ -174,13 +175,15 @@ def imm(
     # Before the first scan nothing speaks for one model.
     weight = np.full((*start.mean.shape[:-1], len(models)), 1.0 / len(models))
     steps, times, weights = [], [], []
-    for time, scan in scans(problem, max(model.order for model in models)):
+    check_trackable(problem)
+    given = {order: Scans.of(problem, order) for order in {model.order for model in models}}
+    for k, time in enumerate(problem.times.tolist()):
         if time <= start.time:
             continue
         # Mixing comes before prediction: each model starts from what all of them believe.
         states, coming = mixed(states, weight, chain)
-        ahead = [predicted(state, model, time, d) for state, model in zip(states, models, strict=True)]
-        done = [take_scan(_of_order(scan, model), state, rule) for state, model in zip(ahead, models, strict=True)]
+        both = zip(states, models, strict=True)
+        done = [step(given[model.order], k, state, model, rule) for state, model in both]
         states = [State(time, each.mean, each.cov) for each, _ in done]
         weight, total = _weigh(done, coming)
         steps.append(_combine(done, weight, total))
@@ -233,10 +236,6 @@ def _transition(transition: Array, count: int) -> Array:
     return chain
 
 
-def _of_order(scan: Problem, model: Dynamics) -> Problem:
-    return replace(scan, motions=(replace(scan.motions[0], order=model.order),))
-
-
 def _lend(state: State, own: State) -> State:
     """Return a state in the order of another one, what it lacks taken from there."""
     n, held = own.mean.shape[-1], state.mean.shape[-1]
@@ -267,19 +266,24 @@ def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array,
 def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
     """Return the update over all models, and its status: the best one of the models."""
     n = max(each.mean.shape[-1] for each, _ in done)
-    means, covs = [], []
-    for each, _ in done:
-        # A model without velocity or acceleration says that they are zero, and is sure of it.
-        pad = n - each.mean.shape[-1]
-        means.append(np.pad(each.mean, [(0, 0)] * (each.mean.ndim - 1) + [(0, pad)]))
-        covs.append(np.pad(each.cov, [(0, 0)] * (each.cov.ndim - 2) + [(0, pad)] * 2))
-    mean, cov = moments(means, covs, weight)
+    both = [_widened(each, n) for each, _ in done]
+    mean, cov = moments([one for one, _ in both], [around for _, around in both], weight)
     nis = np.stack([each.nis for each, _ in done], axis=-1)
     used = np.where(weight > 0.0, nis, 0.0)
     count = np.max([np.broadcast_to(each.count, total.shape) for each, _ in done], axis=0)
     # Ok is the least code: one model that follows the target is enough.
     code = np.min([code for _, code in done], axis=0).astype(np.int8)
     return Updated(mean, cov, (weight * used).sum(-1), total, count), code
+
+
+def _widened(done: Updated, n: int) -> tuple[Array, Array]:
+    """Return mean (..., n) and covariance: a model without velocity or acceleration is sure that they are zero."""
+    held = done.mean.shape[-1]
+    if held == n:
+        return done.mean, done.cov
+    mean, cov = np.zeros((*done.mean.shape[:-1], n)), np.zeros((*done.cov.shape[:-2], n, n))
+    mean[..., :held], cov[..., :held, :held] = done.mean, done.cov
+    return mean, cov
 
 
 # What both are made of.
@@ -362,9 +366,8 @@ def moments(means: Sequence[Array], covs: Sequence[Array], weight: Array) -> tup
     weight : array (..., q)
         Their probabilities.
     """
-    mean = np.asarray(sum(weight[..., i, None] * one for i, one in enumerate(means)))
-    cov = np.zeros((*mean.shape, mean.shape[-1]))
-    for i, (one, around) in enumerate(zip(means, covs, strict=True)):
-        away = one - mean
-        cov = cov + weight[..., i, None, None] * (around + away[..., :, None] * away[..., None, :])
+    centre, each = np.stack(means, axis=-2), np.stack(covs, axis=-3)
+    mean = (weight[..., None, :] @ centre)[..., 0, :]
+    away = centre - mean[..., None, :]
+    cov = (weight[..., None, None] * (each + away[..., :, None] * away[..., None, :])).sum(-3)
     return mean, cov

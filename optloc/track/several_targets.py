@@ -16,8 +16,9 @@ from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.track.associate import Associate
 from optloc.track.dynamics import Dynamics
+from optloc.track.scan_rows import Scans
 from optloc.track.several_models import spread
-from optloc.track.track import State, Track, check_state, collect, predicted, scans, take_scan
+from optloc.track.track import State, Track, check_state, collect, predicted, scans, step
 from optloc.track.updates import Update, filter_of
 
 Missing = Literal["drop", "expect"]
@@ -72,25 +73,27 @@ def associated(
     InvalidProblem
         For an unknown filter, a state that does not fit the dynamics or has no axis of targets.
     """
-    given, step = _check(given), filter_of(update)
+    given, filtering = _check(given), filter_of(update)
     d = given.channels.dimension
     check_state(start, (dynamics.order + 1) * d)
     if start.mean.ndim < 2:
         raise InvalidProblem("the state has no axis of targets", "start", "give means (..., t, n)")
     # The start gets the leading axes of the candidates, and its axis of targets behind them.
     state, steps, times, picks = spread(start, (*given.z.shape[:-2], 1)), [], [], []
-    for time, scan, z in given.scans(dynamics.order):
+    runs = Scans.of(given.channels, dynamics.order)
+    for k, (time, scan, z) in enumerate(given.scans(dynamics.order)):
         if time <= start.time:
             continue
         ahead = predicted(state, dynamics, time, d)
         pick = rule(scan, ahead, z) if scan.rows else np.zeros((*ahead.mean.shape[:-1], 0), dtype=np.int64)
+        more = None
         if scan.rows:
             found = np.take_along_axis(z[..., None, :, :], np.maximum(pick, 0)[..., None], axis=-1)[..., 0]
             expected = predict(scan, ahead.mean)
             # A channel that "expects" has the prediction as its row: an innovation of zero shrinks the covariance.
             weight = (pick >= 0).astype(float) if missing == "drop" else np.ones(pick.shape)
-            scan = scan.with_rows(z=np.where(pick >= 0, found, expected), weight=weight)  # noqa: PLW2901
-        done, code = take_scan(scan, ahead, step)
+            more = np.where(pick >= 0, found, expected), weight
+        done, code = step(runs, k, ahead, dynamics, filtering, more)
         # Rows that no target took were there, but did not fit: that is another status than silence.
         seen = np.asarray(np.isfinite(z).any((-1, -2)))[..., None]
         code = np.where((code == Status.TOO_FEW_ROWS) & seen, Status.REJECTED, code).astype(np.int8)

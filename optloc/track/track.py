@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from optloc.base.errors import NUMERICAL, InvalidProblem
 from optloc.base.types import Array, Motion, Status
+from optloc.compute.filter import CODE, GENERAL, Move
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
-from optloc.track.updates import Update, Updated, filter_of
+from optloc.track.scan_rows import Scans
+from optloc.track.updates import Filter, Update, Updated, filter_of, read
 
 # Eigenvalue below zero, as a share of the largest entry, that rounding makes of a covariance which is singular.
 _NEGATIVE = 1e-9
@@ -111,23 +113,75 @@ def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update 
         For an unknown filter, a state that does not fit the dynamics, or a run that is not one target's.
     """
     check_state(start, (dynamics.order + 1) * problem.dimension)
-    return follow(scans(problem, dynamics.order), start, dynamics, filter_of(update), problem.dimension)
+    check_trackable(problem)
+    return follow(problem, start, dynamics, filter_of(update))
 
 
-def follow(
-    given: Iterable[tuple[float, Problem]], start: State, dynamics: Dynamics, rule: Update, dimension: int
-) -> Track:
-    """Return the track of a state through scans with their times; those not later than the start are left out."""
-    state, steps, times = start, [], []
-    for time, scan in given:
+def follow(problem: Problem, start: State, dynamics: Dynamics, rule: Update) -> Track:
+    """Return the track of a state through the scans of a run; those not later than the start are left out."""
+    given, state, steps, times = Scans.of(problem, dynamics.order), start, [], []
+    for k, time in enumerate(problem.times.tolist()):
         if time <= start.time:
             continue
-        ahead = predicted(state, dynamics, time, dimension)
-        done, code = take_scan(scan, ahead, rule)
+        done, code = step(given, k, state, dynamics, rule)
         state = State(time, done.mean, done.cov)
         steps.append((done, code))
         times.append(time)
-    return collect(np.array(times), steps, dimension)
+    return collect(np.array(times), steps, problem.dimension)
+
+
+def step(
+    given: Scans,
+    k: int,
+    state: State,
+    dynamics: Dynamics,
+    rule: Update,
+    more: tuple[Array, Array] | None = None,
+) -> tuple[Updated, Array]:
+    """Return the update of a state by a scan, and its status (...), as of `take_scan`.
+
+    Parameters
+    ----------
+    given : Scans
+        Of the run.
+    k : int
+        Which scan; it is not before the state.
+    state : State
+        Before the prediction.
+    dynamics : Dynamics
+        Model of motion.
+    rule : callable
+        The filter.
+    more : tuple of array (..., m), optional
+        Measurements less corrections, and weights, that replace the scan's.
+    """
+    problem = given.problem
+    time, d = float(problem.times[k]), problem.dimension
+    if isinstance(rule, Filter) and given.rows[k] is not None:
+        found = given.filtered(
+            k, state.mean, state.cov, rule.how._replace(d=d), move_of(state, dynamics, time, d), more
+        )
+        if found is not None and not (found.values[..., CODE] == GENERAL).any():
+            return read(found), found.values[..., CODE].astype(np.int8)
+    scan = scan_at(problem, k, given.order)
+    if more is not None:
+        scan = scan.with_rows(z=more[0] + scan.correction, weight=more[1])
+    return take_scan(scan, predicted(state, dynamics, time, d), rule)
+
+
+def move_of(state: State, dynamics: Dynamics, time: float, dimension: int) -> Move | None:
+    """Return the prediction of a state (...) for a later time, or None where no time passes."""
+    dt = _elapsed(state, time)
+    if dt == 0.0:
+        return None
+    return Move(*dynamics.step(dt, state.mean, dimension))
+
+
+def _elapsed(state: State, time: float) -> float:
+    """Return the seconds from a state to a later time; raise InvalidProblem for an earlier one."""
+    if time < state.time:
+        raise InvalidProblem(f"the scan at {time} s is before the state at {state.time} s", "times", "sort the scans")
+    return time - state.time
 
 
 def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> State:
@@ -144,9 +198,7 @@ def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> 
     dimension : int
         2 or 3.
     """
-    dt = time - state.time
-    if dt < 0.0:
-        raise InvalidProblem(f"the scan at {time} s is before the state at {state.time} s", "times", "sort the scans")
+    dt = _elapsed(state, time)
     # Two scans of one instant: models that divide by the step are not asked.
     if dt == 0.0:
         return state

@@ -1,33 +1,42 @@
-"""What one scan says about a predicted state: one small function for each filter, all on the same linearisation."""
+"""What one scan says about a predicted state: all filters update from the same linearised rows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Table
 from optloc.base.types import Array
-from optloc.compute.filter import Absorbed, absorb
-from optloc.compute.jit import at_hand
-from optloc.compute.pack import Packed, observed, pack
+from optloc.compute.filter import (
+    CODE,
+    COUNT,
+    EKF,
+    GENERAL,
+    HALVINGS,
+    IEKF,
+    LOGLIKELIHOOD,
+    MGEKF,
+    MVEKF,
+    NIS,
+    NODES,
+    RISE,
+    SHARES,
+    Filtered,
+    Filtering,
+)
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import depends_on_place, linearise, whitener_at
+from optloc.linear.normal import linearise, weighed
+from optloc.problem import noise as noises
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
 from optloc.solvers.robust.reweighting import Doubt, fold_signs
+from optloc.track.scan_rows import Scans, size_of
 
-# Gauss-Legendre nodes along the step: exact up to degree 9, and derivatives of ranges and angles are smooth over it.
-_NODES = 5
-# Halvings of a step that raises the cost: the last is a 256th, beyond which the point is as good as stationary.
-_HALVINGS = 8
-# Rise of a cost, as a share of it, that is rounding and no reason to halve.
-_RISE = 1e-9
 # Turns of weights and updates, and the change of all weights that ends them: it moves a state by less than a thousandth
 # of a sigma. A turn costs what a plain update does and takes about two thirds off the change: seven as a rule.
 _TURNS, _SETTLED = 30, 1e-4
@@ -62,90 +71,77 @@ Update = Callable[[Problem, Array, Array], Updated]
 """Maps a scan (a problem of one epoch whose only unknown is the state), means and covariances to the updated state."""
 
 
-def ekf(scan: Problem, mean: Array, cov: Array) -> Updated:
-    """Return the update of the extended Kalman filter: one linearisation at the prediction.
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """A shipped filter: an `Update` that one call of machine code does for each scan.
 
-    The same as the "log-likelihood pseudo-linear" update of angle trackers: normal equations of the rows linearised at
-    the prediction, with the prediction as prior.
+    - The extended Kalman filter linearises once, at the prediction [1]_. It is the same as the "log-likelihood
+      pseudo-linear" update of angle trackers: normal equations of the rows, with the prediction as prior.
+    - The iterated filter takes Gauss-Newton steps to the maximum a posteriori point [2]_. It halves a step that raises
+      the cost.
+    - The modified gain has the state of the first with another covariance [3]_. This covariance uses a g with
+      h(x) - h(y) = g (x - y) exactly, y the prediction and x the updated state: the mean of the derivative over the way
+      from one to the other, which is such a g for every kind of measurement.
+    - The modified covariance has the state of the first, and a covariance linearised after the step.
+
+    Parameters
+    ----------
+    summary : str
+        One line.
+    how : Filtering
+        Form, steps and gate.
 
     References
     ----------
-    A. H. Jazwinski, "Stochastic Processes and Filtering Theory" (1970), theorem 8.1.
+    .. [1] A. H. Jazwinski, "Stochastic Processes and Filtering Theory" (1970), theorem 8.1.
+    .. [2] B. M. Bell, F. W. Cathey, "The iterated Kalman filter update as a Gauss-Newton method", IEEE Trans. Autom.
+       Control 38 (1993).
+    .. [3] T. L. Song, J. L. Speyer, "A stochastic analysis of a modified gain extended Kalman filter with applications
+       to estimation with bearings only measurements", IEEE Trans. Autom. Control 30 (1985), eq. 9 to 13.
     """
-    quick = _by_machine_code(scan, mean, cov, 1, 0.0)
-    if quick is not None:
-        return quick
-    white = whitened(scan, mean)
-    gain = _gain(white.H, cov)
-    moved = mean + (gain @ white.residual[..., None])[..., 0]
-    return _finish(white, cov, moved, joseph(white.H, gain, cov))
+
+    summary: str
+    how: Filtering
+
+    def __call__(self, scan: Problem, mean: Array, cov: Array) -> Updated:
+        """Return the update of states (..., n) that hold at the time of a scan."""
+        motion = scan.motions[0]
+        if scan.epochs == 1 and motion.known is None and motion.reference in (None, scan.times[0]):
+            found = Scans.of(scan, motion.order).filtered(0, mean, cov, self.how._replace(d=scan.dimension))
+            if found is not None and not (found.values[..., CODE] == GENERAL).any():
+                return read(found)
+        return self._general(scan, mean, cov)
+
+    def _general(self, scan: Problem, mean: Array, cov: Array) -> Updated:
+        """Return the update in NumPy: for what `optloc.track.scan_rows.Scans` does not serve."""
+        form, gate = self.how.form, self.how.gate
+        if np.isfinite(gate):
+            scan = scan.with_rows(weight=weights_within(scan, mean, cov, gate))
+        white = whitened(scan, mean)
+        slope, gain = white.H, _gain(white.H, cov)
+        x = mean + (gain @ white.residual[..., None])[..., 0]
+        if form == IEKF:
+            x = _converged(scan, mean, cov, white, self.how)
+        if form in (IEKF, MVEKF):
+            slope = whitened(scan, x).H
+            gain = _gain(slope, cov)
+        if form == MGEKF:
+            parts = [w * whitened(scan, mean + node * (x - mean)).H for node, w in zip(NODES, SHARES, strict=True)]
+            slope = np.sum(parts, axis=0)
+        return _finish(white, cov, x, joseph(slope, gain, cov))
 
 
+ekf = Filter("the extended Kalman filter: one linearisation at the prediction", Filtering(EKF))
+"""The extended Kalman filter."""
 # Gauss-Newton converges in two to four steps near its answer; a step of a millionth of a sigma is none.
-def iekf(scan: Problem, mean: Array, cov: Array, *, limit: int = 20, tolerance: float = 1e-6) -> Updated:
-    """Return the update of the iterated extended Kalman filter: Gauss-Newton to the maximum a posteriori point.
-
-    Steps that would raise the cost are halved.
-
-    References
-    ----------
-    B. M. Bell, F. W. Cathey, "The iterated Kalman filter update as a Gauss-Newton method", IEEE Trans. Autom. Control
-    38 (1993).
-    """
-    quick = _by_machine_code(scan, mean, cov, limit, tolerance)
-    if quick is not None:
-        return quick
-    first = whitened(scan, mean)
-    # The prior is one more whitened row block: the cost that steps may not raise is that of rows and prior together.
-    prior = linalg.whitening(cov)
-    x, white, moving = mean, first, np.ones(mean.shape[:-1], dtype=bool)
-    cost = (first.residual**2).sum(-1)
-    for _ in range(limit):
-        gain = _gain(white.H, cov)
-        # Gauss-Newton in the form of the filter: rows linearised at x, prior at the prediction.
-        misfit = white.residual - (white.H @ (mean - x)[..., None])[..., 0]
-        step = mean + (gain @ misfit[..., None])[..., 0] - x
-        x, white, cost, length = _shorten(scan, mean, prior, x, step, cost, moving)
-        # Each target of a batch stops by itself, at a step of a millionth of a standard deviation.
-        moving &= length > tolerance
-        if not moving.any():
-            break
-    return _finish(first, cov, x, joseph(white.H, _gain(white.H, cov), cov))
-
-
-def mgekf(scan: Problem, mean: Array, cov: Array) -> Updated:
-    """Return the update of the modified-gain extended Kalman filter.
-
-    Its covariance uses a g with h(x) - h(y) = g (x - y) exactly, y the prediction and x the updated state: the mean of
-    the derivative over the way from one to the other, which is such a g for every kind of measurement.
-
-    References
-    ----------
-    T. L. Song, J. L. Speyer, "A stochastic analysis of a modified gain extended Kalman filter with applications to
-    estimation with bearings only measurements", IEEE Trans. Autom. Control 30 (1985), eq. 9 to 13.
-    """
-    white = whitened(scan, mean)
-    gain = _gain(white.H, cov)
-    # The state moves as in `ekf`; only the covariance is another one.
-    x = mean + (gain @ white.residual[..., None])[..., 0]
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    g = sum(
-        0.5 * weight * whitened(scan, mean + 0.5 * (1.0 + node) * (x - mean)).H
-        for node, weight in zip(nodes, weights, strict=True)
-    )
-    return _finish(white, cov, x, joseph(np.asarray(g), gain, cov))
-
-
-def mvekf(scan: Problem, mean: Array, cov: Array) -> Updated:
-    """Return the update of the modified-covariance extended Kalman filter: the covariance is linearised after the step.
-
-    The state is that of `ekf`; only the next gain differs.
-    """
-    white = whitened(scan, mean)
-    x = mean + (_gain(white.H, cov) @ white.residual[..., None])[..., 0]
-    after = whitened(scan, x)
-    return _finish(white, cov, x, joseph(after.H, _gain(after.H, cov), cov))
-
+iekf = Filter(
+    "the iterated extended Kalman filter: Gauss-Newton to the maximum a posteriori point", Filtering(IEKF, 20, 1e-6)
+)
+"""The iterated extended Kalman filter."""
+mgekf = Filter("the modified-gain extended Kalman filter", Filtering(MGEKF))
+"""The modified-gain extended Kalman filter."""
+mvekf = Filter("the modified-covariance extended Kalman filter: linearised after the step", Filtering(MVEKF))
+"""The modified-covariance extended Kalman filter."""
 
 UPDATES: Table[Update] = Table("optloc.trackers", callable, {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf})
 """Filters by name: add one function and one line, or from another package an entry point of ``optloc.trackers``."""
@@ -158,6 +154,33 @@ def filter_of(update: Update | str) -> Update:
     if update not in UPDATES:
         raise InvalidProblem(f"unknown filter {update!r}", "filter", nearest(update, list(UPDATES)))
     return UPDATES[update]
+
+
+def gated(update: Update | str, width: float = 5.0) -> Update:
+    """Return a filter that leaves out the rows whose innovation is too large to be true.
+
+    Parameters
+    ----------
+    update : callable or str
+        The filter, or its name in `UPDATES`.
+    width : float
+        Half width of the gate in standard deviations of each row's innovation, prediction included.
+
+    Returns
+    -------
+    callable
+        A filter; `Updated.count` is the number of rows that passed.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter or a width that is not positive.
+    """
+    rule = filter_of(update)
+    check_width(width)
+    if isinstance(rule, Filter):
+        return replace(rule, how=rule.how._replace(gate=min(float(width), rule.how.gate)))
+    return lambda scan, mean, cov: rule(scan.with_rows(weight=weights_within(scan, mean, cov, width)), mean, cov)
 
 
 def reweighted(update: Update | str, loss: Loss | str) -> Update:
@@ -216,69 +239,10 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     return robust
 
 
-# One state and one scan by machine code: all but the measurements is kept for scans of the same rows.
-
-
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    """What scans share that differ in time and measurements alone."""
-
-    packed: Packed
-    count: Array
-    logdet: Array
-
-
-# A network has a few sets of rows that hear a target together; each takes some kilobytes.
-_KEPT = Cache["_Kept | None"](256)
-
-
-def _by_machine_code(scan: Problem, mean: Array, cov: Array, limit: int, tolerance: float) -> Updated | None:
-    """Return the update of one state by one scan, or None where it takes numpy: others, or no machine code at hand."""
-    if mean.ndim != 1 or type(mean) is not np.ndarray or not at_hand(absorb) or not _is_plain(scan):
-        return None
-    kept = _KEPT.find(_key_of(scan), lambda: _prepared(scan))
-    if kept is None or kept.packed.tables.shared != len(mean):
-        return None
-    numbers = kept.packed.numbers._replace(observed=observed(scan))
-    out = Absorbed(np.empty(len(mean)), np.empty((len(mean), len(mean))), np.empty(2))
-    x, P = (np.require(array, float, ["C", "W"]) for array in (mean, cov))
-    if absorb(kept.packed._replace(numbers=numbers), x, P, limit, tolerance, out) < 0:
-        return None
-    nis, logdet = out.said
-    return Updated(out.mean, out.cov, nis, -0.5 * (nis + logdet + kept.logdet), kept.count)
-
-
-def _is_plain(scan: Problem) -> bool:
-    """Return whether the state of one target at the time of the scan is all that is unknown."""
-    motion = scan.motions[0]
-    return (
-        not scan.batch_shape
-        and len(scan.times) == len(scan.motions) == 1
-        and motion.known is None
-        and motion.reference in (None, scan.times[0])
-        and not (scan.biases or scan.priors or scan.constraints)
-        and not scan.stations.unknown_for
-    )
-
-
-def _key_of(scan: Problem) -> tuple[Hashable, ...]:
-    """Return a key of all that a scan is made of but its time and its measurements."""
-    s = scan.stations
-    arrays = [s.position, s.velocity, s.axes, s.covariance, s.velocity_covariance]
-    arrays += [b.covariance for b in scan.noise.blocks]
-    arrays += [array for b in scan.noise.blocks for array in (b.row,)]
-    arrays += [array for r in scan.rows for array in (r.a, r.b, r.target, r.weight, r.correction)]
-    sizes = tuple((r.kind, r.count) for r in scan.rows), tuple(b.row.shape for b in scan.noise.blocks)
-    numbers = tuple(None if array is None else array.tobytes() for array in arrays)
-    return (sizes, numbers, s.count, scan.dimension, scan.frame, scan.motions[0].order)
-
-
-def _prepared(scan: Problem) -> _Kept | None:
-    if scan.emitting or depends_on_place(scan):
-        return None
-    noise = whitener_at(scan, np.zeros(scan.layout.size))
-    packed = pack(scan, noise)
-    return None if packed is None or packed.tables.local else _Kept(packed, *_size_of(noise, ()))
+def read(found: Filtered) -> Updated:
+    """Return states after a scan as machine code writes them."""
+    values = found.values
+    return Updated(found.mean, found.cov, values[..., NIS], values[..., LOGLIKELIHOOD], values[..., COUNT])
 
 
 # Rows of a scan, whitened, and what all filters make of them.
@@ -317,16 +281,11 @@ def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None)
 
 def _size_of(noise: tuple[Whitener, ...], shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the number of rows that are present, and the logarithm of the determinant of 2 pi R, each (...)."""
-    count, logdet = np.zeros(shape), np.zeros(shape)
+    total = np.zeros((*shape, 2))
     for w in noise:
-        # A whitener is triangular: the product of its pivots is one over the root of |R|; absent rows have none.
-        pivots = np.diagonal(w.matrix, axis1=-2, axis2=-1)
-        present = pivots > 0.0
         # A block that is common to many groups of rows is stored once.
-        share = len(w.row) if w.matrix.shape[-3] == 1 else 1
-        count = count + share * present.sum((-1, -2))
-        logdet = logdet - 2.0 * share * np.log(np.where(present, pivots, 1.0)).sum((-1, -2))
-    return count, logdet + count * np.log(2.0 * np.pi)
+        total = total + (len(w.row) if w.matrix.shape[-3] == 1 else 1) * size_of(w.matrix).sum(-2)
+    return total[..., 0], total[..., 1]
 
 
 def joseph(H: Array, gain: Array, cov: Array) -> Array:
@@ -354,20 +313,90 @@ def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
     return Updated(mean, after, nis, -0.5 * (nis + logdet), white.count)
 
 
-def _shorten(
-    scan: Problem, mean: Array, prior: Array, x: Array, step: Array, cost: Array, moving: Array
-) -> tuple[Array, White, Array, Array]:
-    """Return the states after steps that do not raise the cost, their rows and costs, and the lengths in sigma."""
-    share = np.where(moving, 1.0, 0.0)
-    for _ in range(_HALVINGS):
-        tried = x + share[..., None] * step
-        white = whitened(scan, tried)
-        away = (prior @ (tried - mean)[..., None])[..., 0]
-        now = (white.residual**2).sum(-1) + (away**2).sum(-1)
-        # NaN counts as worse: a step beyond where h is defined is halved, too.
-        worse = moving & ~(now <= cost + _RISE * (1.0 + np.abs(cost)))
-        if not worse.any():
+def _converged(scan: Problem, mean: Array, cov: Array, white: White, how: Filtering) -> Array:
+    """Return the maximum a posteriori states by Gauss-Newton, from the rows at the predictions on."""
+    # The prior is one more whitened row block: the cost that steps may not raise is that of rows and prior together.
+    prior = linalg.whitening(cov)
+    x, cost, moving = mean, (white.residual**2).sum(-1), np.ones(mean.shape[:-1], dtype=bool)
+    for _ in range(how.limit):
+        # Gauss-Newton in the form of the filter: rows linearised at x, prior at the prediction.
+        misfit = white.residual - (white.H @ (mean - x)[..., None])[..., 0]
+        step = mean + (_gain(white.H, cov) @ misfit[..., None])[..., 0] - x
+        share = np.where(moving, 1.0, 0.0)
+        for _ in range(HALVINGS):
+            tried = x + share[..., None] * step
+            white = whitened(scan, tried)
+            away = (prior @ (tried - mean)[..., None])[..., 0]
+            now = (white.residual**2).sum(-1) + (away**2).sum(-1)
+            # NaN counts as worse: a step beyond where h is defined is halved, too.
+            worse = moving & ~(now <= cost + RISE * (1.0 + np.abs(cost)))
+            if not worse.any():
+                break
+            share = np.where(worse, 0.5 * share, share)
+        # Each target of a batch stops by itself, at a step of a millionth of a standard deviation.
+        length = np.sqrt(((prior @ (tried - x)[..., None])[..., 0] ** 2).sum(-1))
+        x, cost, moving = tried, np.where(moving, now, cost), moving & (length > how.tolerance)
+        if not moving.any():
             break
-        share = np.where(worse, 0.5 * share, share)
-    length = np.sqrt(((prior @ (share[..., None] * step)[..., None])[..., 0] ** 2).sum(-1))
-    return tried, white, np.where(moving, now, cost), length
+    return x
+
+
+# Gates: which rows of a scan can be those of a predicted state.
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """What a scan measures less what a predicted state lets expect.
+
+    Parameters
+    ----------
+    value : array (..., m)
+        z - h(x) of each row in its SI unit, angles wrapped; zero for absent rows.
+    covariance : array (..., m, m)
+        S = H P H' + R.
+    """
+
+    value: Array
+    covariance: Array
+
+    @property
+    def normalised(self) -> Array:
+        """Return each row's innovation in units of its own standard deviation, (..., m)."""
+        return np.asarray(self.value / np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
+
+
+def innovation(scan: Problem, mean: Array, cov: Array) -> Innovation:
+    """Return the innovation of every row of a scan.
+
+    Parameters
+    ----------
+    scan : Problem
+        A problem of one epoch whose only unknown is the state.
+    mean : array (..., n)
+        Predicted states.
+    cov : array (..., n, n)
+        Their covariances.
+
+    References
+    ----------
+    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
+    5.2.3-9.
+    """
+    linear = linearise(scan, mean, ())  # nothing is whitened here
+    H = linear.shared
+    # Station errors are part of the noise, and grow with the place of the target.
+    R = noises.dense(weighed(scan, mean).noise, np.arange(scan.count))
+    return Innovation(linear.residual, H @ cov @ np.swapaxes(H, -1, -2) + R)
+
+
+def weights_within(scan: Problem, mean: Array, cov: Array, width: float) -> Array:
+    """Return the weights (..., m) of a scan's rows, zero where the innovation is outside a gate."""
+    with np.errstate(invalid="ignore"):  # a state that is lost has no row in its gate
+        inside = np.abs(innovation(scan, mean, cov).normalised) <= width
+    return np.asarray(np.where(inside, scan.weight, 0.0))
+
+
+def check_width(width: float) -> None:
+    """Refuse a gate that is not open; raise InvalidProblem."""
+    if not width > 0.0:
+        raise InvalidProblem(f"the gate is {width} wide", "width", "give a number of standard deviations above 0")

@@ -22,8 +22,9 @@ from optloc import Motion, Problem, assemble, measured, with_bias
 from optloc.calibration import calibrate, network_of
 from optloc.cli.fix import run_fix
 from optloc.files.readings import Told
-from optloc.track import State, polynomial, predicted
-from optloc.track.track import scan_at, take_scan
+from optloc.track import State, polynomial
+from optloc.track.scan_rows import Scans
+from optloc.track.track import step
 from optloc.track.updates import UPDATES, filter_of
 
 Array = np.ndarray
@@ -38,10 +39,10 @@ WHITE = np.linalg.inv(np.linalg.cholesky(shared_arrival(5, SIGMA)))
 NODES, SMALL, STEPS = tuple(zip(*np.polynomial.legendre.leggauss(5), strict=True)), 1e-6, 20
 
 
-def scan(z: Array) -> Problem:
-    """Return a scan of measurements (..., 5)."""
+def scan(z: Array) -> Scans:
+    """Return a run of one scan of measurements (..., 5)."""
     rows = measured("tdoa", z, a=np.arange(1, 6), b=0, epoch=np.zeros(5, dtype=int), arrival_sigma=SIGMA)
-    return scan_at(assemble(S, rows, times=[STEP], motions=(Motion(0, span="epoch"),)), 0, 1)
+    return Scans.of(assemble(S, rows, times=[STEP], motions=(Motion(0, span="epoch"),)), 1)
 
 
 def motion() -> tuple[Array, Array]:
@@ -109,8 +110,7 @@ def misfit(x: Array, z: Array) -> float:
 
 def prior_and_scan(name: str, z: Array) -> tuple[Array, Array]:
     """Return mean and covariance after the same by optloc."""
-    state = predicted(BEFORE, polynomial(1, ACCELERATION), STEP, 3)
-    done, _ = take_scan(scan(z), state, filter_of(name))
+    done, _ = step(scan(z), 0, BEFORE, polynomial(1, ACCELERATION), filter_of(name))
     return done.mean, done.cov
 
 
@@ -125,8 +125,8 @@ def filter_case(name: str) -> Case:
     many = State(0.0, np.tile(BEFORE.mean, (BATCH, 1)), np.tile(BEFORE.cov, (BATCH, 1, 1)))
 
     def ready(z: Array, state: State) -> Call:
-        problem = scan(z)
-        return lambda: take_scan(problem, predicted(state, dynamics, STEP, 3), rule)
+        given = scan(z)
+        return lambda: step(given, 0, state, dynamics, rule)
 
     def read(found: list[Any]) -> Answers:
         code = np.concatenate([np.atleast_1d(code) for _, code in found])

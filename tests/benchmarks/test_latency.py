@@ -1,4 +1,4 @@
-"""One fix at once: prepared, of a known and of a new structure, and a tracker's update; ratios to SciPy in one run."""
+"""One fix at once: prepared, of a known and of a new structure; ratios to SciPy in one run."""
 
 import gc
 import os
@@ -12,15 +12,12 @@ from benchmarks.scenes import Scene
 from benchmarks.with_general import scipy_from_the_truth
 from monte_carlo.tables import write
 
-from optloc import Motion, assemble, locate, measured, prepare, solve
+from optloc import assemble, locate, measured, prepare, solve
 from optloc.compute.jit import enabled
 from optloc.engine.fixes import fix_one_by_ranges
 from optloc.engine.memory import Answer
 from optloc.engine.plan import LIMIT, TOLERANCE
 from optloc.proof.batch import prove_here
-from optloc.track import State, polynomial, predicted
-from optloc.track.track import scan_at, take_scan
-from optloc.track.updates import filter_of
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")
 SIGMA, COUNT, WARM = 5.0, 400, 20
@@ -137,26 +134,6 @@ def printed():
     return timed(lambda i: str(fixes[i]))
 
 
-def update(name):
-    """The update of a predicted state by a scan of five differences."""
-    truth, rng = scene(PLACES[0]).truth[0], np.random.default_rng(1)
-    times = np.arange(COUNT, dtype=float)
-    way = truth + times[:, None] * np.array([5.0, 3.0, 0.0])
-    arrival = np.linalg.norm(way[:, None] - STATIONS, axis=-1) + SIGMA * rng.standard_normal((COUNT, 6))
-    z, a, b = (arrival[:, 1:] - arrival[:, :1]).ravel(), np.tile(np.arange(1, 6), COUNT), np.tile(FIRST, COUNT)
-    rows = measured("tdoa", z, a=a, b=b, epoch=np.repeat(np.arange(COUNT), 5), arrival_sigma=SIGMA)
-    run = assemble(STATIONS, rows, times=times, motions=(Motion(0, span="epoch"),))
-    scans, rule, dynamics = [scan_at(run, k, 1) for k in range(COUNT)], filter_of(name), polynomial(1, 0.1)
-    state = [State(-1.0, np.r_[way[0] - [5.0, 3.0, 0.0], 5.0, 3.0, 0.0], np.diag([1e4] * 3 + [25.0] * 3))]
-
-    def work(i):
-        ahead = predicted(state[-1], dynamics, float(times[i]), 3)
-        done, _ = take_scan(scans[i], ahead, rule)
-        state.append(State(float(times[i]), done.mean, done.cov))
-
-    return timed(work)
-
-
 def figures():
     """Return name, median and 99th percentile, and the place whose SciPy each is compared with."""
     for place in PLACES:
@@ -171,8 +148,6 @@ def figures():
     yield "`assemble`", *assembled(), PLACES[0]
     yield "`locate`", *located(), PLACES[0]
     yield "`print` of a fix", *printed(), PLACES[0]
-    for name in ("ekf", "iekf"):
-        yield f"prediction and update of a tracker, {name}", *update(name), PLACES[0]
 
 
 @pytest.mark.parametrize(("place", "proven"), zip(PLACES, (0.7, 1.5), strict=True))

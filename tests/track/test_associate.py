@@ -13,10 +13,11 @@ from optloc.base.types import Motion, Status
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
 from optloc.papers.kinematic import Scenario, draw, start_from_fix, strip_labels
-from optloc.track import State, followed, polynomial
-from optloc.track.associate import Clutter, assigned, gated, innovation, joint, nearest, scored
+from optloc.track import State, followed, gated, polynomial
+from optloc.track.associate import Clutter, assigned, joint, nearest, scored
 from optloc.track.several_targets import Candidates, associated, candidates
 from optloc.track.track import scans
+from optloc.track.updates import innovation
 
 STATIONS = np.array([[0.0, 0.0], [20e3, 1e3], [-3e3, 18e3], [12e3, -15e3]])
 TARGETS = np.array([[40e3, 25e3], [40.2e3, 25.1e3], [39.9e3, 25.2e3]])
@@ -268,7 +269,8 @@ def test_everything_seen_and_nothing_false_is_the_labelled_track(drawn):
     rule = assigned(Clutter(0.99, 1e-7))
     found = associated(given, start_from_fix(own, 1), polynomial(1), rule, "ekf")
     track = followed(own.runs, start_from_fix(own, 1), polynomial(1), "ekf")
-    assert found.track.mean == pytest.approx(track.mean, rel=1e-12)
+    # One predicts before rows are picked, the other with them: rounding differs.
+    assert found.track.mean == pytest.approx(track.mean, rel=1e-9, abs=1e-9)
     assert all((pick == np.arange(3)[:, None]).all() for pick in found.picks)
 
 

@@ -1,0 +1,250 @@
+"""The rows of the scans of a run as arrays, made once, so that each scan is one call of machine code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.cache import Cache
+from optloc.base.types import Array, Motion
+from optloc.compute.filter import VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
+from optloc.compute.jit import at_hand
+from optloc.compute.pack import sources
+from optloc.compute.tables import tables
+from optloc.linear.normal import depends_on_place, weighed
+from optloc.problem.epochs import cut, tied
+from optloc.problem.noise import gathered, variances
+from optloc.problem.problem import Problem
+
+# Scans that come one by one: a network has a few sets of rows that observe a target together, of some kilobytes each.
+_KEPT = Cache["ScanRows | None"](256)
+
+
+@dataclass(frozen=True, slots=True)
+class Scans:
+    """The scans of a run of one target for the compiled update.
+
+    All shipped filters take this form. The general form of `optloc.track.updates` serves kinds without a tape, biases
+    among the states, and station errors whose noise depends on the position. It also serves noise that ties epochs,
+    batches in which stations or noise differ, and arrays of other libraries.
+
+    Parameters
+    ----------
+    problem : Problem
+        The run, see `optloc.track.track.scans`; what it says of the motion does not matter.
+    order : int
+        Order of the states.
+    rows : list of k (ScanRows or None)
+        Rows of each scan; None for a scan of the general form, or without rows.
+    item : list of k int
+        Number of each scan among the scans of its structure.
+    """
+
+    problem: Problem
+    order: int
+    rows: list[ScanRows | None]
+    item: list[int]
+
+    @classmethod
+    def of(cls, problem: Problem, order: int) -> Scans:
+        """Return the scans of a run."""
+        rows: list[ScanRows | None] = [None] * problem.epochs
+        item = [0] * problem.epochs
+        if problem.count and at_hand(filter_scan):
+            observed, weight = problem.observed, problem.weight
+            for epochs, index, kept in _structures(problem, order):
+                made = kept
+                if kept is not None:
+                    made = kept._replace(z=_by_scan(observed, index), weight=_by_scan(weight, index))
+                for i, k in enumerate(epochs.tolist()):
+                    rows[k], item[k] = made, i
+        return cls(problem, order, rows, item)
+
+    def filtered(
+        self,
+        k: int,
+        mean: Array,
+        cov: Array,
+        how: Filtering,
+        move: Move | None = None,
+        more: tuple[Array, Array] | None = None,
+    ) -> Filtered | None:
+        """Return states (..., n) after a scan, or None where it takes the general form.
+
+        Parameters
+        ----------
+        k : int
+            Which scan.
+        mean, cov : array (..., n), array (..., n, n)
+            States before the move.
+        how : Filtering
+            The filter.
+        move : Move
+            From their time to the time of the scan; None for states that hold then.
+        more : tuple of array (..., m), optional
+            Measurements less corrections, and weights, that replace the scan's.
+        """
+        rows, n = self.rows[k], mean.shape[-1]
+        if rows is None or type(mean) is not np.ndarray or rows.tables.shared != n:
+            return None
+        item, shape = self.item[k], mean.shape[:-1]
+        if cov.ndim > 2:
+            shape = np.broadcast_shapes(shape, cov.shape[:-2])
+        if more is not None or shape or self.problem.batch_shape:
+            rows, shape = self._spread(rows, item, more, shape)
+            mean, cov = np.broadcast_to(mean, (*shape, n)), np.broadcast_to(cov, (*shape, n, n))
+        count, move = math.prod(shape), move or _stay(n)
+        ahead = Move(owned(move.F), _each(move.Q, 2, shape), _each(move.drive, 1, shape))
+        out = Filtered(np.empty((count, n)), np.empty((count, n, n)), np.empty((count, VALUES)))
+        filter_scan(rows, item, ahead, _each(mean, 1, shape), _each(cov, 2, shape), how, out)
+        if not shape:
+            return Filtered(out.mean[0], out.cov[0], out.values[0])
+        return Filtered(*(part.reshape(*shape, *part.shape[1:]) for part in out))
+
+    def _spread(
+        self, rows: ScanRows, item: int, more: tuple[Array, Array] | None, shape: tuple[int, ...]
+    ) -> tuple[ScanRows, tuple[int, ...]]:
+        """Return the rows with the measurements and weights (1, N or 1, m) of states (...), and the shape of all."""
+        batch, m = self.problem.batch_shape, rows.z.shape[2]
+        if more is None:
+            own = (part[item if len(part) > 1 else 0] for part in (rows.z, rows.weight))
+            more = tuple(part[0] if len(part) == 1 else part.reshape(*batch, m) for part in own)
+            shape = np.broadcast_shapes(shape, batch)
+        shape = np.broadcast_shapes(shape, *(part.shape[:-1] for part in more))
+        z, weight = (_each(part, 1, shape)[None] for part in more)
+        return rows._replace(z=z, weight=weight), shape
+
+
+def owned(values: Array) -> Array:
+    """Return values as arrays of the type that machine code is made for: floats, C order, writable."""
+    return values if values.flags.carray and values.dtype == float else np.array(values, dtype=float, order="C")
+
+
+def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
+    """Return values (..., core axes) of states (...) as (N, core axes), or as (1, core axes) where they are shared."""
+    if values.ndim == core:
+        return owned(values)[None]
+    inner = values.shape[values.ndim - core :]
+    return owned(np.broadcast_to(values, (*shape, *inner)).reshape(-1, *inner))
+
+
+@cache
+def _stay(n: int) -> Move:
+    return Move(np.eye(n), np.zeros((n, n)), np.zeros(n))
+
+
+def _is_plain(problem: Problem) -> bool:
+    """Return whether only the state of a target is unknown, and a batch shares all except measurements and weights."""
+    stations = problem.stations
+    shared = [(stations.position, 3), (stations.velocity, 3), (stations.axes, 4)]
+    shared += [(covariance, 3) for _, _, covariance in stations.errors]
+    shared += [(block.covariance, 3) for block in problem.noise.blocks]
+    return (
+        problem.count > 0
+        and len(problem.motions) == 1
+        and all(array is None or (type(array) is np.ndarray and array.ndim == core) for array, core in shared)
+        and not (problem.biases or problem.emitting or stations.unknown_for)
+        and not depends_on_place(problem)
+        and not tied(problem)
+    )
+
+
+def _structures(problem: Problem, order: int) -> Iterator[tuple[Array, Array, ScanRows | None]]:
+    """Yield the epochs (G,) of each structure, the rows (G, m) of each of them, and what is made of these."""
+    if problem.epochs == 1:
+        one = np.zeros(1, dtype=np.int64), np.arange(problem.count)[None]
+        made = _KEPT.find(_key(problem, order), lambda: _made(problem, order, *one) if _is_plain(problem) else None)
+        yield *one, made
+    elif _is_plain(problem):
+        for epochs, index in _alike(problem):
+            yield epochs, index, _made(problem, order, epochs, index)
+
+
+def _key(scan: Problem, order: int) -> Hashable:
+    """Return a key of all of a scan but its time, measurements and weights."""
+    s = scan.stations
+    arrays = [s.position, s.velocity, s.axes, s.covariance, s.velocity_covariance]
+    arrays += [array for block in scan.noise.blocks for array in (block.covariance, block.row)]
+    arrays += [array for rows in scan.rows for array in (rows.a, rows.b, rows.target)]
+    numbers = tuple(None if array is None else (array.shape, array.tobytes()) for array in arrays)
+    kinds, biases = tuple(rows.kind for rows in scan.rows), len(scan.biases)
+    return (numbers, kinds, s.span, scan.frame, scan.medium, len(scan.motions), biases, order)
+
+
+def _alike(problem: Problem) -> list[tuple[Array, Array]]:
+    """Return the epochs (G,) of each structure, and the rows (G, m) of each of them."""
+    epoch = problem.epoch
+    order = np.argsort(epoch, kind="stable")
+    start = np.searchsorted(epoch[order], np.arange(problem.epochs + 1))
+    kind = np.repeat(np.arange(len(problem.rows)), [block.count for block in problem.rows])
+    parts = [np.concatenate([getattr(block, name) for block in problem.rows]) for name in ("a", "b", "target")]
+    line = np.stack([kind, *parts], axis=1)[order]
+    found: dict[bytes, list[int]] = {}
+    for k, (first, last) in enumerate(zip(start.tolist(), start[1:].tolist(), strict=False)):
+        if last > first:
+            found.setdefault(line[first:last].tobytes(), []).append(k)
+    out = []
+    for members in found.values():
+        epochs = np.array(members)
+        count = start[members[0] + 1] - start[members[0]]
+        out.append((epochs, order[start[epochs][:, None] + np.arange(count)]))
+    return out
+
+
+def _by_scan(values: Array, index: Array) -> Array:
+    """Return numbers (..., m) of rows (G, r) as (G, N, r), the leading axes flattened."""
+    if index.shape[0] == 1 and values.ndim == 1:
+        return values[index][None]
+    picked = np.moveaxis(values[..., index], -2, 0)
+    return np.ascontiguousarray(picked.reshape(len(index), -1, index.shape[1]))
+
+
+def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
+    """Return scans without measurements and weights, or None where one of their kinds has no tape."""
+    problem, m = weighed(problem), index.shape[1]
+    scan = _first_of(problem, order, epochs)
+    found = tables(scan, (np.arange(m)[None],))
+    if found is None or found.tables.local:
+        return None
+    divided, white, total = sources(scan), np.zeros((1, 0)), np.zeros((1, 2))
+    covariance = variances(problem.noise, problem.count)[index]
+    if any(block.row.shape[1] > 1 for block in problem.noise.blocks):
+        dense = gathered(problem.noise, index)
+        if (dense * (1.0 - np.eye(m))).any():
+            covariance = dense.reshape(len(index), m * m)
+    covariance = np.ascontiguousarray(covariance[:1] if (covariance == covariance[:1]).all() else covariance)
+    if covariance.shape[1] > m:
+        matrix = linalg.whitening(covariance.reshape(-1, m, m))
+        white, total = np.ascontiguousarray(matrix.reshape(len(matrix), m * m)), size_of(matrix)
+    none = np.zeros((1, 1, m))
+    return ScanRows(found.tables, divided.common, divided.own, covariance, white, total, none, none)
+
+
+def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
+    """Return the first of some scans with the stations of all of them, as a batch."""
+    first, s = int(epochs[0]), problem.stations
+    one = cut(replace(problem, motions=(Motion(order),), priors=(), constraints=()), first, first + 1)
+    every = ((name, getattr(s, name)) for name in ("position", "velocity", "axes"))
+    moving = {name: array[epochs][:, None] for name, array in every if array is not None and len(array) > 1}
+    motion = Motion(order, reference=0.0)
+    return replace(one, stations=replace(one.stations, **moving), times=np.zeros(1), motions=(motion,))
+
+
+def size_of(white: Array) -> Array:
+    """Return the rank of covariances R whose whitening matrices (..., r, r) are given, and ln det(2 pi R), (..., 2).
+
+    For a singular covariance the determinant follows from the singular values of the matrix that are not zero.
+    """
+    pivots = np.diagonal(white, axis1=-2, axis2=-1)
+    if np.triu(white, 1).any():
+        pivots = np.linalg.svd(white, compute_uv=False)
+        # the matrix of a singular covariance has rows of zeros
+        pivots = np.where(np.arange(white.shape[-1]) < (white != 0.0).any(-1).sum(-1, keepdims=True), pivots, 0.0)
+    present = pivots > 0.0
+    logdet = np.log(2.0 * np.pi) * present.sum(-1) - 2.0 * np.log(np.where(present, pivots, 1.0)).sum(-1)
+    return np.stack([present.sum(-1).astype(float), logdet], axis=-1)
