@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
-from optloc.calibration.calibrated import refuted_blocks
 from optloc.calibration.blocks import settled
+from optloc.calibration.calibrated import refuted_blocks
 from optloc.calibration.gauge import departure, determined
 from optloc.calibration.likelihood import Estimate, likelihood
 from optloc.calibration.rounds import starts_of
