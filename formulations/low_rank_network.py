@@ -29,12 +29,13 @@ import numpy as np
 
 from formulations.algebra import Array, Mask
 
-# Steps that a start takes; more of them end at the same fits.
-_STEPS = 90
-# First step in which equations are divided by distances, and how many of the last keep those they have. A random start
-# knows no distances: of 12 x 20 networks in flat halls 60 % of the starts end at the best fit, 5 % where all steps
-# divide. The last steps minimise one function.
-_WEIGHED, _FROZEN = 30, 5
+# Steps that a start takes at most: before equations are divided by distances, while they are, and with the last
+# distances. A random start knows no distances: of 12 x 20 networks in flat halls 60 % of the starts end at the best
+# fit, 5 % where all steps divide. The last steps minimise one function.
+_PLAIN, _WEIGHED, _FROZEN = 30, 55, 5
+# Relative change of the costs of all starts that ends a stage, and how many such steps in a row: costs are compared
+# by factors, and after five bad steps the damping is three thousand times as large.
+_SETTLED, _CALM = 1e-4, 5
 # Share of the spread that stands for a distance below it: a pulse beside a station must not rule the sum.
 _NEAR = 0.05
 # Pivots below this share of the largest are columns that say nothing: eight digits are left of the sixteen.
@@ -158,15 +159,21 @@ class _Fit:
         scale = np.broadcast_to(self.weight, (count, *self.z.shape))
         damping = np.full(count, _DAMPING)
         here = self.project(at, scale)
-        for step in range(_STEPS):
-            if _WEIGHED <= step < _STEPS - _FROZEN:
-                scale = self.weight / (2.0 * self.distance(at, here.pulses))
-                here = self.project(at, scale)
-            trial = self.moved(at, here, damping)
-            there = self.project(trial, scale)
-            good = there.cost < here.cost
-            at, here = _chosen(good, trial, at), here.replaced(good, there)
-            damping = np.clip(np.where(good, damping * _EASE, damping * _STIFFEN), _LEAST, _MOST)
+        for limit, weighed in ((_PLAIN, False), (_WEIGHED, True), (_FROZEN, False)):
+            calm = 0
+            for _ in range(limit):
+                before = here.cost
+                if weighed:
+                    scale = self.weight / (2.0 * self.distance(at, here.pulses))
+                    here = self.project(at, scale)
+                trial = self.moved(at, here, damping)
+                there = self.project(trial, scale)
+                good = there.cost < here.cost
+                at, here = _chosen(good, trial, at), here.replaced(good, there)
+                damping = np.clip(np.where(good, damping * _EASE, damping * _STIFFEN), _LEAST, _MOST)
+                calm = calm + 1 if (np.abs(here.cost - before) <= _SETTLED * before).all() else 0
+                if calm == _CALM:
+                    break
         return LowRank(at, here.pulses, here.cost)
 
     def distance(self, at: Stations, pulses: Pulses) -> Array:

@@ -1,7 +1,5 @@
 """Networks from nothing: known answers, what no frame changes, named refusals, and single blocks refuted."""
 
-from dataclasses import replace
-
 import casadi
 import numpy as np
 import pytest
@@ -11,10 +9,12 @@ from scipy.stats import chi2
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
+from optloc.calibration.blocks import settled
 from optloc.calibration.calibrated import refuted_blocks
-from optloc.calibration.gauge import determined, excess, rise
+from optloc.calibration.gauge import departure, determined
 from optloc.calibration.likelihood import Estimate, likelihood
 from optloc.calibration.rounds import starts_of
+from optloc.compute.jit import plain
 
 EXACT = 1e-6
 
@@ -69,25 +69,27 @@ def test_derivatives_are_those_of_automatic_differentiation():
     both = casadi.Function("f", [a, b, y, o], [cost, casadi.gradient(cost, unknowns)])
     value, gradient = both(near.stations[0], near.clocks[0], near.pulses[0], near.emission[0])
     assert lik.cost(near)[0] == pytest.approx(float(value))
-    by_station, by_pulse = lik.jacobian(near)
-    residual, (extra, more) = lik.residual(near)[0], (one[0] for one in lik.known(near))
-    stations = -2.0 * (np.einsum("nrp,nr->p", by_station[0], residual) + more.T @ extra)
-    pulses = -2.0 * np.einsum("nrq,nr->nq", by_pulse[0], residual)
+    by_station, by_pulse, known = lik.jacobian(near)
+    residual, line = lik.residual(near)[0], near.stations[0, 0] - near.stations[0, 2]
+    extra = [(7.0 - np.linalg.norm(line)) / 0.2, *((net.place - near.stations[0]) / 0.5).ravel()]
+    stations = -2.0 * (np.einsum("nrp,nr->p", by_station, residual) + known.T @ extra)
+    pulses = -2.0 * np.einsum("nrq,nr->nq", by_pulse, residual)
     ours = np.concatenate([stations, pulses[:, :3].ravel(), pulses[:, 3]])
     assert ours == pytest.approx(np.asarray(gradient).ravel(), rel=1e-9, abs=1e-7)
 
 
-def test_machine_code_takes_the_steps_of_numpy():
+def test_machine_code_finds_the_minima_of_numpy():
     truth, z = hall(5, 7, 12, 0.1, clocks=True)
     z[2, 3] = np.nan
-    distances = [(0, 2, 7.0, 0.2)]
+    distances = [(0, 2, float(np.linalg.norm(truth.stations[0, 0] - truth.stations[0, 2])), 0.2)]
     lik = likelihood(
         network_of(z, 0.1, synchronised=False, distances=distances, place=truth.stations[0], place_sigma=0.5)
     )
-    at = starts_of(lik, 0).random(3)
-    (one, first), (two, second) = lik.refine_together(at, 30), lik.refine(at, 30)
-    assert first == pytest.approx(second, rel=1e-6)
-    assert one.stations == pytest.approx(two.stations, abs=1e-4)
+    with plain():
+        one, first = lik.refine(truth)
+    two, second = lik.refine(truth)
+    assert first == pytest.approx(second, abs=1e-5)
+    assert one.stations == pytest.approx(two.stations, abs=1e-3)
 
 
 def test_random_places_lead_to_the_minimum():
@@ -97,17 +99,6 @@ def test_random_places_lead_to_the_minimum():
     assert cost.min() == pytest.approx(lik.refine(truth)[1][0], abs=0.01)
 
 
-def test_errors_exceed_a_covariance_where_noise_is_large():
-    shares = []
-    for sigma in (0.003, 0.6):
-        truth, z = hall(4, 7, 20, sigma)
-        lik = likelihood(network_of(z, sigma))
-        at = lik.refine(truth)[0]
-        shares.append(excess(lik, at, determined(lik, at), 0.2))
-    assert abs(shares[0]) < 0.02
-    assert shares[1] > 0.2
-
-
 def test_a_covariance_that_only_the_cost_refutes_is_not_ok():
     # the truth, its pulses wherever they fit best, costs no more than noise does, and is beyond the 99.99 % ellipsoid
     truth, z = hall(500096, 6, 20, 0.03)
@@ -115,7 +106,7 @@ def test_a_covariance_that_only_the_cost_refutes_is_not_ok():
     lik = likelihood(net)
     found = calibrate(net)
     error, covariance = errors(found, truth)
-    _, dearer = replace(lik, free=np.zeros_like(lik.free)).refine(truth)
+    dearer = lik.cost(settled(net, truth))
     width, axes = np.linalg.eigh(covariance)
     told = width > 1e-9 * width[-1]
     assert dearer[0] - found.cost < chi2.ppf(0.95, told.sum())
@@ -123,15 +114,15 @@ def test_a_covariance_that_only_the_cost_refutes_is_not_ok():
     assert found.status is Status.CURVED
 
 
-def test_the_cost_rises_as_the_covariance_says_where_noise_is_small():
-    shares = []
+def test_the_cost_is_that_of_a_gaussian_where_noise_is_small():
+    far = []
     for sigma in (1e-4, 0.03):
         truth, z = hall(500096, 6, 20, sigma)
         lik = likelihood(network_of(z, sigma))
         at = lik.refine(truth)[0]
-        shares.append(rise(lik, at, determined(lik, at)))
-    assert abs(shares[0] - 1.0) < 0.02
-    assert shares[1] < 0.74
+        far.append(departure(lik, at, determined(lik, at)))
+    assert far[0] < 0.02
+    assert far[1] > 0.3
 
 
 def test_gross_rows_are_named_and_the_network_is_unproven_at_best():
@@ -307,11 +298,11 @@ def test_starts_that_share_a_fit_of_low_rank_do_not_agree():
 
 
 def test_a_network_that_is_thin_beside_its_errors_is_curved():
-    """Its truth is far beyond the 99.99 % ellipsoid, and neither repetitions nor the cost along axes tell."""
+    """Its truth is far beyond the 99.99 % ellipsoid: along one axis the cost rises faster than it should."""
     _, z = hall(900014, 10, 12, 0.3)
     found = calibrate(network_of(z, 0.3))
     assert found.status in (Status.CURVED, Status.AMBIGUOUS)  # a bent network fits about as well
-    assert any("m thick" in words for words in found.findings)
+    assert any("does not cover" in words for words in found.findings)
 
 
 def test_joint_moves_find_the_cheaper_network_of_a_curved_valley():

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Prior
-from optloc.calibration.descent import EASE, FIRST, FLOOR, LEAST, MOST, NOTHING, STIFFEN
-from optloc.calibration.likelihood import Estimate, Likelihood
+from optloc.calibration.likelihood import Estimate, Likelihood, clock_signs, together
 from optloc.calibration.network import Network
-from optloc.problem.build import assemble, measured
+from optloc.compute.least_squares import refine
+from optloc.linear.vectors import vectors
+from optloc.models import MODELS
+from optloc.problem.build import Measured, assemble, measured
 from optloc.problem.claims import GLOBAL
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -21,9 +23,9 @@ MOVED = 16.0
 """Cost that a block's other place may have beyond its present one for all to be refined from there: what is dearer by
 four sigma with the others held hardly ends below when they move as well."""
 
-# Steps of a block alone from a mirrored place: most are near their minimum then, and the rest is refined with
-# all others anyway.
-_ALONE = 15
+# Steps of a block alone, and the length in deviations below which one is the last: most are near their minimum then,
+# and the rest is refined with all others anyway.
+_ALONE, _LAST = 30, 1e-3
 # Rows above which a station's proof begins where it is.
 _MANY = 100
 # Share of the spread below which two places are one.
@@ -87,12 +89,13 @@ def blocks(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
         together.
     """
     net = lik.network
-    d, cost = net.dimension, float(lik.cost(at)[0])
-    found = []
-    for i, fix in _stations(net, at, _sought(net)):
-        at_best = _moved_station(lik, at, i, fix.position[:d])
-        above = cost - float(lik.cost(at_best)[0])
-        found.append(_block(fix, i, f"station {net.names[i]}", True, at.stations[0, i], above))
+    d, cost, found = net.dimension, float(lik.cost(at)[0]), list[Block]()
+    fixes = _stations(net, at, _sought(net))
+    if fixes:
+        costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
+        for (i, fix), best in zip(fixes, costs, strict=True):
+            name = f"station {net.names[i]}"
+            found.append(_block(fix, i, name, True, at.stations[0, i], cost - float(best)))
     fix = place_pulses(net, at, np.arange(net.pulses))
     # pulses do not know of each other: all are moved at once
     before = (lik.residual(at)[0] ** 2).sum(axis=1)
@@ -107,77 +110,25 @@ def _sought(net: Network) -> list[int]:
     return [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
-    """Blocks that see the same partners: B blocks, Q rows ``gain_0 |x - one| + gain_1 |x - two| + offset``."""
+def mirrored(problem: Problem, here: Array) -> Array:
+    """Return places (B, K, d) of blocks mirrored in the principal planes of their partners, and in their centre."""
+    partners = problem.stations.position[..., 0, np.concatenate([rows.a for rows in problem.rows]), :]
+    weight = np.broadcast_to(problem.weight > 0.0, (len(here), problem.count))
+    weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1)
+    middle = (weight[:, None] @ partners)[:, 0]
+    centred = (partners - middle[:, None]) * np.sqrt(weight)[..., None]
+    axes = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)[1]
+    along = np.einsum("bd,bdk->bk", here - middle, axes)
+    single = here[:, None] - 2.0 * along[..., None] * np.swapaxes(axes, 1, 2)
+    return np.concatenate([single, (2.0 * middle - here)[:, None]], axis=1)
 
-    one: Array  # (Q, d)
-    two: Array
-    gains: Array  # (2, Q)
-    offset: Array  # (B, Q) what the block's own clock or emission counts
-    value: Array  # (B, Q)
-    root: Array
-    place: Array  # (B, d) what is known of the place, and its inverse standard deviation
-    prior: Array
 
-    def equations(self, x: Array, t: Array) -> tuple[Array, Array]:
-        """Return whitened residuals (B, K, Q + d) and derivatives (B, K, Q + d, d + 1) at places and offsets."""
-        shape = (*x.shape[:2], self.one.shape[0])
-        predicted = t[..., None] * self.offset[:, None]
-        slope = np.zeros((*shape, x.shape[-1] + 1))
-        for end, gain in zip((self.one, self.two), self.gains, strict=True):
-            line = x[:, :, None] - end
-            length = np.maximum(np.sqrt(np.sum(line * line, axis=-1)), 1e-300)
-            predicted = predicted + gain * length
-            slope[..., :-1] += line * (gain / length)[..., None]
-        slope[..., -1] = self.offset[:, None]
-        root = self.root[:, None]
-        known = np.zeros((*x.shape, x.shape[-1] + 1))
-        every = np.arange(x.shape[-1])
-        known[..., every, every] = self.prior[:, None]
-        off = (self.place[:, None] - x) * self.prior[:, None]
-        residual = np.concatenate([(self.value[:, None] - predicted) * root, off], axis=-1)
-        return residual, np.concatenate([slope * root[..., None], known], axis=-2)
-
-    def repeated(self, count: int) -> Points:
-        """Return each block `count` times in a row."""
-        names = ("offset", "value", "root", "place", "prior")
-        return replace(self, **{name: np.repeat(getattr(self, name), count, axis=0) for name in names})
-
-    def mirrored(self, here: Array) -> Array:
-        """Return places (B, K, d) mirrored in the partners' principal planes, and in their centre."""
-        weight = (self.root > 0.0) / np.maximum((self.root > 0.0).sum(axis=1, keepdims=True), 1)
-        middle = weight @ self.one
-        centred = (self.one - middle[:, None]) * np.sqrt(weight)[..., None]
-        axes = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred)[1]
-        along = np.einsum("bd,bdk->bk", here - middle, axes)
-        single = here[:, None] - 2.0 * along[..., None] * np.swapaxes(axes, 1, 2)
-        return np.concatenate([single, (2.0 * middle - here)[:, None]], axis=1)
-
-    def settled(self, x: Array, t: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return minima (B, K, d) that places lead to, their offsets and costs (B, K)."""
-        if t is None:
-            weight = self.root**2 * self.offset
-            residual = self.equations(x, np.zeros(x.shape[:2]))[0][..., : self.one.shape[0]]
-            total = np.maximum((weight * self.offset).sum(axis=1), 1e-300)[:, None]
-            t = np.einsum("bkq,bq->bk", residual, self.root * self.offset) / total
-        damping = np.full(t.shape, FIRST)
-        residual, slope = self.equations(x, t)
-        cost = np.sum(residual**2, axis=-1)
-        for _ in range(_ALONE):
-            normal = np.swapaxes(slope, -1, -2) @ slope
-            diagonal = np.einsum("bkii->bki", normal)
-            diagonal += damping[..., None] * diagonal + FLOOR * diagonal.max(axis=-1, keepdims=True) + NOTHING
-            step = np.linalg.solve(normal, np.einsum("bkqi,bkq->bki", slope, residual)[..., None])[..., 0]
-            there, late = x + step[..., :-1], t + step[..., -1]
-            after, change = self.equations(there, late)
-            new = np.sum(after**2, axis=-1)
-            good = new < cost
-            x, t, cost = np.where(good[..., None], there, x), np.where(good, late, t), np.where(good, new, cost)
-            residual = np.where(good[..., None], after, residual)
-            slope = np.where(good[..., None, None], change, slope)
-            damping = np.clip(np.where(good, damping * EASE, damping * STIFFEN), LEAST, MOST)
-        return x, t, cost
+def minima(problem: Problem, places: Array) -> tuple[Array, Array]:
+    """Return the minima (B, K, size) of blocks that places (B, K, d) lead to, and their costs (B, K)."""
+    count, each = places.shape[:2]
+    start = vectors(problem, places).reshape(count * each, -1)
+    done = refine(problem, start, item=np.repeat(np.arange(count), each), tolerance=_LAST, limit=_ALONE)
+    return done.x.reshape(count, each, -1), done.cost.reshape(count, each)
 
 
 def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
@@ -196,15 +147,15 @@ def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
         Those that have other places, found from mirror images in the principal planes of their partners.
     """
     net = lik.network
-    stations = np.array(_sought(net), dtype=int)
-    groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(lik, at))]
+    stations, d = np.array(_sought(net), dtype=int), net.dimension
+    groups = [(False, np.arange(net.pulses), at.pulses[0], pulses_alone(net, at))]
     if stations.size:
-        groups.append((True, stations, at.stations[0, stations], stations_alone(lik, at, stations)))
+        groups.append((True, stations, at.stations[0, stations], stations_alone(net, at, stations)))
     near = _APART * float(np.ptp(np.concatenate([at.stations[0], at.pulses[0]]), axis=0).max())
     found = []
-    for station, which, here, points in groups:
-        x, _, cost = points.settled(points.mirrored(here))
-        gap = cost - points.settled(here[:, None])[2]
+    for station, which, here, problem in groups:
+        x, cost = minima(problem, np.concatenate([here[:, None], mirrored(problem, here)], axis=1))
+        x, gap = x[:, 1:, :d], np.where(np.isfinite(cost[:, 1:]), cost[:, 1:] - cost[:, :1], np.inf)
         for n in np.flatnonzero(gap.min(axis=1) <= MOVED):
             places: list[Array] = []
             for k in np.flatnonzero(gap[n] <= MOVED):
@@ -216,32 +167,50 @@ def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
     return tuple(found)
 
 
-def pulses_alone(lik: Likelihood, at: Estimate) -> Points:
-    """Return the pulses as blocks whose stations are held."""
-    stations, clocks, net = at.stations[0], at.clocks[0], lik.network
-    tick = lik.ticks[0] * clocks[lik.first] + lik.ticks[1] * clocks[lik.second]
-    nothing = np.zeros((net.pulses, net.dimension))
-    offset = lik.emits * lik.emission[:, None]
-    one, two = stations[lik.first], stations[lik.second]
-    return Points(one, two, lik.gains, offset, net.z - tick, lik.root, nothing, nothing)
+def pulses_alone(net: Network, at: Estimate, which: Array | None = None) -> Problem:
+    """Return n pulses (all) of S estimates as a batch of S n fixes from stations that are held."""
+    which = np.arange(net.pulses) if which is None else which
+    first, second, sign = clock_signs(net)
+    tick = (sign[0] * at.clocks[:, first] + sign[1] * at.clocks[:, second])[:, None]
+    z, given = (net.z[which] - tick).reshape(-1, len(net.slots)), np.tile(net.given[which], (at.count, 1))
+    sigma, kinds = np.tile(net.sigma[which], (at.count, 1)), np.array([slot.kind for slot in net.slots])
+    rows = []
+    for kind in dict.fromkeys(kinds.tolist()):
+        slots = np.flatnonzero(kinds == kind)
+        ends = {"a": first[slots], "b": second[slots]}
+        rows.append(_given(kind, z[:, slots], sigma[:, slots], given[:, slots], **ends))
+    one = at.count == 1
+    return assemble(at.stations[0] if one else np.repeat(at.stations, len(which), axis=0)[:, None], *rows).flat()
 
 
-def stations_alone(lik: Likelihood, at: Estimate, which: Array) -> Points:
-    """Return some stations as blocks, with pulses and the other stations held."""
-    net = lik.network
-    places, groups = _station_rows(net, at)
-    ends = np.concatenate([ends for _, ends, _, _ in groups])
-    timed = np.concatenate([np.full(len(ends), float(kind == "toa")) for kind, ends, _, _ in groups])
-    value = np.concatenate([z[which] for _, _, _, z in groups], axis=1)
-    with np.errstate(divide="ignore"):
-        root = 1.0 / np.concatenate([sigma[which] for _, _, sigma, _ in groups], axis=1)
-    gains = np.array([np.ones(len(ends)), np.zeros(len(ends))])
-    offset = np.broadcast_to(timed, value.shape)
-    one = places[ends]
-    # a coordinate that is known exactly does not move
-    exact = 1.0 / (_EXACT * (float(np.ptp(places)) or 1.0))
-    prior = np.where(net.place_sigma[which] <= 0.0, exact, lik.prior[which])
-    return Points(one, one, gains, offset, value, root, net.place[which], prior)
+def _given(kind: str, z: Array, sigma: Array, given: Array, **ends: Array) -> Measured:
+    """Return rows (B, q) of which some are absent."""
+    deviation, weight = _shared(np.where(given, sigma, 1.0)), _shared(given.astype(float))
+    return measured(kind, np.where(given, z, 0.0), sigma=deviation, weight=weight, **ends)
+
+
+def settled(net: Network, at: Estimate) -> Estimate:
+    """Return estimates with their pulses where they fit best, the stations held."""
+    problem = pulses_alone(net, at)
+    done = minima(problem, at.pulses.reshape(-1, 1, net.dimension))[0].reshape(at.count, net.pulses, -1)
+    d = net.dimension
+    return replace(at, pulses=done[..., :d], emission=done[..., d] if done.shape[-1] > d else at.emission)
+
+
+def stations_alone(net: Network, at: Estimate, which: Array) -> Problem:
+    """Return some stations as a batch of fixes from pulses and the other stations, which are held."""
+    places, kinds = _station_rows(net, at)
+    rows = []
+    for kind, ends, sigma, z in kinds:
+        given = np.isfinite(sigma[which])
+        if given.any():
+            rows.append(_given(kind, z[which], sigma[which], given, a=ends))
+    soft = np.isfinite(net.place_sigma[which])
+    # a coordinate of which nothing is known has a prior that says nothing, too
+    spread = float(np.ptp(places, axis=0).max()) or 1.0
+    sigma = np.clip(net.place_sigma[which], _EXACT * spread, 1e6 * spread)
+    prior = Prior("position", net.place[which], sigma[..., None] ** 2 * np.eye(net.dimension))
+    return assemble(places, *rows, priors=(prior,) if soft.any() else ()).flat()
 
 
 def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> Block:
@@ -280,25 +249,7 @@ def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto")
     Fix
         A batch of n.
     """
-    stations, clocks = at.stations[0], at.clocks[0]
-    kinds = []
-    for kind in dict.fromkeys(slot.kind for slot in net.slots):
-        slots = np.array([r for r, slot in enumerate(net.slots) if slot.kind == kind])
-        a = np.array([net.slots[r].a for r in slots])
-        b = np.array([net.slots[r].b for r in slots])
-        tick = 0.0 if kind == "range" else clocks[a] - (clocks[b] if kind == "tdoa" else 0.0)
-        given = net.given[np.ix_(which, slots)]
-        kinds.append(
-            measured(
-                kind,
-                np.where(given, net.z[np.ix_(which, slots)] - tick, 0.0),
-                a=a,
-                b=b if kind == "tdoa" else None,
-                sigma=_shared(np.where(given, net.sigma[np.ix_(which, slots)], 1.0)),
-                weight=_shared(given.astype(float)),
-            )
-        )
-    return solve(assemble(stations, *kinds), method)
+    return solve(pulses_alone(net, at, which), method)
 
 
 def _shared(values: Array) -> Array:
@@ -322,35 +273,12 @@ def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Ar
 
 def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, Fix]]:
     """Return fixes of some stations from pulses and stations that are held."""
-    if not which:
-        return []
-    places, kinds = _station_rows(net, at)
-    rows = []
-    for kind, ends, sigma, z in kinds:
-        given = np.isfinite(sigma[which])
-        if given.any():
-            rows.append(
-                measured(
-                    kind,
-                    np.where(given, z[which], 0.0),
-                    a=ends,
-                    sigma=_shared(np.where(given, sigma[which], 1.0)),
-                    weight=_shared(given.astype(float)),
-                )
-            )
-    spread = float(np.ptp(places, axis=0).max()) or 1.0
-    out, soft = [], np.asarray(np.isfinite(net.place_sigma[which]).any(axis=1))
-    plain = [i for i, known in zip(which, soft, strict=True) if not known]
-    problem = assemble(places, *rows)
-    free = _fixes(problem.take(np.flatnonzero(~soft)), at.stations[0, plain]) if plain else None
-    out += [(i, free[n]) for n, i in enumerate(plain) if free is not None]
-    for n in np.flatnonzero(soft):
-        i = which[n]
-        # a coordinate of which nothing is known has a prior that says nothing, too
-        sigma = np.clip(net.place_sigma[i], _EXACT * spread, 1e6 * spread)
-        prior = Prior("position", net.place[i], np.diag(sigma**2))
-        out.append((i, solve(replace(problem.take(np.array([n])), priors=(prior,)))[0]))
-    return out
+    soft = np.isfinite(net.place_sigma[which]).any(axis=1) if which else np.zeros(0, dtype=bool)
+    plain = np.array(which, dtype=int)[~soft]
+    free = _fixes(stations_alone(net, at, plain), at.stations[0, plain]) if plain.size else None
+    out = [(int(i), free[n]) for n, i in enumerate(plain) if free is not None]
+    known = np.array(which, dtype=int)[soft]
+    return out + [(int(i), solve(stations_alone(net, at, np.array([i])))[0]) for i in known]
 
 
 def _fixes(problem: Problem, here: Array) -> Fix:
@@ -396,23 +324,26 @@ def moved(lik: Likelihood, at: Estimate, block: Block, place: Array) -> Estimate
 
 def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array) -> Estimate:
     """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it."""
-    pulses, emission = at.pulses.copy(), at.emission.copy()
+    net, pulses, emission = lik.network, at.pulses.copy(), at.emission.copy()
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
     there = replace(at, pulses=pulses)
-    weight = lik.root[which] * lik.emits
-    total = np.maximum((weight**2).sum(axis=1), 1e-300)
-    shift = (lik.residual(there)[0, which] * weight).sum(axis=1) / total
-    emission[0, which] += np.where(lik.emission[which], shift, 0.0)
-    return replace(there, emission=emission)
+    emits = np.array([MODELS[slot.kind].emission for slot in net.slots])
+    emission[0, which] += _mean(lik.residual(there)[0, which], (emits / net.sigma)[which])
+    return replace(there, emission=np.where(net.emission, emission, at.emission))
 
 
 def _moved_station(lik: Likelihood, at: Estimate, i: int, place: Array) -> Estimate:
-    stations, clocks = at.stations.copy(), at.clocks.copy()
+    stations, clocks, net = at.stations.copy(), at.clocks.copy(), lik.network
     stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])
     there = replace(at, stations=stations)
-    if lik.network.synchronised:
+    if net.synchronised:
         return there
-    own = np.where(lik.first == i, lik.ticks[0], 0.0) + np.where(lik.second == i, lik.ticks[1], 0.0)
-    weight = lik.root * own
-    clocks[0, i] += (lik.residual(there)[0] * weight).sum() / max(float((weight**2).sum()), 1e-300)
+    first, second, sign = clock_signs(net)
+    own = np.where(first == i, sign[0], 0.0) + np.where(second == i, sign[1], 0.0)
+    clocks[0, i] += _mean(lik.residual(there)[0].ravel(), (own / net.sigma).ravel())
     return replace(there, clocks=clocks)
+
+
+def _mean(residual: Array, slope: Array) -> Array:
+    """Return the change (...) of an unknown that fits whitened residuals (..., q), by their slopes."""
+    return np.asarray((residual * slope).sum(axis=-1) / np.maximum((slope**2).sum(axis=-1), 1e-300))

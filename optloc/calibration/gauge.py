@@ -9,7 +9,8 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from optloc.base.types import Array
-from optloc.calibration.likelihood import Estimate, Likelihood
+from optloc.calibration.blocks import settled
+from optloc.calibration.likelihood import Estimate, Likelihood, together
 from optloc.calibration.network import Network
 from optloc.problem.chart import quantile
 from optloc.solvers.policy import AMBIGUOUS_GAP
@@ -69,7 +70,7 @@ def determined(lik: Likelihood, at: Estimate) -> Determined:
 
 def without_pulses(lik: Likelihood, at: Estimate) -> Array:
     """Return a triangle (q, P) with the derivatives of an estimate (S = 1), what pulses explain taken away."""
-    by_station, by_pulse = (one[0] for one in lik.jacobian(at))
+    by_station, by_pulse, known = lik.jacobian(at)
     n, r, p = by_station.shape
     # a pulse far away has columns of very different lengths
     length = np.sqrt((by_pulse**2).sum(axis=1, keepdims=True))
@@ -77,74 +78,20 @@ def without_pulses(lik: Likelihood, at: Estimate) -> Array:
     pivot = np.abs(np.einsum("nii->ni", triangle))
     q = q * (pivot > _ZERO)[:, None]
     reduced = (by_station - q @ (np.swapaxes(q, 1, 2) @ by_station)).reshape(n * r, p)
-    return np.asarray(np.linalg.qr(np.concatenate([reduced, lik.known(at)[1][0]]), mode="r"))
+    return np.asarray(np.linalg.qr(np.concatenate([reduced, known]), mode="r"))
 
 
-# Repetitions of the measurement that a covariance is checked by: so few where there is hardly an excess, as of most
-# networks of many stations; else so many at least, and at most, until they tell on which side of what is allowed it is.
-_FEW, _NONE = 4, 0.05
-_REPEATED, _MOST = 10, 60
-# Deviations at which the cost is compared with that of a Gaussian, and steps in which pulses settle there.
-_FAR, _SETTLING = 3.0, 6
+# Deviations at which the cost is compared with that of a Gaussian: as of a fix.
+_FAR = 3.0
+# Share of that cost below which a rise counts as none.
+_NONE = 1e-9
 
 
-def excess(lik: Likelihood, at: Estimate, told: Determined, allowed: float) -> float:
-    """Return by what share squared errors, in the covariance that comes with them, exceed what it promises.
+def departure(lik: Likelihood, at: Estimate, told: Determined) -> float:
+    """Return how far the cost departs from that of a Gaussian with the covariance found.
 
-    The measurement is repeated, as if the network were the one found. Each repetition has an estimate and a covariance
-    of its own; the squared error of the estimate in it (NEES) is compared with the cost of the network found, which is
-    chi-square however curved the coordinates are. So the noise of few repetitions cancels, and what is left is what
-    curvature does: places that the ellipsoid leaves out, and information that errors of the places feign.
-
-    Parameters
-    ----------
-    lik : Likelihood
-        The network.
-    at : Estimate
-        The one found, S = 1.
-    told : Determined
-        What is determined there, nothing left open.
-    allowed : float
-        The share that matters: repetitions end where they tell on which side of it the excess is.
-
-    Returns
-    -------
-    float
-        Mean of (NEES - chi-square), and two deviations of that mean, over the number of station unknowns: zero where
-        all is linear.
-    """
-    net, rng = lik.network, np.random.default_rng(0)
-    size = int(lik.free.sum()) - told.free.shape[1]
-    sigma = np.where(net.given, net.sigma, 0.0)
-    exact = np.where(net.given, net.z - lik.residual(at)[0] * sigma, 0.0)
-    soft = np.where(np.isfinite(net.place_sigma) & (net.place_sigma > 0.0), net.place_sigma, 0.0)
-    place = np.where(soft > 0.0, at.stations[0], net.place)
-    apart = net.distance - lik.spans(at)[0][0] * net.distance_sigma
-    over_by: list[float] = []
-    while not _is_told(over_by, allowed):
-        again = replace(
-            net,
-            z=exact + sigma * rng.standard_normal(sigma.shape),
-            place=place + soft * rng.standard_normal(soft.shape),
-            distance=apart + net.distance_sigma * rng.standard_normal(apart.shape),
-        )
-        own = replace(lik, network=again)
-        found, cost = own.refine(at)
-        truth = at if np.isfinite(net.place_sigma).any() else over(at, found)
-        off = (truth.stations[0] - found.stations[0]).ravel()
-        if not net.synchronised:
-            off = np.concatenate([off, truth.clocks[0] - found.clocks[0]])
-        held = replace(own, free=np.zeros_like(lik.free))
-        squared = float(((without_pulses(own, found) @ off) ** 2).sum())
-        over_by.append((squared - float((held.refine(at)[1] - cost)[0])) / max(size, 1))
-    return sum(_mean(over_by))
-
-
-def rise(lik: Likelihood, at: Estimate, told: Determined) -> float:
-    """Return the least share that the cost rises by of what the covariance says, in any of its principal directions.
-
-    Looked at three deviations to either side, as of a fix, the pulses wherever they then fit best. Where the network
-    found happens to have more information than its neighbours, repetitions of it show nothing, and the cost does.
+    Three deviations to either side along each principal axis of stations and clocks, the pulses wherever they then fit
+    best: the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|``, as of a fix (`optloc.adequacy.shape`).
 
     Parameters
     ----------
@@ -155,61 +102,19 @@ def rise(lik: Likelihood, at: Estimate, told: Determined) -> float:
     told : Determined
         What is determined there, nothing left open.
     """
-    m, d = lik.network.stations, lik.network.dimension
     width, axes = np.linalg.eigh(told.covariance(told.free.T))
     far = (axes * (_FAR * np.sqrt(np.maximum(width, 0.0))))[:, width > _ZERO * width[-1]].T
-    moves = np.concatenate([far, -far])
-    s = len(moves)
-    clocks = at.clocks if lik.network.synchronised else at.clocks + moves[:, m * d :]
-    there = at.take(np.zeros(s, dtype=int))
-    stations = at.stations + moves[:, : m * d].reshape(s, m, d)
-    there = replace(there, stations=stations, clocks=np.broadcast_to(clocks, (s, m)))
-    held = replace(lik, free=np.zeros_like(lik.free))
-    return float((held.refine(there, _SETTLING)[1].min() - lik.cost(at)[0]) / _FAR**2)
+    costs = lik.cost(together(at, settled(lik.network, shifted(at, np.concatenate([far, -far])))))
+    rise = (costs[1:] - costs[0]) / _FAR**2
+    return float(np.abs(np.log(np.maximum(rise, _NONE))).max())
 
 
-def thinness(lik: Likelihood, at: Estimate, told: Determined) -> tuple[float, float]:
-    """Return how unsure the shape of a free network is, and how thick the network is.
-
-    Errors of a share of the thickness turn lines between stations by as many radians, and what is turned is not linear.
-    Neither the cost at the network found nor repetitions of it show that where the thickness itself is an error.
-
-    Parameters
-    ----------
-    lik : Likelihood
-        The network.
-    at : Estimate
-        The one found, S = 1.
-    told : Determined
-        What is determined there, nothing left open.
-
-    Returns
-    -------
-    deviation : float
-        Standard deviation of all stations together along the weakest direction, metres; zero where places are known.
-    thickness : float
-        Root mean square of the stations' distances from their best plane (line in two dimensions), metres.
-    """
-    m, d = lik.network.stations, lik.network.dimension
-    if m <= d or np.isfinite(lik.network.place_sigma).any():
-        return 0.0, 0.0
-    width = np.linalg.eigvalsh(told.covariance(told.free.T)[: m * d, : m * d])
-    centred = at.stations[0] - at.stations[0].mean(axis=0)
-    return float(np.sqrt(width[-1])), float(np.linalg.svd(centred, compute_uv=False)[-1] / np.sqrt(m))
-
-
-def _is_told(over_by: list[float], allowed: float) -> bool:
-    """Return whether repetitions tell on which side of a bound their mean is, or are many enough."""
-    if len(over_by) < _FEW:
-        return False
-    mean, error = _mean(over_by)
-    enough = len(over_by) >= _REPEATED and not mean - error <= allowed < mean + error
-    return len(over_by) >= _MOST or enough or mean + error <= min(_NONE, allowed)
-
-
-def _mean(values: list[float]) -> tuple[float, float]:
-    """Return a mean and two of its deviations."""
-    return float(np.mean(values)), float(2.0 * np.std(values, ddof=1) / np.sqrt(len(values)))
+def shifted(at: Estimate, moves: Array) -> Estimate:
+    """Return an estimate (S = 1) with its stations, and clocks where these are sought, moved in several ways (n, P)."""
+    there, size = at.take(np.zeros(len(moves), dtype=int)), at.stations[0].size
+    stations = there.stations + moves[:, :size].reshape(there.stations.shape)
+    clocks = there.clocks + moves[:, size:] if moves.shape[1] > size else there.clocks
+    return replace(there, stations=stations, clocks=clocks)
 
 
 def over(one: Estimate, at: Estimate) -> Estimate:
@@ -373,7 +278,7 @@ def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
 
 def _of_pulses(lik: Likelihood, at: Estimate, covariance: Array, which: Array, normal: Array) -> Array:
     """Return the covariance (n, n) of the heights of some pulses: from their own rows, and from the stations."""
-    by_station, by_pulse = (one[0, which] for one in lik.jacobian(at))
+    by_station, by_pulse = (one[which] for one in lik.jacobian(at)[:2])
     own = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])
     along = np.einsum("jr,jrp->jp", own, by_station)
     # a pulse's own errors and those of the stations have nothing in common: these come from what pulses leave over

@@ -7,12 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.calibration.gauge import determined
+from optloc.calibration.gauge import determined, shifted
 from optloc.calibration.likelihood import Estimate, Likelihood
 
 # Directions of largest variance, and standard deviations to either side: other minima were 5 to 20 deviations away, in
 # a valley that is curved.
 _WEAK, _STEPS = 3, (6.0, 14.0)
+# Deviation of the tether, as a share of that of the direction: it holds the direction to a tenth, and gives way to
+# those that are better determined.
+_TETHER = 0.3
+# Steps with a tether: the rest follows roughly.
+_SETTLING = 30
 # Share of the largest variance below which a direction is exact.
 _EXACT = 1e-9
 
@@ -20,8 +25,8 @@ _EXACT = 1e-9
 def bent(lik: Likelihood, at: Estimate) -> tuple[Estimate, Array] | None:
     """Return the minima that bent networks lead to, and their costs.
 
-    Each network is moved along one direction and refined while it is held there, so that all else follows. Then it is
-    released and refined.
+    Each network is moved along one direction and refined while its stations are tethered there, so that the directions
+    that rows determine better follow. Then it is released and refined.
 
     Parameters
     ----------
@@ -40,13 +45,7 @@ def bent(lik: Likelihood, at: Estimate) -> tuple[Estimate, Array] | None:
         return None
     width, axes = np.linalg.eigh(told.covariance(told.free.T))
     weak = np.flatnonzero(width > _EXACT * width[-1])[-_WEAK:]
-    ahead = np.repeat(axes[:, weak].T, 2 * len(_STEPS), axis=0)
-    far = np.tile([*_STEPS, *(-step for step in _STEPS)], len(weak))
-    moves = ahead * (far * np.repeat(np.sqrt(width[weak]), 2 * len(_STEPS)))[:, None]
-    m, d = lik.network.stations, lik.network.dimension
-    there = at.take(np.zeros(len(moves), dtype=int))
-    there = replace(there, stations=there.stations + moves[:, : m * d].reshape(-1, m, d))
-    if not lik.network.synchronised:
-        there = replace(there, clocks=there.clocks + moves[:, m * d :])
-    held = replace(lik, hold=np.ascontiguousarray(ahead[:, None]))
-    return lik.refine(held.refine(there)[0])
+    deviation = np.repeat(np.sqrt(width[weak]), 2 * len(_STEPS))
+    far = np.tile([*_STEPS, *(-step for step in _STEPS)], len(weak)) * deviation
+    there = shifted(at, np.repeat(axes[:, weak].T, 2 * len(_STEPS), axis=0) * far[:, None])
+    return lik.refine(replace(lik, tether=_TETHER * deviation).refine(there, _SETTLING)[0])

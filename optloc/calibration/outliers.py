@@ -14,10 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.calibration.blocks import Points, pulses_alone, stations_alone
+from optloc.calibration.blocks import minima, pulses_alone, stations_alone
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
 from optloc.calibration.rounds import Starts, starts_of
+from optloc.linear.evaluate import predict
+from optloc.linear.vectors import vectors
+from optloc.problem.noise import variances
+from optloc.problem.problem import Problem
 
 PRICE = 16.0
 """Cost of a row that is left out: beyond four sigma it is cheaper than what it says, as with suspects of a fix."""
@@ -70,55 +74,63 @@ def weights(residual: Array, given: Array) -> Array:
 def reweighted(lik: Likelihood, at: Estimate, rounds: int) -> Estimate:
     """Refine networks (S) in rounds of weights: steps without them would lead away from what most rows agree with."""
     for _ in range(rounds):
-        root = lik.root * np.sqrt(weights(lik.residual(at), lik.network.given))
-        at, _ = replace(lik, root=root).refine(at, _STEPS)
+        own = weights(lik.residual(at), lik.network.given)
+        at, _ = replace(lik, weight=own).refine(at, _STEPS)
     return at
 
 
 def truncated(lik: Likelihood, at: Estimate) -> tuple[Estimate, Array]:
     """Refine networks (S) without what is beyond four sigma; return them and their truncated costs (S,)."""
     for _ in range(_SETTLING):
-        at, _ = replace(lik, root=lik.root * (lik.residual(at) ** 2 < PRICE)).refine(at, 2 * _STEPS)
+        at, _ = replace(lik, weight=1.0 * (lik.residual(at) ** 2 < PRICE)).refine(at, 2 * _STEPS)
     square = lik.residual(at) ** 2
-    return at, np.asarray(lik.total(at, np.minimum(square, PRICE) ** 0.5))
+    return at, np.asarray(lik.cost(at) - np.maximum(square - PRICE, 0.0).sum(axis=(1, 2)))
 
 
 def placed_anew(lik: Likelihood, starts: Starts, at: Estimate) -> Estimate:
     """Return a network (S = 1) with pulses, and then stations, at the places that most of their rows agree with."""
-    net = lik.network
-    x, t = _agreed(pulses_alone(lik, at), at.pulses[0], at.emission[0], starts)
-    at = replace(at, pulses=x[None], emission=np.where(lik.emission, t, at.emission[0])[None])
+    net, d = lik.network, lik.network.dimension
+    x = _agreed(pulses_alone(net, at), at.pulses[0], starts)
+    emission = x[:, d] if x.shape[1] > d else at.emission[0]
+    at = replace(at, pulses=x[None, :, :d], emission=np.where(net.emission, emission, at.emission[0])[None])
     which = np.flatnonzero((net.place_sigma > 0.0).any(axis=1))
     if not which.size:
         return at
-    x, t = _agreed(stations_alone(lik, at, which), at.stations[0, which], at.clocks[0, which], starts)
+    x = _agreed(stations_alone(net, at, which), at.stations[0, which], starts)
     stations, clocks = at.stations.copy(), at.clocks.copy()
-    stations[0, which] = x
+    stations[0, which] = x[:, :d]
     if not net.synchronised:
-        clocks[0, which] = t
+        clocks[0, which] = x[:, d]
     return replace(at, stations=stations, clocks=clocks)
 
 
-def _agreed(points: Points, here: Array, now: Array, starts: Starts) -> tuple[Array, Array]:
-    """Return places (B, d) and offsets (B,) of least truncated cost: where blocks are, or where a few rows alone lead.
+def _agreed(problem: Problem, here: Array, starts: Starts) -> Array:
+    """Return the values (B, size) of least truncated cost: of blocks where they are, or where a few rows alone lead.
 
     A handful of rows drawn at random has no gross one in it often enough, where all rows at once lead astray.
 
     Source: M. Fischler and R. Bolles, "Random sample consensus", Commun. ACM 24 (1981).
     """
     size, d = here.shape
-    middle, spread = points.one.mean(axis=0), np.ptp(points.one, axis=0) * 2.0 + 1e-3 * starts.spread
+    partners = problem.stations.places
+    middle, spread = partners.mean(axis=-2), np.ptp(partners, axis=-2) * 2.0 + 1e-3 * starts.spread
     x = middle + (starts.rng.random((size, _PLACES, d)) - 0.5) * spread
-    many = points.repeated(_PLACES)
-    order = np.argsort(starts.rng.random(many.root.shape) + (many.root <= 0.0), axis=1)
-    few = np.zeros(many.root.shape)
+    many = problem.take(np.repeat(np.arange(size), _PLACES))
+    given = np.broadcast_to(many.weight > 0.0, (size * _PLACES, many.count))
+    order = np.argsort(starts.rng.random(given.shape) + ~given, axis=1)
+    few = np.zeros(given.shape)
     np.put_along_axis(few, order[:, : d + _SPARE], 1.0, axis=1)
-    x, t = replace(many, root=many.root * few).settled(x.reshape(-1, 1, d))[:2]
+    x = minima(many.with_rows(weight=few * given), x.reshape(-1, 1, d))[0][:, 0]
     for _ in range(_ALONE):
-        residual = many.equations(x, t)[0][:, 0, : points.one.shape[0]]
-        x, t = replace(many, root=many.root * np.sqrt(weights(residual, many.root > 0.0))).settled(x, t)[:2]
-    x, t = (values.reshape(size, _PLACES, *values.shape[2:]) for values in (x, t))
-    x, t = np.concatenate([here[:, None], x], axis=1), np.concatenate([now[:, None], t], axis=1)
-    cost = np.minimum(points.equations(x, t)[0] ** 2, PRICE).sum(axis=-1)
-    best = np.arange(size), cost.argmin(axis=1)
-    return np.asarray(x[best]), np.asarray(t[best])
+        own = weights(whitened(many, x), given) * given
+        x = minima(many.with_rows(weight=own), x[:, None, :d])[0][:, 0]
+    now = vectors(problem, here[:, None])
+    x = np.concatenate([now, x.reshape(size, _PLACES, -1)], axis=1)
+    cost = np.stack([np.minimum(whitened(problem, x[:, k]) ** 2, PRICE).sum(axis=-1) for k in range(1 + _PLACES)])
+    return np.asarray(x[np.arange(size), cost.argmin(axis=0)])
+
+
+def whitened(problem: Problem, x: Array) -> Array:
+    """Return residuals (B, q) in deviations, zero of absent rows."""
+    left = np.where(problem.weight > 0.0, problem.observed - predict(problem, x), 0.0)
+    return np.asarray(left / np.sqrt(variances(problem.noise, problem.count)))

@@ -217,15 +217,15 @@ def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
     begun, patient = 0, net.stations >= _MANY
     while True:
-        made = list[Ends]()
-        if able and not patient:
-            at, start = starts.low_rank(_LOW_RANK)
-            made += [starts.ends(at, start + begun)] if at.count else []
-            begun += _LOW_RANK
-        made.append(starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun))
+        at, start = starts.random(_RANDOM), np.arange(_RANDOM) + begun
         begun += _RANDOM
+        if able and not patient:
+            # all are refined side by side
+            fits, which = starts.low_rank(_LOW_RANK)
+            at, start = together(fits, at), np.concatenate([which + begun, start])
+            begun += _LOW_RANK
         patient = False
-        yield begun, joined(made)
+        yield begun, starts.ends(at, start)
 
 
 def laid(at: Estimate, net: Network, rng: np.random.Generator) -> Estimate:

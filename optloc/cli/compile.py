@@ -25,9 +25,6 @@ from rich.table import Table
 
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Motion, Stations
-from optloc.calibration.descent import descend
-from optloc.calibration.likelihood import Estimate, likelihood
-from optloc.calibration.network import network_of
 from optloc.cli.output import Screen, dumps, meter
 from optloc.compute.filter import filter_scan
 from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, named, names_in, plain
@@ -137,15 +134,6 @@ def _place() -> None:
     place(SiteSelection(_problem_of("toa"), _TARGET[None], choose=4, gap=0.5))
 
 
-def _calibrate() -> None:
-    pulses = _TARGET * np.linspace(0.5, 1.5, 8)[:, None]
-    arrivals = np.linalg.norm(pulses[:, None] - _STATIONS, axis=-1)
-    insist_on(descend)
-    likelihood(network_of(arrivals, 1.0)).refine(
-        Estimate(_STATIONS[None], np.zeros((1, 6)), pulses[None], np.zeros((1, 8)))
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class Part:
     """What one process compiles: how that is had, and the kernels that Python calls."""
@@ -214,9 +202,6 @@ PARTS: Mapping[str, Part] = {
             *(f"optloc.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
             "optloc.placement.completions.exhaust",
         ),
-    ),
-    "networks": Part(
-        "networks of stations", "optloc.calibration", (_calibrate,), ("optloc.calibration.descent.descend",)
     ),
     "regions": Part(
         "cells of regions",

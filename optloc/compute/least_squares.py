@@ -281,15 +281,17 @@ def _at(equations: Normal, index: Array) -> Normal:
 
 # By machine code: which problems it serves, and with which weights.
 
-# Systems of more unknowns are better solved one after the other, by LAPACK, than side by side in lanes.
-_UNKNOWNS = 40
+# Systems of more unknowns are better solved one after the other, by LAPACK, than side by side in lanes; of runs with
+# unknowns of their epochs, whose elimination lanes share, networks of 64 took half of the time in lanes.
+_UNKNOWNS, _OF_RUNS = 40, 70
 # Numbers of the derivatives from which weights that depend on the place are made at a time: 16 MB.
 _WEIGHED = 2**21
 
 
 def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: Rules) -> Refined | None:
     """Return the refinement by machine code, or None without machine code for the problem."""
-    few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
+    most = _OF_RUNS if problem.layout.n_local and problem.epochs > 1 else _UNKNOWNS
+    few = problem.layout.n_shared + problem.layout.n_local <= most
     if not few or not serves(problem, len(start)):
         return None
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)

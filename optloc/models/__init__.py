@@ -31,6 +31,7 @@ from optloc.models.primitives import (
 
 __all__ = [
     "BEARING",
+    "BETWEEN",
     "MODELS",
     "LiftedRow",
     "Model",
@@ -335,10 +336,16 @@ _KINDS: dict[str, Model] = {
 }
 
 
-class _AlongRays(dict[str, Model]):
-    """Kinds along rays, which are made of what their names say and listed nowhere."""
+BETWEEN = "station to station"
+"""The kind of a distance between two stations, which no target enters: of networks whose stations are unknown."""
+
+
+class _Unlisted(dict[str, Model]):
+    """Kinds that are listed nowhere: those along rays, made of what their names say, and distances of stations."""
 
     def __missing__(self, name: str) -> Model:
+        if name == BETWEEN:
+            return Model(lambda t, a, b: distance(a, b), "length", 2, "distance of two stations")
         if not name.startswith(RAY):
             raise KeyError(name)
         return _along_rays(name)
@@ -366,7 +373,7 @@ def _along_rays(name: str) -> Model:
     )
 
 
-MODELS: Table[Model] = Table("optloc.models", lambda value: isinstance(value, Model), _KINDS, _AlongRays)
+MODELS: Table[Model] = Table("optloc.models", lambda value: isinstance(value, Model), _KINDS, _Unlisted)
 
 
 def kind_named(word: str, where: str | None = "kind") -> str:

@@ -170,7 +170,7 @@ def told_gross(seed, m, n):
     truth, z, wrong = with_gross_rows(seed, m, n)
     net = network_of(z, 0.03)
     lik = likelihood(net)
-    judge = truncated(lik, replace(lik, root=lik.root * ~wrong).refine(truth)[0])[0]
+    judge = truncated(lik, replace(lik, weight=1.0 * ~wrong[None]).refine(truth)[0])[0]
     begun = time.process_time()
     found = calibrate(net, robust=True)
     seconds = time.process_time() - begun

@@ -69,7 +69,8 @@ def test_a_trial_does_not_depend_on_the_others_and_has_the_flaws_that_were_asked
 
 
 def test_the_judge_is_below_the_truth_and_below_random_places():
-    found = frames(changed(HALL, trials=8))
+    in_space = HALL.replace("dimension = 2", "dimension = 3").replace('"20 m"]', '"20 m", "6 m"]')
+    found = frames(changed(in_space, trials=8))
     judge, random = found["truth"], found["one-random"]
     assert (judge["data"] == random["data"]).all()
     assert (judge["cost"] < judge["cost_truth"]).all()
