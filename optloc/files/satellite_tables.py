@@ -22,8 +22,8 @@ from optloc.files.readings import Told, sort_named
 from optloc.files.roles import Places, Roles, check_told, places_of, scaled
 from optloc.files.schema import Units
 from optloc.files.shapes import sigma_column, sigma_of
-from optloc.files.table import distinct
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
+from optloc.files.words import distinct
 from optloc.files.writer import write_csv
 
 # Nothing is nearer to the centre of the Earth than its poles but what has another unit, metres.
