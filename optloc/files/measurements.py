@@ -495,8 +495,8 @@ def check_repeats(
     for kind in dict.fromkeys(chunk.kind for chunk in chunks):
         same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
         ends = [(chunks[i].a + 1, chunks[i].b + 1, index[i], target[i]) for i in same]
-        keys = [np.concatenate(each) for each in zip(*ends, strict=True)]
-        if len(first_rows(*keys)[0]) == len(keys[0]):
+        own = [np.concatenate(each) for each in zip(*ends, strict=True)]
+        if len(first_rows(*own)[0]) == len(own[0]):
             continue  # no two rows are of the same stations at the same epoch
         # Sorted by all that makes rows equal, equal ones are neighbours, the first of the file first.
         table = np.concatenate([_table(chunks[i], index[i], target[i], i) for i in same], axis=1)

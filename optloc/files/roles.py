@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from optloc.files.columns import any_unit, check_unit, rank, role_named, role_of
 from optloc.files.foreign import read_table, records
 from optloc.files.schema import MeasurementsTable, ProblemFile, join
 from optloc.files.table import Table
-from optloc.files.words import Words, equal_rows, numbered
+from optloc.files.words import Words, equal_rows, numbered, objects
 from optloc.models import BEARING, MODELS, kind_named
 
 WORDS = {
@@ -115,14 +115,14 @@ class Roles:
             raise InvalidProblem(f"no column looks like the {role}", self.table.source, advice)
         return found
 
-    def labels(self, role: str) -> Words:
+    def labels(self, role: str) -> Array:
         """Return text (m,), that of several columns with "-" between it."""
         parts = [self.table.labels(part) for part in self.column(role).split("+")]
         if len(parts) == 1:
             return parts[0]
         first, index = equal_rows(parts, self.table.count)
         joined = ["-".join(row) for row in zip(*(part[first] for part in parts), strict=True)]
-        return Words(first, index).renamed(joined)
+        return cast("Array", Words(first, index).renamed(joined))  # NumPy takes words for an array
 
     def numbers(self, role: str) -> Array:
         """Return finite numbers (m,)."""
@@ -240,7 +240,8 @@ def _rows_in_our_words(
         # A column without other words stays as it is: millions of rows are not spelled again.
         if any(word != kind for word, kind in kinds.items()):
             labels = table.labels("kind")
-            spelled = labels.renamed([kinds[word] for word in labels.cells])
+            cells, index = numbered(labels)
+            spelled = Words(objects(cells), index).renamed([kinds[word] for word in cells])
             table = replace(table, columns={**table.columns, table.name("kind"): spelled})
         return _units_by_kind(section.model_copy(update=changes)), _ends(section, table)
     changes["kind"] = kinds[section.kind]

@@ -60,7 +60,7 @@ def pseudoranges(source: Path, roles: Roles, told: Told) -> TableProblem:
     uses = {roles.column(role): role for role in ("satellite", "toa", *"xyz")}
     uses |= dict.fromkeys(roles.column(by).split("+"), by) | ({} if when is None else {when: "time"})
     if own is not None:
-        columns["sigma"] = sigma_of(roles.table, own, form, unit, range(len(z)))
+        columns["sigma"] = sigma_of(roles.table, own, form, unit, np.arange(len(z)))
         uses[own] = "sigma_toa"
     rest = left_over(roles, uses, (), lengths=True)
     satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))

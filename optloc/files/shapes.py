@@ -175,7 +175,7 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> A
     if len(lacking):
         advice = "give a number, or leave the row out"
         raise InvalidProblem("the reading has no standard deviation", table.where(column, int(lacking[0])), advice)
-    return held.values.floats()[place[pick]] * known[own] / known[unit]  # type: ignore[index]  # as above
+    return np.asarray(held.values.floats()[place[pick]] * known[own] / known[unit])
 
 
 def _ends(one: Named, form: Form, told: Told, source: str) -> tuple[str, str | None]:

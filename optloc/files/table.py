@@ -9,7 +9,7 @@ from csv import Error as CSVError
 from csv import reader as lines_of
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -110,7 +110,7 @@ class Table:
             raise InvalidProblem(what, self.where(key, row), "give a number, or leave the row out")
         return values
 
-    def labels(self, key: str) -> Words:
+    def labels(self, key: str) -> Array:
         """Return a column as text (m,); an empty cell is refused."""
         column = self.cells(key)
         if column.dtype.kind in "iu":
@@ -126,7 +126,7 @@ class Table:
                 what = f"{spelled[wrong]!r} holds control characters" if spelled[wrong] else "the cell is empty"
                 row = int(np.flatnonzero(words.index == wrong)[0])
                 raise InvalidProblem(what, self.where(key, row), "give a name")
-        return words.renamed(spelled)
+        return cast("Array", words.renamed(spelled))  # NumPy takes words for an array
 
     def times(self, key: str, factor: float) -> Array:
         """Return a column of numbers (times `factor` seconds) or ISO 8601 dates as seconds (m,)."""
@@ -387,20 +387,20 @@ class Keys:
 
     Parameters
     ----------
-    label : Words (m,), optional
+    label : object array (m,), optional
         Epoch column.
     time : array (m,), optional
         Time column, seconds.
-    written : Words (m,), optional
+    written : object array (m,), optional
         The time column as it was written.
-    target : Words (m,), optional
+    target : object array (m,), optional
         Target column.
     """
 
-    label: Words | None
+    label: Array | None
     time: Array | None
-    written: Words | None
-    target: Words | None
+    written: Array | None
+    target: Array | None
 
 
 @dataclass(frozen=True, slots=True)

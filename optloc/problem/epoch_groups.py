@@ -114,7 +114,7 @@ def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
         return whole
     table = _RowTable.of(problem)
     found = [_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
-    layouts = [one.take(slice(1)).problem.layout if one.rows.size else None for one in found]
+    layouts = [one.take(slice(1)).problem.layout if one.rows is not None and one.rows.size else None for one in found]
     # Epochs without rows, and those that lack an unknown of others, are problems of one batch with the others only.
     return whole if any(layout != layouts[0] or layout is None for layout in layouts) else tuple(found)
 
@@ -220,8 +220,8 @@ def _stations_of(stations: Stations, own: Array) -> Stations:
         if array is None:
             return None
         if array.ndim == 3:  # the same place at all epochs
-            return array[0][own][:, None]
-        return np.take_along_axis(array, own[:, None, :, None], axis=2)
+            return np.asarray(array[0][own][:, None])
+        return np.asarray(np.take_along_axis(array, own[:, None, :, None], axis=2))
 
     position = pick(stations.position)
     assert position is not None
