@@ -132,7 +132,8 @@ def test_small_headings_without_a_unit_are_asked_for(tmp_path):
     path.write_text("lat,lon,heading,bearing_deg\n59.9,10.7,1.0,30\n59.8,10.75,2.0,20\n")
     with pytest.raises(InvalidProblem, match=r"the unit of the column 'heading' is not known; call it heading_deg"):
         fixed(path)
-    assert understood(path, Told(sigma="1 deg", still=True, unit="deg")).sections[0].columns["z"] == ["31.0", "22.0"]
+    found = understood(path, Told(sigma="1 deg", still=True, unit="deg")).sections[0]
+    assert found.columns["z"].texts() == ["31.0", "22.0"]
 
 
 def test_a_declination_without_bearings_from_north_is_refused(tmp_path):

@@ -22,7 +22,7 @@ DEMOS = package_files("optloc") / "scenarios"
 @pytest.mark.parametrize(("name", "panels"), [("demo", 3), ("ambiguous", 2), ("run", 1)])
 def test_demos_are_drawn(name, panels, tmp_path):
     fixed = fix_file(read(DEMOS / f"{name}.toml"), "auto", quiet=True)
-    figure = plot_fixes(fixed.loaded.problem, fixed.fixes, title=name)
+    figure = plot_fixes(fixed.loaded.problem, (fixed.fix,), title=name)
     assert len(figure.axes) == panels
     for axes in figure.axes:
         assert axes.get_aspect() == 1.0
@@ -34,7 +34,7 @@ def test_demos_are_drawn(name, panels, tmp_path):
 
 def test_alternatives_are_labelled_with_their_cost():
     fixed = fix_file(read(DEMOS / "ambiguous.toml"), "auto", quiet=True)
-    figure = plot_fixes(fixed.loaded.problem, fixed.fixes)
+    figure = plot_fixes(fixed.loaded.problem, (fixed.fix,))
     assert any(text.get_text().startswith("+") for text in figure.axes[0].texts)
 
 

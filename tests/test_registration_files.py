@@ -67,7 +67,7 @@ def test_the_shipped_registration_is_solved_without_a_guess():
 def test_the_table_names_the_members(fixed):
     text = run("fix", DEMO, *ALLOW).stdout
     assert all(name in text for name in ("Biases", "clock", "R2", "R5", "from data", "100 %"))
-    assert fixed.fixes[0].members("clock") == tuple(TRUE)
+    assert fixed.fix.members("clock") == tuple(TRUE)
 
 
 def test_a_prior_on_all_clocks_leaves_their_common_error_open(tmp_path):
@@ -164,11 +164,11 @@ def test_the_bound_of_a_calibration_needs_no_position(tmp_path):
 
 def test_tracks_are_drawn(fixed):
     problem = fixed.loaded.problem
-    scene = scene_of(problem, fixed.fixes)
+    scene = scene_of(problem, (fixed.fix,))
     assert len(scene.tracks) == 5
     np.testing.assert_array_equal(scene.tracks[0][[0, -1]], problem.stations.position[[0, -1], 0])
     assert scene.fixes.shape == (1, 3)
-    figure = plot_fixes(problem, fixed.fixes)
+    figure = plot_fixes(problem, (fixed.fix,))
     assert "track of a station" in [text.get_text() for text in figure.legends[0].texts]
     assert len(plot_course(*_courses(problem)).axes) == 2
 

@@ -309,3 +309,25 @@ class Portable(np.ndarray):
 
 def _plain(value: Any) -> Any:
     return value.view(np.ndarray) if isinstance(value, Portable) else value
+
+
+# Equal rows of tables.
+
+
+def first_rows(*numbers: Array) -> tuple[Array, Array]:
+    """Return the first rows (n,) of all groups of rows with equal numbers, and the group of each row (m,).
+
+    Parameters
+    ----------
+    *numbers : int array (m,)
+        Numbers that are not negative, and not more than there are rows.
+    """
+    code = np.zeros(len(numbers[0]), dtype=np.int64)
+    for own in numbers:
+        # Codes stay below the square of the number of rows, which 64 bits hold.
+        code = np.unique(code * (int(own.max(initial=0)) + 1) + own, return_inverse=True)[1].ravel()
+    _, first, inverse = np.unique(code, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return first[order], place[inverse.ravel()]

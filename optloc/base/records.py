@@ -151,7 +151,7 @@ class _Column:
     def array(self) -> Array | None:
         if self.whole is None and self.parts:
             value = self.parts[0][1]
-            if not self.layout.slots and sum(len(own) for _, own in self.parts) == self.count:
+            if self._is_shared():
                 return np.broadcast_to(value[:1], (self.count, *value.shape[1:]))
             width = max(own.shape[1] for _, own in self.parts) if self.layout.slots else 0
             self._allocate(value, (width, *value.shape[2:]) if self.layout.slots else value.shape[1:])
@@ -164,6 +164,13 @@ class _Column:
     def _shares(self, value: Array) -> bool:
         """Return whether a part is one row for all, the same as of the parts before."""
         return value.strides[0] == 0 and all(_is_equal(own[:1], value[:1]) for _, own in self.parts[:1])
+
+    def _is_shared(self) -> bool:
+        """Return whether all parts are one row for all entries."""
+        own = [value for _, value in self.parts]
+        if sum(map(len, own)) < self.count or len({value.shape[1:] for value in own}) > 1:
+            return False
+        return not self.layout.slots or all(map(self._shares, own))
 
     def _allocate(self, like: Array, shape: tuple[int, ...]) -> None:
         if self.whole is None:

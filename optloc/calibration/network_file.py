@@ -17,7 +17,8 @@ from optloc.calibration.calibrated import Calibration
 from optloc.calibration.network import KINDS, Network, Slot, checked
 from optloc.files.roles import worded
 from optloc.files.schema import Amount, DataTable, ProblemFile, Units, conform, join, name_of, parse_toml
-from optloc.files.table import Table, distinct, table_of
+from optloc.files.table import Table, table_of
+from optloc.files.words import distinct
 from optloc.files.writer import toml_text
 from optloc.models import MODELS, kind_named
 

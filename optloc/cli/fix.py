@@ -61,6 +61,7 @@ from optloc.report.fixes import (
     with_sigma,
 )
 from optloc.report.formats.marks import geojson
+from optloc.solvers.policy import REFUTED
 
 # What a screen holds of each list; the rest is counted, and --json and --out have all of it.
 _STATES, _FAILURES = SHOWN, 10
@@ -101,20 +102,22 @@ def run_fix(
     found = fix_file(loaded, signals.method if signals is not None and signals.share else method, quiet or as_json)
     if signals is not None and len(signals.late) == len(found.columns["x"]):
         found.columns.update(late_rows=signals.late, on_late_rows=signals.carried)
-    level = rescaled or _level_of(found)
-    signals = signals or _late_of(found)
     levels = found.loaded.levels
     _write(found, out, geojson_path, plot, html)
+    if quiet and not as_json:
+        return 0 if found.passes(allow) else 1
     # many statuses are told by their own sentence; causes take a search, which only readers need
-    told = advice_for_fixes(found) if as_json or not quiet else ()
-    other = _explain(found, method) if explain and (as_json or not quiet) else None
+    level = rescaled or _level_of(found)
+    signals = signals or _late_of(found)
+    told = advice_for_fixes(found)
+    other = _explain(found, method) if explain else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
         noise_found |= {} if level is None else {"noise_level": level_json(level, rescaled is not None)}
         noise_found |= {"explained": explained_json(found, other)} if explain else {}
         noise_found |= {} if signals is None else {"late_signals": late_json(signals, late)}
         write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
-    elif not quiet:
+    else:
         console = Screen(stderr=on_output)
         show(found, console)
         show_advice(told, console)
@@ -140,23 +143,23 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
             from optloc.report import fix_page
 
             labels = [str(label) for label in found.columns["epoch"]]
-            write_text(html, fix_page(found.loaded.problem, found.fixes, found.loaded.title, labels))
+            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels))
 
 
 def draw(found: FileFixes, path: Path) -> None:
     """Draw fixes to a picture file; raise InvalidProblem where that fails."""
     from optloc.plot import plot_fixes
 
-    write_picture(plot_fixes(found.loaded.problem, found.fixes, title=found.loaded.title), path)
+    write_picture(plot_fixes(found.loaded.problem, (found.fix,), title=found.loaded.title), path)
 
 
 def show(found: FileFixes, console: Console) -> None:
     """Print fixes: one in full, a few of a run below each other, many as a count by status."""
-    first = found.fixes[0]
+    fix = found.fix
     if len(found.columns["x"]) == 1:
-        _show_one(found, first[0] if first.shape else first, console)
-    elif not first.shape:
-        _show_one(found, first, console)
+        _show_one(found, fix[0] if found.apart else fix, console)
+    elif not found.apart:
+        _show_one(found, fix, console)
     else:
         _show_many(found, console)
 
@@ -199,7 +202,7 @@ def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
         return
     from optloc.cli.crlb import reliability_of, show_reliability
 
-    show_reliability(reliability_of(found.problem, fix.x, fix.suspects), console)
+    show_reliability(reliability_of(found.loaded.problem, fix.x, fix.suspects), console)
 
 
 def _show_many(found: FileFixes, console: Console) -> None:
@@ -243,23 +246,31 @@ def _common_level(problem: Problem) -> CommonLevel:
         raise InvalidProblem(error.what, "--rescale-noise", "leave it out") from None
 
 
+# Probability below which the number of refuted fixes is not chance: then the noise as stated is tested.
+_BY_CHANCE = 0.01
+
+
+def _are_refuted(fix: Fix) -> bool:
+    """Return whether more fixes of a batch are refuted than chance refutes, or a search for suspects was asked for."""
+    from scipy.special import bdtrc
+
+    refuted = np.isin(fix.code, [Status.MISFIT, Status.CONTRADICTORY])
+    by_chance = bdtrc(int(refuted.sum()) - 1, len(fix), REFUTED)
+    return bool(refuted.any() and by_chance < _BY_CHANCE) or fix.explanations is not None
+
+
 def _level_of(found: FileFixes) -> CommonLevel | None:
-    """Return whether the fixes of a file accuse its noise; None of one fix, and where none is but ok."""
-    if not found.fixes[0].shape or sum(map(len, found.fixes)) < SEVERAL:
+    """Return whether the fixes of a file accuse its noise; None of few fixes, and where they are not refuted."""
+    if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
         return None
-    if all(bool((fix.code == Status.OK).all()) and fix.explanations is None for fix in found.fixes):
-        return None
-    batch = batch_of(found.loaded.problem)
-    return common_level_at(batch, np.concatenate([fix.x for fix in found.fixes]))
+    return common_level_at(batch_of(found.loaded.problem), found.fix.x)
 
 
 def _late_of(found: FileFixes) -> LateSignals | None:
-    """Return whether rows of a file are late, by its fixes; None of one fix, and where none is but ok."""
-    if not found.fixes[0].shape or sum(map(len, found.fixes)) < SEVERAL:
+    """Return whether rows of a file are late, by its fixes; None of few fixes, and where they are not refuted."""
+    if not found.apart or len(found.fix) < SEVERAL or not _are_refuted(found.fix):
         return None
-    if all(bool((fix.code == Status.OK).all()) for fix in found.fixes):
-        return None
-    x, answered = (np.concatenate([getattr(fix, name) for fix in found.fixes]) for name in ("x", "answered"))
+    x, answered = found.fix.x, found.fix.answered
     kept = answered & np.isfinite(x).all(-1)
     return late_signals_at(batch_of(found.loaded.problem), np.flatnonzero(kept), x[kept]) if kept.any() else None
 
@@ -338,12 +349,10 @@ def _show_levels(levels: NoiseLevels, console: Console) -> None:
 
 def advice_for_fixes(found: FileFixes) -> tuple[Advice, ...]:
     """Return the advice for all fixes of a file together; nothing where every one is ok."""
-    if all(bool((fix.code == Status.OK).all()) for fix in found.fixes):
+    if bool((found.fix.code == Status.OK).all()):
         return ()
     problem = found.loaded.problem
-    if not found.fixes[0].shape:
-        return tuple(advise(problem, found.fixes[0]))
-    return advice_for_vectors(problem, np.concatenate([fix.x for fix in found.fixes]))
+    return advice_for_vectors(problem, found.fix.x) if found.apart else tuple(advise(problem, found.fix))
 
 
 def advice_for_vectors(problem: Problem, vectors: Array | None) -> tuple[Advice, ...]:
@@ -373,8 +382,7 @@ def show_advice(found: tuple[Advice, ...], console: Console) -> None:
 
 def _explain(found: FileFixes, method: str) -> FileFixes | None:
     """Return the fixes of a file with the error among its unknowns that explains most, or None where none does."""
-    x = np.concatenate([np.atleast_2d(fix.x) for fix in found.fixes])
-    larger = explained_at(found.loaded.problem, x if found.fixes[0].shape else x[0])
+    larger = explained_at(found.loaded.problem, found.fix.x)
     return None if larger is None else fix_file(replace(found.loaded, problem=larger), method, True)
 
 
@@ -391,12 +399,12 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
     if other is None:
         say(console, "No single error explains what does not fit.")
         return
-    bias, fix = other.loaded.problem.biases[-1], other.fixes[0]
+    bias, fix = other.loaded.problem.biases[-1], other.fix
     table = Table(title=f"With the {bias.name}", title_justify="left")
     for name in ("", "as it was", "with it", "change"):
         table.add_column(name, justify="left" if not name else "right")
-    table.add_row("status", Status(int(found.fixes[0].flat().code[0])).label, Status(int(fix.code)).label, "")
-    before = "-" if found.fixes[0].shape else as_p(float(found.fixes[0].p_value))
+    table.add_row("status", Status(int(found.fix.flat().code[0])).label, Status(int(fix.code)).label, "")
+    before = "-" if found.apart else as_p(float(found.fix.p_value))
     table.add_row("p", before, as_p(float(fix.p_value)), "")
     rows = min(len(found.columns["x"]), _STATES)
     for i in range(rows):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from decimal import Decimal
@@ -17,13 +16,14 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import claim
 from optloc.base.types import Array
 from optloc.base.units import UNITS
+from optloc.files.cells import Decimals
 from optloc.files.columns import PLACE, role_named, role_of
 from optloc.files.declination import angle_of, date_of
 from optloc.files.foreign import read_table
 from optloc.files.headings import stations_turned
 from optloc.files.measurements import ESTIMATE
 from optloc.files.pseudoranges import is_gnss
-from optloc.files.reading_report import about, left_over, uses_of
+from optloc.files.reading_report import about, check_receivers, left_over, uses_of
 from optloc.files.readings import (
     CARTESIAN,
     CONVENTIONS,
@@ -38,12 +38,12 @@ from optloc.files.readings import (
     sorts_of,
     without,
 )
-from optloc.files.receiver_names import check_receivers
 from optloc.files.roles import Places, Roles, in_space, places_of
 from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
 from optloc.files.schema import Units
 from optloc.files.shapes import epochs_of, inline, long, wide
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
+from optloc.files.words import equal_rows
 from optloc.files.writer import write_csv
 from optloc.models import MODELS, kind_named
 
@@ -314,7 +314,7 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     values, text = found.values, found.form.text
     if found.form.kind == "toa":
         values, text = _from_first(found, columns), "arrivals, counted from the first of each message"
-    columns |= {"a": found.a} | ({} if found.b is None else {"b": found.b}) | {"z": [f"{value:f}" for value in values]}
+    columns |= {"a": found.a} | ({} if found.b is None else {"b": found.b}) | {"z": values}
     if found.sigma is not None and sigma is None:
         columns["sigma"] = found.sigma
     lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
@@ -346,35 +346,36 @@ def _share(sigma: str, unit: str) -> str:
         return sigma
 
 
-def _from_first(found: Readings, columns: dict[str, Any]) -> list[Decimal]:
+def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
     """Return arrivals counted from the first of their message, whose time becomes a column where there is none.
 
     Seconds of today in nanoseconds have 19 digits, a float 16: differences are taken before anything is rounded.
     """
-    keys = [columns[name].tolist() for name in ("epoch", "time", "target") if name in columns]
-    labels: list[Any] = list(zip(*keys, strict=True)) if keys else [()] * len(found.values)
-    first: dict[Any, Decimal] = {}
-    for label, value in zip(labels, found.values, strict=True):
-        first[label] = min(value, first.get(label, value))
+    keys = [columns[name] for name in ("epoch", "time", "target") if name in columns]
+    _, message = equal_rows(keys, len(found.values))
+    order = np.lexsort((found.values.units, message))
+    first = order[np.unique(message[order], return_index=True)[1]]
     # Arrivals that are counted from their first already say nothing of when that was.
-    dated = found.unit in UNITS["time"] and len(set(first.values())) == len(first)
+    dated = found.unit in UNITS["time"] and len(np.unique(found.values.units[first])) == len(first)
     if dated and "time" not in columns:
         factor = Decimal(repr(UNITS["time"][found.unit]))
-        columns["time"] = np.array([float(first[label] * factor) for label in labels])
-    return [value - first[label] for label, value in zip(labels, found.values, strict=True)]
+        begins = np.array([float(value * factor) for value in found.values.take(first).tolist()])
+        columns["time"] = begins[message]
+    return found.values.since(first, message)
 
 
 def _few(sections: Sequence[Section], told: Told) -> list[str]:
     """Return what is to be said of epochs with few readings."""
-    counts: Counter[Any] = Counter()
-    for section in sections:
-        keys = [section.columns[name] for name in ("epoch", "target") if name in section.columns]
-        keys = keys or [section.columns[name] for name in ("time",) if name in section.columns]
-        counts.update(zip(*(column.tolist() for column in keys), strict=True))
-    few = sum(count < _FEW for count in counts.values())
+    names = [name for name in ("epoch", "target") if name in sections[0].columns] or ["time"]
+    held = [section.columns for section in sections if set(names) <= set(section.columns)]
+    if not held:
+        return []
+    columns = [np.concatenate([own[name] for own in held]) for name in names]
+    counts = np.bincount(equal_rows(columns, len(columns[0]))[1])
+    few = int((counts < _FEW).sum())
     if sections[0].kind == "toa" and few:
         return [f"{few} of {len(counts)} messages were heard by fewer than three stations"]
-    if len(counts) > 1 and max(counts.values()) == 1 and told.window is None:
+    if len(counts) > 1 and counts.max() == 1 and told.window is None:
         advice = "--still puts them together if the target stays, --window '0.1 s' those of 0.1 s"
         return [f"each of the {len(counts)} instants has one reading: {advice}"]
     return []

@@ -1,17 +1,178 @@
-"""Files of other programs as tables: CSV and Parquet, JSON of mlat-server, logs of KrakenSDR."""
+"""Files of other programs as tables: CSV and Parquet, nested records such as JSON, logs of KrakenSDR."""
 
 from __future__ import annotations
 
+import ast
+import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from decimal import Decimal
+from math import sqrt
 from pathlib import Path
+from typing import Any
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import decoded, json_of, read_bytes
-from optloc.files.records import records, with_lists
+from optloc.base.inputs import at_most, decoded, json_of, read_bytes
+from optloc.files.columns import any_unit, stem
 from optloc.files.table import Table, csv, of_rows, parquet
+
+# mlat-server writes seconds since 1970, arrivals in microseconds and their variances in their squares.
+_CLUSTER = ("ecef_x_m", "ecef_y_m", "ecef_z_m", "toa_us", "sigma_us")
+# Names of lists of two or three numbers that are the coordinates of one point.
+_POINTS = ("position", "pos", "xyz", "ecef")
+# Letters of a record that a message repeats.
+_SHOWN = 80
+
+Row = dict[str, Any]
+
+
+def records(data: Any, source: str) -> Table:
+    """Return the table of nested records: a list of objects, an object of objects by name, or one object.
+
+    Names of nested objects are joined by "_". Each object in a list is a row, with the values of the objects around the
+    list. Lists of equal length in one object are columns beside each other. A list of coordinates is x, y and z.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there are no records, or the lists of an object have different lengths.
+    """
+    if isinstance(data, Mapping) and isinstance(data.get("aircraft"), list):
+        advice = "give receptions instead, such as mlat-server writes with --dump-pseudorange"
+        raise InvalidProblem("aircraft.json has positions of aircraft, no measurements", source, advice)
+    if isinstance(data, Mapping):
+        named = data and all(isinstance(value, Mapping) for value in data.values())
+        data = [{"name": name, **value} for name, value in data.items()] if named else [data]
+    if not isinstance(data, list) or not data or not all(isinstance(row, Mapping) for row in data):
+        raise InvalidProblem("there is no list of records", source, "write it as a list of objects, or as CSV")
+    if any("cluster" in row for row in data):
+        rows = list(_clusters(data, source))
+    else:
+        rows = [row for i, record in enumerate(data) for row in _rows(record, f"{source}, row {i + 1}")]
+    at_most("cells", sum(map(len, rows)), source)
+    if not any(rows):
+        raise InvalidProblem("there is no list of records", source, "write it as a list of objects, or as CSV")
+    return of_rows(rows, source, {})
+
+
+def with_lists(table: Table) -> Table:
+    """Return a table whose cells hold no lists: their items are rows of their own, as in `records`."""
+    lists = [name for name, column in table.columns.items() if column.dtype == object and _holds_list(column)]
+    if not lists:
+        return table
+    columns = {name: column.tolist() for name, column in table.columns.items()}
+    columns |= {name: [_list_of(cell) for cell in columns[name]] for name in lists}
+    rows = [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
+    found = [row for i, one in enumerate(rows) for row in _rows(one, f"{table.source}, row {i + 1}")]
+    at_most("cells", sum(map(len, found)), table.source)
+    return replace(of_rows(found, table.source, {}), others=table.others, notes=table.notes)
+
+
+def _holds_list(column: Any) -> bool:
+    """Return whether the first cell that holds something holds a list."""
+    first = next((cell for cell in column if cell is not None and str(cell).strip()), None)
+    return isinstance(_list_of(first), list)
+
+
+def _list_of(cell: Any) -> Any:
+    """Return the list that a cell spells as JSON or Python does, else the cell."""
+    text = cell.strip() if isinstance(cell, str) else ""
+    if not (text.startswith("[") and text.endswith("]")):
+        return cell
+    with suppress(ValueError, RecursionError):
+        return json.loads(text, parse_float=Decimal)
+    with suppress(ValueError, SyntaxError, RecursionError, MemoryError):
+        return ast.literal_eval(text)
+    return cell
+
+
+def _rows(record: Mapping[str, Any], place: str) -> list[Row]:
+    """Return the rows of one record: one, or one for each item of its lists."""
+    around: Row = {}
+    inner: list[Row] = []
+    parallel: dict[str, list[Any]] = {}
+    for key, value in _flat(record, place):
+        if not isinstance(value, list):
+            _put(around, key, value, place)
+        elif not value:
+            continue
+        elif all(isinstance(item, Mapping) for item in value):
+            inner += [_inside(row, key, record) for item in value for row in _rows(item, place)]
+        elif stem(key) in _POINTS and len(value) in (2, 3) and all(_is_number(item) for item in value):
+            for axis, item in zip("xyz", value, strict=False):
+                _put(around, _axis_name(key, axis), _cell(item), place)
+        elif any(isinstance(item, list | Mapping) for item in value):
+            _put(around, key, json.dumps(value, default=str), place)
+        else:
+            parallel[key] = [_cell(item) for item in value]
+    if len({len(items) for items in parallel.values()}) > 1:
+        sizes = ", ".join(f"{key} has {len(items)}" for key, items in parallel.items())
+        raise InvalidProblem(f"its lists have different lengths: {sizes}", place, "give them one length")
+    beside = [dict(zip(parallel, cells, strict=True)) for cells in zip(*parallel.values(), strict=True)]
+    rows = [*inner, *beside]
+    return [around | row for row in rows] if rows else [around]
+
+
+def _flat(record: Mapping[str, Any], place: str, before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of a record; the names of nested ones are joined."""
+    for key, value in record.items():
+        name = f"{before}{key}"
+        if isinstance(value, Mapping):
+            yield from _flat(value, place, f"{name}_")
+        else:
+            yield name, value if isinstance(value, list) else _cell(value)
+
+
+def _inside(row: Row, key: str, record: Mapping[str, Any]) -> Row:
+    """Return a row of a list: a name that the object around it has, too, follows that of the list."""
+    return {f"{key}_{name}" if name in record else name: value for name, value in row.items()}
+
+
+def _put(row: Row, key: str, value: Any, place: str) -> None:
+    if key in row:
+        raise InvalidProblem(f"the value {key!r} is given twice", place, "rename one of them")
+    row[key] = value
+
+
+def _axis_name(key: str, axis: str) -> str:
+    """Return the name of a coordinate of a list: "x_m" of "position_m", "ecef_x" of "ecef"."""
+    unit = any_unit(key)
+    name = f"ecef_{axis}" if stem(key) == "ecef" else axis
+    return name if unit is None else f"{name}_{unit}"
+
+
+def _is_number(item: Any) -> bool:
+    return isinstance(item, int | float | Decimal) and not isinstance(item, bool)
+
+
+def _cell(value: Any) -> Any:
+    """Return a value as a cell: numbers with all their digits, truth values as words."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str | int | float | None):
+        return value
+    return str(value)
+
+
+def _clusters(data: Sequence[Mapping[str, Any]], source: str) -> Iterator[Row]:
+    """Yield the receptions of an mlat-server dump of pseudoranges, with the place of each receiver in ECEF."""
+    for i, row in enumerate(data):
+        place = f"{source}, row {i + 1}"
+        cluster = row.get("cluster")
+        if not isinstance(cluster, list):
+            raise InvalidProblem("there is no cluster of receptions, which other rows have", place, "leave it out")
+        for cells in cluster:
+            numbers = isinstance(cells, list) and all(type(cell) in (int, float, Decimal) for cell in cells)
+            if not numbers or len(cells) < len(_CLUSTER) - 1:
+                what = f"{str(cells)[:_SHOWN]} is no reception"
+                raise InvalidProblem(what, place, "write [x, y, z, microseconds]")
+            reals = [float(cell) for cell in cells]
+            reception = dict(zip(_CLUSTER, [*reals[:4], *(sqrt(max(cell, 0.0)) for cell in reals[4:5])], strict=False))
+            name = "/".join(f"{cell:.0f}" for cell in reals[:3])
+            yield {"message": i + 1, "icao": str(row.get("icao", "")) or None, "station": name} | reception
+
 
 # How Parquet spells the types of cells that hold several values.
 _NESTED = ("list<", "large_list<", "fixed_size_list<", "struct<", "map<")

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.units import UNITS
-from optloc.files.cells import numbers
+from optloc.files.cells import Decimals, numbers
 from optloc.files.columns import stem, unit_of
 from optloc.files.readings import BOW, COMPASS, Readings, Told, in_unit, marks_of
 from optloc.files.roles import Places, Roles
@@ -41,7 +41,7 @@ def heading_of(found: Readings, roles: Roles, told: Told) -> str | None:
         return None
     column = roles.column("heading") if told.azimuth == BOW else roles.find("heading")
     # A heading that was measured is a bearing, and the heading of one vehicle is not the one of several receivers.
-    if column is None or column in found.cells or (told.azimuth is None and len(set(found.cells)) > 1):
+    if column is None or column in found.columns or (told.azimuth is None and len(found.columns) > 1):
         return None
     return column
 
@@ -70,11 +70,12 @@ def from_bow(found: Readings, roles: Roles, column: str, told: Told) -> Readings
         advice = "give it with --declination, such as '4 deg' or the date 2026-06-01"
         raise InvalidProblem(f"the headings {column!r} are magnetic, of unknown declination", table.source, advice)
     held, nothing = numbers(table, column), marks_of(told) or frozenset()
-    lacking = next((row for row in found.row.tolist() if held[row] is None or held[row] in nothing), None)
+    given = dict(zip(held.row.tolist(), held.values.tolist(), strict=True))
+    lacking = next((row for row in found.row.tolist() if given.get(row) is None or given[row] in nothing), None)
     if lacking is not None:
         advice = "leave the row out, or say --azimuth north-clockwise if bearings are true ones"
         raise InvalidProblem("the bearing has no heading", table.where(column, lacking), advice)
-    used = [held[row] or Decimal(0) for row in found.row.tolist()]
+    used = [given[row] for row in found.row.tolist()]
     unit = _unit(column, used, told, table.where(column))
     turn = in_unit(Decimal(360), "deg", unit, found.form)
     wrong = next((i for i, heading in enumerate(used) if abs(heading) > turn * Decimal("1.0001")), None)
@@ -83,14 +84,14 @@ def from_bow(found: Readings, roles: Roles, column: str, told: Told) -> Readings
         raise InvalidProblem(f"the heading {used[wrong]:f} {unit} is more than a turn", spot, "leave the row out")
     sums = [
         value + in_unit(heading, unit, found.unit, found.form)
-        for value, heading in zip(found.values, used, strict=True)
+        for value, heading in zip(found.values.tolist(), used, strict=True)
     ]
     if found.unit in _TURNS:
         turn = _TURNS[found.unit]
         sums = [(value % turn + turn) % turn for value in sums]
     note = f"bearings are taken clockwise from the bow of the vehicle, and its heading was added, column {column!r}"
     note += "" if told.azimuth == BOW else f"; --azimuth {COMPASS} takes them as true bearings"
-    return replace(found, values=sums, azimuth=COMPASS, heading=column, notes=(note, *found.notes))
+    return replace(found, values=Decimals.of(sums), azimuth=COMPASS, heading=column, notes=(note, *found.notes))
 
 
 def stations_turned(place: Places, found: Sequence[Readings]) -> tuple[Places, str]:

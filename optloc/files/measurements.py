@@ -8,13 +8,15 @@ from datetime import date
 
 import numpy as np
 
+from optloc.base.arrays import first_rows
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Stations
 from optloc.base.units import LARGEST, Conversion
 from optloc.files.declination import angle_of, date_of, declinations
 from optloc.files.schema import DeclinationTable, MeasurementsTable, Units, join, kind_model
-from optloc.files.table import Epochs, Table, distinct
+from optloc.files.table import Epochs, Table
+from optloc.files.words import distinct, numbered
 from optloc.models import Model
 from optloc.problem.signal import Signal
 
@@ -131,7 +133,8 @@ def chunks_of(
     """
 
     def chunk(kind: str, pick: Array) -> Chunk:
-        part = Context(section, table.take(pick), stations, where, speed, values)
+        own = table if len(pick) == table.count else table.take(pick)
+        part = Context(section, own, stations, where, speed, values)
         return replace(_chunk(part, kind), row=pick, table=table)
 
     if section.kind is not None:
@@ -168,13 +171,14 @@ def _chunk(c: Context, kind: str) -> Chunk:
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
     east, day = _declination(c, units.name(name)) if kind == "azimuth" else (0.0, None)
+    correction = _correction(c, units, unit)
     return Chunk(
-        kind, np.arange(table.count), z, a, b, weight, _correction(c, units, unit) + east, unit, units,
-        units.name(name), np.broadcast_to(unit.slope(z), z.shape), np.zeros(c.table.count),
+        kind, np.arange(table.count), z, a, b, weight, correction + east if east else correction, unit, units,
+        units.name(name), np.broadcast_to(unit.slope(z), z.shape), np.broadcast_to(0.0, z.shape),
         sigma, arrival, covariance, signal_of(c),
         table.labels("epoch") if table.has("epoch") else None,
         table.times("time", seconds) if table.has("time") else None,
-        table.labels("time") if table.has("time") else None,
+        table.labels("time") if table.has("time") and not table.has("epoch") else None,
         table.labels("target") if table.has("target") else None,
         section.excess and _adds_up(model), table, day,
     )  # fmt: skip
@@ -221,7 +225,7 @@ def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
 
 
 def _numbers(c: Context, key: str, default: float) -> Array:
-    return c.table.numbers(key) if c.table.has(key) else np.full(c.table.count, default)
+    return c.table.numbers(key) if c.table.has(key) else np.broadcast_to(default, (c.table.count,))
 
 
 def _check_weight(c: Context, weight: Array) -> None:
@@ -253,18 +257,17 @@ def _values(c: Context, unit: Conversion, weight: Array) -> Array:
 
 def _stations(c: Context, key: str, needed: bool) -> Array:
     if not needed:
-        return np.full(c.table.count, -1)
+        return np.broadcast_to(-1, (c.table.count,))
     single = getattr(c.section, key)
     column = c.table.has(key) or single is None
-    labels = c.table.labels(key) if column else np.full(c.table.count, single, dtype=object)
-    # One look-up for each of what may be millions of rows.
-    numbers = {name: i for i, name in enumerate(c.stations)}
-    unknown = set(labels.tolist()) - numbers.keys()
-    if unknown:
-        row = next(i for i, label in enumerate(labels.tolist()) if label in unknown)
+    names, index = numbered(c.table.labels(key)) if column else ([single], np.zeros(c.table.count, dtype=np.int64))
+    number = {name: i for i, name in enumerate(c.stations)}
+    unknown = next((name for name in names if name not in number), None)
+    if unknown is not None:
+        row = int(np.flatnonzero(index == names.index(unknown))[0])
         place = c.table.where(key, row) if c.table.has(key) else join(c.where, f"key {key!r}")
-        raise InvalidProblem(f"there is no station {labels[row]!r}", place, nearest(labels[row], list(c.stations)))
-    return np.array(list(map(numbers.__getitem__, labels.tolist())), dtype=np.int64)
+        raise InvalidProblem(f"there is no station {unknown!r}", place, nearest(unknown, list(c.stations)))
+    return np.array([number[name] for name in names], dtype=np.int64)[index]
 
 
 def _check_pairs(c: Context, kind: str, a: Array, b: Array) -> None:
@@ -279,7 +282,7 @@ def _correction(c: Context, units: Units, unit: Conversion) -> Array:
     if c.table.has("correction"):
         return c.table.numbers("correction") * _size(unit, units, c)
     if c.section.correction is None:
-        return np.zeros(c.table.count)
+        return np.broadcast_to(0.0, (c.table.count,))
     number, own = units.amount(c.section.correction, unit, join(c.where, "key 'correction'"))
     return np.full(c.table.count, number * _size(own, units, c))
 
@@ -491,6 +494,10 @@ def check_repeats(
     """
     for kind in dict.fromkeys(chunk.kind for chunk in chunks):
         same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
+        ends = [(chunks[i].a + 1, chunks[i].b + 1, index[i], target[i]) for i in same]
+        own = [np.concatenate(each) for each in zip(*ends, strict=True)]
+        if len(first_rows(*own)[0]) == len(own[0]):
+            continue  # no two rows are of the same stations at the same epoch
         # Sorted by all that makes rows equal, equal ones are neighbours, the first of the file first.
         table = np.concatenate([_table(chunks[i], index[i], target[i], i) for i in same], axis=1)
         order = np.lexsort(table[_PLACE:0:-1])

@@ -243,7 +243,7 @@ def at_reception(source: Path, epoch: Array, place: Array, z: Array) -> Array:
     InvalidProblem
         Where no epoch has the satellites that fix a receiver.
     """
-    labels, number = np.unique(epoch.astype(str), return_inverse=True)
+    labels, number = np.unique(np.asarray(epoch).astype(str), return_inverse=True)
     order = np.argsort(number, kind="stable")
     number, place, z = number[order], place[order], z[order]
     now = place

@@ -332,12 +332,12 @@ def _rows(
     for kind, clockwise in kinds:
         same = [i for i, chunk in enumerate(chunks) if (chunk.kind, chunk.units.clockwise) == (kind, clockwise)]
         columns = {
-            name: np.concatenate([getattr(chunks[i], name) for i in same])
+            name: _concatenate([getattr(chunks[i], name) for i in same])
             for name in ("z", "a", "b", "weight", "correction")
         }
         joined = {
-            "epoch": np.concatenate([index[i] for i in same]),
-            "target": np.concatenate([target[i] for i in same]),
+            "epoch": _concatenate([index[i] for i in same]),
+            "target": _concatenate([target[i] for i in same]),
         }
         made = Rows(kind, **columns, **joined)
         rows.append(made.clockwise() if clockwise else made)
@@ -345,6 +345,11 @@ def _rows(
             numbers[i] = start + np.arange(len(chunks[i].z))
             start += len(chunks[i].z)
     return tuple(rows), numbers
+
+
+def _concatenate(parts: Sequence[Array]) -> Array:
+    # One part is not copied: constant columns of millions of rows take no memory.
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 # Covariance blocks of measurements: independent rows, arrivals, a matrix for each epoch, or one over all kinds.

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from math import atan2, cos, degrees, radians, sin
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+
+from optloc.base.arrays import first_rows
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.cells import NOTHING
+from optloc.files.cells import NOTHING, Decimals
 from optloc.files.columns import any_unit, bare, is_sigma, role_of, sigma_kind, stem, tokens, unit_of
 from optloc.files.roles import Roles
 from optloc.files.table import Table
+from optloc.files.words import numbered
 from optloc.models import MODELS, kind_named
 
 
@@ -71,7 +73,7 @@ _ANGLE_OR_HEIGHT = ("elevation", "elev")
 # Letters of names such as d, r and el, which programs use for much else.
 _LETTERS = 2
 # Radians of a turn: what is beyond is in degrees.
-_TURN = Decimal("6.2832")
+_TURN = 6.2832
 COMPASS, CARTESIAN = "north-clockwise", "east-counterclockwise"
 COUNTER, BOW = "north-counterclockwise", "bow-clockwise"
 CONVENTIONS = (COMPASS, CARTESIAN, COUNTER, BOW)
@@ -170,12 +172,14 @@ class Readings:
         The sort.
     unit : str
         Of the values.
-    values : list of m Decimal
-        With all their digits.
+    values : Decimals
+        m numbers with all their digits.
     row : int array (m,)
         Row of the table that each is from.
-    cells : list of m str
-        Column that each is from.
+    headers : tuple of str
+        Names of columns.
+    column : int array (m,)
+        Which of these each is from.
     a, b : object array (m,)
         Names of the stations; b of pairs only.
     positive : str
@@ -194,9 +198,10 @@ class Readings:
 
     form: Form
     unit: str
-    values: list[Decimal]
+    values: Decimals
     row: Array
-    cells: list[str]
+    headers: tuple[str, ...]
+    column: Array
     a: Array
     b: Array | None = None
     positive: str = "a-farther"
@@ -206,17 +211,27 @@ class Readings:
     errors: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
-    def take(self, pick: Sequence[int]) -> Readings:
+    def take(self, pick: Array) -> Readings:
         """Return some of the readings."""
         return replace(
             self,
-            values=[self.values[i] for i in pick],
-            row=self.row[list(pick)],
-            cells=[self.cells[i] for i in pick],
-            a=self.a[list(pick)],
-            b=None if self.b is None else self.b[list(pick)],
-            sigma=None if self.sigma is None else self.sigma[list(pick)],
+            values=self.values.take(pick),
+            row=self.row[pick],
+            column=self.column[pick],
+            a=self.a[pick],
+            b=None if self.b is None else self.b[pick],
+            sigma=None if self.sigma is None else self.sigma[pick],
         )
+
+    def where(self, table: Table, item: int) -> str:
+        """Return the place of the cell of a reading."""
+        return table.where(self.headers[int(self.column[item])], int(self.row[item]))
+
+    @property
+    def columns(self) -> list[str]:
+        """Return the columns that hold readings, in the order of the readings."""
+        number, first = np.unique(self.column, return_index=True)
+        return [self.headers[i] for i in number[np.argsort(first)].tolist()]
 
 
 # Which column holds readings of which stations.
@@ -408,7 +423,7 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
 # Units, gaps, repeats.
 
 
-def unit_for(column: str, form: Form, told: Told, held: Sequence[Decimal | None], where: str) -> tuple[str, str]:
+def unit_for(column: str, form: Form, told: Told, held: Decimals, where: str) -> tuple[str, str]:
     """Return the unit of a column and a remark; raise InvalidProblem where neither its name nor --unit says it."""
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     own = unit_of(column, known)
@@ -418,7 +433,7 @@ def unit_for(column: str, form: Form, told: Told, held: Sequence[Decimal | None]
         raise InvalidProblem(f"{told.unit!r} is no unit of {form.text}", "--unit", nearest(told.unit, list(known)))
     if own is not None:
         return own, ""
-    if form.quantity == "angle" and any(value is not None and abs(value) > _TURN for value in held):
+    if form.quantity == "angle" and bool((np.abs(held.floats()) > _TURN).any()):
         return "deg", f"{column!r} is in degrees: some of its values are beyond a turn in radians"
     some = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")
     raise InvalidProblem(f"the unit of the column {column!r} is not known", where, f"say it with --unit {some}")
@@ -450,15 +465,15 @@ def marks_of(told: Told) -> frozenset[Decimal] | None:
         raise InvalidProblem(f"{told.missing!r} is no list of numbers", "--missing", advice) from None
 
 
-def without_gaps(found: Readings, epoch: Sequence[Any], told: Told, table: Table, empty: int) -> Readings:
+def without_gaps(found: Readings, epoch: Array, told: Told, table: Table, empty: int) -> Readings:
     """Return readings without those that a number marks as missing; one that may be such a mark is asked for.
 
     Parameters
     ----------
     found : Readings
         All numbers.
-    epoch : sequence of m
-        Epoch of each.
+    epoch : int array (m,)
+        Number of the epoch of each.
     told : Told
         What is known of such numbers.
     table : Table
@@ -471,84 +486,91 @@ def without_gaps(found: Readings, epoch: Sequence[Any], told: Told, table: Table
         marks = frozenset()
         doubtful = _doubtful(found, epoch)
         if doubtful is not None:
-            count = found.values.count(doubtful)
-            where = next(i for i, value in enumerate(found.values) if value == doubtful)
-            times = f"{count} times, first here" if count > 1 else "once"
+            own = np.flatnonzero(found.values.units == found.values.number(doubtful))
+            times = f"{len(own)} times, first here" if len(own) > 1 else "once"
             advice = f"say --missing {doubtful}, or --missing none if it is a reading"
             what = f"{doubtful} occurs {times}, and may be a reading or mean that there is none"
-            raise InvalidProblem(what, table.where(found.cells[where], int(found.row[where])), advice)
-    keep = [i for i, value in enumerate(found.values) if value not in marks]
-    if not keep:
+            raise InvalidProblem(what, found.where(table, int(own[0])), advice)
+    gone = np.zeros(len(found.values), dtype=bool)
+    for number in (found.values.number(mark) for mark in marks):
+        gone |= False if number is None else found.values.units == number
+    if gone.all():
         raise InvalidProblem("no cell holds a reading", table.source, "look at --missing and the columns")
-    gone = len(found.values) - len(keep)
-    notes = [f"{_cells(gone)} with {told.missing}: no reading"] if gone else []
+    count = int(gone.sum())
+    notes = [f"{_cells(count)} with {told.missing}: no reading"] if count else []
     notes += [f"{_cells(empty)} without a number: no reading"] if empty else []
-    return replace(found.take(keep) if gone else found, notes=(*found.notes, *notes))
+    return replace(found.take(np.flatnonzero(~gone)) if count else found, notes=(*found.notes, *notes))
 
 
 def _cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-def _doubtful(found: Readings, epoch: Sequence[Any]) -> Decimal | None:
+def _doubtful(found: Readings, epoch: Array) -> Decimal | None:
     """Return a number that may mark what is missing, None where there is none.
 
     Such a number is doubted where it is beyond all others or as frequent as none of them.
     """
-    counts = Counter(found.values)
+    values, counts = np.unique(found.values.units, return_counts=True)
     for mark in _MARKS:
-        if mark not in counts or len(counts) == 1:
+        number = found.values.number(mark)
+        here = np.flatnonzero(values == number)
+        if number is None or not len(here) or len(values) == 1:
             continue
         if mark == 0 and found.form.kind == "toa" and _begins(found, epoch):
             continue
-        others = [value for value in counts if value != mark]
-        beyond = mark < min(others) or mark > max(others)
-        if beyond or (counts[mark] > 1 and counts[mark] > max(counts[value] for value in others)):
+        beyond = int(here[0]) in (0, len(values) - 1)
+        count, others = counts[here[0]], np.delete(counts, here[0])
+        if beyond or (count > 1 and count > others.max()):
             return mark
     return None
 
 
-def _begins(found: Readings, epoch: Sequence[Any]) -> bool:
+def _begins(found: Readings, epoch: Array) -> bool:
     """Return whether each epoch has one zero and nothing below: then arrivals are counted from the first."""
-    zeros = Counter(label for label, value in zip(epoch, found.values, strict=True) if value == 0)
-    return min(found.values) >= 0 and set(zeros) == set(epoch) and max(zeros.values()) == 1
+    units = found.values.units
+    zeros = np.bincount(epoch[units == 0], minlength=int(epoch.max()) + 1)
+    return bool((units >= 0).all() and (zeros[np.unique(epoch)] == 1).all())
 
 
-def without_repeats(found: Readings, epoch: Sequence[Any], told: Told, table: Table) -> Readings:
+def without_repeats(found: Readings, epoch: Array, told: Told, table: Table, label: Callable[[int], str]) -> Readings:
     """Return readings of which none repeats another: their means where that is asked for, else they are refused.
 
     Parameters
     ----------
     found : Readings
         All of them.
-    epoch : sequence of m
-        Epoch and target of each.
+    epoch : int array (m,)
+        Number of the epoch and target of each.
     told : Told
         Whether means are wanted.
     table : Table
         Where they are from.
+    label : callable
+        Returns the label of the epoch of a row of the table.
     """
-    groups: dict[tuple[Any, ...], list[int]] = {}
-    b = [None] * len(found.values) if found.b is None else found.b.tolist()
-    for i, key in enumerate(zip(epoch, found.a.tolist(), b, strict=True)):
-        groups.setdefault(key, []).append(i)
-    again = [members for members in groups.values() if len(members) > 1]
-    if not again:
+    ends = [numbered(end)[1] for end in (found.a, found.b) if end is not None]
+    first, group = first_rows(epoch, *ends)
+    count = len(first)
+    if count == len(found.values):
         return found
-    extra = sum(map(len, again)) - len(again)
+    extra = len(found.values) - count
+    again = np.setdiff1d(np.arange(len(found.values)), first)
     if not told.average:
-        first, second = min(again, key=lambda members: members[1])[:2]
-        ends = " and ".join(repr(str(end)) for end in (found.a[second], b[second]) if end is not None)
-        label = epoch[second][0]
-        what = f"station {ends} has a second reading of message {label!r}, first in row {found.row[first] + 1}"
+        second = int(again[0])
+        one = int(first[group[second]])
+        names = " and ".join(repr(str(end[second])) for end in (found.a, found.b) if end is not None)
+        what = f"station {names} has a second reading of message {label(int(found.row[second]))!r}, "
+        what += f"first in row {found.row[one] + 1}"
         if extra > 1:
             what += f"; {extra} such repeats in all"
         advice = "say --average for their means, or tell messages apart: --column message=ONE+TWO"
         raise InvalidProblem(what, table.at(int(found.row[second])), advice)
-    values = list(found.values)
-    for members in again:
-        values[members[0]] = _mean([found.values[i] for i in members], found)
-    kept = replace(found, values=values).take([members[0] for members in groups.values()])
+    values = found.values.tolist()
+    for number in np.unique(group[again]).tolist():
+        members = np.flatnonzero(group == number).tolist()
+        values[members[0]] = _mean([values[i] for i in members], found)
+    kept = replace(found, values=Decimals.of(values)).take(first)
     note = f"{extra} repeated readings were averaged with the first of their message; sigma stays that of one"
     return replace(kept, notes=(*found.notes, note))
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -15,10 +15,10 @@ from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
 from optloc.files.columns import any_unit, check_unit, rank, role_named, role_of, stem, unit_of
-from optloc.files.foreign import read_table
-from optloc.files.records import records
+from optloc.files.foreign import read_table, records
 from optloc.files.schema import MeasurementsTable, ProblemFile, join
 from optloc.files.table import Table
+from optloc.files.words import Words, equal_rows, numbered, objects
 from optloc.models import BEARING, MODELS, kind_named
 
 WORDS = {
@@ -120,7 +120,9 @@ class Roles:
         parts = [self.table.labels(part) for part in self.column(role).split("+")]
         if len(parts) == 1:
             return parts[0]
-        return np.array(["-".join(row) for row in zip(*parts, strict=True)], dtype=object)
+        first, index = equal_rows(parts, self.table.count)
+        joined = ["-".join(row) for row in zip(*(part[first] for part in parts), strict=True)]
+        return cast("Array", Words(first, index).renamed(joined))  # NumPy takes words for an array
 
     def numbers(self, role: str) -> Array:
         """Return finite numbers (m,)."""
@@ -222,7 +224,7 @@ def _rows_in_our_words(
     """Return measurements by our names, with the convention of azimuths; `compass` is that of the format."""
     words = [] if section.kind is None else [section.kind]
     if section.kind is None and table.has("kind"):
-        words = sorted(set(table.labels("kind")))
+        words = sorted(numbered(table.labels("kind"))[0])
     places = {word: _place_of(word, section, table, where) for word in words}
     kinds = {word: kind_named(word, places[word]) for word in words}
     bearing = {word for word, kind in kinds.items() if kind == "azimuth" and word.strip().lower() == BEARING}
@@ -237,7 +239,9 @@ def _rows_in_our_words(
     if section.kind is None:
         # A column without other words stays as it is: millions of rows are not spelled again.
         if any(word != kind for word, kind in kinds.items()):
-            spelled = np.array([kinds[word] for word in table.labels("kind").tolist()], dtype=object)
+            labels = table.labels("kind")
+            cells, index = numbered(labels)
+            spelled = Words(objects(cells), index).renamed([kinds[word] for word in cells])
             table = replace(table, columns={**table.columns, table.name("kind"): spelled})
         return _units_by_kind(section.model_copy(update=changes)), _ends(section, table)
     changes["kind"] = kinds[section.kind]

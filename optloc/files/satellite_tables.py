@@ -22,8 +22,8 @@ from optloc.files.readings import Told, sort_named
 from optloc.files.roles import Places, Roles, check_told, places_of, scaled
 from optloc.files.schema import Units
 from optloc.files.shapes import sigma_column, sigma_of
-from optloc.files.table import distinct
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
+from optloc.files.words import distinct
 from optloc.files.writer import write_csv
 
 # Nothing is nearer to the centre of the Earth than its poles but what has another unit, metres.
@@ -60,7 +60,7 @@ def pseudoranges(source: Path, roles: Roles, told: Told) -> TableProblem:
     uses = {roles.column(role): role for role in ("satellite", "toa", *"xyz")}
     uses |= dict.fromkeys(roles.column(by).split("+"), by) | ({} if when is None else {when: "time"})
     if own is not None:
-        columns["sigma"] = sigma_of(roles.table, own, form, unit, range(len(z)))
+        columns["sigma"] = sigma_of(roles.table, own, form, unit, np.arange(len(z)))
         uses[own] = "sigma_toa"
     rest = left_over(roles, uses, (), lengths=True)
     satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))

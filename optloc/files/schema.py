@@ -439,8 +439,12 @@ def schema() -> dict[str, Any]:
 
 def read_document(path: Path) -> ProblemFile:
     """Return the contents of a problem file, or of standard input; raise InvalidProblem where it is none."""
-    source = name_of(path)
-    data = parse_toml(read_text(path), source, formats=(1, 2))
+    return document_of(read_text(path), name_of(path))
+
+
+def document_of(text: str, source: str) -> ProblemFile:
+    """Return the contents of the text of a problem file; `source` is the place to name."""
+    data = parse_toml(text, source, formats=(1, 2))
     # these two a network alone has: `optloc.calibration.network_file`
     if isinstance(stations := data.get("stations"), dict) and {"dimension", "synchronised"} & set(stations):
         raise InvalidProblem("the stations of this file are yet to be found", source, "use optloc calibrate")

@@ -12,7 +12,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
-from optloc.files.cells import instants, is_dated, moments, numbers
+from optloc.files.cells import Decimals, Numbers, instants, is_dated, moments, numbers
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
 from optloc.files.readings import (
@@ -32,6 +32,7 @@ from optloc.files.readings import (
 from optloc.files.roles import Places, Roles, placed
 from optloc.files.schema import Units
 from optloc.files.table import Table
+from optloc.files.words import equal_rows, numbered
 from optloc.models import BEARING
 
 # Names of columns that are repeated of a list.
@@ -69,38 +70,47 @@ def _wide_sort(
 ) -> Readings:
     """Return the readings of one sort; `errors` are the columns of standard deviations, `forms` all sorts by name."""
     table = roles.table
-    values: list[Decimal] = []
-    rows, cells, ends, notes = [], [], [], []
+    values: list[Decimals] = []
+    rows, ends, notes = [], [], []
     deviations: list[Array] = []
     errors_used: list[str] = []
     first, empty = "", 0
     for one in columns:
         dated = form.quantity == "length" and is_dated(table, one.column)
         held = instants(table, one.column, told.zone) if dated else numbers(table, one.column)
-        unit, note = ("s", "") if dated else unit_for(one.column, form, told, held, table.source)
+        unit, note = ("s", "") if dated else unit_for(one.column, form, told, held.values, table.source)
         first = first or unit
         notes += [note] if note else []
-        pick = [row for row, value in enumerate(held) if value is not None]
-        empty += len(held) - len(pick)
-        values += [in_unit(value, unit, first, form) for value in held if value is not None]
-        rows += pick
-        cells += [one.column] * len(pick)
-        ends += [_ends(one, form, told, table.source)] * len(pick)
+        empty += table.count - len(held.row)
+        values.append(_in_unit(held.values, unit, first, form))
+        rows.append(held.row)
+        ends.append(_ends(one, form, told, table.source))
         own = next((each.column for each in errors if _is_error_of(each, one, form)), None)
         own = None if sigma_told(told, form.kind) is not None else own
         own = own or sigma_column(roles, form, told, list(forms.values()))
         if own is not None:
-            deviations.append(sigma_of(table, own, form, first, pick))
+            deviations.append(sigma_of(table, own, form, first, held.row))
             errors_used.append(own)
-    if not values:
+    if not any(map(len, values)):
         raise InvalidProblem("no cell holds a reading", table.source, "look at the columns of the receivers")
     pairs = form.stations > 1
     minus = all(one.minus or len(one.ends) == 1 for one in columns)
-    found = Readings(form, first, values, np.array(rows), cells, np.array([a for a, _ in ends], dtype=object))
-    found = replace(found, b=np.array([b for _, b in ends], dtype=object) if pairs else None, notes=tuple(notes))
+    number = np.repeat(np.arange(len(columns)), list(map(len, values)))
+    names, row = tuple(one.column for one in columns), np.concatenate(rows)
+    a, b = (np.array(end, dtype=object)[number] for end in zip(*ends, strict=True))
+    found = Readings(
+        form, first, Decimals.join(values), row, names, number, a, b if pairs else None, notes=tuple(notes)
+    )
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
     return _settled(found, roles, told, place, empty, "a-farther" if minus else None)
+
+
+def _in_unit(values: Decimals, unit: str, wanted: str, form: Form) -> Decimals:
+    """Return numbers in another unit of their quantity, with all their digits."""
+    if unit == wanted:
+        return values
+    return Decimals.of([in_unit(value, unit, wanted, form) for value in values.tolist()])
 
 
 def _is_error_of(error: Named, one: Named, form: Form) -> bool:
@@ -151,7 +161,7 @@ def sigma_column(roles: Roles, form: Form, told: Told, forms: Sequence[Form]) ->
     return column
 
 
-def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Sequence[int]) -> Array:
+def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> Array:
     """Return the standard deviations of some rows in the unit of their values."""
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     own = unit_of(column, known) or unit
@@ -159,11 +169,13 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Sequence[in
         advice = "give both in one unit, or say --sigma"
         raise InvalidProblem(f"it is in {own}, its readings are in {unit}", table.where(column), advice)
     held = numbers(table, column)
-    for row in pick:
-        if held[row] is None:
-            advice = "give a number, or leave the row out"
-            raise InvalidProblem("the reading has no standard deviation", table.where(column, row), advice)
-    return np.array([float(held[row]) for row in pick]) * known[own] / known[unit]  # type: ignore[arg-type]  # checked
+    place = np.full(table.count, -1)
+    place[held.row] = np.arange(len(held.row))
+    lacking = pick[place[pick] < 0]
+    if len(lacking):
+        advice = "give a number, or leave the row out"
+        raise InvalidProblem("the reading has no standard deviation", table.where(column, int(lacking[0])), advice)
+    return np.asarray(held.values.floats()[place[pick]] * known[own] / known[unit])
 
 
 def _ends(one: Named, form: Form, told: Told, source: str) -> tuple[str, str | None]:
@@ -228,17 +240,22 @@ def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | Non
     column = roles.column(form.value)
     dated = form.quantity == "length" and is_dated(table, column)
     held = instants(table, column, told.zone) if dated else numbers(table, column)
-    unit, note = ("s", "") if dated else unit_for(column, form, told, held, table.source)
-    pick = np.array([row for row, value in enumerate(held) if value is not None], dtype=np.int64)
+    unit, note = ("s", "") if dated else unit_for(column, form, told, held.values, table.source)
+    pick = held.row
     if not len(pick):
         raise InvalidProblem("no cell holds a reading", table.where(column), "look at the column")
     a = roles.labels("station") if heard is None else heard
     positive, b = ("a-farther", None) if form.stations == 1 else _others(roles, told)
-    found = Readings(form, unit, [value for value in held if value is not None], pick, [column] * len(pick), a[pick])
+    found = _of_column(form, unit, held, column, a)
     found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
     if (own := sigma_column(roles, form, told, forms)) is not None:
-        found = replace(found, sigma=sigma_of(table, own, form, unit, pick.tolist()), errors=(own,))
+        found = replace(found, sigma=sigma_of(table, own, form, unit, pick), errors=(own,))
     return _settled(found, roles, told, place, table.count - len(pick), positive)
+
+
+def _of_column(form: Form, unit: str, held: Numbers, column: str, a: Array) -> Readings:
+    """Return the readings of one column; `a` has the station of each row of the table."""
+    return Readings(form, unit, held.values, held.row, (column,), np.zeros(len(held.row), dtype=int), a[held.row])
 
 
 def _others(roles: Roles, told: Told) -> tuple[str | None, Array]:
@@ -258,18 +275,21 @@ def _picks(roles: Roles, told: Told, place: Places) -> Readings:
     table, zone = roles.table, told.zone
 
     def times(role: str) -> list[Decimal | None]:
-        column = roles.column(role)
-        if is_dated(table, column):
-            return instants(table, column, zone)
-        held = numbers(table, column)
-        unit, _ = unit_for(column, sort_named("sp"), told, held, table.source)
-        return [None if value is None else in_unit(value, unit, "s", sort_named("sp")) for value in held]
+        column, unit = roles.column(role), "s"
+        dated = is_dated(table, column)
+        held = instants(table, column, zone) if dated else numbers(table, column)
+        if not dated:
+            unit, _ = unit_for(column, sort_named("sp"), told, held.values, table.source)
+        out: list[Decimal | None] = [None] * table.count
+        for row, value in zip(held.row.tolist(), held.values.tolist(), strict=True):
+            out[row] = in_unit(value, unit, "s", sort_named("sp"))
+        return out
 
     station = roles.labels("station")
     if roles.find("p") and roles.find("s"):
         pairs = [(row, p, s) for row, (p, s) in enumerate(zip(times("p"), times("s"), strict=True))]
     else:
-        phases, held = [phase[:1].upper() for phase in roles.labels("phase").tolist()], times("time")
+        phases, picked = [phase[:1].upper() for phase in roles.labels("phase").tolist()], times("time")
         event = roles.labels("message").tolist() if roles.find("message") else [""] * table.count
         first: dict[tuple[str, str, str], int] = {}
         for row, key in enumerate(zip(event, station.tolist(), phases, strict=True)):
@@ -279,7 +299,7 @@ def _picks(roles: Roles, told: Told, place: Places) -> Readings:
                 raise InvalidProblem(what, table.at(row), advice)
             first[key] = row
         pairs = [
-            (row, held[row], held[first[label, name, "S"]])
+            (row, picked[row], picked[first[label, name, "S"]])
             for (label, name, phase), row in first.items()
             if phase == "P" and (label, name, "S") in first
         ]
@@ -289,9 +309,8 @@ def _picks(roles: Roles, told: Told, place: Places) -> Readings:
         raise InvalidProblem("the S wave is not behind the P wave", table.at(early), "correct the picks")
     if not both:
         raise InvalidProblem("no station has both P and S", table.source, "name their columns with --column p=, s=")
-    rows = np.array([row for row, _ in both])
-    column = roles.find("s") or roles.column("time")
-    found = Readings(sort_named("sp"), "s", [value for _, value in both], rows, [column] * len(rows), station[rows])
+    held = Numbers(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
+    found = _of_column(sort_named("sp"), "s", held, roles.find("s") or roles.column("time"), station)
     lone = len({*station.tolist()}) - len({*found.a.tolist()})
     found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())
     return _settled(found, roles, told, place, 0, "a-farther")
@@ -304,24 +323,29 @@ def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: in
     """Return readings whose stations are known, of which none is missing or repeated, with sign and convention."""
     table, known = roles.table, set(place.names)
     for end in (found.a, found.b):
-        for i, name in enumerate([] if end is None else end.tolist()):
+        for name in [] if end is None else numbered(end)[0]:
             if name not in known:
                 where = told.stations.name if told.stations is not None else table.source
-                column = roles.find("station") if len(set(found.cells)) == 1 else None
-                spot = table.where(column or found.cells[i], int(found.row[i]))
+                column = roles.find("station") if len(found.columns) == 1 else None
+                item = int(np.flatnonzero(end == name)[0])
+                spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
                 raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, place.names))
     if found.b is not None:
-        same = next((i for i, (a, b) in enumerate(zip(found.a, found.b, strict=True)) if a == b), None)
-        if same is not None:
-            spot = table.at(int(found.row[same]))
-            raise InvalidProblem(f"{found.form.kind} names station {found.a[same]!r} twice", spot, "name two stations")
+        same = np.flatnonzero(found.a == found.b)
+        if len(same):
+            spot = table.at(int(found.row[same[0]]))
+            raise InvalidProblem(
+                f"{found.form.kind} names station {found.a[same[0]]!r} twice", spot, "name two stations"
+            )
     found = _with_digits(found, table)
-    keys = _keys(found, roles, told)
-    found = without_gaps(found, [keys[row] for row in found.row.tolist()], told, table, empty)
+    columns = [column for key, column in epochs_of(roles, told, [found]).items()]
+    _, epoch = equal_rows(columns, table.count)
+    found = without_gaps(found, epoch[found.row], told, table, empty)
     if found.form.kind == "azimuth" and (heading := heading_of(found, roles, told)) is not None:
         found = from_bow(found, roles, heading, told)
     if not told.still:
-        found = without_repeats(found, [keys[row] for row in found.row.tolist()], told, table)
+        label = (lambda row: str(columns[0][row])) if columns else (lambda _: "")
+        found = without_repeats(found, epoch[found.row], told, table, label)
     signed = found.form.stations > 1 and found.form.kind != "range_sum"
     if signed and told.positive is None and positive is None:
         advice = "say --positive a-farther if the first is farther then, or --positive b-farther"
@@ -339,14 +363,14 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     """Return arrivals that have all their digits; raise InvalidProblem where a spreadsheet took them."""
     if found.form.kind != "toa":
         return found
-    for i, value in enumerate(found.values):
-        if int(value.as_tuple().exponent) > 0 and len(value.as_tuple().digits) <= _INSTANT <= value.adjusted():
-            spot = table.where(found.cells[i], int(found.row[i]))
+    for i in np.flatnonzero(found.values.written < 0).tolist():
+        value = found.values[i]
+        if len(value.as_tuple().digits) <= _INSTANT <= value.adjusted():
             advice = "write it with all digits; a spreadsheet must take the column for text"
-            raise InvalidProblem(f"the arrival {value:E} has lost its digits", spot, advice)
-    floats = any(table.raw(cell).dtype.kind == "f" for cell in set(found.cells))
+            raise InvalidProblem(f"the arrival {value:E} has lost its digits", found.where(table, i), advice)
+    floats = any(table.raw(name).dtype.kind == "f" for name in found.columns)
     factor = UNITS["length"][found.unit] * (SPEED_OF_LIGHT if found.unit in UNITS["time"] else 1.0)
-    step = float(np.spacing(max(abs(float(value)) for value in found.values))) * factor
+    step = float(np.spacing(np.abs(found.values.floats()).max())) * factor
     if not floats or step < _ROUNDED:
         return found
     note = f"arrivals are floating-point numbers, at this size rounded to {step:.3g} m: text or integers keep more"
@@ -355,7 +379,7 @@ def _with_digits(found: Readings, table: Table) -> Readings:
 
 def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readings:
     """Return azimuths with their convention: as told, as their name says, or, on Earth, that of a compass."""
-    named = any(word in stem(found.cells[0]) for word in (BEARING, "brg", "compass", "heading"))
+    named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
     if found.heading is not None:
         return found
     if told.azimuth is not None or named:
@@ -367,16 +391,9 @@ def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readin
     return replace(found, azimuth=COMPASS, notes=(*found.notes, note))
 
 
-def _keys(found: Readings, roles: Roles, told: Told) -> list[tuple[str, ...]]:
-    """Return what tells the rows (n,) of a table apart beside their stations: message and target, or time."""
-    epochs = epochs_of(roles, told, [found])
-    columns = [column.tolist() for key in ("epoch", "time", "target") if (column := epochs.get(key)) is not None]
-    return [tuple(map(str, row)) for row in zip(*columns, strict=True)] if columns else [("",)] * roles.table.count
-
-
 def epochs_of(roles: Roles, told: Told, found: Sequence[Readings]) -> dict[str, Array]:
     """Return the columns epoch, time and target (n,) of the rows of a table, those that there are."""
-    table, taken = roles.table, {cell for one in found for cell in one.cells}
+    table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
     long = len(taken) == len(found)
     if found[0].form.value == "sp":
@@ -420,9 +437,8 @@ def _clusters(found: Readings, window: str, count: int) -> Array:
     seconds = Decimal(repr(UNITS["length"][found.unit]))
     seconds = seconds if found.unit in UNITS["time"] else seconds / Decimal(repr(SPEED_OF_LIGHT))
     factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / seconds
-    out, label, last = np.full(count, "", dtype=object), 0, None
-    for i in sorted(range(len(found.values)), key=lambda i: found.values[i]):
-        label += last is None or found.values[i] - last > factor
-        last = found.values[i]
-        out[found.row[i]] = str(label)
+    values, order = found.values, np.argsort(found.values.units, kind="stable")
+    apart = np.diff(values.units[order]) > int(factor.scaleb(values.places))
+    out = np.full(count, "", dtype=object)
+    out[found.row[order]] = np.concatenate([[1], 1 + np.cumsum(apart)]).astype(str)
     return out

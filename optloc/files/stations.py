@@ -13,7 +13,8 @@ from optloc.base.inputs import at_most
 from optloc.base.types import Array, Stations
 from optloc.files.roles import worded
 from optloc.files.schema import FrameTable, StationsTable, Units, join
-from optloc.files.table import Epochs, Table, distinct
+from optloc.files.table import Epochs, Table
+from optloc.files.words import distinct
 
 _XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
 _QUATERNION = ("qw", "qx", "qy", "qz")

@@ -9,15 +9,17 @@ from csv import Error as CSVError
 from csv import reader as lines_of
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
+from optloc.base.arrays import first_rows
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import at_most, decoded, has_controls, read_bytes, within
 from optloc.base.types import Array
 from optloc.base.units import LARGEST
 from optloc.files.schema import DataTable, join
+from optloc.files.words import Words, distinct, objects, words_of
 
 _PARQUET = (".parquet", ".pq")
 _FILES = (".csv", ".txt", ".tsv", *_PARQUET)
@@ -33,7 +35,7 @@ class Table:
     ----------
     source : str
         File, or place in a file, to name.
-    columns : mapping of str to array (m,)
+    columns : mapping of str to array (m,) or Words
         Numbers, datetimes, or objects (text, None where a cell is empty).
     count : int
         Number of rows m.
@@ -48,7 +50,7 @@ class Table:
     """
 
     source: str
-    columns: Mapping[str, Array]
+    columns: Mapping[str, Array | Words]
     count: int
     names: Mapping[str, str] = field(default_factory=dict)
     first: Array | None = None
@@ -78,6 +80,10 @@ class Table:
 
     def raw(self, key: str) -> Array:
         """Return a column as it was read; raise InvalidProblem where there is none."""
+        return np.asarray(self.cells(key))
+
+    def cells(self, key: str) -> Array | Words:
+        """Return a column as it is kept; raise InvalidProblem where it is missing."""
         name = self.name(key)
         if name in self.others:
             what = f"it holds {self.others[name]}, which is neither numbers, dates nor text"
@@ -106,21 +112,21 @@ class Table:
 
     def labels(self, key: str) -> Array:
         """Return a column as text (m,); an empty cell is refused."""
-        column = self.raw(key)
+        column = self.cells(key)
         if column.dtype.kind in "iu":
-            return column.astype(str).astype(object)
+            column = np.asarray(column).astype(str).astype(object)
         if column.dtype.kind == "M":
-            column = np.datetime_as_string(column).astype(object)
+            column = np.datetime_as_string(np.asarray(column)).astype(object)
+        words = column if isinstance(column, Words) else words_of(column)
         # Each different cell is spelled once: millions of rows have few names.
-        # The list is made once: a cell that is no number equals nothing but itself.
-        cells = column.tolist()
-        spelled = {cell: _spelled(cell) for cell in set(cells)}
-        out = np.array(list(map(spelled.__getitem__, cells)), dtype=object)
-        wrong = next((text for text in spelled.values() if not text or has_controls(text)), None)
-        if wrong is not None:
-            what = f"{wrong!r} holds control characters" if wrong else "the cell is empty"
-            raise InvalidProblem(what, self.where(key, out.tolist().index(wrong)), "give a name")
-        return out
+        spelled = [_spelled(cell) for cell in words.cells]
+        if not all(spelled) or has_controls("".join(spelled)):
+            wrong = next((i for i in words.index.tolist() if not spelled[i] or has_controls(spelled[i])), None)
+            if wrong is not None:
+                what = f"{spelled[wrong]!r} holds control characters" if spelled[wrong] else "the cell is empty"
+                row = int(np.flatnonzero(words.index == wrong)[0])
+                raise InvalidProblem(what, self.where(key, row), "give a name")
+        return cast("Array", words.renamed(spelled))  # NumPy takes words for an array
 
     def times(self, key: str, factor: float) -> Array:
         """Return a column of numbers (times `factor` seconds) or ISO 8601 dates as seconds (m,)."""
@@ -174,25 +180,10 @@ class Table:
 _YEARS = 290
 
 
-def distinct(labels: Array) -> tuple[list[str], Array, Array]:
-    """Return what `np.unique` does of text: the names in order, the first row (n,) and the number (m,) of each.
-
-    Parameters
-    ----------
-    labels : object array (m,)
-        Text. As an array of fixed width a single long name would make it as large as all rows times its length.
-    """
-    rows = labels.tolist()
-    names = sorted(dict.fromkeys(rows))
-    number = {name: i for i, name in enumerate(names)}
-    index = np.array(list(map(number.__getitem__, rows)), dtype=np.int64)
-    first = np.full(len(names), len(rows))
-    np.minimum.at(first, index, np.arange(len(rows)))
-    return names, first, index
-
-
 def _spelled(cell: object) -> str:
     """Return a name as text, empty where the cell is."""
+    if isinstance(cell, str):
+        return cell.strip()
     if is_empty(cell):
         return ""
     # Names that a table has as floats: 3.0 is the station 3; of larger ones no float knows the last digit.
@@ -268,8 +259,12 @@ def csv(path: Path, separator: str | None, names: Mapping[str, str]) -> Table:
         decoded(data, path.name)  # what is not UTF-8 is told with its line
         raise _no_csv(str(error), path.name) from None
     at_most("cells", read.num_rows * len(header), path.name)
-    columns = {name: read.column(name).to_numpy(zero_copy_only=False).astype(object) for name in header}
-    return Table(path.name, columns, read.num_rows, names)
+    columns = {name: _text_column(pa, read.column(name)) for name in header}
+    count = read.num_rows
+    del read, data
+    # Its pool would keep the memory of the file for the rest of the program.
+    pa.default_memory_pool().release_unused()
+    return Table(path.name, columns, count, names)
 
 
 def _header(line: str, separator: str, source: str) -> list[str]:
@@ -316,7 +311,7 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
         read = reader.ParquetFile(data, read_dictionary=texts).read(columns=[name for name in fit if fit[name]])
         # A damaged page may name words that its dictionary has not.
         read.validate(full=True)
-        columns = {name: _parquet_column(pa, read.column(name)) for name in read.column_names}
+        columns = {name: _column_of(pa, read.column(name)) for name in read.column_names}
     except (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError) as error:
         text = isinstance(error, UnicodeDecodeError) or "UTF8" in str(error)
         what = "a column of text is not UTF-8" if text else "the file is not Parquet"
@@ -346,12 +341,27 @@ def _fits(pa: Any, kind: Any) -> bool:
     return any(getattr(pa.types, test)(kind) for test in tests.split())
 
 
-def _parquet_column(pa: Any, column: Any) -> Array:
+# Cells from which it is seen whether a column repeats its words.
+_SAMPLE = 2000
+
+
+def _text_column(pa: Any, column: Any) -> Array | Words:
+    """Return a column of text; words that it repeats are there once, which saves time and memory in what follows."""
+    sample = column.slice(0, _SAMPLE)
+    repeats = 2 * len(sample.unique()) <= len(sample)
+    return _column_of(pa, column.dictionary_encode() if repeats else column)
+
+
+def _column_of(pa: Any, column: Any) -> Array | Words:
     if not pa.types.is_dictionary(column.type):
         return np.asarray(column.to_numpy(zero_copy_only=False))
     column = column.unify_dictionaries().combine_chunks()  # each group of rows has a dictionary of its own
-    words = np.array([*column.dictionary.to_pylist(), None], dtype=object)
-    return np.asarray(words[column.indices.fill_null(len(words) - 1).to_numpy(zero_copy_only=False)])
+    words = objects([*column.dictionary.to_pylist(), None])
+    index = column.indices.fill_null(len(words) - 1).to_numpy(zero_copy_only=False)
+    first = first_rows(index)[0]  # a file may have words in its dictionary that no row has
+    place = np.zeros(len(words), dtype=index.dtype)
+    place[index[first]] = np.arange(len(first))
+    return Words(words[index[first]], place[index])
 
 
 def _to_column(cells: list[Any]) -> Array:
@@ -459,7 +469,7 @@ def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, s
     index, labels, times = _group(keys, count, window)
     _check_instants(keys, labels, index, source)
     if keys.target is None:
-        return Epochs(index, np.zeros(count, dtype=np.int64), labels, times, ("target",))
+        return Epochs(index, np.broadcast_to(0, (count,)), labels, times, ("target",))
     names, _, target = distinct(keys.target)
     # Rows of a moving target or of one epoch stay together: its targets share the epoch.
     if len(names) == 1 or not (len(labels) > 1 if free is None else free):
@@ -487,7 +497,7 @@ def _group(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple[s
         assert keys.written is not None
         bins = keys.time if window is None else np.floor((keys.time - keys.time.min()) / window + _ROUNDING)
         _, first, index = np.unique(bins, return_index=True, return_inverse=True)
-        order, labels = np.arange(len(first)), keys.written[first]
+        order, labels = np.arange(len(first)), np.asarray(keys.written[first])
     times = np.full(len(first), np.nan)
     if keys.time is not None:
         # Differences from the first row: equal times stay exactly themselves.

@@ -8,14 +8,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
+
+import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import together, write_text
-from optloc.files.reader import Loaded, read
+from optloc.base.types import Array
+from optloc.files.cells import Decimals
+from optloc.files.reader import Loaded, assemble
 from optloc.files.roles import Places
-from optloc.files.schema import ConstraintTable
+from optloc.files.schema import ConstraintTable, document_of
+from optloc.files.table import Table
+from optloc.files.words import Words
 from optloc.files.writer import write_csv
 
 # Letters of the name of a file that is not kept.
@@ -77,21 +82,25 @@ class TableProblem:
         return {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
 
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
-        """Return the problem, with more constraints; nothing is left on the disk."""
-        with TemporaryDirectory() as folder:
-            # As the table is called, as far as every system writes such a name.
-            place = Path(folder) / f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml"
-            # A height that is told takes the place of one that was assumed.
-            (replace(self, height="") if "--height" in (more or {}) else self).write(place)
-            return replace(read(place, more=more), source=self.source.name, table=self.as_read)
+        """Return the problem, with more constraints, as `optloc.files.read` does of the files that `write` writes."""
+        # As the table is called, as far as every system writes such a name.
+        out = Path(f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml")
+        names = [path.name for path in self.tables(out)]
+        # A height that is told takes the place of one that was assumed.
+        told = replace(self, height="") if "--height" in (more or {}) else self
+        file = document_of(told.text(names), out.name)
+        sheets = (self.places.columns, *(section.columns for section in self.sections))
+        stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
+        loaded = assemble(file, stations, tables, out.name, values=True, more=more).loaded
+        return replace(loaded, source=self.source.name, table=self.as_read)
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file with its tables beside it, and return their paths."""
         tables = self.tables(out)
         with together():
             for path, columns in zip(tables, (self.places.columns, *(s.columns for s in self.sections)), strict=True):
-                write_csv(path, columns)
-            write_text(out, self._text([path.name for path in tables]))
+                write_csv(path, {name: _written(column) for name, column in columns.items()})
+            write_text(out, self.text([path.name for path in tables]))
         return (out, *tables)
 
     def tables(self, out: Path) -> tuple[Path, ...]:
@@ -100,7 +109,8 @@ class TableProblem:
         names = ("stations", *(section.kind if many else "rows" for section in self.sections))
         return tuple(out.with_name(f"{out.stem}-{name}.csv") for name in names)
 
-    def _text(self, names: Sequence[str]) -> str:
+    def text(self, names: Sequence[str]) -> str:
+        """Return the text of the problem file; `names` are the names of its tables."""
         # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
         quoted = partial(json.dumps, ensure_ascii=False)
         lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 2"]
@@ -112,6 +122,26 @@ class TableProblem:
             lines += [f"sigma = {quoted(section.sigma)}"] if section.sigma is not None else []
         lines += [*self.after, *(["", "[[constraints]]", 'kind = "height"', self.height] if self.height else [])]
         return "\n".join(lines) + "\n"
+
+
+def _written(column: Any) -> Any:
+    """Return a column as a file has it."""
+    return column.texts() if isinstance(column, Decimals) else column
+
+
+def _table(name: str, columns: Mapping[str, Any]) -> Table:
+    """Return columns as the table of a file that has them; times may be labels, and become text as in a file."""
+    import pyarrow as pa
+
+    def read(key: str, column: Any) -> Array | Words:
+        if isinstance(column, Decimals):
+            return column.floats()
+        if key == "time":
+            return np.asarray(pa.array(column).cast(pa.string()).to_numpy(zero_copy_only=False))
+        return column if isinstance(column, Words) else np.asarray(column)
+
+    read_columns = {key: read(key, column) for key, column in columns.items()}
+    return Table(name, read_columns, len(read_columns[next(iter(read_columns))]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,9 @@ from optloc.files.schema import (
     validate,
 )
 from optloc.files.stations import survey
-from optloc.files.table import Table, distinct, of_rows, table_of
+from optloc.files.table import Table, of_rows, table_of
 from optloc.files.unknowns import settle_frame
+from optloc.files.words import distinct
 from optloc.files.writer import toml_text
 from optloc.placement.areas import convex_parts, corners_in_frame, ground_of, inside, polygons_of, region_of, visible
 from optloc.placement.sites import Group, Name, SiteSelection

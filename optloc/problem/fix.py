@@ -217,7 +217,7 @@ class Fix:
     alternatives: Alternatives
     cost: Annotated[Array, Axes(0)]
     dof: Annotated[Array, Axes(0)]
-    weights: Annotated[Array, Axes(1)]
+    weights: Annotated[Array, Axes(1, slots=True, empty=0.0)]
     stages: tuple[Stage, ...] = ()
     active: Annotated[Array, Axes(0, empty=())] | None = None
     local: Annotated[Array, Axes(3)] | None = None
@@ -459,11 +459,12 @@ class Fix:
         The most serious comes first: it is the status. Notes come last: an `ok` fix has nothing but these, `unchecked`
         where it has no redundancy.
         """
-        marks, out = self._all_marks, np.empty(self.shape, dtype=object)
-        for i in np.ndindex(self.shape):
-            found = int(marks[i])
-            out[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and found & one.mark)
-        return out[()]
+        # Many fixes have few different sets of findings.
+        marks, index = np.unique(self._all_marks, return_inverse=True)
+        sets = np.empty(len(marks), dtype=object)
+        for i, found in enumerate(marks.tolist()):
+            sets[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and found & one.mark)
+        return sets[index.reshape(self.shape)] if self.shape else sets[0]
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
         """Return whether points lie in the regions that hold the target with a given probability.

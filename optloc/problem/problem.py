@@ -204,12 +204,12 @@ class Problem:
             inner = array.shape[array.ndim - core :]
             return np.broadcast_to(array, (*shape, *inner)).reshape(size, *inner)
 
-        flat = _map(self, reshape)
+        flat = map_numbers(self, reshape)
         return flat if shape else _map_z(flat, lambda z: z[None])
 
     def placed(self, like: Any) -> Problem:
         """Return the problem with its numbers as arrays of another array's library, device and float type."""
-        return _map(self, lambda array, core: placed(array, like))
+        return map_numbers(self, lambda array, core: placed(array, like))
 
     def take(self, index: Array) -> Problem:
         """Return the problems of a flat batch at an index or mask; structure stays."""
@@ -222,7 +222,7 @@ class Problem:
             # A batch axis of length one is shared like none at all.
             return array if array.ndim == core or array.shape[0] == 1 else array[index]
 
-        taken = _map(self, pick)
+        taken = map_numbers(self, pick)
         # Where no array has the batch axis the measurements carry it: problems that are equal stay as many.
         if taken.batch_shape == (1,):
             taken = _map_z(taken, lambda z: np.broadcast_to(z, (numbers.size, z.shape[-1])))
@@ -326,7 +326,7 @@ def _arrays(problem: Problem) -> list[tuple[Array, int]]:
     return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
-def _map(problem: Problem, change: Any) -> Problem:
+def map_numbers(problem: Problem, change: Any) -> Problem:
     """Return the problem with every numeric array replaced; `change` gets the array and its unbatched rank."""
 
     def changed(part: Any) -> Any:

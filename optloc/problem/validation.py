@@ -208,14 +208,14 @@ def _check_noise(noise: Noise, count: int) -> None:
     if not np.array_equal(seen, np.arange(count)):
         raise InvalidProblem("the noise does not cover every row exactly once", "noise", "give each row one covariance")
     for block in noise.blocks:
-        _check_covariance(block.covariance, "noise of row", tuple(str(row) for row in block.row[:, 0]))
+        _check_covariance(block.covariance, "noise of row", block.row[:, 0])
 
 
-def _check_covariance(covariance: Array, what: str, names: tuple[str, ...] | None) -> None:
+def _check_covariance(covariance: Array, what: str, names: Sequence[str] | Array | None) -> None:
     def fail(bad: Any, why: str) -> None:
         if np.any(bad):
             place = int(np.argwhere(bad)[0][-1])
-            label = f" {names[place]}" if names and place < len(names) else ""
+            label = f" {names[place]}" if names is not None and place < len(names) else ""
             raise InvalidProblem(f"the covariance in {what}{label} is {why}", "covariance", "give a true covariance")
 
     fail(~np.isfinite(covariance).all((-1, -2)), "not finite")

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
-from optloc.base.types import Array, Status
+from optloc.base.types import Array, Status, statuses_of
 from optloc.bounds.observability import Observability
 from optloc.problem.chart import CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
@@ -23,6 +23,8 @@ UNCHECKED = "no redundancy: a wrong measurement would not be noticed"
 """The sentence beside the status of a fix that nothing checks."""
 
 _RATES = {"velocity": "v", "acceleration": "a"}
+# Fixes whose ellipses are found together: some megabytes.
+_BLOCK = 8192
 _STATES = ("position", *_RATES)
 
 # Numbers and tables.
@@ -157,7 +159,7 @@ def _of_target(
     local = geodetic_columns(fix.frame, position, covariance)
     covariance, lost = without_open(covariance, open_, "xyz")
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    columns |= _repeat(count, status=[Status(int(code)).label for code in fix.code], reason=list(fix.reason))
+    columns |= _repeat(count, status=[one.label for one in statuses_of(fix.code)], reason=list(fix.reason))
     columns |= {axis: position[:, i] for i, axis in enumerate("xyz"[:d])}
     columns |= {f"sigma_{axis}": sigma[:, i] for i, axis in enumerate("xyz"[:d])}
     columns |= covariance_columns(covariance, "xyz")
@@ -173,7 +175,9 @@ def _of_target(
         limit = np.repeat(fix.widest(names[0]), count) if estimated else np.full(n * count, np.inf)
         local, lost = _without_open_level(local, limit, lost)
     columns |= local
-    semi_axes, _ = error_ellipse(covariance)
+    # in blocks: the eigenvectors of a long table are larger than its columns
+    blocks = np.array_split(covariance, 1 + len(covariance) // _BLOCK)
+    semi_axes = np.concatenate([error_ellipse(block)[0] for block in blocks])
     # Longest axis first.
     columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}
     for name, numbers in {"cost": fix.cost, "dof": fix.dof, "p_value": np.asarray(fix.p_value)}.items():
@@ -231,7 +235,8 @@ def _repeat(count: int, **texts: Sequence[str]) -> Columns:
 def _told_in_words(fix: Fix, constrained: bool) -> dict[str, list[str]]:
     """Return the proof of each fix, the constraints that hold it, and its suspects: "A; B" together, "A | B" either."""
     texts = {"proof": [PROOFS[number] for number in fix.claims.proof.tolist()]}
-    texts["findings"] = ["; ".join(one.label for one in each) for each in fix.findings]
+    found = {each: "; ".join(one.label for one in each) for each in set(fix.findings)}
+    texts["findings"] = [found[each] for each in fix.findings]
     texts["chart"] = [""] * len(fix) if fix.chart is None else list(fix.chart.name)
     if constrained:
         held = [()] * len(fix) if fix.active is None else fix.active

@@ -181,14 +181,14 @@ def test_geojson_has_the_region_of_a_far_fix():
     truth = optloc.solve(problem).x.copy()
     truth[:3] = away
     far = fix_file(replace(loaded, problem=optloc.simulate(problem, truth, 5)), "auto", quiet=True)
-    assert far.fixes[0].chart.name != "cartesian"
+    assert far.fix.chart.name != "cartesian"
     found = geojson(results_of(far))["features"][-1]
     assert found["properties"]["role"] == "region95"
     assert found["geometry"]["type"] == "Polygon"
     ring = np.array(found["geometry"]["coordinates"][0])
     assert (ring[0] == ring[-1]).all()
     assert area(ring[:, :2]) > 0
-    lon, lat = np.degrees(problem.frame.to_geodetic(far.fixes[0].position.reshape(1, 3))[1::-1]).ravel()
+    lon, lat = np.degrees(problem.frame.to_geodetic(far.fix.position.reshape(1, 3))[1::-1]).ravel()
     assert inside((lon, lat), [ring[:, :2]])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -188,15 +188,15 @@ class Results:
     fixes: Sequence[Fix] = ()
     problem: Problem | None = None
     title: str = "optloc"
-    _rows: list[dict[str, Any]] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_rows", records(self.columns))
 
     @property
     def course(self) -> bool:
         """Return whether the rows of a target are one track."""
         return not self.fixes
+
+    @property
+    def _count(self) -> int:
+        return len(self.columns["status"])
 
     @property
     def axes(self) -> str:
@@ -206,7 +206,7 @@ class Results:
     def marks(self) -> list[Mark]:
         """Return a mark for each row of the table."""
         found = self._others()
-        return [self._mark(row, others) for row, others in zip(self._rows, found, strict=True)]
+        return [self._mark(row, others) for row, others in zip(records(self.columns), found, strict=True)]
 
     def stations(self) -> list[tuple[str, Array]]:
         """Return names of the stations, and their longitudes, latitudes (degrees) and heights (3,)."""
@@ -223,7 +223,7 @@ class Results:
         outlines: dict[int, Outline] = {}
         if self.problem is not None and self.fixes:
             outlines = self._outlines(self.problem)
-        return [self._area(row, outlines.get(i)) for i, row in enumerate(self._rows)]
+        return [self._area(row, outlines.get(i)) for i, row in enumerate(records(self.columns))]
 
     def _mark(self, row: dict[str, Any], others: tuple[Other, ...]) -> Mark:
         axes = self.axes
@@ -262,7 +262,7 @@ class Results:
                     # Of each epoch of a run (q, k, d), else one (q, d).
                     each = np.moveaxis(places[i], -2, 0) if places.ndim == 4 else places[i][None]
                     found += [self._of(flat, i, position) for position in each]
-        return found if len(found) == len(self._rows) else [()] * len(self._rows)
+        return found if len(found) == self._count else [()] * self._count
 
     def _of(self, fix: Fix, i: int, position: Array) -> tuple[Other, ...]:
         gap, doubt = fix.alternatives.gap[i], fix.alternatives.doubt[i]
@@ -295,7 +295,7 @@ class Results:
         charts = [fix.chart for fix in self.fixes]
         kinds = [np.ravel(chart.kind) for chart in charts if chart is not None]
         # Fixes of one position each: a row is a fix.
-        if len(kinds) != len(charts) or sum(map(len, kinds)) != len(self._rows):
+        if len(kinds) != len(charts) or sum(map(len, kinds)) != self._count:
             return {}
         found: list[list[Outline]] = []
         for fix in self.fixes:

@@ -1,0 +1,126 @@
+"""Columns of text as their different words and the number of each row's word: long tables repeat few words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optloc.base.arrays import first_rows
+from optloc.base.types import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Words:
+    """A column (m,) of text; NumPy takes it for an array of objects.
+
+    Parameters
+    ----------
+    cells : object array (n,)
+        The different cells, in the order of their appearance.
+    index : int array (m,)
+        Which of them each row has.
+    """
+
+    cells: Array
+    index: Array
+
+    @property
+    def dtype(self) -> Any:
+        """Return the type of its cells."""
+        return self.cells.dtype
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return np.asarray(self.cells[self.index], dtype=dtype)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __iter__(self) -> Iterator[Any]:
+        cells = self.cells
+        return (cells[i] for i in self.index)
+
+    def __getitem__(self, pick: Any) -> Any:
+        """Return one cell, or some rows as words."""
+        index = self.index[pick]
+        return self.cells[index] if np.ndim(index) == 0 else Words(self.cells, index)
+
+    def __eq__(self, other: object) -> Any:
+        return np.asarray(self) == np.asarray(other)
+
+    __hash__ = None  # type: ignore[assignment]  # like arrays, which are compared entry by entry
+
+    def __arrow_array__(self, type: Any = None) -> Any:  # noqa: A002  (its name in the protocol)
+        import pyarrow as pa
+
+        return pa.array(np.asarray(self), type)
+
+    def renamed(self, cells: Sequence[Any]) -> Words:
+        """Return the column with other cells (n,); equal cells are joined."""
+        names, number = numbered(objects(cells))
+        return Words(objects(names), number[self.index])
+
+    def tolist(self) -> list[Any]:
+        """Return the cells of all rows."""
+        return list(self.cells[self.index])
+
+
+def numbered(column: Array | Words) -> tuple[list[Any], Array]:
+    """Return the different cells of a column in the order of their appearance, and which of them each row (m,) has."""
+    import pyarrow as pa
+
+    if isinstance(column, Words):
+        first, index = first_rows(column.index)
+        return column.cells[column.index[first]].tolist(), index
+    try:
+        words = pa.array(column, pa.string()).dictionary_encode(null_encoding="encode")
+        return words.dictionary.to_pylist(), words.indices.to_numpy()
+    except (pa.ArrowException, UnicodeEncodeError, TypeError):
+        # The list is made once: a cell that is no number equals nothing but itself.
+        cells = column.tolist()
+        number = {cell: i for i, cell in enumerate(dict.fromkeys(cells))}
+        return list(number), np.array(list(map(number.__getitem__, cells)), dtype=np.int64)
+
+
+def words_of(column: Array) -> Words:
+    """Return a column of text as words."""
+    cells, index = numbered(column)
+    return Words(objects(cells), index)
+
+
+def objects(cells: Sequence[Any]) -> Array:
+    """Return cells as an array of objects."""
+    out = np.empty(len(cells), dtype=object)
+    out[:] = cells
+    return out
+
+
+def equal_rows(columns: Sequence[Array | Words], count: int) -> tuple[Array, Array]:
+    """Return the first rows (n,) of all groups of equal rows, and the group of each row (m,)."""
+    if not columns:
+        return np.zeros(min(count, 1), dtype=np.int64), np.zeros(count, dtype=np.int64)
+    return first_rows(*(c.index if isinstance(c, Words) else _numbers(c) for c in columns))
+
+
+def _numbers(column: Array) -> Array:
+    return np.unique(column, return_inverse=True)[1] if column.dtype.kind == "f" else numbered(column)[1]
+
+
+def distinct(labels: Array | Words) -> tuple[list[str], Array, Array]:
+    """Return what `np.unique` does of text: the names in order, the first row (n,) and the number (m,) of each.
+
+    Parameters
+    ----------
+    labels : object array (m,) or Words
+        Text. As an array of fixed width a single long name would make it as large as all rows times its length.
+    """
+    names, number = numbered(labels)
+    order = sorted(range(len(names)), key=names.__getitem__)
+    place = np.empty(len(names), dtype=np.int64)
+    place[order] = np.arange(len(names))
+    index = place[number]
+    first = np.full(len(names), len(labels))
+    np.minimum.at(first, index, np.arange(len(labels)))
+    return [names[i] for i in order], first, index

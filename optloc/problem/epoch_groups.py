@@ -1,0 +1,265 @@
+"""Epochs of one structure as a batch: which stations measured is data of each problem, not structure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.arrays import first_rows
+from optloc.base.types import Array, Rows, Stations
+from optloc.problem.epochs import by_epoch, separable, states_by_epoch
+from optloc.problem.fix import Explanation, Fix
+from optloc.problem.noise import Block, Noise, gathered, group
+from optloc.problem.problem import Problem, map_numbers
+
+# Signs for private use around the number of a station: no name of a station has them.
+_MARK = re.compile("\ue000(\\d+)\ue001")
+
+
+@dataclass(frozen=True, slots=True)
+class EpochGroup:
+    """Epochs that differ in numbers only, and in which stations measured.
+
+    Parameters
+    ----------
+    epochs : int array (n,)
+        Epochs of the run, increasing.
+    run : Problem
+        The run.
+    rows : int array (n, r), optional
+        Rows of each epoch, in the same order of kinds; None where `by_epoch` makes the batch.
+    ends : int array (2, r), optional
+        Stations at the ends of these rows, as numbers in the batch.
+    stations : int array (n, s), optional
+        Station of the run that each station of the batch is; None where the batch has the stations of the run.
+    """
+
+    epochs: Array
+    run: Problem
+    rows: Array | None = None
+    ends: Array | None = None
+    stations: Array | None = None
+
+    @property
+    def problem(self) -> Problem:
+        """Return the epochs as a flat batch of n problems."""
+        if self.rows is None or self.ends is None:
+            return by_epoch(self.run).take(self.epochs)
+        epochs = self.epochs
+        bare = map_numbers(
+            states_by_epoch(self.run), lambda array, core: array if array.ndim == core else array[epochs]
+        )
+        stations = bare.stations if self.stations is None else _stations_of(bare.stations, self.stations)
+        block = np.searchsorted(self.run.starts, self.rows[0], side="right") - 1
+        made = []
+        for number, one in enumerate(self.run.rows):
+            own = np.flatnonzero(block == number)
+            if len(own):
+                made.append(_rows(one, self.rows[:, own] - self.run.starts[number], *self.ends[:, own]))
+        return replace(bare, stations=stations, rows=tuple(made), noise=_noise(self.run.noise, self.rows)).flat()
+
+    def take(self, items: slice) -> EpochGroup:
+        """Return some of the epochs as a group."""
+        rows, stations = (None if array is None else array[items] for array in (self.rows, self.stations))
+        return EpochGroup(self.epochs[items], self.run, rows, self.ends, stations)
+
+    def parts(self, most: int) -> Iterator[EpochGroup]:
+        """Yield groups with at most this number of epochs."""
+        yield from (self.take(slice(first, first + most)) for first in range(0, len(self.epochs), most))
+
+    def label(self, text: str, item: int) -> str:
+        """Return a text about a problem of the batch with the names that its stations have in the run."""
+        if self.stations is None:
+            return text
+        own = self.stations[item]
+        return _MARK.sub(lambda found: self.run.stations.names[own[int(found[1])]], text)
+
+    def name(self, fix: Fix) -> Fix:
+        """Return the fixes of the batch with the names that their stations have in the run."""
+        if self.stations is None:
+            return fix
+        reason = fix.reason.copy()
+        for i, text in enumerate(reason.tolist()):
+            if "\ue000" in text:
+                reason[i] = self.label(text, i)
+        if fix.explanations is None:
+            return replace(fix, reason=reason)
+        explanations = np.empty(len(reason), dtype=object)
+        for i, found in enumerate(fix.explanations):
+            explanations[i] = tuple(self._name_suspects(one, i) for one in found)
+        return replace(fix, reason=reason, explanations=explanations)
+
+    def _name_suspects(self, one: Explanation, item: int) -> Explanation:
+        return replace(one, suspects=tuple(replace(s, name=self.label(s.name, item)) for s in one.suspects))
+
+
+def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
+    """Return the epochs of a run that share no unknown in groups of one structure each.
+
+    Epochs of a group have the same numbers of rows of each kind, which link their stations in the same way. Where all
+    of them have the same rows the batch is the batch of `by_epoch`.
+
+    Parameters
+    ----------
+    problem : Problem
+        A separable run, without batch axes.
+    """
+    assert separable(problem)
+    whole = (EpochGroup(np.arange(problem.epochs), problem),)
+    # Station errors are unknowns with the names of their stations, and axes of stations are constants of a plan.
+    if problem.batch_shape or problem.stations.estimated or problem.stations.axes is not None:
+        return whole
+    table = _RowTable.of(problem)
+    found = [_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
+    layouts = [one.take(slice(1)).problem.layout if one.rows is not None and one.rows.size else None for one in found]
+    # Epochs without rows, and those that lack an unknown of others, are problems of one batch with the others only.
+    return whole if any(layout != layouts[0] or layout is None for layout in layouts) else tuple(found)
+
+
+def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
+    """Return the problem of one epoch, a flat batch of one, with the names that its stations have in the run."""
+    for one in groups:
+        item = int(np.searchsorted(one.epochs, epoch))
+        if item < len(one.epochs) and one.epochs[item] == epoch:
+            problem = one.take(slice(item, item + 1)).problem
+            names = tuple(one.label(name, item) for name in problem.stations.names)
+            return replace(problem, stations=replace(problem.stations, names=names))
+    raise LookupError(epoch)
+
+
+@dataclass(frozen=True, slots=True)
+class _RowTable:
+    """The rows (m,) of all kinds by epoch: their block, stations, target, epoch, presence and group of noise.
+
+    `order` sorts the rows by epoch, then as `by_epoch` does: by the first appearance of kind, stations and target.
+    """
+
+    block: Array
+    a: Array
+    b: Array
+    target: Array
+    epoch: Array
+    present: Array
+    noise: Array
+    order: Array
+    epochs: int
+
+    @classmethod
+    def of(cls, problem: Problem) -> _RowTable:
+        block = np.repeat(np.arange(len(problem.rows)), [rows.count for rows in problem.rows]).astype(np.int32)
+        a, b, target, epoch, weight = (
+            np.concatenate([getattr(rows, name) for rows in problem.rows])
+            for name in ("a", "b", "target", "epoch", "weight")
+        )
+        noise = np.arange(len(block))
+        for one in problem.noise.blocks:
+            if one.row.shape[1] > 1:
+                noise[one.row] = one.row[:, :1]
+        _, place = first_rows(block, a + 1, b + 1, target + 1)  # -1 is no station
+        order = np.lexsort((place, block, epoch))
+        return cls(block, a, b, target, epoch, weight > 0.0, noise, order, problem.epochs)
+
+    def alike(self) -> Iterator[tuple[Array, Array]]:
+        """Yield the epochs (n,) of each structure, and their rows (n, r)."""
+        size = np.bincount(self.epoch, minlength=self.epochs)
+        start = np.cumsum(size) - size
+        for count in np.unique(size).tolist():
+            epochs = np.flatnonzero(size == count)
+            members = self.order[start[epochs, None] + np.arange(count)]
+            for pick in _equal(self._structure(members)):
+                yield epochs[pick], members[pick]
+
+    def _structure(self, members: Array) -> Array:
+        """Return the structure of each epoch (n, c): epochs of a batch have equal ones."""
+        ends = np.concatenate([self.a[members], self.b[members]], axis=1)
+        columns = [self.block[members], self.target[members], self.present[members], _labels(ends)]
+        return np.concatenate([*columns, _labels(self.noise[members])], axis=1, dtype=np.int32)
+
+
+def _labels(values: Array) -> Array:
+    """Return the entries (n, r) of each row as numbers in the order of their appearance; negative ones stay."""
+    out = np.full(values.shape, -1, dtype=np.int32)
+    used = np.zeros(len(values), dtype=np.int32)
+    for j in range(values.shape[1]):
+        same = values[:, :j] == values[:, j : j + 1]
+        earlier = same.any(1) if j else np.zeros(len(values), dtype=bool)
+        fresh = ~earlier & (values[:, j] >= 0)
+        if j:
+            out[earlier, j] = out[earlier, same.argmax(1)[earlier]]
+        out[fresh, j] = used[fresh]
+        used += fresh
+    return out
+
+
+def _equal(table: Array) -> list[Array]:
+    """Return the numbers of equal rows of a table (n, c), those that appear first before the others."""
+    varying = table[:, (table != table[:1]).any(0)]
+    if not varying.shape[1]:
+        return [np.arange(len(table))]
+    _, first, inverse = np.unique(varying, axis=0, return_index=True, return_inverse=True)
+    return [np.flatnonzero(inverse.ravel() == i) for i in np.argsort(first)]
+
+
+def _group(problem: Problem, table: _RowTable, epochs: Array, rows: Array) -> EpochGroup:
+    """Return epochs (n,) with rows (n, r) as one group."""
+    ends = np.stack([table.a[rows], table.b[rows]], axis=1)
+    if (ends == ends[:1]).all():
+        return EpochGroup(epochs, problem, rows, ends[0])
+    local = _labels(ends[:1].reshape(1, -1))[0].astype(np.int64)
+    first = [int(np.flatnonzero(local == i)[0]) for i in range(int(local.max(initial=-1)) + 1)]
+    return EpochGroup(epochs, problem, rows, local.reshape(2, -1), ends.reshape(len(ends), -1)[:, first])
+
+
+def _stations_of(stations: Stations, own: Array) -> Stations:
+    """Return the stations (n, s) of each problem of a batch, named by their numbers."""
+
+    def pick(array: Array | None) -> Array | None:
+        if array is None:
+            return None
+        if array.ndim == 3:  # the same place at all epochs
+            return np.asarray(array[0][own][:, None])
+        return np.asarray(np.take_along_axis(array, own[:, None, :, None], axis=2))
+
+    position = pick(stations.position)
+    assert position is not None
+    names = tuple(f"\ue000{i}\ue001" for i in range(own.shape[1]))
+    return replace(stations, position=position, velocity=pick(stations.velocity), names=names)
+
+
+def _rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:
+    """Return chosen rows (n, r) of a kind as rows of a batch; equal numbers have no batch axis."""
+    zeros = np.zeros(len(a), dtype=np.int64)
+    return replace(
+        one,
+        z=one.z[chosen],
+        a=a,
+        b=b,
+        epoch=zeros,
+        target=one.target[chosen[0]],
+        weight=_once(one.weight[chosen]),
+        correction=_once(one.correction[chosen]),
+    )
+
+
+def _once(values: Array) -> Array:
+    """Return values (n, ...) without the batch axis where all problems have equal ones."""
+    return values[0] if (values == values[:1]).all() else values
+
+
+def _noise(noise: Noise, rows: Array) -> Noise:
+    """Return the noise of rows (n, r) for a batch."""
+    one = np.full(1 + max(int(block.row.max()) for block in noise.blocks), -1)
+    for block in noise.blocks:
+        one[block.row] = block.row[:, :1]
+    label, blocks = one[rows[0]], []
+    alone = np.flatnonzero((label[:, None] == label).sum(1) == 1)
+    if len(alone):
+        variance = gathered(noise, rows[:, alone].reshape(-1, 1)).reshape(len(rows), len(alone), 1, 1)
+        blocks.append(Block(alone[:, None], _once(variance)))
+    for name in np.unique(np.delete(label, alone)):
+        own = np.flatnonzero(label == name)
+        blocks.append(Block(own[None], _once(gathered(noise, rows[:, own])[:, None])))
+    return group(blocks)
