@@ -110,7 +110,7 @@ def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
     assert separable(problem)
     whole = (EpochGroup(np.arange(problem.epochs), problem),)
     # Station errors are unknowns with the names of their stations, and axes of stations are constants of a plan.
-    if problem.batch_shape or problem.stations.estimated or problem.stations.axes is not None:
+    if problem.batch_shape or problem.stations.unknown_for or problem.stations.axes is not None:
         return whole
     table = _RowTable.of(problem)
     found = [_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
