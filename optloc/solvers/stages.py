@@ -366,8 +366,8 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         count("lsr", int(done.iterations.sum()))
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
     # on the face without inequalities, number 0; `bound_pool` adds those on others
-    face, told = np.zeros(shape, dtype=int), pool.missing
-    refined = Pool(x, cost, code, face, weights, pool.dof, pool.stages, missing=told, hidden=pool.hidden)
+    inside, told = np.zeros(shape, dtype=int), pool.missing
+    refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=told, hidden=pool.hidden)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
     return settle(problem, refined, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
