@@ -329,8 +329,15 @@ def _eliminate(equations: Normal) -> tuple[Array, Array, Array, Array]:
         return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool), right
     # Coupling and vector are solved for at once.
     solved, ok = _solve_local(equations, right)
-    lost = xp.sum(equations.cross @ solved, axis=-3)
+    # One product over all epochs: their own products would take the square of the shared unknowns for each of them.
+    lost = _joined(equations.cross.mT).mT @ _joined(solved)
     return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok, solved
+
+
+def _joined(blocks: Array) -> Array:
+    """Return blocks (..., k, l, p) of epochs as one matrix (..., k l, p)."""
+    *batch, k, size, p = blocks.shape
+    return library(blocks).reshape(blocks, (*batch, k * size, p))
 
 
 def eliminated(equations: Normal) -> Normal:
