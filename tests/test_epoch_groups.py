@@ -1,5 +1,6 @@
 """Epochs in groups of one structure have the fixes that their own problems have, whichever stations measured."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -7,11 +8,11 @@ import pytest
 
 import optloc
 from optloc import assemble, measured
-from optloc.base.types import Motion
+from optloc.base.types import Motion, Rows
 from optloc.engine.plan import plan_of
 from optloc.problem.build import station_array
 from optloc.problem.epoch_groups import epoch_groups, problem_of
-from optloc.problem.epochs import by_epoch
+from optloc.problem.epochs import _places, by_epoch
 
 STATIONS = np.random.default_rng(3).uniform([-3e4, -3e4, 0.0], [3e4, 3e4, 3e3], (12, 3))
 NAMES = tuple(f"R{i}" for i in range(12))
@@ -94,3 +95,18 @@ def test_equal_rows_of_all_epochs_make_the_batch_of_by_epoch():
     assert group.problem.stations.names == NAMES
     np.testing.assert_array_equal(group.problem.z, batch.z)
     assert group.problem.structure == batch.structure
+
+
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_rows_that_repeat_within_an_epoch_keep_places_of_their_own(count, seed):
+    """A dictionary of all rows, in the order in which they come, is the reference."""
+    rng = np.random.default_rng(seed)
+    a, b, target, epoch = (rng.integers(low, 4, count) for low in (-1, -1, -1, 0))
+    rows = Rows("tdoa", np.zeros(count), a, b, epoch, target, np.ones(count), np.zeros(count))
+    seen, keys, places = Counter(), {}, []
+    for key in zip(a.tolist(), b.tolist(), target.tolist(), epoch.tolist(), strict=True):
+        places.append(keys.setdefault((*key[:3], seen[key]), len(keys)))
+        seen[key] += 1
+    found, place = _places(rows)
+    assert [tuple(one) for one in found.tolist()] == list(keys)
+    assert place.tolist() == places

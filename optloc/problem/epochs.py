@@ -69,7 +69,7 @@ def by_epoch(problem: Problem) -> Problem:
     rows = []
     for old, (keys, place) in zip(problem.rows, places, strict=True):
         # A row of the batch is one (stations, target, occurrence): twice measured in an epoch, twice in the batch.
-        a, b, target, _ = np.array(keys, dtype=np.int64).reshape(-1, 4).T
+        a, b, target, _ = keys.T
 
         def spread(values: Array, old: Rows = old, place: Array = place, size: int = len(keys)) -> Array:
             out = np.zeros((*batch, k, size))
@@ -145,18 +145,29 @@ def untied(problem: Problem) -> Problem:
     return replace(problem, noise=group(parts))
 
 
-def _places(rows: Rows) -> tuple[list[tuple[int, int, int, int]], Array]:
-    """Return the distinct rows (a, b, target, occurrence) of all epochs and the place of each row among them."""
-    seen: dict[tuple[int, int, int, int], int] = {}
-    keys: dict[tuple[int, int, int, int], int] = {}
-    place = np.empty(rows.count, dtype=np.int64)
-    for i, key in enumerate(
-        zip(rows.a.tolist(), rows.b.tolist(), rows.target.tolist(), rows.epoch.tolist(), strict=True)
-    ):
-        occurrence = seen.get(key, 0)
-        seen[key] = occurrence + 1
-        place[i] = keys.setdefault((*key[:3], occurrence), len(keys))
-    return list(keys), place
+def _places(rows: Rows) -> tuple[Array, Array]:
+    """Return the distinct rows (q, 4) of all epochs, a, b, target and occurrence, and the place of each row in them."""
+    columns = np.stack([rows.a, rows.b, rows.target])
+    # Indices begin at -1: each row and epoch is one number, which sorts faster than four.
+    named = np.ravel_multi_index(tuple(columns + 1), tuple(columns.max(axis=1, initial=0) + 2))
+    occurrence = _occurrences(named * (1 + rows.epoch.max(initial=0)) + rows.epoch)
+    each = named * (1 + occurrence.max(initial=0)) + occurrence
+    _, first, place = np.unique(each, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    number = np.empty_like(order)
+    number[order] = np.arange(len(order))
+    first = first[order]
+    return np.column_stack([columns[:, first].T, occurrence[first]]), number[place]
+
+
+def _occurrences(values: Array) -> Array:
+    """Return how many equal values come before each (m,)."""
+    order = np.argsort(values, kind="stable")
+    number, sorted_ = np.arange(len(values)), values[order]
+    begins = np.append(True, sorted_[1:] != sorted_[:-1])[: len(values)]
+    out = np.empty_like(number)
+    out[order] = number - np.maximum.accumulate(np.where(begins, number, 0))
+    return out
 
 
 def _split(array: Array, core: int) -> Array:
