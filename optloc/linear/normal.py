@@ -337,7 +337,8 @@ def _eliminate(equations: Normal) -> tuple[Array, Array, Array, Array]:
 def _joined(blocks: Array) -> Array:
     """Return blocks (..., k, l, p) of epochs as one matrix (..., k l, p)."""
     *batch, k, size, p = blocks.shape
-    return library(blocks).reshape(blocks, (*batch, k * size, p))
+    joined: Array = library(blocks).reshape(blocks, (*batch, k * size, p))
+    return joined
 
 
 def eliminated(equations: Normal) -> Normal:
