@@ -28,6 +28,7 @@ from optloc.calibration.rounds import laid
 from optloc.engine.shape import STRAIGHT
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
+from optloc.solvers.verdict.findings import Finding, objections
 
 # Pulses that starts are made from: those with most rows. More find nothing that so many do not.
 _CORE = 60
@@ -299,36 +300,20 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
     cost = float(lik.cost(at)[0])
     dof = net.rows - net.unknowns + told.free.shape[1]
     p = float(tail_probability(np.array(cost), np.array(dof)))
-    findings: list[tuple[Status, str]] = []
-    if told.open.shape[1]:
-        findings.append((Status.SINGULAR_GEOMETRY, _open_words(net, told)))
-        covariance = np.full((lik.free.size, lik.free.size), np.nan)
-    else:
+    covariance, sides, bent = np.full((lik.free.size, lik.free.size), np.nan), list[str](), np.nan
+    if not told.open.shape[1]:
         covariance = told.covariance(fixed_by(net, named) if named else told.free.T)
-        findings += [(Status.AMBIGUOUS, words) for words in flat(lik, at, covariance)]
-        findings += _curved_findings(lik, at, told)
-    if p < REFUTED:
-        findings.append((Status.MISFIT, f"The residuals are larger than the stated noise allows: p = {p:.2g}."))
-    proof, block_findings = _proof(checked)
+        sides, bent = flat(lik, at, covariance), departure(lik, at, told)
     alternatives = _alternatives(lik, at, cost, found, others)
     pulses = at.pulses[0].copy()
     pulses[[block.index for block in checked if not block.station and not block.proven]] = np.nan
-    for other in alternatives:
-        if other.gap < AMBIGUOUS_GAP and _same_stations(at, other, covariance):
-            pulses[_moved_pulses(at, other)] = np.nan
-        elif other.gap < AMBIGUOUS_GAP:
-            findings.append((Status.AMBIGUOUS, f"{other.what} costs {other.gap:.2g} more: both fit the data."))
-    twofold = np.isnan(pulses).any(axis=1)
-    if twofold.mean() > _TWOFOLD:
-        words = (
-            f"{twofold.sum()} of {len(pulses)} pulses have no single place, as where stations are nearly in one plane."
-        )
-        findings.append((Status.AMBIGUOUS, words))
-    findings += block_findings
-    if found.agreeing < AGREEING:
-        words = f"{found.agreeing} of {found.made} starts arrived at this network; {AGREEING} must agree."
-        findings.append((Status.SEARCHED, words))
-    findings.sort(key=lambda one: PRECEDENCE.index(one[0]))
+    rivals = [other for other in alternatives if other.gap < AMBIGUOUS_GAP]
+    same = [_same_stations(at, other, covariance) for other in rivals]
+    for other in (one for one, alike in zip(rivals, same, strict=True) if alike):
+        pulses[_moved_pulses(at, other)] = np.nan
+    elsewhere = tuple(one for one, alike in zip(rivals, same, strict=True) if not alike)
+    evidence = _Evidence(net, found, told, p, tuple(sides), bent, checked, elsewhere, np.isnan(pulses).any(axis=1))
+    findings = objections(_FINDINGS, evidence)
     gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
     return Calibration(
         net,
@@ -340,7 +325,7 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
         gauge or "centre and main axes of the stations",
         findings[0][0] if findings else Status.OK,
         tuple(words for _, words in findings),
-        proof,
+        "unknown" if evidence.refuted or evidence.unproven else "blockwise",
         cost,
         dof,
         p,
@@ -364,24 +349,92 @@ def _open_words(net: Network, told: Determined) -> str:
     )
 
 
-def _curved_findings(lik: Likelihood, at: Estimate, told: Determined) -> list[tuple[Status, str]]:
-    far = departure(lik, at, told)
-    if far <= STRAIGHT:
-        return []
+def _curved_words(far: float) -> str:
     words = f"three deviations away the cost is up to {np.exp(far):.2g} times more or less than it says"
-    return [(Status.CURVED, f"The covariance does not cover: {words}.")]
+    return f"The covariance does not cover: {words}."
 
 
-def _proof(found: tuple[Block, ...]) -> tuple[str, list[tuple[Status, str]]]:
-    """Return the claim that blocks allow; that a pulse may be elsewhere at no less cost is between it and its place."""
-    refuted = [block.name for block in found if block.refuted]
-    open_ = [block.name for block in found if not (block.proven if block.station else block.cheapest)]
-    if refuted:
-        return "unknown", [(Status.UNPROVEN, f"Another place costs less for {_few(refuted)}, the others held.")]
-    if open_:
-        words = f"That no other place fits as well is not proven of {_few(open_)}."
-        return "unknown", [(Status.UNPROVEN, words)]
-    return "blockwise", []
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """The facts that decide about a network.
+
+    Parameters
+    ----------
+    net, found, motions : Network, Found, Determined
+        The network, its starts, and the motions that the data determine.
+    p : float
+        Probability of residuals as large.
+    sides : tuple of str
+        Sentences on stations, or pulses, in one plane.
+    departure : float
+        See `optloc.calibration.gauge.departure`; NaN where a motion is open.
+    blocks : tuple of Block
+        Stations and pulses with their proofs.
+    elsewhere : tuple of Alternative
+        Networks with other stations that fit about as well.
+    twofold : bool array (N,)
+        Pulses without a single place.
+    """
+
+    net: Network
+    found: Found
+    motions: Determined
+    p: float
+    sides: tuple[str, ...]
+    departure: float
+    blocks: tuple[Block, ...]
+    elsewhere: tuple[Alternative, ...]
+    twofold: Array
+
+    @property
+    def refuted(self) -> list[str]:
+        """Return the names of blocks that cost less elsewhere."""
+        return [block.name for block in self.blocks if block.refuted]
+
+    @property
+    def unproven(self) -> list[str]:
+        """Return the names of blocks without a proof; a pulse may be elsewhere at the same cost."""
+        return [block.name for block in self.blocks if not (block.proven if block.station else block.cheapest)]
+
+
+_FINDINGS = (
+    Finding(Status.SINGULAR_GEOMETRY, lambda e: e.motions.open.shape[1], lambda e: [_open_words(e.net, e.motions)]),
+    Finding(Status.AMBIGUOUS, lambda e: e.sides, lambda e: e.sides),
+    Finding(Status.CURVED, lambda e: e.departure > STRAIGHT, lambda e: [_curved_words(e.departure)]),
+    Finding(
+        Status.MISFIT,
+        lambda e: e.p < REFUTED,
+        lambda e: [f"The residuals are larger than the stated noise allows: p = {e.p:.2g}."],
+    ),
+    Finding(
+        Status.AMBIGUOUS,
+        lambda e: e.elsewhere,
+        lambda e: [f"{other.what} costs {other.gap:.2g} more: both fit the data." for other in e.elsewhere],
+    ),
+    Finding(
+        Status.AMBIGUOUS,
+        lambda e: e.twofold.mean() > _TWOFOLD,
+        lambda e: [
+            f"{e.twofold.sum()} of {len(e.twofold)} pulses have no single place, as near a plane of all stations."
+        ],
+    ),
+    Finding(
+        Status.UNPROVEN,
+        lambda e: e.refuted,
+        lambda e: [f"Another place costs less for {_few(e.refuted)}, the others held."],
+    ),
+    Finding(
+        Status.UNPROVEN,
+        lambda e: e.unproven and not e.refuted,
+        lambda e: [f"That no other place fits as well is not proven of {_few(e.unproven)}."],
+    ),
+    Finding(
+        Status.SEARCHED,
+        lambda e: e.found.agreeing < AGREEING,
+        lambda e: [f"{e.found.agreeing} of {e.found.made} starts arrived at this network; {AGREEING} must agree."],
+    ),
+)
+"""All findings against networks."""
 
 
 def _few(names: list[str]) -> str:

@@ -161,7 +161,7 @@ def _places(rows: Rows) -> tuple[Array, Array]:
 
 
 def _occurrences(values: Array) -> Array:
-    """Return how many equal values come before each (m,)."""
+    """Return the number of equal values before each (m,)."""
     order = np.argsort(values, kind="stable")
     number, sorted_ = np.arange(len(values)), values[order]
     begins = np.append(True, sorted_[1:] != sorted_[:-1])[: len(values)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 from optloc.adequacy.shape import BENT, cost_at_infinity, departure
 from optloc.base.linalg import centre_and_spread, centre_of_points
 from optloc.base.records import present, take
-from optloc.base.types import Array, Certificate, Status
+from optloc.base.types import PRECEDENCE, Array, Certificate, Status
 from optloc.linear.constraints import faces
 from optloc.linear.redundancy import largest
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
@@ -96,21 +96,28 @@ class Answers:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An objection to finished answers.
+    """An objection to answers: fixes, networks, or starts of tracks.
 
     Parameters
     ----------
     status : Status
         The status of an answer without other findings that precede it; its sentence is the advice.
     test : callable
-        Maps evidence to where it applies: by operators alone, so that numbers and arrays take the same rules.
+        Maps evidence to where it applies. Of fixes by operators alone, so that numbers and arrays take the same rules.
     sentence : callable
-        Maps answers and the indices of some to one sentence for all of these, or to one for each.
+        Maps the evidence of a network or start to sentences. Of fixes it maps `Answers` and the indices of some to one
+        sentence for all of these, or to one for each.
     """
 
     status: Status
-    test: Callable[[Evidence], Any]
-    sentence: Callable[[Answers, Array], Any]
+    test: Callable[[Any], Any]
+    sentence: Callable[..., Any]
+
+
+def objections(table: Sequence[Finding], evidence: Any) -> list[tuple[Status, str]]:
+    """Return status and sentence of all findings against one answer, in the order of `PRECEDENCE`."""
+    found = [(one.status, words) for one in table if one.test(evidence) for words in one.sentence(evidence)]
+    return sorted(found, key=lambda one: PRECEDENCE.index(one[0]))
 
 
 def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
