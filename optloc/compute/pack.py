@@ -223,14 +223,14 @@ class Folding:
         Number of each row of the run within its epoch.
     epoch : int array (m,)
         Epoch of each row of the run.
-    biases : tuple of Bias
-        Biases of one epoch.
+    touches : tuple of int array (n,)
+        Touches of one epoch, for each bias. Priors are numbers of a problem, which structures leave out.
     """
 
     rows: tuple[Array, ...]
     local: Array
     epoch: Array
-    biases: tuple[Bias, ...]
+    touches: tuple[Array, ...]
 
     @property
     def epochs(self) -> int:
@@ -278,18 +278,15 @@ def _fold(problem: Problem) -> Folding | None:
         rows.append(own)
         local[first + own] = start + np.arange(own.shape[1])
         start += own.shape[1]
-    epoch, biases = problem.epoch, []
+    epoch, touches = problem.epoch, []
     for bias in problem.biases:
         own = _alike(epoch[bias.row], k, local[bias.row], bias.member, bias.coefficient)
         form = form_of(bias)
         # Errors that depend on the time are another function of their members in each epoch.
         if own is None or form.changes or form.enters == "moves":
             return None
-        one = own[0]
-        biases.append(
-            replace(bias, row=local[bias.row[one]], member=bias.member[one], coefficient=bias.coefficient[one])
-        )
-    found = Folding(tuple(rows), local, epoch, tuple(biases))
+        touches.append(own[0])
+    found = Folding(tuple(rows), local, epoch, tuple(touches))
     return found if all(found.groups(block.row) is not None for block in problem.noise.blocks) else None
 
 
@@ -339,10 +336,14 @@ def fold(problem: Problem, found: Folding) -> Problem:
         rows=tuple(_fold_rows(rows, own, count) for rows, own in zip(problem.rows, found.rows, strict=True)),
         noise=Noise(tuple(blocks)),
         times=problem.times[:1],
-        biases=found.biases,
+        biases=tuple(_fold_bias(bias, own, found) for bias, own in zip(problem.biases, found.touches, strict=True)),
         priors=priors,
         constraints=(),
     )
+
+
+def _fold_bias(bias: Bias, own: Array, found: Folding) -> Bias:
+    return replace(bias, row=found.local[bias.row[own]], member=bias.member[own], coefficient=bias.coefficient[own])
 
 
 def fold_whiteners(noise: tuple[Whitener, ...], found: Folding, count: int) -> tuple[Whitener, ...] | None:

@@ -147,3 +147,18 @@ def test_epochs_that_differ_are_not_folded():
     assert folding(drift) is None
     moving = replace(problem, motions=(Motion(1),))
     assert folding(moving) is None
+
+
+def test_runs_of_one_structure_keep_their_own_priors():
+    """Structures leave numbers out: a run must not have the prior of one before it."""
+    one = drawn(estimated(run(20, prior=100.0)), 3, 1)
+    other = replace(one, biases=tuple(replace(bias, sigma=np.full(4, 1.0)) for bias in one.biases))
+    assert one.structure == other.structure
+    costs = []
+    for problem in (one, other):
+        x = truth(problem)[None]
+        found = refine(problem, x)
+        linear = with_priors(problem, found.x, normal(linearise(problem, found.x), problem.epochs))
+        np.testing.assert_allclose(found.cost, linear.cost, rtol=1e-9)
+        costs.append(float(found.cost[0]))
+    assert costs[1] > 1.01 * costs[0]
