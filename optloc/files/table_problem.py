@@ -88,7 +88,9 @@ class TableProblem:
         names = [path.name for path in self.tables(out)]
         # A height that is told takes the place of one that was assumed.
         told = replace(self, height="") if "--height" in (more or {}) else self
-        file = document_of(told.text(names), out.name)
+        # As in a file: characters of its name that are not Unicode are replaced.
+        text = told.text(names).encode("utf-8", "replace").decode("utf-8")
+        file = document_of(text, out.name)
         sheets = (self.places.columns, *(section.columns for section in self.sections))
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
         loaded = assemble(file, stations, tables, out.name, values=True, more=more).loaded
