@@ -96,7 +96,8 @@ def same(shown, printed):
 
 
 def _plain(text):
-    # The lines of a table are as long as the terminal is wide.
+    # A busy machine shows that it loads machine code. The lines of a table are as long as the terminal is wide.
+    text = re.sub(r"(?m)^ *\d+ ms +(?:loading|making) machine code.*\n", "", text)
     return re.sub(r"[─━═]+", "─", re.sub(r"[ \t]+", " ", text)).strip() + "\n"
 
 
