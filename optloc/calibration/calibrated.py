@@ -312,8 +312,8 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
     for other in (one for one, alike in zip(rivals, same, strict=True) if alike):
         pulses[_moved_pulses(at, other)] = np.nan
     elsewhere = tuple(one for one, alike in zip(rivals, same, strict=True) if not alike)
-    evidence = _Evidence(net, found, told, p, tuple(sides), bent, checked, elsewhere, np.isnan(pulses).any(axis=1))
-    findings = objections(_FINDINGS, evidence)
+    facts = _Facts(net, found, told, p, tuple(sides), bent, checked, elsewhere, np.isnan(pulses).any(axis=1))
+    findings = objections(_FINDINGS, facts)
     gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
     return Calibration(
         net,
@@ -325,7 +325,7 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
         gauge or "centre and main axes of the stations",
         findings[0][0] if findings else Status.OK,
         tuple(words for _, words in findings),
-        "unknown" if evidence.refuted or evidence.unproven else "blockwise",
+        "unknown" if facts.refuted or facts.unproven else "blockwise",
         cost,
         dof,
         p,
@@ -355,7 +355,7 @@ def _curved_words(far: float) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Evidence:
+class _Facts:
     """The facts that decide about a network.
 
     Parameters

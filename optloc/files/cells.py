@@ -27,7 +27,7 @@ _LARGEST = 2**62
 
 @dataclass(frozen=True, slots=True)
 class Decimals:
-    """Numbers (m,) with all their digits.
+    """NumberColumn (m,) with all their digits.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Decimals:
         Parameters
         ----------
         first : int array (n,)
-            Numbers that are subtracted.
+            NumberColumn that are subtracted.
         index : int array (m,)
             Which of them is subtracted from each number.
         """
@@ -145,14 +145,14 @@ _FRACTION = re.compile(r"^(.*:\d\d)[.,](\d+)(.*)$")
 
 
 @dataclass(frozen=True, slots=True)
-class Numbers:
+class NumberColumn:
     """The numbers (m,) of a column, and the row of each: cells that hold nothing are left out."""
 
     values: Decimals
     row: Array
 
 
-def numbers(table: Table, name: str) -> Numbers:
+def numbers(table: Table, name: str) -> NumberColumn:
     """Return a column with all its digits; raise InvalidProblem for other words than those of empty cells."""
     column = table.raw(name)
     if column.dtype.kind not in "iufO":
@@ -162,16 +162,16 @@ def numbers(table: Table, name: str) -> Numbers:
     )
 
 
-def _of_cells(cells: list[Decimal | None]) -> Numbers:
+def _of_cells(cells: list[Decimal | None]) -> NumberColumn:
     row = np.array([row for row, value in enumerate(cells) if value is not None], dtype=np.int64)
-    return Numbers(Decimals.of([value for value in cells if value is not None]), row)
+    return NumberColumn(Decimals.of([value for value in cells if value is not None]), row)
 
 
-# Numbers as nearly all tables have them: digits, perhaps with a point.
+# NumberColumn as nearly all tables have them: digits, perhaps with a point.
 _PLAIN = r"^-?([0-9]+(\.[0-9]*)?|\.[0-9]+)$"
 
 
-def _plain_numbers(column: Array) -> Numbers | None:
+def _plain_numbers(column: Array) -> NumberColumn | None:
     """Return a column of text with plain numbers of at most 64 bits; None for other columns."""
     import pyarrow as pa
     from pyarrow import compute as pc
@@ -196,7 +196,7 @@ def _plain_numbers(column: Array) -> Numbers | None:
     # Values that may be too large are read cell by cell: the error names the cell.
     if (np.abs(units / 10.0**written) > _NEARLY * LARGEST).any():
         return None
-    return Numbers(Decimals.scaled(units, written), row)
+    return NumberColumn(Decimals.scaled(units, written), row)
 
 
 def _number(table: Table, name: str, row: int, cell: Any) -> Decimal | None:
@@ -224,7 +224,7 @@ def is_dated(table: Table, name: str) -> bool:
     return isinstance(first, str) and _DATE.match(first.strip()) is not None
 
 
-def instants(table: Table, name: str, zone: str | None) -> Numbers:
+def instants(table: Table, name: str, zone: str | None) -> NumberColumn:
     """Return a column of dates as seconds since 1970, UTC.
 
     Parameters
@@ -242,7 +242,7 @@ def instants(table: Table, name: str, zone: str | None) -> Numbers:
     if column.dtype.kind == "M":
         row = np.flatnonzero(~np.isnat(column))
         nanoseconds = column[row].astype("datetime64[ns]").astype(np.int64)
-        return Numbers(Decimals.scaled(nanoseconds, np.full(len(row), 9)), row)
+        return NumberColumn(Decimals.scaled(nanoseconds, np.full(len(row), 9)), row)
     cells = ["" if cell is None else str(cell).strip() for cell in column.tolist()]
     held = [row for row, cell in enumerate(cells) if cell.lower() not in NOTHING]
     bare_rows = [row for row in held if not _ZONE.search(cells[row].partition("T")[2] or cells[row].partition(" ")[2])]
@@ -264,7 +264,7 @@ def instants(table: Table, name: str, zone: str | None) -> Numbers:
         raise InvalidProblem(f"a date cannot be read ({what})", table.where(name), "use ISO 8601") from None
     fractions = [part[2][:_DIGITS] if part else "" for part in parts]
     values = [Decimal(second) + Decimal(f"0.{more}") for second, more in zip(seconds.tolist(), fractions, strict=True)]
-    return Numbers(Decimals.of(values), np.array(held, dtype=np.int64))
+    return NumberColumn(Decimals.of(values), np.array(held, dtype=np.int64))
 
 
 def _zone(name: str) -> ZoneInfo:

@@ -107,7 +107,7 @@ class Told:
     times : Path, optional
         Table of the measurements, whose times satellites are wanted at.
     missing : str, optional
-        Numbers that stand for no reading, such as "0,-1,9999"; "none": every number is a reading.
+        NumberColumn that stand for no reading, such as "0,-1,9999"; "none": every number is a reading.
     average : bool
         Whether several readings of the same become their mean; by default they are refused.
     azimuth : str, optional

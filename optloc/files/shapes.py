@@ -12,7 +12,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
-from optloc.files.cells import Decimals, Numbers, instants, is_dated, moments, numbers
+from optloc.files.cells import Decimals, NumberColumn, instants, is_dated, moments, numbers
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
 from optloc.files.readings import (
@@ -253,7 +253,7 @@ def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | Non
     return _settled(found, roles, told, place, table.count - len(pick), positive)
 
 
-def _of_column(form: Form, unit: str, held: Numbers, column: str, a: Array) -> Readings:
+def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array) -> Readings:
     """Return the readings of one column; `a` has the station of each row of the table."""
     return Readings(form, unit, held.values, held.row, (column,), np.zeros(len(held.row), dtype=int), a[held.row])
 
@@ -309,7 +309,7 @@ def _picks(roles: Roles, told: Told, place: Places) -> Readings:
         raise InvalidProblem("the S wave is not behind the P wave", table.at(early), "correct the picks")
     if not both:
         raise InvalidProblem("no station has both P and S", table.source, "name their columns with --column p=, s=")
-    held = Numbers(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
+    held = NumberColumn(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
     found = _of_column(sort_named("sp"), "s", held, roles.find("s") or roles.column("time"), station)
     lone = len({*station.tolist()}) - len({*found.a.tolist()})
     found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())

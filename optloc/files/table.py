@@ -36,7 +36,7 @@ class Table:
     source : str
         File, or place in a file, to name.
     columns : mapping of str to array (m,) or Words
-        Numbers, datetimes, or objects (text, None where a cell is empty).
+        NumberColumn, datetimes, or objects (text, None where a cell is empty).
     count : int
         Number of rows m.
     names : mapping of str to str

@@ -61,7 +61,7 @@ def _table(columns: Mapping[str, Any], for_people: bool) -> Any:
         try:
             return pa.array(values, from_pandas=True)
         except (pa.ArrowException, OverflowError):
-            # Numbers and words in one column, or numbers of many digits, go back as they came.
+            # NumberColumn and words in one column, or numbers of many digits, go back as they came.
             return pa.array([None if is_empty(value) else str(value) for value in values])
 
     return pa.table({name: column(values) for name, values in cells.items()})

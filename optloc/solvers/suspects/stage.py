@@ -30,7 +30,7 @@ from optloc.solvers.pool import Pool, begin, crowd_of, in_parts, offer
 from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.suspects.subsets import (
-    Finding,
+    Outcome,
     Rest,
     begin_without,
     enumerable,
@@ -135,17 +135,17 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     pool = replace(pool, asked=True, refuted=refuted)
     fix, conclusion = judge(problem, pool), fill(len(pool), None)
     step = crowd_of(problem)
-    for items, groups, findings in found:
+    for items, groups, outcomes in found:
         for first in range(0, len(items), step):
             part = slice(first, first + step)
             own = items[part]
-            conclusion[own] = _conclude(problem.take(own), fix[own], groups, findings[part], refuted)
+            conclusion[own] = _conclude(problem.take(own), fix[own], groups, outcomes[part], refuted)
     count = sum(len(items) for items, _, _ in found)
     stage = Stage("suspects", f"{count} of {len(fix)} contradict themselves", perf_counter() - began)
     return replace(pool, conclusion=conclusion, stages=(*before, stage))
 
 
-_Explained = list[tuple[Array, tuple[Group, ...], list[Finding]]]
+_Explained = list[tuple[Array, tuple[Group, ...], list[Outcome]]]
 
 
 def _weigh(
@@ -185,10 +185,10 @@ def _score(found: _Explained, fix: Fix, more: Array) -> float:
     """
     good = np.isfinite(fix.cost) & (fix.dof > 0)
     score, dof = np.where(good, fix.cost, 0.0), np.where(good, fix.dof, 0)
-    for items, _, findings in found:
-        for i, finding in zip(items, findings, strict=True):
-            if good[i] and np.isfinite(finding.least):
-                score[i], dof[i] = finding.least, finding.dof
+    for items, _, outcomes in found:
+        for i, outcome in zip(items, outcomes, strict=True):
+            if good[i] and np.isfinite(outcome.least):
+                score[i], dof[i] = outcome.least, outcome.dof
     return float((score + dof * more).sum())
 
 
@@ -211,7 +211,7 @@ def _group_alike(present: Array) -> list[Array]:
 
 def _explain_pattern(
     problem: Problem, fix: Fix, doubted: _Doubted, by: Sequence[GroupKind]
-) -> tuple[tuple[Group, ...], list[Finding]]:
+) -> tuple[tuple[Group, ...], list[Outcome]]:
     """Return what may be wrong in problems (N,) in which the same rows are present, and what explains each."""
     arrivals = as_arrivals(problem)
     work = problem if arrivals is None else arrivals.problem
@@ -220,29 +220,29 @@ def _explain_pattern(
     # few sets: all are tried, and nothing masks anything; runs and many groups: one at a time
     if problem.epochs > 1 or not enumerable(groups, work.count, 1):
         return groups, [_grow(work, groups, fix, i, doubted, None) for i in range(len(fix.x))]
-    findings = explain(work, groups, fix)
+    outcomes = explain(work, groups, fix)
     # sets that were too many to be tried: group by group from the best that was found
-    untried = [not own.rests and own.tried < dof - 1 for own, dof in zip(findings, fix.dof, strict=True)]
+    untried = [not own.rests and own.tried < dof - 1 for own, dof in zip(outcomes, fix.dof, strict=True)]
     for i in np.flatnonzero(untried).tolist():
-        more = _grow(work, groups, fix, i, doubted, findings[i].closest)
-        findings[i] = replace(more, p_value=findings[i].p_value | more.p_value)
-    return groups, findings
+        more = _grow(work, groups, fix, i, doubted, outcomes[i].closest)
+        outcomes[i] = replace(more, p_value=outcomes[i].p_value | more.p_value)
+    return groups, outcomes
 
 
 def _conclude(
-    problem: Problem, fix: Fix, groups: tuple[Group, ...], findings: Sequence[Finding], refuted: str
+    problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome], refuted: str
 ) -> Array:
     """Return what is concluded of problems (N,) in which the same rows are present, None where nothing is."""
-    arrivals, out = as_arrivals(problem), fill(len(findings), None)
+    arrivals, out = as_arrivals(problem), fill(len(outcomes), None)
     cases: list[Case] = []
     chosen: dict[int, Rest] = {}
-    for i, finding in enumerate(findings):
+    for i, outcome in enumerate(outcomes):
         item = np.array([i])
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(item))
         cases.append(Case(problem.take(item), one, groups, fix[i], refuted))
-        if not finding.rests:
-            out[i] = _unexplained(cases[i], finding)
-        elif (best := _best_rest(cases[i], finding)) is not None:
+        if not outcome.rests:
+            out[i] = _unexplained(cases[i], outcome)
+        elif (best := _best_rest(cases[i], outcome)) is not None:
             chosen[i] = best
     # fixes of the problem as given have other unknowns than fixes of its arrivals
     for given in (True, False):
@@ -252,13 +252,13 @@ def _conclude(
             proven = prove_rests(work.take(np.array(items)), groups, [chosen[i] for i in items])
             chosen |= dict(zip(items, proven, strict=True))
     for i, best in chosen.items():
-        out[i] = _explained(cases[i], findings[i], best)
+        out[i] = _explained(cases[i], outcomes[i], best)
     return out
 
 
 def _grow(
     problem: Problem, groups: Sequence[Group], fix: Fix, i: int, doubted: _Doubted, start: Rest | None
-) -> Finding:
+) -> Outcome:
     """Return what explains the i-th of some problems, found group by group.
 
     The fix of all rows is where wrong ones have drawn it, perhaps to another minimum, from which the right ones look
@@ -326,17 +326,17 @@ class Case:
         return tuple(sorted({int(i) for row in group.rows for i in self.arrivals.origin[row]}))
 
 
-def _unexplained(case: Case, finding: Finding) -> Conclusion | None:
+def _unexplained(case: Case, outcome: Outcome) -> Conclusion | None:
     """Return the conclusion of a problem that nothing explains; None where the fix of all data is kept."""
     # no set was tried and nothing stood out: a run whose noise is larger than stated keeps its fix
-    if case.whole.answered and set(finding.p_value) == {()} and not finding.note:
+    if case.whole.answered and set(outcome.p_value) == {()} and not outcome.note:
         return None
-    return Conclusion((), case.whole, case.whole.alternatives, tried=_name_closest(case, finding))
+    return Conclusion((), case.whole, case.whole.alternatives, tried=_name_closest(case, outcome))
 
 
-def _best_rest(case: Case, finding: Finding) -> Rest | None:
+def _best_rest(case: Case, outcome: Outcome) -> Rest | None:
     """Return the rest that explains a problem best, to be proven; None where the fix of all data is kept."""
-    best, *others = finding.rests
+    best, *others = outcome.rests
     if not best.left and all(_same_place(best.fix, rest.fix) for rest in others):
         return None
     if case.refuted:  # it was found by other noise than is stated
@@ -345,11 +345,11 @@ def _best_rest(case: Case, finding: Finding) -> Rest | None:
     return best
 
 
-def _explained(case: Case, finding: Finding, best: Rest) -> Conclusion:
+def _explained(case: Case, outcome: Outcome, best: Rest) -> Conclusion:
     """Return the conclusion of a problem whose best rest is proven."""
-    first, *others = finding.rests
+    first, *others = outcome.rests
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
-    explanations = tuple(_explanation(case, rest, finding) for rest in (best, *others))
+    explanations = tuple(_explanation(case, rest, outcome) for rest in (best, *others))
     spent, fix = int(case.whole.dof) - int(best.fix.dof), _in_layout(case, best.fix)
     return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere), case.refuted)
 
@@ -384,18 +384,18 @@ def _in_layout(case: Case, fix: Fix) -> Fix:
     )
 
 
-def _name_closest(case: Case, finding: Finding) -> str:
+def _name_closest(case: Case, outcome: Outcome) -> str:
     """Return what came closest to an explanation, in words."""
-    tested = {left: p for left, p in finding.p_value.items() if left and np.isfinite(p)}
+    tested = {left: p for left, p in outcome.p_value.items() if left and np.isfinite(p)}
     if not tested:
-        return finding.note
+        return outcome.note
     best = max(tested, key=tested.__getitem__)
     names = list_names([case.groups[i].name for i in best])
     reason = f"nothing explains it; best is to leave out {names} (p = {tested[best]:.1g})"
-    return reason + (f"; {finding.note}" if finding.note else "")
+    return reason + (f"; {outcome.note}" if outcome.note else "")
 
 
-def _explanation(case: Case, rest: Rest, finding: Finding) -> Explanation:
+def _explanation(case: Case, rest: Rest, outcome: Outcome) -> Explanation:
     fix = rest.fix
     p_without = float(fix.p_value)
     told = _errors(case, rest)
@@ -404,7 +404,7 @@ def _explanation(case: Case, rest: Rest, finding: Finding) -> Explanation:
     suspects = []
     for i in rest.left:
         group, error = case.groups[i], told.get(i)
-        known = finding.p_value.get(tuple(j for j in rest.left if j != i))
+        known = outcome.p_value.get(tuple(j for j in rest.left if j != i))
         p_with = _p_with(fix, error) if known is None else known
         none = np.full(1, np.nan)
         value, sigma = (none, none) if error is None else (error.value, error.sigma)

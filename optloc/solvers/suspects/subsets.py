@@ -58,7 +58,7 @@ class Rest:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Outcome:
     """What explains the data of one problem.
 
     Parameters
@@ -107,7 +107,7 @@ def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
     return comb(len(groups), size) * rows <= _MOST
 
 
-def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Finding]:
+def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Outcome]:
     """Return what explains each problem of a flat batch: all sets of groups within the gap of the best.
 
     Sets of one, of two and so on are tried, as long as their prices alone do not exceed what has been found, the rest
@@ -158,7 +158,7 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
             collect(items[first : first + step], sets)
     notes = ["" if dof > 1 else _BLIND for dof in whole.dof]
     parts = zip(rests, probability, notes, closest, tried, least, strict=True)
-    return [Finding(listed(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
+    return [Outcome(listed(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
 
 
 def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
@@ -319,7 +319,7 @@ _LARGE = 16
 _MOST_LEFT_OUT, _RIVALS = 8, 3
 
 
-def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Finding:
+def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Outcome:
     """Return what explains one problem, found group by group.
 
     Parameters
@@ -339,7 +339,7 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Fi
     while (worst := _worst(problem, groups, left, rest, level)) is not None:
         # nothing would be left to agree
         if int(rest.dof) <= len(groups[worst].rows):
-            return Finding(
+            return Outcome(
                 (), {(): float(fix.p_value)}, f"{len(left)} of {len(groups)} left out, and still no rest agrees"
             )
         # a station takes the place of its rows that were left out before
@@ -347,17 +347,17 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Fi
         rest = fix_without(problem, groups, left, rest.x)
     left, rest = _take_back(problem, groups, left, rest, level)
     if not left or not rest.answered:
-        return Finding((), {(): float(fix.p_value)}, "" if rest.answered else str(rest.reason))
+        return Outcome((), {(): float(fix.p_value)}, "" if rest.answered else str(rest.reason))
     found = [rest_of(groups, tuple(sorted(left)), rest), *_rivals(problem, groups, left, rest, level)]
     if passes(fix):
         found.append(rest_of(groups, (), fix))
-    return Finding(listed(found, groups), {(): float(fix.p_value)})
+    return Outcome(listed(found, groups), {(): float(fix.p_value)})
 
 
-def joined(findings: Sequence[Finding], groups: Sequence[Group]) -> Finding:
+def joined(outcomes: Sequence[Outcome], groups: Sequence[Group]) -> Outcome:
     """Return what explains one problem, found from several beginnings: the first one's where none explains it."""
-    rests = {rest.left: rest for finding in findings for rest in finding.rests}
-    return replace(findings[0], rests=listed([*rests.values()], groups)) if rests else findings[0]
+    rests = {rest.left: rest for outcome in outcomes for rest in outcome.rests}
+    return replace(outcomes[0], rests=listed([*rests.values()], groups)) if rests else outcomes[0]
 
 
 def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> Rest:

@@ -75,8 +75,8 @@ class Evidence(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
-    """N finished answers that are to be spoken of.
+class Finished:
+    """N finished answers, and what is known of them.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class Finding:
     test : callable
         Maps evidence to where it applies. Of fixes by operators alone, so that numbers and arrays take the same rules.
     sentence : callable
-        Maps the evidence of a network or start to sentences. Of fixes it maps `Answers` and the indices of some to one
+        Maps the evidence of a network or start to sentences. Of fixes it maps `Finished` and the indices of some to one
         sentence for all of these, or to one for each.
     """
 
@@ -326,61 +326,61 @@ def chart_kind(metres: Any, inverse: Any) -> Any:
 # Findings in sentences.
 
 
-def explain(answers: Answers, code: Array, reason: Array) -> None:
+def explain(finished: Finished, code: Array, reason: Array) -> None:
     """Write the reasons (N,) that belong to the statuses of finished answers, where there is none yet.
 
     Parameters
     ----------
-    answers : Answers
+    finished : Finished
         Finished, and others, whose costs are NaN.
     code : int array (N,)
         `Status` numbers.
     reason : object array (N,)
         Written where it is empty.
     """
-    pool = answers.pool
+    pool = finished.pool
     empty = (reason == "") & np.isfinite(pool.cost[:, 0])
     for finding in FINDINGS:
         items = np.flatnonzero(empty & (code == finding.status))
         if len(items):
-            reason[items] = finding.sentence(answers, items)
+            reason[items] = finding.sentence(finished, items)
     doubtful = np.flatnonzero(empty & (code == Status.OK) & is_improbable(pool.cost[:, 0], pool.dof, DOUBT))
     if len(doubtful):
-        reason[doubtful] = _name_residuals(answers, doubtful)
+        reason[doubtful] = _name_residuals(finished, doubtful)
 
 
-def _name_residuals(answers: Answers, items: Array) -> Any:
+def _name_residuals(finished: Finished, items: Array) -> Any:
     """Return the sentences on residuals: one for all fixes of a problem, or one for each."""
-    pool = answers.pool
+    pool = finished.pool
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], DOUBT)
     told = tail_probability(pool.cost[items, 0], pool.dof[items])
     said = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in told]
     return pool.refuted or np.where(improbable, np.array(said, dtype=object), "")
 
 
-def _name_infinity(answers: Answers, items: Array) -> Any:
-    assert answers.pool.infinity is not None
-    more = answers.pool.infinity[items] - answers.pool.cost[items, 0]
+def _name_infinity(finished: Finished, items: Array) -> Any:
+    assert finished.pool.infinity is not None
+    more = finished.pool.infinity[items] - finished.pool.cost[items, 0]
     told = [f"infinity costs {f'only {one:.2g}' if one > _NONE else 'no'} more" for one in more.tolist()]
     return np.array(told, dtype=object)
 
 
-def _name_rivals(answers: Answers, items: Array) -> Any:
-    gaps = answers.gap[items].min(1).tolist()
-    return np.array([ambiguity(answers.problem, gap) for gap in gaps], dtype=object)
+def _name_rivals(finished: Finished, items: Array) -> Any:
+    gaps = finished.gap[items].min(1).tolist()
+    return np.array([ambiguity(finished.problem, gap) for gap in gaps], dtype=object)
 
 
-def _name_search(answers: Answers, items: Array) -> Any:
-    return "" if answers.pool.remark is None else answers.pool.remark[items]
+def _name_search(finished: Finished, items: Array) -> Any:
+    return "" if finished.pool.remark is None else finished.pool.remark[items]
 
 
-def _name_proof(answers: Answers, items: Array) -> Any:
-    told = answers.proven.reason[items]
-    return NOT_TRIED if answers.pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
+def _name_proof(finished: Finished, items: Array) -> Any:
+    told = finished.proven.reason[items]
+    return NOT_TRIED if finished.pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
 
 
-def _name_shape(answers: Answers, items: Array) -> Any:
-    curvature = answers.pool.curvature
+def _name_shape(finished: Finished, items: Array) -> Any:
+    curvature = finished.pool.curvature
     assert curvature is not None
     assert curvature.kappa is not None
     inverse = chart_kind(*curvature.kappa[items].T) == INVERSE_RANGE

@@ -26,7 +26,7 @@ from optloc.solvers.verdict.conclusion import conclude
 from optloc.solvers.verdict.findings import (
     NO_ANSWER,
     NO_PROOF,
-    Answers,
+    Finished,
     chart_of,
     examine,
     explain,
@@ -111,7 +111,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     if pool.free is not None:
         _hold_against_constraints(pool, cost, finished, marks, reason)
     code = first_status(marks)
-    explain(Answers(problem, pool, gap, proven), code, reason)
+    explain(Finished(problem, pool, gap, proven), code, reason)
     if pool.hidden is not None:
         _name_hidden(pool.hidden, finished & (code == Status.MISFIT), reason)
     if pool.loss:
@@ -365,7 +365,7 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         marks, chart = mark(problem, pool, gap), chart_of(problem, pool.x[:, 0], curvature.covariance, curvature)
     code = first_status(marks)
     if pool.plain is not None:
-        explain(Answers(problem, pool, gap, proven), code, reason)
+        explain(Finished(problem, pool, gap, proven), code, reason)
     return Fix(
         pool.x[:, 0],
         curvature.covariance,
