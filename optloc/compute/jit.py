@@ -365,9 +365,9 @@ def with_constants(
         one, other = others.get(one, one), one in others
         if one in made:
             return made[one][0], made[one][1], made[one][2] or other
-        old, changed, differ, reaches = one.function, dict[str, Any](), frozenset[tuple[str, Any]](), other
+        old, changed, differ, reaches = one.function, dict[str, Any](), frozenset[tuple[str, Any]](), False
         assert isinstance(old, FunctionType)
-        for name in set(old.__code__.co_names) & old.__globals__.keys():
+        for name in sorted(set(old.__code__.co_names) & old.__globals__.keys()):
             value = old.__globals__[name]
             if isinstance(value, _Kernel):
                 new, below, replaces = copy(value)
@@ -384,7 +384,7 @@ def with_constants(
             own.__annotations__ = old.__annotations__
             _COPIES[key] = _Kernel(own, taken_in=one.taken_in)
         made[one] = _COPIES[key] if changed else one, differ, reaches
-        return made[one]
+        return made[one][0], differ, reaches or other
 
     assert isinstance(kernel, _Kernel)
     out = copy(kernel)[0]

@@ -3,6 +3,9 @@
 import ast
 import importlib
 import inspect
+import os
+import subprocess
+import sys
 import textwrap
 from collections import defaultdict
 from functools import cache
@@ -92,6 +95,20 @@ def test_digests_differ_and_are_the_same_each_time():
     assert len(set(made.values())) >= 0.98 * len(made)  # kernels that call each other share one
     digests._own.cache_clear()
     assert {name: digests.digest_of(kernel) for name, kernel in shipped().items()} == made
+
+
+@pytest.mark.parametrize("order", ["1", "2", "3"])
+def test_digests_do_not_depend_on_the_order_of_sets(order):
+    """Code under a digest that the next process does not compute is compiled by every process."""
+    code = """
+from optloc.cli.compile import PARTS
+from optloc.compute import digests
+from optloc.compute.jit import named
+print(*(digests.digest_of(named(name)) for part in PARTS.values() for name in part.entries))
+"""
+    command, environment = [sys.executable, "-P", "-c", code], {**os.environ, "PYTHONHASHSEED": order}
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+    assert said == [digests.digest_of(named(name)) for part in PARTS.values() for name in part.entries]
 
 
 def test_no_kernel_names_a_value_without_a_text_of_its_own():
