@@ -48,6 +48,40 @@ def around_node(
         lower[k], upper[k] = max(lower[k], centre - reach), min(upper[k], centre + reach)
 
 
+@compiled
+def around_foci(one: Array, other: Array, most: float, x: Array, back: Array, lower: Array, upper: Array) -> None:
+    """Clip a box of search coordinates by all points whose distances from two places sum to `most` at most.
+
+    They are an ellipsoid of revolution. With 2a the sum and c the vector from its centre to a focus, it reaches
+    ``sqrt((a^2 - |c|^2) |b|^2 + (b.c)^2)`` from its centre along a row b of `back`.
+
+    Parameters
+    ----------
+    one, other : array (3,)
+        The places, metres.
+    most : float
+        The sum of distances, metres.
+    x, back, lower, upper : arrays
+        As of `around_node`.
+    """
+    half = np.empty((2, 3))
+    middle, focus = half[0], half[1]
+    size = 0.0
+    for m in range(3):
+        middle[m], focus[m] = 0.5 * (one[m] + other[m]) - x[m], 0.5 * (other[m] - one[m])
+        size += focus[m] * focus[m]
+    a, c = 0.5 * most * (1.0 + _WIDER), sqrt(size)
+    across = max(a - c, 0.0) * (a + c)
+    for k in range(3):
+        length = along = centre = 0.0
+        for m in range(3):
+            length += back[k, m] * back[k, m]
+            along += back[k, m] * focus[m]
+            centre += back[k, m] * middle[m]
+        reach = sqrt(across * length + along * along) * (1.0 + _WIDER) + _WIDER * abs(centre)
+        lower[k], upper[k] = max(lower[k], centre - reach), min(upper[k], centre + reach)
+
+
 # Squared rows of ranges: linear in the position and one more unknown, they bound both.
 
 # A left inverse is exact to this share, and the slack of all bounds from an enclosure: nothing beside its widths, which
@@ -397,8 +431,8 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
     Within a group of nodes (`optloc.proof.search_space.Groups`) errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
-    Ranges and linear forms are squared to equations linear in position and one more unknown; other nodes give balls of
-    their own.
+    Ranges and linear forms are squared to equations linear in position and one more unknown; sums of two ranges give
+    ellipsoids, and other nodes balls of their own.
 
     Parameters
     ----------
@@ -444,6 +478,9 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
                 ties[j, SWING] = abs(error) + reach
                 rays += int(kinds[j] != RANGE and has_ray(kinds[j]))
                 around_node(kinds[j], data[j], middle - reach, middle + reach, x, back, lower, upper)
+            elif groups.tie[j] < 0.0:  # a sum of two ranges
+                most = nodes[j, PHI] + nodes[reference, PHI] - error + rho * sqrt(own[i, i])
+                around_foci(data[j, :3], data[reference, :3], most, x, back, lower, upper)
         around_squares(kinds, data, A, nodes, sense, rho, member, reference, own, groups.tie, ties, lower, upper)
     if rays:
         around_rays(kinds, data, x, back, ties[:, SWING].copy(), lower, upper)
