@@ -360,7 +360,8 @@ _SENTENCES: dict[Status, str] = {
     "another solver.",
     Status.REJECTED: "A measurement is not a finite number; remove the row or give it weight zero.",
     Status.UNAVAILABLE: "The method gives no start for these rows; the reason says why, and 'auto' takes all kinds.",
-    Status.DISCONNECTED: "The station pairs fall into groups without a common station; add a pair that links them.",
+    Status.DISCONNECTED: "The station pairs fall into groups without a common station: no closed form starts from "
+    "them; take 'auto', which searches, or add a pair that links them.",
     Status.CONTRADICTORY: "The measurements contradict each other, and leaving few of them out does not help, or they "
     "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
     Status.MISFIT: "The residuals are larger than the stated noise allows, so position and covariance are refuted; see "

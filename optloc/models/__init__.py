@@ -188,7 +188,8 @@ def rss_difference(exponent: float = 2.0) -> Model:
         return LiftedRow(None, 1.0, -1.0 * ratio, 0.0, lambda t, a, b: ratio / decibels * distance(t, b))
 
     summary = f"difference of received signal strengths, {10.0 * exponent:g} log10(r_b / r_a)"
-    return Model(h, "level", 2, summary, signs=(1, -1), lifted=lifted, aliases=("rssd", "drss"))
+    nodes = ((-decibels, "log range"),)
+    return Model(h, "level", 2, summary, signs=(1, -1), nodes=nodes, lifted=lifted, aliases=("rssd", "drss"))
 
 
 def _basis(a: Point) -> tuple[Components, ...]:

@@ -11,6 +11,8 @@ from optloc.compute.jit import compiled, inlined, zero
 from optloc.compute.systems import inverse
 from optloc.proof.nodes.dispatch import bound_others, infinity_of, points_of
 from optloc.proof.nodes.node import (
+    BALANCED,
+    BETWEEN,
     DIFFERENCE,
     GROWS,
     HIGH,
@@ -31,6 +33,8 @@ _WIDER, _SHIFT = 1e-12, 1e-15
 # Coordinate descents towards the least-squares point of a box; any point gives a valid bound. Over 8 fixes by range
 # differences one descent took 6 % more boxes of an atlas than three, and ten took 0.6 % fewer.
 _SWEEPS = 3
+# Share of v that its pull on a node without an end keeps of the right sign, whatever is rounded.
+_BEYOND = 1e-9
 # Columns of a table of rows over a box (q, ROW_WIDTH): residual in the middle of the remainders, Jacobian, direction v.
 MIDDLE, J0, J1, J2, DIRECTION, ROW_WIDTH = range(6)
 
@@ -63,16 +67,37 @@ def bound_nodes(
 
 @inlined
 def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
-    """Fill residuals (in the middle of the remainders) and Jacobian of the table of rows (q, ROW_WIDTH)."""
+    """Fill residuals (in the middle of the remainders) and Jacobian of the table of rows (q, ROW_WIDTH).
+
+    A remainder that is bounded from one side counts with its bound.
+    """
+    for j in range(K.shape[1]):
+        nodes[j, BETWEEN] = middle_of(nodes[j, LOW], nodes[j, HIGH])
     for i in range(K.shape[0]):
         middle, j0, j1, j2 = -w[i], 0.0, 0.0, 0.0
         for j in range(K.shape[1]):
             factor = K[i, j]
-            middle += factor * (nodes[j, PHI] + 0.5 * (nodes[j, LOW] + nodes[j, HIGH]))
+            middle += factor * (nodes[j, PHI] + nodes[j, BETWEEN])
             j0 += factor * nodes[j, SLOPE0]
             j1 += factor * nodes[j, SLOPE1]
             j2 += factor * nodes[j, SLOPE2]
         rows[i, MIDDLE], rows[i, J0], rows[i, J1], rows[i, J2] = middle, j0, j1, j2
+
+
+@inlined
+def middle_of(low: float, high: float) -> float:
+    """Return the middle of an interval; of one that ends on one side alone its end, and 0 of one without ends."""
+    middle = 0.5 * (low + high)
+    if abs(middle) < inf:
+        return middle
+    return high if high < inf else (low if low > -inf else 0.0)
+
+
+@inlined
+def size_within(low: float, high: float) -> float:
+    """Return the sizes of the ends of an interval, as far as it has ends: what is rounded is finite."""
+    size = abs(low) + abs(high)
+    return size if size < inf else abs(middle_of(low, high))
 
 
 @inlined
@@ -128,7 +153,10 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
             total = 0.0
             for i in range(K.shape[0]):
                 total += K[i, j] * rows[i, DIRECTION]
-            reach -= abs(total) * radius
+            if radius < inf:
+                reach -= abs(total) * radius
+            elif not total * _open_side(nodes, j) > digits(K) * weight[j] * sqrt(length):
+                return -1.0  # along v the node takes off as much as it likes
     return float(reach / sqrt(length)) - rounding(K, weight, floor, nodes)
 
 
@@ -143,7 +171,7 @@ def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
     """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
     size = floor
     for j in range(K.shape[1]):
-        size += weight[j] * (abs(nodes[j, PHI]) + abs(nodes[j, LOW]) + abs(nodes[j, HIGH]))
+        size += weight[j] * (abs(nodes[j, PHI]) + size_within(nodes[j, LOW], nodes[j, HIGH]))
     return float(digits(K) * size)
 
 
@@ -202,14 +230,33 @@ def _absorb(K: Array, weight: Array, nodes: Array, rows: Array) -> None:
         for j in range(K.shape[1]):
             radius = 0.5 * (nodes[j, HIGH] - nodes[j, LOW])
             still = nodes[j, SLOPE0] == 0.0 and nodes[j, SLOPE1] == 0.0 and nodes[j, SLOPE2] == 0.0
-            if not (still and 0.0 < radius < inf and weight[j] > 0.0):
+            if not (still and 0.0 < radius and weight[j] > 0.0):
                 continue
             pull = 0.0
             for i in range(K.shape[0]):
                 pull += K[i, j] * rows[i, DIRECTION]
-            move = within(-pull / (weight[j] * weight[j]), radius)
+            if radius < inf:
+                move = within(-pull / (weight[j] * weight[j]), radius)
+            else:
+                move = _move_beyond(K, weight[j], rows, pull, _open_side(nodes, j))
             for i in range(K.shape[0]):
                 rows[i, DIRECTION] += move * K[i, j]
+
+
+@compiled
+def _open_side(nodes: Array, j: int) -> float:
+    """Return 1 where a node may be greater by anything, -1 where it may be less, and 0 where it may be both."""
+    return (1.0 if nodes[j, LOW] > -inf else 0.0) - (1.0 if nodes[j, HIGH] < inf else 0.0)
+
+
+@compiled
+def _move_beyond(K: Array, weight: float, rows: Array, pull: float, side: float) -> float:
+    """Return by how much a node without an end on one side goes there, so that it takes nothing off along v."""
+    length = 0.0
+    for i in range(K.shape[0]):
+        length += rows[i, DIRECTION] * rows[i, DIRECTION]
+    move = (_BEYOND * sqrt(length) * weight - side * pull) / (weight * weight)
+    return side * max(move, 0.0)
 
 
 # Parts of a box that may be left out: where residuals are too long.
@@ -450,7 +497,7 @@ _REACHES = 1.25
 def reaches_infinity(kinds: Array, K: Array) -> bool:
     """Return whether a cost stays finite at infinity, so that the chart holds.
 
-    Linear forms, heights, and ranges that no other balances grow without end.
+    Linear forms, heights, and ranges that no other balances grow without end, and so do their logarithms.
 
     Parameters
     ----------
@@ -464,12 +511,15 @@ def reaches_infinity(kinds: Array, K: Array) -> bool:
         if kinds[j] != RANGE and infinity_of(kinds[j]) == GROWS:
             return False
     for i in range(K.shape[0]):
-        total = size = 0.0
+        total = size = logarithms = lengths = 0.0
         for j in range(kinds.shape[0]):
             if kinds[j] == RANGE or infinity_of(kinds[j]) == DIFFERENCE:
                 total += K[i, j]
                 size += abs(K[i, j])
-        if abs(total) > _BALANCED * size:
+            elif infinity_of(kinds[j]) == BALANCED:
+                logarithms += K[i, j]
+                lengths += abs(K[i, j])
+        if abs(total) > _BALANCED * size or abs(logarithms) > _BALANCED * lengths:
             return False
     return True
 

@@ -188,7 +188,7 @@ def _fold(basis: Array, w: Array) -> Array:
 
 
 def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
-    """Return the numbers of the nodes with a mark on those whose rows are their own, and that make something of it.
+    """Return the numbers of the nodes with a mark on those that are alone in their rows, with the least cost at zero.
 
     Nodes that share no row with others: their part of the cost is a function of one number, which may be folded.
 
@@ -205,8 +205,7 @@ def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
 
     Returns
     -------
-    array (B or N, J, width)
-        N where marks differ from problem to problem.
+    array (B, J, width)
     """
     if not any(NODES[kind].mark for kind in kinds):
         return data
@@ -231,18 +230,13 @@ def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Arra
         ``K'w``.
     """
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
-    # Of a column that is orthogonal to all others, the least squares: the value that the rows say of the node.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        measured = np.where(size > 0.0, force / size**2, 0.0)
-    marked = {int(kind) for kind in kinds if NODES[kind].mark is not None}
-    differs = any(NODES[kind].differs for kind in marked)
-    out = np.array(np.broadcast_to(data, (len(w), *data.shape[1:])) if differs else data)
-    for kind in marked:
-        own, mark = kinds == kind, NODES[kind].mark
-        assert mark is not None
-        numbers = out[:, own]
-        mark(numbers, alone[:, own], centred[own], measured[:, own])
-        out[:, own] = numbers
+    out = np.array(data)
+    for kind in {int(kind) for kind in kinds}:
+        mark, own = NODES[kind].mark, kinds == kind
+        if mark is not None:
+            numbers = out[:, own]
+            mark(numbers, alone[:, own] & centred[own])
+            out[:, own] = numbers
     return out
 
 

@@ -310,7 +310,7 @@ class Single:
         affine = self.map
         none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0)), np.empty((n, 0)), np.empty(n)
         costs = PositionCosts(*none) if affine is None else affine.room(n)
-        gap, nowhere = np.full(n, LISTED_GAP), np.full((n, 2, d), np.nan)
+        nowhere = np.full((n, 2, d), np.nan)
         asked = Asked(
             x=np.empty((n, d)),
             others=np.zeros((n, 1, d)),
@@ -321,7 +321,7 @@ class Single:
             region=nowhere,
             # where all positions cannot be bounded the long way says what can
             fallback=nowhere,
-            budget=budgets(gap, len(costs.kinds), 1) * (1 if self.upward is None else ALL_AROUND),
+            budget=budgets(n, len(costs.kinds), 1) * (1 if self.upward is None else ALL_AROUND),
             planes=np.repeat(self.planes, n, axis=0),
             surface=np.repeat(self.surface, n, axis=0),
         )

@@ -234,6 +234,8 @@ _SEED = 20261121  # any: the same problem always gets the same places
 
 # More starts change nothing about these.
 _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONTRADICTORY)
+# Of these no closed form had a start.
+_STARTLESS = (Status.DISCONNECTED, Status.UNAVAILABLE)
 
 
 def search(problem: Problem, pool: Pool | None) -> Pool:
@@ -263,17 +265,19 @@ def _answer(
     refuted = fix.answered & (fix.code == Status.MISFIT) & problem.frame.geodetic
     behind: Array = np.flatnonzero(refuted)
     lost[behind] = is_hidden(problem.take(behind), fix.x[behind]) if len(behind) else False
-    # unlinked groups have fewer equations than the count says: without redundancy any place would fit
-    lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
+    lost &= fix.dof >= 0
     items = np.flatnonzero(lost)
     if not len(items):
         return pool
     began = perf_counter()
     part = problem.take(items)
     found = lsr(part, offer(part, starts(part), take(pool, items), "search", began))
-    good = np.flatnonzero(judge(part, found).answered)
+    now = judge(part, found)
+    # where nothing was known, why what was found is no answer says more than why no closed form began
+    better = np.isin(fix.code[items], _STARTLESS) & ~np.isin(now.code, _STARTLESS)
+    good = np.flatnonzero(now.answered | better)
     found = replace(found, **says(fix.reason[items]))
-    stage = Stage("search", f"{len(good)} of {len(items)} found", perf_counter() - began)
+    stage = Stage("search", f"{int(now.answered.sum())} of {len(items)} found", perf_counter() - began)
     return pool.merge(items[good], take(found, good), stage)
 
 

@@ -43,6 +43,9 @@ class Trial:
                 angle = np.arctan2(apart[a, 1], apart[a, 0]) if kind == "azimuth" else np.arctan2(apart[a, 2], level)
                 out.append((angle - z + np.pi) % (2.0 * np.pi) - np.pi)
                 continue
+            if kind == "rss_difference":
+                out.append(20.0 * np.log10(r[b] / r[a]) - z)
+                continue
             value = r[a] / r[b] if kind == "groa" else r[a] + {"tdoa": -1.0, "range_sum": 1.0}.get(kind, 0.0) * r[b]
             out.append(value - z)
         return self.white @ np.concatenate(out)
@@ -59,6 +62,8 @@ class Trial:
             elif kind == "elevation":
                 level = np.hypot(apart[a, 0], apart[a, 1])
                 row = np.column_stack([-apart[a, 2:] * apart[a, :2] / level[:, None], level]) / (r[a] ** 2)[:, None]
+            elif kind == "rss_difference":
+                row = 20.0 / np.log(10.0) * (u[b] / r[b][:, None] - u[a] / r[a][:, None])
             elif kind == "groa":
                 row = u[a] / r[b][:, None] - (r[a] / r[b] ** 2)[:, None] * u[b]
             else:

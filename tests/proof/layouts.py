@@ -70,6 +70,13 @@ def rows(kind: str, stations: Array, x: Array, sigma: float, rng: Rng):
     if kind == "groa":
         z = r[:, 1:] / r[:, :1] + sigma * rng.standard_normal((n, s - 1))
         return [measured("groa", z, a=a, b=b, sigma=sigma)]
+    if kind == "rss_difference":
+        level = -20.0 * np.log10(r) + sigma * rng.standard_normal((n, s))
+        return [measured(kind, level[:, 1:] - level[:, :1], a=a, b=b, arrival_sigma=sigma)]
+    if kind == "pairs":  # range differences of stations none of which has two
+        a, b = np.arange(0, s - 1, 2), np.arange(1, s, 2)
+        z = r[:, a] - r[:, b] + sigma * rng.standard_normal((n, len(a)))
+        return [measured("tdoa", z, a=a, b=b, sigma=sigma)]
     if kind == "range_sum":
         z = r[:, 1:] + r[:, :1] + sigma * rng.standard_normal((n, s - 1))
         return [measured("range_sum", z, a=a, b=b, sigma=sigma)]
@@ -156,6 +163,10 @@ CELLS = [
     *_family("GROA + TDOA, 5 stations", lambda s: (("tdoa", 5, s), ("groa", 5, 0.01)), (10.0,), "m", random_box),
     *_family("AOA + TDOA, 4 stations", lambda s: (("tdoa", 4, s), ("aoa", 1, 0.01)), (10.0,), "m", random_box),
     *_family("GROA, 6 stations", lambda s: (("groa", 6, 1e-3 * s),), (2.0,), "permille", random_box),
+    *_family("RSS, 6 stations", lambda s: (("rss_difference", 6, s),), (0.1,), "dB", random_box),
+    *_family("TDOA, 3 disjoint pairs", lambda s: (("pairs", 6, s),), (3.0,), "m", random_box),
+    Cell("RSS in the plane, 5 stations, 0.5 dB", planar("rss_difference", 5, 0.5, 20e3)),
+    Cell("TDOA in the plane, 2 disjoint pairs, 3 m", planar("pairs", 4, 3.0, 20e3)),
     Cell("TDOA in the plane, 4 stations, 10 m", planar("tdoa", 4, 10.0, 20e3)),
     Cell("AOA in the plane, 3 stations, 10 mrad", planar("aoa", 3, 10e-3, 20e3)),
     Cell("bistatic, two illuminators, 10 m, 5 mrad", bistatic),

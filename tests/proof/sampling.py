@@ -8,12 +8,14 @@ from optloc.compute.jit import enabled
 from optloc.models import Point, range_rate
 from optloc.proof.nodes.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
 from optloc.proof.nodes.level import bound_height, curve_height
+from optloc.proof.nodes.log_range import bound_logarithm, curve_logarithm
 from optloc.proof.nodes.rate import VELOCITY, bound_rate, curve_rate
 from optloc.proof.nodes.ratio import bound_ratio, curve_ratio
 
 BOUND = {"azimuth": bound_azimuth, "elevation": bound_elevation, "groa": bound_ratio, "height": bound_height}
 CURVE = {"azimuth": curve_azimuth, "elevation": curve_elevation, "groa": curve_ratio, "height": curve_height}
 BOUND["range_rate"], CURVE["range_rate"] = bound_rate, curve_rate
+BOUND["log range"], CURVE["log range"] = bound_logarithm, curve_logarithm
 RADIUS = 6.37e6
 
 
@@ -55,6 +57,8 @@ def value(kind, d, data, x):
     """Return the node at positions (..., 3) by the package's h; azimuths from their measured value, wrapped."""
     parts = tuple(x[..., i] for i in range(d))
     a = Point(tuple(data[:d]), None, tuple(tuple(data[6 + 3 * i : 6 + 3 * i + d]) for i in range(d)))
+    if kind == "log range":  # what a station measures of which `rss_difference` is a difference
+        return np.log(np.linalg.norm(x - data[:3], axis=-1))
     if kind == "range_rate":
         still, moving = (0.0,) * d, tuple(-data[VELOCITY : VELOCITY + d])
         return range_rate(Point(parts, still), Point(tuple(data[:d]), moving))

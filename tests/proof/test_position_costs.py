@@ -7,7 +7,7 @@ import pytest
 from cases import CASES, STATIONS, TARGET, pairs, stations
 from proof.plain import cost_of
 
-from optloc import Motion, Prior, Stations, assemble, measured, simulate, with_bias
+from optloc import MODELS, Motion, Prior, Stations, assemble, measured, simulate, with_bias
 from optloc.base.types import Bias
 from optloc.compute.sums import equations_at
 from optloc.proof.position_costs import position_costs
@@ -184,7 +184,6 @@ def uncertain(problem, variance):
 @pytest.mark.parametrize(
     ("problem", "what"),
     [
-        (lambda: CASES["rss_difference-3d"].problem, "neither sums of ranges or rates"),
         (lambda: CASES["tdoa+fdoa-3d"].problem, "moves"),
         (lambda: with_bias(tdoa(3), "scale", per="kind", form="scale", sigma=0.1), "multiplies"),
         (lambda: with_bias(CASES["angles-3d"].problem, "north", per="kind", kind="azimuth"), "whole turns"),
@@ -196,3 +195,9 @@ def uncertain(problem, variance):
 )
 def test_what_is_beyond_the_proof_is_named(problem, what):
     assert what in unsupported(problem().flat())
+
+
+def test_a_kind_without_nodes_is_beyond_the_proof(monkeypatch):
+    bare = replace(MODELS["rss_difference"], nodes=())
+    monkeypatch.setattr("optloc.proof.scope.MODELS", {**MODELS, "rss_difference": bare})
+    assert "neither sums of ranges or rates" in unsupported(CASES["rss_difference-3d"].problem.flat())

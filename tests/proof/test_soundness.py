@@ -28,6 +28,8 @@ HARD = [
     "AOA, 4 stations, outside, 20 mrad",
     "GROA + TDOA, 5 stations, outside, 10 m",
     "AOA + TDOA, 4 stations, outside, 10 m",
+    "RSS, 6 stations, inside, 0.1 dB",
+    "TDOA, 3 disjoint pairs, inside, 3 m",
     "GROA, 6 stations, inside, 2 permille",
     "TDOA in the plane, 4 stations, 10 m",
     "AOA in the plane, 3 stations, 10 mrad",
@@ -130,6 +132,8 @@ SIGMAS = {
     "range": (1.0, 30.0, 300.0),
     "range_sum": (10.0, 300.0),
     "groa": (2e-3, 2e-2, 0.2),
+    "rss_difference": (0.02, 0.2, 2.0),
+    "pairs": (1.0, 30.0, 300.0),
     "aoa": (5e-3, 0.05, 0.5),
 }
 

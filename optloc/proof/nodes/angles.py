@@ -193,9 +193,9 @@ def _numbers(row: Row) -> Array:
     return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a), MEASURED: row.measured[:, None]})
 
 
-def _mark(numbers: Array, alone: Array, centred: Array, measured: Array) -> None:
+def _mark(numbers: Array, alone: Array) -> None:
     """Let an azimuth alone be folded: its cost is even, so where it jumps from pi to -pi its absolute value serves."""
-    numbers[..., ALONE] = alone & centred
+    numbers[..., ALONE] = alone
 
 
 HORIZONTAL_ANGLE = Node(

@@ -19,13 +19,17 @@ from optloc.proof.atlas import frame_of, set_line
 from optloc.proof.nodes import node as columns
 from optloc.proof.nodes.angles import HORIZONTAL_ANGLE, VERTICAL_ANGLE
 from optloc.proof.nodes.level import GEODETIC_HEIGHT, LINEAR_FORM
-from optloc.proof.nodes.node import DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node, range_form, triple
+from optloc.proof.nodes.log_range import LOGARITHM
+from optloc.proof.nodes.node import BALANCED, DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node, range_form, triple
 from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_centre, curve_difference
 from optloc.proof.nodes.rate import RATE_OF_RANGE
 from optloc.proof.nodes.ratio import RATIO_OF_RANGES
 
 # In the order of their codes (`optloc.proof.nodes.node`); those from outside follow as they are met.
-_SHIPPED = (DISTANCE, LINEAR_FORM, HORIZONTAL_ANGLE, VERTICAL_ANGLE, RATIO_OF_RANGES, GEODETIC_HEIGHT, RATE_OF_RANGE)
+_SHIPPED = (
+    *(DISTANCE, LINEAR_FORM, HORIZONTAL_ANGLE, VERTICAL_ANGLE, RATIO_OF_RANGES, GEODETIC_HEIGHT, RATE_OF_RANGE),
+    LOGARITHM,
+)
 NODES: list[Node] = list(_SHIPPED)
 _CODES = {node: code for code, node in enumerate(NODES)}
 _NAMES = {node.name: node for node in NODES}
@@ -168,7 +172,7 @@ def _near_case(node: Node, code: int, call: str) -> list[str]:
 
 def _far_case(node: Node, code: int, call: str) -> list[str]:
     """Return the lines that bound or curve a node over a box of an atlas, if scaled lines serve as well."""
-    if node.infinity != SCALED:
+    if node.infinity not in (SCALED, BALANCED):
         return []
     if node.points == 1:
         return [call.format(code, "away, sense")]

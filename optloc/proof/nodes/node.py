@@ -18,7 +18,7 @@ Over a box (centre c, half-widths h in search coordinates s, x = c + T s) a node
 ``bound(data, line, sense, half, slope) -> (value, low, high)``
     value at the centre; writes its gradient with respect to s into slope (3,); low and high enclose the remainder
     ``phi(s) - value - slope.s`` for all |s_k| <= half_k. What cannot be bounded sharply has slope 0 and a wide
-    interval.
+    interval, of which an end may be infinite.
 ``curve(data, line, sense, half, curvature, turn) -> chi``
     writes the Hessian with respect to s at the centre into curvature (3, 3), a bound of the change of each component of
     the gradient over the box into turn (3,), and returns a bound of the spectral norm of the change of the Hessian;
@@ -41,19 +41,21 @@ from optloc.problem.problem import Problem
 
 # Codes of the shipped nodes, by which machine code knows them; nodes from outside are counted on. ANY stands for a node
 # of which nothing is known but its tables.
-RANGE, LINEAR, AZIMUTH, ELEVATION, RATIO, HEIGHT, RATE = range(7)
+RANGE, LINEAR, AZIMUTH, ELEVATION, RATIO, HEIGHT, RATE, LOG_RANGE = range(8)
 ANY = -1
 
 # How a node curves: not at all, with a Hessian that is nowhere negative (a bound of its force from below is enough
 # then), or in any way.
 FLAT, CONVEX, MIXED = range(3)
 # What becomes of a node at infinity. It grows without end, and so does the cost. Or it depends on the directions of its
-# lines alone, so that scaled lines serve as well. Or only differences of such nodes are finite: ranges.
-GROWS, SCALED, DIFFERENCE = range(3)
+# lines alone, so that scaled lines serve as well. Or only differences of such nodes are finite: ranges; or logarithms,
+# for whose differences scaled lines serve.
+GROWS, SCALED, DIFFERENCE, BALANCED = range(4)
 
-# Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, enclosure of the remainder. And
-# of a range over a piece of an atlas what its curvature asks for: all that `range_form` says, but for the last number.
-PHI, SLOPE0, SLOPE1, SLOPE2, LOW, HIGH, FORM, NODE_WIDTH = 0, 1, 2, 3, 4, 5, 6, 12
+# Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, enclosure of the remainder and
+# its middle. And of a range over a piece of an atlas what its curvature asks for: all that `range_form` says, but for
+# the last number.
+PHI, SLOPE0, SLOPE1, SLOPE2, LOW, HIGH, BETWEEN, FORM, NODE_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 13
 # Columns of a table of second derivatives (J, CURVE_WIDTH): the Hessian's entries, bounds of the change of the gradient
 # and of the Hessian, and what the rows add to them: the force K'(K phi - w) on the node, its pull K'J, and how far the
 # force may be from what it is computed to be.
@@ -136,7 +138,7 @@ class Node:
     shape : int
         FLAT, CONVEX or MIXED.
     infinity : int
-        GROWS, SCALED or DIFFERENCE.
+        GROWS, SCALED, DIFFERENCE or BALANCED.
     size : callable, optional
         ``(data, reach) -> float``: the size of what the value is a difference of, where the lengths of the
         coordinates sum to `reach`; it limits the accuracy. None: 1, as angles and ratios.
@@ -154,11 +156,8 @@ class Node:
     most : float
         Greatest size of the node, for kinds with a period: residuals are wrapped, nodes are not.
     mark : callable, optional
-        ``(numbers, alone, centred, measured)``: marks nodes whose rows are their own in their numbers (B, n, width),
-        from where they are (B, n), where such a row has its least cost at zero for all problems (n,), and at which
-        value for each (N, n).
-    differs : bool
-        Whether `mark` needs numbers for each problem.
+        ``(numbers, alone)``: marks nodes whose rows are their own, with the least cost at zero, in their numbers
+        (B, n, width), from where they are (B, n).
     """
 
     name: str
@@ -175,8 +174,7 @@ class Node:
     of_station: bool = False
     counts_from_measured: bool = False
     most: float = inf
-    mark: Callable[[Array, Array, Array, Array], None] | None = None
-    differs: bool = False
+    mark: Callable[[Array, Array], None] | None = None
 
 
 # Linear forms of a box's coordinates as triples of numbers: their reach, their products, ranges over a box.

@@ -30,8 +30,8 @@ from optloc.proof.nodes.node import (
     write_symmetric,
 )
 
-# Numbers: stations a and b, the measured value, and what is not 0 where the row is the node's own.
-STATION, STATION_B, MEASURED, ALONE, _WIDTH = 0, 3, 15, 16, 17
+# Numbers: stations a and b.
+STATION, STATION_B, _WIDTH = 0, 3, 6
 
 
 @compiled
@@ -44,8 +44,7 @@ def bound_ratio(
     position), S = r_a + r_b, delta = N/S = r_a - r_b and phi = 1 + delta/r_b, the remainder of a quotient phi = N/S is
     ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'`` with g its slope, and S' = S + u.s + q_S elsewhere in the box.
 
-    Where the box may touch station b the ratio has no upper end. A row of its own (number `ALONE`) only grows beyond
-    its measured value, so there the lower end may stand for the ratio.
+    Where the box may touch station b the ratio has no upper end.
     """
     h = triple(half, 0)
     ra, ua, least_a, most_a, far_a = range_form(line, sense, h)
@@ -68,7 +67,7 @@ def bound_ratio(
             write(g, slope)
             return phi, less, more
     else:
-        high = max(low, data[MEASURED]) if data[ALONE] != 0.0 else inf
+        high = inf
     slope[0] = slope[1] = slope[2] = 0.0
     return phi, low - phi, high - phi
 
@@ -252,11 +251,4 @@ def _numbers(row: Row) -> Array:
     return lay_out({STATION: row.place(row.a), STATION_B: row.place(row.b)})
 
 
-def _mark(numbers: Array, alone: Array, centred: Array, measured: Array) -> None:
-    """Let a ratio alone know its measured value: it only grows beyond, so one without an upper end is cut there."""
-    numbers[..., MEASURED], numbers[..., ALONE] = measured, alone
-
-
-RATIO_OF_RANGES = Node(
-    "ratio", _WIDTH, 2, _numbers, bound_ratio, curve_ratio, infinity=SCALED, ball=_ball, mark=_mark, differs=True
-)
+RATIO_OF_RANGES = Node("ratio", _WIDTH, 2, _numbers, bound_ratio, curve_ratio, infinity=SCALED, ball=_ball)

@@ -319,7 +319,7 @@ def _question(on: Problem, costs: Costs, x: Array, less: Array, effort: int) -> 
         eps=less,
         region=np.full((n, 2, d), np.nan),
         fallback=np.full((n, 2, d), np.nan),
-        budget=budgets(value, costs.dense, effort),
+        budget=budgets(n, costs.dense, effort),
         planes=planes,
         surface=surface,
     )

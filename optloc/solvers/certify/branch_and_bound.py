@@ -130,9 +130,10 @@ def _text(corner: Corner) -> str:
 _MARGINS, _LEVEL = (LISTED_GAP, AMBIGUOUS_GAP, 0.0), 0.95
 # Rounds of proof and repair: every margin may be lowered and the region tried, with a few minima found in between.
 _ROUNDS = 6
-# Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
-# for each: a budget of all.
-_BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
+# Boxes for a proof, with up to so many nodes: of 60 fixes by six signal strengths in space, far ones too, nine in
+# ten took fewer than 4300, and each fewer than 8000. Plain Python takes a thousand times longer for each: a budget of
+# all.
+_BUDGET, _NODES, _SLOW_BUDGET, _AT_LEAST = 8000, 12, 2000, 5
 ALL_AROUND = 15
 """Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth,
 of two coordinates and 2 us each."""
@@ -325,19 +326,19 @@ def _asked(work: Work, items: Array) -> Asked:
         eps=equal_cost(fix.cost[items]),
         region=work.region[items],
         fallback=work.fallback[items],
-        budget=budgets(kappa, work.costs.dense, work.effort) * (ALL_AROUND if surface.shape[1] else 1),
+        budget=budgets(len(kappa), work.costs.dense, work.effort) * (ALL_AROUND if surface.shape[1] else 1),
         planes=planes,
         surface=surface,
     )
 
 
-def budgets(kappa: Array, nodes: float, effort: int) -> Array:
+def budgets(n: int, nodes: float, effort: int) -> Array:
     """Return the boxes (n,) that proofs may take: one takes time with the square of the nodes of dense rows."""
     if not enabled():
-        return np.full(len(kappa), max(_AT_LEAST, _SLOW_BUDGET // len(kappa)))
+        return np.full(n, max(_AT_LEAST, _SLOW_BUDGET // max(n, 1)))
     # The same time whatever the number of nodes, not the same number of boxes.
     share = max(1.0, (nodes / _NODES) ** 2) / effort
-    return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
+    return np.full(n, int(_BUDGET / share))
 
 
 def _unfinished(costs: Costs, count: int) -> str:

@@ -82,7 +82,7 @@ def question(edges: Edges, count: int, d: int, nodes: float) -> Asked:
         eps=np.empty(n),
         region=np.repeat(edges.region[None], n, axis=0),
         fallback=np.full((n, 2, d), np.nan),
-        budget=budgets(np.zeros(n), nodes, 1),
+        budget=budgets(n, nodes, 1),
         planes=np.zeros((n, 1, 3)),
         surface=np.zeros((n, 0)),
     )

@@ -1,0 +1,93 @@
+"""Logarithms of ranges over a box: signal strengths in decibels are multiples of them.
+
+Differences of logarithms stay finite and smooth at infinity, where scaled lines serve as well: their scale falls out.
+"""
+
+from __future__ import annotations
+
+from math import inf, log, log1p
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.proof.nodes.node import (
+    BALANCED,
+    Node,
+    Row,
+    Symmetric,
+    blend,
+    length,
+    range_bend,
+    range_form,
+    reach,
+    reaches,
+    still,
+    triple,
+    unbounded,
+    write,
+    write_symmetric,
+)
+
+# The least range of which a logarithm is taken: that of a place at the station itself has none.
+_LEAST = 1e-300
+
+
+@compiled
+def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
+    """Bound the logarithm of a range over a box (see `optloc.proof.nodes.node`).
+
+    With r' = r (1 + t) elsewhere in the box ``log r' = log r + t + (log(1 + t) - t)``, and the bracket is never
+    positive and falls with |t|. Where the box may touch the station the logarithm has no lower end.
+    """
+    h = triple(half, 0)
+    r, u, least, most, far = range_form(line, sense, h)
+    phi = log(max(r, _LEAST))
+    if not least > 0.0:
+        slope[0] = slope[1] = slope[2] = 0.0
+        return phi, -inf, log(max(far, _LEAST)) - phi
+    below, above = least / r - 1.0, far / r - 1.0
+    low, high = log1p(below), log1p(above)
+    less, more = min(log1p(below) - below, log1p(above) - above), most / r
+    # Else two numbers for the whole box say more than a slope and its remainder.
+    if more - less <= high - low:
+        write(blend(1.0 / r, u, 0.0, u), slope)
+        return phi, less, more
+    slope[0] = slope[1] = slope[2] = 0.0
+    return phi, low, high
+
+
+@compiled
+def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
+    """Bound how the logarithm of a range curves over a box (see `optloc.proof.nodes.node`).
+
+    Its gradient is g = u/r, u that of the range, and its Hessian that of the range over r less g g'.
+    """
+    h = triple(half, 0)
+    bound_logarithm(data, line, sense, half, turn)
+    r, u, least, most, _ = range_form(line, sense, h)
+    if still(turn) or not least > 0.0:
+        return unbounded(curvature, turn)
+    bend, du, chi, norm = range_bend(sense, h, r, u, least, most)
+    g, swing = blend(1.0 / r, u, 0.0, u), reach(u, h) + most
+    own: Symmetric = (
+        bend[0] / r - g[0] * g[0],
+        bend[1] / r - g[0] * g[1],
+        bend[2] / r - g[0] * g[2],
+        bend[3] / r - g[1] * g[1],
+        bend[4] / r - g[1] * g[2],
+        bend[5] / r - g[2] * g[2],
+    )
+    # g' - g = (u' - u - g (r' - r)) / r', as of any quotient.
+    wide = blend(1.0 / least, du, swing / least, (abs(g[0]), abs(g[1]), abs(g[2])))
+    dg = length(wide)
+    change = (chi + swing * norm / r) / least + dg * (2.0 * length(g) + dg)
+    (w0, w1, w2), away = reaches(own, h), change * length(h)
+    write((min(wide[0], w0 + away), min(wide[1], w1 + away), min(wide[2], w2 + away)), turn)
+    write_symmetric(own, curvature)
+    return change
+
+
+def _numbers(row: Row) -> Array:
+    return row.place(row.a)
+
+
+LOGARITHM = Node("log range", 3, 1, _numbers, bound_logarithm, curve_logarithm, infinity=BALANCED, of_station=True)
