@@ -267,8 +267,9 @@ def infinity(atlas: Atlas, piece: int) -> float:
 def within(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
     """Return whether a box around the centre set lies inside the convex box of minimum i, and whether in its core."""
     minima, d = atlas.minima, atlas.dimension
-    # Boxes of another face never lie inside: their coordinates are not those of the minimum.
-    convex = core = bool(minima.home[i] == atlas.place[0])
+    if minima.home[i] != atlas.place[0]:
+        return _within_from_another(atlas, half, i), False
+    convex = core = True
     for k in range(d):
         if not (convex or core):
             break
@@ -285,6 +286,52 @@ def within(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
         convex = convex and max(high, -low) <= minima.sides[i, k]
         core = core and high <= minima.core[i, 1, k] and low >= minima.core[i, 0, k]
     return convex, core
+
+
+@compiled
+def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
+    """Return whether a box around the centre set lies inside the convex box of a minimum whose home is another.
+
+    Coordinates there are quotients N/D of linear functions of those of the box, and so are sums of them: where they are
+    q at the centre they differ from that by ``(dN - q dD) / D'``.
+    """
+    minima, d, home = atlas.minima, atlas.dimension, int(atlas.minima.home[i])
+    level, face = home // 2, home < 2 * d
+    sign = 1.0 if home % 2 else -1.0
+    divisor = sign * atlas.point[level] if face else atlas.scale[0]
+    least = divisor
+    for c in range(d):
+        least -= half[c] * abs(atlas.slant[level, c] if face else atlas.scale[1 + c])
+    if not least > 0.0:  # part of the box is on the other side of the cube, or at infinity
+        return False
+    for k in range(d):
+        top = start = rounded = 0.0
+        for m in range(d):
+            part, column = minima.back[i, k, m], _column(m, level, face, d)
+            top += part * (atlas.scale[0] if column < 0 else atlas.point[column])
+            start += part * minima.start[i, m]
+            rounded += _PLACED * abs(part)
+        q = top / divisor
+        reach = rounded
+        for c in range(d):
+            slope = -q * (sign * atlas.slant[level, c] if face else atlas.scale[1 + c])
+            for m in range(d):
+                column = _column(m, level, face, d)
+                slope += minima.back[i, k, m] * (atlas.scale[1 + c] if column < 0 else atlas.slant[column, c])
+            reach += abs(slope) * half[c] / least
+        if not (abs(q - start) + reach) * _OUTWARDS <= minima.sides[i, k]:
+            return False
+    return True
+
+
+@inlined
+def _column(m: int, level: int, face: bool, d: int) -> int:
+    """Return which coordinate of p is coordinate m of a home, -1 for v; on a face that at its level is left out."""
+    if not face:
+        return m
+    if m == d - 1:
+        return -1
+    return m + 1 if m >= level else m
 
 
 class Frame(NamedTuple):

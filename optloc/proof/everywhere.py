@@ -474,9 +474,6 @@ UNBOUNDED = 8
 # between the stations and of others, and boxes after which that is given up for the atlas. What is six times as large
 # takes some sixteen boxes, as an atlas of a fix outside does; of what is fifty times as large few end with a hundred.
 _REACH, _REACH_OUTSIDE, _SOON = 50.0, 6.0, 100
-# How many times the budget a search may take where nothing but an enclosure is searched: four arrivals and a measured
-# height took 8 700 boxes of the whole Earth at the median of 1000 fixes, and 11 100 at most.
-_BOUNDED = 4
 # Distance, relative to that of the fix, within which two minima are the same: a descent's own accuracy.
 _CLOSE = 1e-3
 
@@ -515,7 +512,7 @@ def prove_everywhere(
     """
     nowhere, bound_to = np.full(x.shape[0], np.nan), beside.planes.shape[0] + beside.surface.shape[0] > 0
     open_end = not bound_to and reaches_infinity(cost.kinds, cost.K)  # the atlas is of all space
-    first, reach = (min(budget, _SOON), _reach_of(cost, x)) if open_end else (_BOUNDED * budget, inf)
+    first, reach = (min(budget, _SOON), _reach_of(cost, x)) if open_end else (budget, inf)
     verdict, boxes, bound = prove(cost, box, x, beside, gaps[0], eps, first, reach, nowhere, nowhere, False, found)
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))
     if not open_end or not again or boxes >= budget:
