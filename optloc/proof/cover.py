@@ -72,7 +72,8 @@ def cost_of_point(cost: Cost, box: Box, x: Array) -> float:
     for k in range(x.shape[0]):
         origin[k] = x[k]
     box.half[:] = 0.0
-    _bound_near(cost, Chart(origin, numbers[0], numbers[1], numbers[2], np.zeros(3), 0.0, np.zeros(0)), box)
+    plain = Chart(origin, numbers[0], numbers[1], numbers[2], np.zeros(3), 0.0, np.zeros(0), False, origin)
+    _bound_near(cost, plain, box)
     return cost_at(cost.K, cost.w, box.nodes)
 
 

@@ -171,7 +171,7 @@ def branch(
             continue
         if unique or aim.whole:
             if bent:
-                curve_along(cost, box)
+                curve_along(cost, chart, box)
             else:
                 curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
             sum_up(K, w, weight, noise, nodes, curves, sums)

@@ -8,16 +8,19 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put_rows, zero
+from optloc.compute.jit import compiled, inlined, put, put_rows, zero
 from optloc.compute.systems import invert, roughly_principal
-from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, rounding
+from optloc.models.primitives import WGS84_A
+from optloc.proof.atlas import Atlas, atlas_of
+from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, cube, digits, reaches_infinity, rounding
 from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
-from optloc.proof.nodes.dispatch import size_of
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, size_of
 from optloc.proof.nodes.level import LEAST_RADIUS
 from optloc.proof.nodes.node import ANY, CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE
 from optloc.proof.surface import (
     FIRST,
     GRAPH_WIDTH,
+    LEVEL,
     MIDDLE,
     SAG,
     SECOND,
@@ -48,6 +51,8 @@ _PLACED = 8.0 * 2.0**-52
 # position to stations are as exact as their own lengths, for a difference of two doubles is rounded once: what is left
 # are the 8 roundings of a position as it is placed.
 LINES = 0.25
+# Rounding of a residual up to which ranges are counted from a place: costs can then be told apart to a hundredth.
+_SHARP = 0.02
 # References of a group that needs none, and of one whose rows are too few.
 NONE, LOOSE = -1, -2
 
@@ -141,6 +146,9 @@ class Chart(NamedTuple):
         The sizes of what residuals are differences of, beside the nodes: measurements and coordinates.
     surface : array (0,) or (SURFACE_WIDTH,)
         The surface of a height, with the axes of this piece.
+    differs, middle : bool, array (3,)
+        Whether ranges on it are counted from a place, the middle of the stations: differences of ranges
+        (`optloc.proof.nodes.range.bound_difference`) bend less over boxes as large as a continent.
     """
 
     origin: Array
@@ -150,6 +158,8 @@ class Chart(NamedTuple):
     slip: Array
     floor: float
     surface: Array
+    differs: bool
+    middle: Array
 
 
 class Box(NamedTuple):
@@ -171,6 +181,8 @@ class Box(NamedTuple):
         Ends of the part of the box that is left, about its centre.
     sense, gram, graph, lean : array (3, 3), (3, 3), (GRAPH_WIDTH,), (J,)
         Of a box on a surface: its own T and T'T, the graph of the surface, and slopes along the upward axis.
+    inside : Atlas
+        Of a box on a surface: its place in the inside of an atlas, whose cube is as large as the Earth.
     """
 
     at: Array
@@ -187,6 +199,7 @@ class Box(NamedTuple):
     gram: Array
     graph: Array
     lean: Array
+    inside: Atlas
 
 
 @compiled
@@ -315,6 +328,7 @@ def empty_box(q: int, J: int) -> Box:
         np.empty((3, 3)),
         np.empty(GRAPH_WIDTH),
         np.empty(J),
+        atlas_of(np.zeros(3), LEAST_RADIUS, 3, 0),
     )
 
 
@@ -374,7 +388,31 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         for m in range(3):
             gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
     floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin, LINES)
-    return Chart(origin, sense, back, gram, slip, floor, own), good
+    chart = Chart(origin, sense, back, gram, slip, floor, own, False, origin)
+    if own.shape[0] > 0 and reaches_infinity(cost.kinds, cost.K):
+        middle, _ = cube(cost.kinds, cost.data, x)
+        floor += _length_of_lines(cost, own, middle)
+        # Lines from anywhere have fewer digits than those from the fix, which very sharp rows need.
+        if digits(cost.K) * floor < _SHARP:
+            chart = Chart(origin, sense, back, gram, slip, floor, own, True, middle)
+    return chart, good
+
+
+@compiled
+def _length_of_lines(cost: Cost, surface: Array, middle: Array) -> float:
+    """Return the sizes of what differences of ranges are made of: lines from anywhere on a surface, and two of them."""
+    size, total = WGS84_A + abs(surface[LEVEL]) + abs(middle[0]) + abs(middle[1]) + abs(middle[2]), 0.0
+    for j in range(cost.kinds.shape[0]):
+        if cost.kinds[j] == RANGE:
+            total += 4.0 * cost.weight[j] * (size + abs(cost.data[j, 0]) + abs(cost.data[j, 1]) + abs(cost.data[j, 2]))
+    return total
+
+
+@compiled
+def without_differences(chart: Chart) -> Chart:
+    """Return the same search coordinates, in which ranges are bounded one by one."""
+    origin = chart.origin
+    return Chart(origin, chart.sense, chart.back, chart.gram, chart.slip, chart.floor, chart.surface, False, origin)
 
 
 @compiled
@@ -440,19 +478,39 @@ def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
     if not lay(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
         box.half[2] = 0.0
         return False
-    bound_nodes(cost.kinds, cost.data, box.centre, box.sense, box.gram, box.half, box.line, box.nodes)
+    if chart.differs:
+        _set_inside(chart, box)
+        bound_pieces(box.inside, cost.kinds, cost.data, box.half, box.nodes)
+    else:
+        bound_nodes(cost.kinds, cost.data, box.centre, box.sense, box.gram, box.half, box.line, box.nodes)
     fold_bounds(box.graph, box.lean, box.nodes)
     box.half[2] = 0.0
     return True
 
 
 @compiled
-def curve_along(cost: Cost, box: Box) -> None:
+def _set_inside(chart: Chart, box: Box) -> None:
+    """Set the centre of a box on a surface, and its axes, in the inside of the box's atlas."""
+    inside = box.inside
+    put(chart.middle, inside.middle)
+    inside.scale[0] = 1.0
+    for m in range(3):
+        inside.point[m] = (box.centre[m] - inside.middle[m]) / inside.radius
+        inside.scale[1 + m] = 0.0
+        for k in range(3):
+            inside.slant[m, k] = box.sense[m, k] / inside.radius
+
+
+@compiled
+def curve_along(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the table of second derivatives along a surface of a box that lies on it."""
     unfold_slopes(box.lean, box.nodes)
     box.half[2] = box.graph[SAG] + box.graph[SLIP]
     sense, gram, half, line, nodes, curves = box.sense, box.gram, box.half, box.line, box.nodes, box.curves
-    curve_nodes(cost.kinds, cost.data, box.centre, sense, gram, half, line, box.solve, nodes, curves)
+    if chart.differs:
+        curve_pieces(box.inside, cost.kinds, cost.data, half, nodes, curves)
+    else:
+        curve_nodes(cost.kinds, cost.data, box.centre, sense, gram, half, line, box.solve, nodes, curves)
     fold_curves(box.graph, box.lean, nodes, curves)
     box.half[2] = 0.0
 
@@ -464,7 +522,7 @@ def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     if chart.surface.shape[0] == 0:
         curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
     else:
-        curve_along(cost, box)
+        curve_along(cost, chart, box)
     noise = rounding(cost.K, cost.weight, chart.floor, nodes)
     sum_up(cost.K, cost.w, cost.weight, noise, nodes, curves, box.sums)
 
@@ -547,4 +605,6 @@ def turned(cost: Cost, chart: Chart, side: int) -> Chart:
         origin[m] = own[MIDDLE + m] + radius * own[UP + m]
     slip[2] = 0.0
     floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin, LINES)
-    return Chart(origin, sense, back, numbers[2], slip, floor, own)
+    if chart.differs:
+        floor += _length_of_lines(cost, own, chart.middle)
+    return Chart(origin, sense, back, numbers[2], slip, floor, own, chart.differs, chart.middle)

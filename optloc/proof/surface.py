@@ -109,7 +109,7 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
             centre[m] -= off / rise * up[m]
     if not abs(off) <= _LOOSE * exact:
         return False
-    reach = size = 0.0
+    farthest = size = 0.0
     for k in range(2):
         lean = -inner(normal, (sense[0, k], sense[1, k], sense[2, k])) / rise
         square = 0.0
@@ -117,10 +117,14 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
             sense[m, k] += up[m] * lean
             square += sense[m, k] * sense[m, k]
         graph[_STEEP0 + k] = sqrt(square)  # the length of the column, for now
-        reach += sqrt(square) * half[k]
+        farthest += square * half[k] * half[k]
         size += square
-    # With |w| <= reach + sag the height is at most (its slope).w + |w|^2 / 2R: what holds t between zero and the sag.
-    radius = LEAST_RADIUS + surface[LEVEL] - 2.0 * reach
+    between = sense[0, 0] * sense[0, 1] + sense[1, 0] * sense[1, 1] + sense[2, 0] * sense[2, 1]
+    reach = sqrt(farthest + 2.0 * abs(between) * half[0] * half[1])
+    # A tangent plane is outside the surface, and so is all between the two: nowhere there does a height curve more than
+    # on the surface. With |w| <= reach it is at most |w|^2 / 2R in the plane, and falls from there by its slope less
+    # what the normal turns on the way: that holds t between zero and the sag.
+    radius = LEAST_RADIUS + surface[LEVEL]
     if not radius > _LEFT * LEAST_RADIUS:
         return False
     bend = 1.0 / radius

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from optloc.base.frames import Frame
 from optloc.base.types import Array, Status
 from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
@@ -22,7 +23,7 @@ from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
 
 
-def is_hidden(problem: Problem, x: Array) -> Array:
+def is_hidden(problem: Problem, x: Array, reach: float = 0.0) -> Array:
     """Return which vectors x (N, size) place a target behind the Earth as seen from a station that hears it.
 
     One end of the line is in space, above 100 km: no wave passes through the Earth and leaves it. Or the row is an
@@ -36,34 +37,68 @@ def is_hidden(problem: Problem, x: Array) -> Array:
         Flat batch of N problems; in plain Cartesian frames nothing is hidden.
     x : array (N, size)
         Parameter vectors.
+    reach : float
+        Whether all within so many metres is hidden as well.
     """
     out = np.zeros(len(x), dtype=bool)
-    for _, blocked in _blocked(problem, x):
-        out |= blocked
+    for sight in sights(problem):
+        out |= sight.blocked(x, reach).any(1)
     return out
 
 
-def _blocked(problem: Problem, x: Array) -> Iterator[tuple[int, Array]]:
-    """Yield each station that measures a target, and where the Earth is between them (N,); arguments of `is_hidden`."""
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """The lines of sight of a target to its k stations.
+
+    Parameters
+    ----------
+    frame : Frame
+        Of the vectors.
+    part : slice
+        Where its position is in a vector.
+    station : int array (k,)
+        Numbers of the stations.
+    place : array (N, k, 3)
+        Where they are, Earth-centred, in coordinates in which the ellipsoid is the unit sphere.
+    heard, seen : bool array (N, k)
+        In which problems they have a row, and in which an angle.
+    """
+
+    frame: Frame
+    part: slice
+    station: Array
+    place: Array
+    heard: Array
+    seen: Array
+
+    def blocked(self, x: Array, reach: float = 0.0) -> Array:
+        """Return to which stations (N, k) the Earth blocks the sight of vectors x (N, size), see `is_hidden`."""
+        point = self.frame.to_ecef(x[:, self.part]) * _STRETCH
+        return _is_blocked(point[:, None], self.place, self.heard, self.seen, reach * float(_STRETCH.max()))
+
+
+# Stretched along the axis the ellipsoid is the unit sphere, and lines stay lines.
+_STRETCH = np.array([1.0, 1.0, 1.0 / (1.0 - WGS84_F)]) / WGS84_A
+
+
+def sights(problem: Problem) -> list[Sight]:
+    """Return the lines of sight of all targets of a flat batch; none in plain Cartesian frames."""
     if not problem.frame.geodetic or problem.dimension != 3:
-        return
-    position = np.broadcast_to(problem.stations.position, (len(x), *problem.stations.position.shape[-3:]))
-    # stretched along the axis the ellipsoid is the unit sphere, and lines stay lines
-    stretch = np.array([1.0, 1.0, 1.0 / (1.0 - WGS84_F)]) / WGS84_A
-    stations = problem.frame.to_ecef(position) * stretch
+        return []
+    found, position = list[Sight](), problem.stations.position
+    place = problem.frame.to_ecef(position if position.ndim == 4 else position[None]) * _STRETCH
     for target, motion in enumerate(problem.motions):
         if motion.known is not None or motion.span == "epoch":
             continue
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
-        point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3]) * stretch
-        sighted = {(epoch, station): seen for epoch, station, seen in _heard(problem, target, angles=True)}
-        for epoch, station, heard in _heard(problem, target):
-            seen = sighted.get((epoch, station), np.zeros_like(heard))
-            yield station, _is_blocked(point, stations[:, epoch, station], heard, seen)
+        epoch, station, heard, seen = _heard(problem, target)
+        part = slice(slot.start, slot.start + 3)
+        found.append(Sight(problem.frame, part, station, place[:, epoch, station], heard, seen))
+    return found
 
 
-def _heard(problem: Problem, target: int, *, angles: bool = False) -> list[tuple[int, int, Array]]:
-    """Return (epoch, station, mask (N,) of problems in which it has a row) of every station that measures a target.
+def _heard(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
+    """Return epochs and stations (k,) that measure a target, in which problems (N, k), and in which by an angle.
 
     Parameters
     ----------
@@ -71,32 +106,39 @@ def _heard(problem: Problem, target: int, *, angles: bool = False) -> list[tuple
         Flat batch of N problems.
     target : int
         The target.
-    angles : bool
-        Whether only angles count as rows.
     """
     moving = problem.stations.position.shape[-3] > 1
     weight = np.broadcast_to(problem.weight, (problem.batch_shape[0], problem.count))
+    none = np.zeros(len(weight), dtype=bool)
     found: dict[tuple[int, int], Array] = {}
+    sighted: dict[tuple[int, int], Array] = {}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
-        if angles and MODELS[rows.kind].quantity != "angle":
-            continue
-        present = weight[:, start : start + rows.count] > 0.0
-        for index in (rows.a, rows.b)[: MODELS[rows.kind].stations]:
-            for i in np.flatnonzero(rows.target == target):
+        present, model = weight[:, start : start + rows.count] > 0.0, MODELS[rows.kind]
+        mine = np.flatnonzero(rows.target == target).tolist()
+        for index in (rows.a, rows.b)[: model.stations]:
+            for i in mine:
                 key = (int(rows.epoch[i]) if moving else 0, int(index[i]))
-                found[key] = found.get(key, np.zeros(len(present), dtype=bool)) | present[:, i]
-    return [(epoch, station, mask) for (epoch, station), mask in found.items()]
+                found[key] = found.get(key, none) | present[:, i]
+                if model.quantity == "angle":
+                    sighted[key] = sighted.get(key, none) | present[:, i]
+    epoch, station = np.array(list(found), dtype=int).reshape(-1, 2).T
+    heard, seen = (np.empty((len(weight), len(found)), dtype=bool) for _ in range(2))
+    for k, key in enumerate(found):
+        heard[:, k], seen[:, k] = found[key], sighted.get(key, none)
+    return epoch, station, heard, seen
 
 
-def _is_blocked(point: Array, station: Array, heard: Array, seen: Array) -> Array:
+def _is_blocked(point: Array, station: Array, heard: Array, seen: Array, reach: float) -> Array:
     """Return whether the line from point to station dips too deep; unit sphere coordinates.
 
     Parameters
     ----------
-    point, station : array (N, 3)
+    point, station : array (..., 3)
         Ends of the line.
-    heard, seen : bool array (N,)
+    heard, seen : bool array (...)
         Whether the station has a row, and whether it has an angle.
+    reach : float
+        How much deeper it has to dip.
     """
     satellite = (station**2).sum(-1) > SATELLITE**2
     limit = np.where(satellite, GRAZE, GROUND)
@@ -105,8 +147,8 @@ def _is_blocked(point: Array, station: Array, heard: Array, seen: Array) -> Arra
         outside = seen | satellite | ((point**2).sum(-1) > SATELLITE**2)
         # the point of the segment next to the centre; at its ends nothing lies in between
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
-        nearest = ((point + share[:, None] * line) ** 2).sum(-1)
-    return np.asarray(heard & outside & (share > 0.0) & (nearest < limit**2))
+        nearest = ((point + share[..., None] * line) ** 2).sum(-1)
+    return np.asarray(heard & outside & (share > 0.0) & (nearest < (limit - reach) ** 2))
 
 
 def lowest_sight(problem: Problem, x: Array) -> Array:
@@ -125,11 +167,11 @@ def lowest_sight(problem: Problem, x: Array) -> Array:
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
         point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3])
         up = np.stack(geodetic_normal((point[:, 0], point[:, 1], point[:, 2])), axis=-1)
-        for epoch, station, heard in _heard(problem, target):
-            line = stations[:, epoch, station] - point
-            high = heard & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
-            sine = (line * up).sum(-1) / np.sqrt((line**2).sum(-1))
-            worst = np.where(high, np.minimum(worst, sine), worst)
+        epoch, station, heard, _ = _heard(problem, target)
+        line = stations[:, epoch, station] - point[:, None]
+        high = heard & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
+        sine = (line * up[:, None]).sum(-1) / np.sqrt((line**2).sum(-1))
+        worst = np.minimum(worst, np.where(high, sine, np.inf).min(-1, initial=np.inf))
     return np.where(np.isfinite(worst), worst, 0.0)
 
 
@@ -370,7 +412,8 @@ def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
 
 def _below(problem: Problem, x: Array, item: int) -> str:
     """Return the names of the stations that the Earth hides from a target at a vector (size,) of one problem."""
-    found = sorted({station for station, blocked in _blocked(problem.take(np.array([item])), x[None]) if blocked[0]})
+    lines = sights(problem.take(np.array([item])))
+    found = sorted({int(one) for sight in lines for one in sight.station[sight.blocked(x[None])[0]]})
     names = [problem.stations.names[station] for station in found]
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return f"{', '.join(names[:_NAMED])}{more}"

@@ -33,13 +33,23 @@ from optloc.problem.epochs import separable
 from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_here
-from optloc.proof.near import UNIQUE
+from optloc.proof.near import OTHER, UNIQUE
 from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
 from optloc.proof.scope import is_run, unsupported
+from optloc.proof.search_space import HIDDEN_REACH
 from optloc.proof.surface import UP
-from optloc.solvers.certify.branch_and_bound import ALL_AROUND, METHOD, budgets, certify_stage, gaps_below, sentence
+from optloc.solvers.certify.branch_and_bound import (
+    ALL_AROUND,
+    HIDDEN,
+    METHOD,
+    budgets,
+    certify_stage,
+    gaps_below,
+    sentence,
+)
 from optloc.solvers.certify.out_of_reach import Edges, Scratch, are_out_of_reach, edges_of, scratch
 from optloc.solvers.certify.position_cost import agrees, surfaces_of
+from optloc.solvers.inequalities import Sight, sights
 from optloc.solvers.methods import Method
 from optloc.solvers.planned import active_of, direct_stages
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
@@ -142,6 +152,8 @@ class Single:
         Which of what holds fixes is the height whose gradient is the surface's upward axis.
     edges : Edges, optional
         Bounds that proofs show to be out of reach; None without bounds.
+    sights : list of Sight
+        Lines of sight that the Earth may block.
     absent : bool array (m,), optional
         Rows of weight zero, which may hold anything; None where all count.
     centre : array (d,)
@@ -163,6 +175,7 @@ class Single:
     surface: Array
     upward: int | None
     edges: Edges | None
+    sights: list[Sight]
     absent: Array | None
     centre: Array
     doubt: float
@@ -221,6 +234,9 @@ class Single:
             asked.eps[i] = equal_cost(one.cost)
         asked.x[:] = answer.x[:, :d]
         prove_here(room.costs, asked, answered)
+        if self.sights:
+            for i in range(len(found)):
+                self._pass_hidden(room, answer.x[i], i)
         if self.edges is not None and not self._is_inside(self.edges, answer, room):
             return False
         told = zip(found, *(array.tolist() for array in (answered.verdict, *answered[2:6])), strict=True)
@@ -231,6 +247,24 @@ class Single:
             if not abs(one.cost - bound) <= _APART * equal_cost(one.cost):
                 return False
         return True
+
+    def _pass_hidden(self, room: _Room, x: Array, i: int) -> None:
+        """Prove a fix x (size,), number i, anew beside the minima that a proof meets behind the Earth."""
+        one, d = slice(i, i + 1), room.asked.x.shape[-1]
+        costs, asked, answered = room.costs.take(one), room.asked.take(one), room.answered.take(one)
+        asked.hidden[0] = 0
+        boxes = 0
+        while answered.verdict[0] == OTHER and asked.hidden[0] < HIDDEN:
+            met = x.copy()
+            met[:d] = answered.found[0]
+            if not any(sight.blocked(met[None], HIDDEN_REACH).any() for sight in self.sights):
+                break
+            asked.others[0, asked.known[0]] = met[:d]
+            asked.known[0] += 1
+            asked.hidden[0] += 1
+            boxes += int(answered.boxes[0])
+            prove_here(costs, asked, answered)
+        answered.boxes[0] += boxes
 
     def _is_inside(self, edges: Edges, answer: Answer, room: _Room) -> bool:
         """Return whether nothing on a bound costs as little as what the proofs are about."""
@@ -313,7 +347,7 @@ class Single:
         nowhere = np.full((n, 2, d), np.nan)
         asked = Asked(
             x=np.empty((n, d)),
-            others=np.zeros((n, 1, d)),
+            others=np.zeros((n, 1 + HIDDEN, d)),  # another image, and what the Earth hides
             known=np.zeros(n, dtype=np.int64),
             hidden=np.zeros(n, dtype=np.int64),
             gaps=np.tile(gaps_below(LISTED_GAP, d), (n, 1)),
@@ -427,6 +461,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         surface,
         upward[0] if upward else None,
         edges,
+        sights(bare.flat()),
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),
         largest(plan.dof, DOUBT),

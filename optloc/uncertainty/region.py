@@ -223,7 +223,17 @@ def _cover(surface: Surface, threshold: float, boxes: int | None) -> tuple[Cells
     lists, endless = room(most), bool(reaches_infinity(cost.kinds, cost.K))
     if endless and surface.kind != CARTESIAN:
         return _far_cells(cost, x, level, most, lists)
-    axes = Axes(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), 0.0, np.zeros(0))
+    axes = Axes(
+        np.zeros(3),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+        np.zeros(3),
+        0.0,
+        np.zeros(0),
+        False,
+        np.zeros(3),
+    )
     count, inside, _ = cover_near(cost, box, x, level, most, lists, axes)
     if count >= 0:
         return _near_cells(lists[2, :count], axes, d, inside), False, ""

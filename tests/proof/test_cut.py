@@ -126,7 +126,7 @@ def some_box(rng, made):
     box = empty_box(len(made.K), len(made.names))
     box.half[:d] = 10.0 ** rng.uniform(-2.0, 0.3, d)
     floor = 2.0 * (np.abs(x).sum() + np.abs(made.data[:, :6]).sum()) * np.abs(made.K).sum()
-    return Chart(x, sense, back, sense.T @ sense, np.zeros(3), floor, np.zeros(0)), box
+    return Chart(x, sense, back, sense.T @ sense, np.zeros(3), floor, np.zeros(0), False, x), box
 
 
 def some_point(rng, half):

@@ -58,6 +58,7 @@ from optloc.proof.search_space import (
     equal_within,
     turned,
     widen,
+    without_differences,
 )
 from optloc.proof.surface import SIDES, is_one_side, reach_of_piece
 
@@ -220,6 +221,7 @@ def prove_run(
     """
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
+    chart = without_differences(chart)  # few rows are balanced where all may not be
     least = cost_of_place(run, x, tables)
     middle, radius = cube(run.cost.kinds, run.cost.data, x)
     bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])

@@ -123,7 +123,7 @@ def set_curves(space: Space, cost: Cost, box: Box) -> None:
     if space.far:
         curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
     elif chart.surface.shape[0] > 0:
-        curve_along(cost, box)
+        curve_along(cost, chart, box)
     else:
         half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
         curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)

@@ -139,8 +139,8 @@ ALL_AROUND = 2
 of two coordinates and 2 us each."""
 # Within what share of its distance from the fix a minimum that was met is one that is listed: a descent's accuracy.
 _SAME = 1e-3
-# Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
-_HIDDEN = 4
+HIDDEN = 4
+"""Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof."""
 
 
 @dataclass(slots=True)
@@ -449,30 +449,18 @@ def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
 def _ignore(work: Work, items: Array, points: Array) -> Array:
     """Note the minima next to points (n, d) that the Earth hides, and return which are new (n,)."""
     problem = work.problem
-    if not problem.frame.geodetic or problem.motions[0].order or not len(items) or work.ignored.shape[1] >= _HIDDEN:
+    if not problem.frame.geodetic or problem.motions[0].order or not len(items) or work.ignored.shape[1] >= HIDDEN:
         return np.zeros(len(items), dtype=bool)
     part = problem.take(items)
     done = refine(part, vectors(part, points[:, None])[:, 0], face=exact(problem))
     place = problem.layout.take(done.x, "position")
     # The same minimum, refined twice: metres in Earth-centred coordinates.
     known = (np.abs(work.ignored[items] - place[:, None]) <= 1e-6 * np.abs(place[:, None])).all(-1).any(1)
-    fresh = _deep(part, done.x) & ~known
+    fresh = is_hidden(part, done.x, HIDDEN_REACH) & ~known
     more = np.full((len(work.ignored), 1, place.shape[-1]), np.nan)
     more[items[fresh], 0] = place[fresh]
     work.ignored = np.concatenate([work.ignored, more], axis=1)
     return np.asarray(fresh)
-
-
-def _deep(problem: Problem, x: Array) -> Array:
-    """Return which vectors (N, size) the Earth hides together with all that is near them, (N,)."""
-    slot, _ = problem.layout.find("position")
-    out = np.asarray(np.isfinite(x).all(-1))
-    for axis in range(slot.start, slot.start + slot.size):
-        for side in (-HIDDEN_REACH, HIDDEN_REACH):
-            beside = np.where(np.isfinite(x), x, 0.0)
-            beside[:, axis] += side
-            out &= is_hidden(problem, beside)
-    return out
 
 
 def keep_evidence(pool: Pool, before: Pool) -> Pool:
