@@ -292,8 +292,8 @@ def within(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
 def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
     """Return whether a box around the centre set lies inside the convex box of a minimum whose home is another.
 
-    Coordinates there are quotients N/D of linear functions of those of the box, and so are sums of them: where they are
-    q at the centre they differ from that by ``(dN - q dD) / D'``.
+    Sums of coordinates there are quotients N/D of linear functions of the box's coordinates. From their value q at the
+    centre they differ by ``(dN - q dD) / D'``.
     """
     minima, d, home = atlas.minima, atlas.dimension, int(atlas.minima.home[i])
     level, face = home // 2, home < 2 * d
@@ -326,7 +326,7 @@ def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
 
 @inlined
 def _column(m: int, level: int, face: bool, d: int) -> int:
-    """Return which coordinate of p is coordinate m of a home, -1 for v; on a face that at its level is left out."""
+    """Return the coordinate of p for coordinate m of a home, -1 for v; a face leaves out its level coordinate."""
     if not face:
         return m
     if m == d - 1:

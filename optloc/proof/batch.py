@@ -12,9 +12,10 @@ from optloc.base.types import Array
 from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, worth_loading
 from optloc.proof.box import bound_nodes, cost_at, rounding
 from optloc.proof.everywhere import prove_everywhere
+from optloc.proof.groups import empty_groups
 from optloc.proof.near import OPEN, prove
 from optloc.proof.position_costs import PositionCosts
-from optloc.proof.search_space import LINES, Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
+from optloc.proof.search_space import LINES, Cost, Known, accuracy_floor, cost_of, empty_box, set_geometry
 
 # Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
 # what is left of a batch by stretches, of which each should get several (`_PARTS` in all).

@@ -95,7 +95,7 @@ def middle_of(low: float, high: float) -> float:
 
 @inlined
 def size_within(low: float, high: float) -> float:
-    """Return the sizes of the ends of an interval, as far as it has ends: what is rounded is finite."""
+    """Return the sizes of the finite ends of an interval, which limit its accuracy."""
     size = abs(low) + abs(high)
     return size if size < inf else abs(middle_of(low, high))
 
@@ -156,7 +156,7 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
             if radius < inf:
                 reach -= abs(total) * radius
             elif not total * _open_side(nodes, j) > digits(K) * weight[j] * sqrt(length):
-                return -1.0  # along v the node takes off as much as it likes
+                return -1.0  # along v the node has no bound
     return float(reach / sqrt(length)) - rounding(K, weight, floor, nodes)
 
 
@@ -251,7 +251,7 @@ def _open_side(nodes: Array, j: int) -> float:
 
 @compiled
 def _move_beyond(K: Array, weight: float, rows: Array, pull: float, side: float) -> float:
-    """Return by how much a node without an end on one side goes there, so that it takes nothing off along v."""
+    """Return a step of a node towards the side without an end, after which it takes nothing off along v."""
     length = 0.0
     for i in range(K.shape[0]):
         length += rows[i, DIRECTION] * rows[i, DIRECTION]

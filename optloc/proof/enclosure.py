@@ -10,9 +10,10 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
 from optloc.compute.systems import inverse, invert
 from optloc.proof.box import rounding
+from optloc.proof.groups import LOOSE
 from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
 from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
-from optloc.proof.search_space import LOOSE, Box, Chart, Cost
+from optloc.proof.search_space import Box, Chart, Cost
 
 # Balls that hold all points at which one node lies in an interval.
 
@@ -52,8 +53,8 @@ def around_node(
 def around_foci(one: Array, other: Array, most: float, x: Array, back: Array, lower: Array, upper: Array) -> None:
     """Clip a box of search coordinates by all points whose distances from two places sum to `most` at most.
 
-    They are an ellipsoid of revolution. With 2a the sum and c the vector from its centre to a focus, it reaches
-    ``sqrt((a^2 - |c|^2) |b|^2 + (b.c)^2)`` from its centre along a row b of `back`.
+    They are an ellipsoid of revolution, with 2a the sum and c the vector from its centre to a focus. Along a row b of
+    `back` it reaches ``sqrt((a^2 - |c|^2) |b|^2 + (b.c)^2)`` from its centre.
 
     Parameters
     ----------
@@ -430,7 +431,7 @@ def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bo
 def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array) -> bool:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
-    Within a group of nodes (`optloc.proof.search_space.Groups`) errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
+    Within a group of nodes (`optloc.proof.groups.Groups`) errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
     Ranges and linear forms are squared to equations linear in position and one more unknown; sums of two ranges give
     ellipsoids, and other nodes balls of their own.
 

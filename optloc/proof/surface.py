@@ -121,9 +121,9 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
         size += square
     between = sense[0, 0] * sense[0, 1] + sense[1, 0] * sense[1, 1] + sense[2, 0] * sense[2, 1]
     reach = sqrt(farthest + 2.0 * abs(between) * half[0] * half[1])
-    # A tangent plane is outside the surface, and so is all between the two: nowhere there does a height curve more than
-    # on the surface. With |w| <= reach it is at most |w|^2 / 2R in the plane, and falls from there by its slope less
-    # what the normal turns on the way: that holds t between zero and the sag.
+    # A tangent plane is outside the surface, and so is all between the two. Nowhere there does a height curve more than
+    # on the surface. With |w| <= reach it is at most |w|^2 / 2R in the plane. From there it falls by its slope, less
+    # the turn of the normal on the way. So t is between zero and the sag.
     radius = LEAST_RADIUS + surface[LEVEL]
     if not radius > _LEFT * LEAST_RADIUS:
         return False

@@ -38,7 +38,7 @@ def is_hidden(problem: Problem, x: Array, reach: float = 0.0) -> Array:
     x : array (N, size)
         Parameter vectors.
     reach : float
-        Whether all within so many metres is hidden as well.
+        Radius, metres, of a ball that must be hidden as a whole.
     """
     out = np.zeros(len(x), dtype=bool)
     for sight in sights(problem):
@@ -60,21 +60,21 @@ class Sight:
         Numbers of the stations.
     place : array (N, k, 3)
         Where they are, Earth-centred, in coordinates in which the ellipsoid is the unit sphere.
-    heard, seen : bool array (N, k)
-        In which problems they have a row, and in which an angle.
+    present, angular : bool array (N, k)
+        Whether they have a row in a problem, and whether it has an angle.
     """
 
     frame: Frame
     part: slice
     station: Array
     place: Array
-    heard: Array
-    seen: Array
+    present: Array
+    angular: Array
 
     def blocked(self, x: Array, reach: float = 0.0) -> Array:
         """Return to which stations (N, k) the Earth blocks the sight of vectors x (N, size), see `is_hidden`."""
         point = self.frame.to_ecef(x[:, self.part]) * _STRETCH
-        return _is_blocked(point[:, None], self.place, self.heard, self.seen, reach * float(_STRETCH.max()))
+        return _is_blocked(point[:, None], self.place, self.present, self.angular, reach * float(_STRETCH.max()))
 
 
 # Stretched along the axis the ellipsoid is the unit sphere, and lines stay lines.
@@ -128,14 +128,14 @@ def _heard(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
     return epoch, station, heard, seen
 
 
-def _is_blocked(point: Array, station: Array, heard: Array, seen: Array, reach: float) -> Array:
+def _is_blocked(point: Array, station: Array, present: Array, angular: Array, reach: float) -> Array:
     """Return whether the line from point to station dips too deep; unit sphere coordinates.
 
     Parameters
     ----------
     point, station : array (..., 3)
         Ends of the line.
-    heard, seen : bool array (...)
+    present, angular : bool array (...)
         Whether the station has a row, and whether it has an angle.
     reach : float
         How much deeper it has to dip.
@@ -144,11 +144,11 @@ def _is_blocked(point: Array, station: Array, heard: Array, seen: Array, reach: 
     limit = np.where(satellite, GRAZE, GROUND)
     line = station - point
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        outside = seen | satellite | ((point**2).sum(-1) > SATELLITE**2)
+        outside = angular | satellite | ((point**2).sum(-1) > SATELLITE**2)
         # the point of the segment next to the centre; at its ends nothing lies in between
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[..., None] * line) ** 2).sum(-1)
-    return np.asarray(heard & outside & (share > 0.0) & (nearest < (limit - reach) ** 2))
+    return np.asarray(present & outside & (share > 0.0) & (nearest < (limit - reach) ** 2))
 
 
 def lowest_sight(problem: Problem, x: Array) -> Array:

@@ -249,7 +249,7 @@ class Single:
         return True
 
     def _pass_hidden(self, room: _Room, x: Array, i: int) -> None:
-        """Prove a fix x (size,), number i, anew beside the minima that a proof meets behind the Earth."""
+        """Prove a fix x (size,), number i, again without the minima behind the Earth that its proof meets."""
         one, d = slice(i, i + 1), room.asked.x.shape[-1]
         costs, asked, answered = room.costs.take(one), room.asked.take(one), room.answered.take(one)
         asked.hidden[0] = 0

@@ -273,7 +273,7 @@ def _answer(
     part = problem.take(items)
     found = lsr(part, offer(part, starts(part), take(pool, items), "search", began))
     now = judge(part, found)
-    # where nothing was known, why what was found is no answer says more than why no closed form began
+    # a minimum with an objection is better news than a missing start
     better = np.isin(fix.code[items], _STARTLESS) & ~np.isin(now.code, _STARTLESS)
     good = np.flatnonzero(now.answered | better)
     found = replace(found, **says(fix.reason[items]))

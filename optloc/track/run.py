@@ -16,6 +16,7 @@ from optloc.compute.filter import CODE, GENERAL, INNOVATION, PRESENT, REJECTED_R
 from optloc.problem.epochs import joined
 from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
+from optloc.solvers.verdict.findings import Finding, objections
 from optloc.track.dynamics import Dynamics
 from optloc.track.scan_rows import Scans
 from optloc.track.start import Beginning, Fit, Undecided, begin, reach, with_height_rows
@@ -300,14 +301,40 @@ class _Run:
 
     def _entry(self, k: int, done: Updated, code: int, lost: int, causes: list[str]) -> Entry:
         """Return the entry of an update, of which a number of rows (`lost`) did not pass the gate."""
-        status, rejected, count, reason = Status(code), lost + self.bad[k], int(done.count), ""
-        if status == Status.TOO_FEW_ROWS and not rejected:
-            reason = "no valid row: the state was only predicted"
-        elif rejected > count:
-            status, reason = Status.REJECTED, f"{rejected} of {rejected + count} rows were left out"
-        elif status == Status.NUMERICAL:
-            reason = "; ".join([*causes, "the update failed: the state was only predicted"])
+        rejected = lost + self.bad[k]
+        found = objections(_FINDINGS, _Taken(Status(code), rejected, int(done.count), causes))
+        status, reason = found[0] if found else (Status(code), "")
         return Entry(float(self.problem.times[k]), done, status, rejected, "", reason)
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """A scan after its update: status, rows left out and used, and causes of a failure."""
+
+    status: Status
+    rejected: int
+    count: int
+    causes: list[str]
+
+
+_FINDINGS = (
+    Finding(
+        Status.TOO_FEW_ROWS,
+        lambda t: t.status == Status.TOO_FEW_ROWS and not t.rejected,
+        lambda t: ["no valid row: the state was only predicted"],
+    ),
+    Finding(
+        Status.REJECTED,
+        lambda t: t.rejected > t.count,
+        lambda t: [f"{t.rejected} of {t.rejected + t.count} rows were left out"],
+    ),
+    Finding(
+        Status.NUMERICAL,
+        lambda t: t.status == Status.NUMERICAL,
+        lambda t: ["; ".join([*t.causes, "the update failed: the state was only predicted"])],
+    ),
+)
+"""All findings against one scan by itself."""
 
 
 class _Recent:
@@ -353,9 +380,12 @@ class _Recent:
 
     def judge(self, entry: Entry) -> Entry:
         """Return a scan with the status that those before it deserve, where its own is clean."""
-        if entry.code != Status.OK or self.share <= _DOUBTFUL:
-            return entry
-        return replace(entry, code=Status.MISFIT, reason=self.sentence)
+        found = objections(_RECENTLY, self) if entry.code == Status.OK else []
+        return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
+
+
+_RECENTLY = (Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),)
+"""All findings against a scan by those before it."""
 
 
 @dataclass(slots=True)

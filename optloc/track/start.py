@@ -16,6 +16,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
+from optloc.solvers.verdict.findings import Finding, objections
 from optloc.track.dynamics import Dynamics
 from optloc.track.track import State, check_trackable
 
@@ -264,6 +265,11 @@ class _Stretch:
         return 1.0 if np.isnan(p) else p
 
     @property
+    def others(self) -> int:
+        """Return the number of other minima that explain the rows."""
+        return int(np.isfinite(self.fix.alternatives.gap).sum())
+
+    @property
     def fit(self) -> Fit:
         """Return the chi-square of the rows and its degrees of freedom."""
         return float(self.fix.cost), int(self.fix.dof)
@@ -340,14 +346,24 @@ def begin(
 
 def _doubtful(best: _Stretch) -> Beginning:
     """Return a start that is not clean, with a status that says what is wrong with it."""
-    others = int(np.isfinite(best.fix.alternatives.gap).sum())
-    if best.p < _PLAUSIBLE:
-        code, reason = Status.REJECTED, f"the rows of the start contradict each other (p = {best.p:.2g})"
-    elif others:
-        code, reason = Status.AMBIGUOUS, f"the start has {others} alternative{'s' if others > 1 else ''}"
-    else:
-        code, reason = Status.CURVED, "the covariance of the start does not cover"
-    return best.beginning(code, reason)
+    return best.beginning(*objections(_FINDINGS, best)[0])
+
+
+_FINDINGS = (
+    Finding(
+        Status.REJECTED,
+        lambda start: start.p < _PLAUSIBLE,
+        lambda start: [f"the rows of the start contradict each other (p = {start.p:.2g})"],
+    ),
+    Finding(
+        Status.AMBIGUOUS,
+        lambda start: start.others,
+        lambda start: [f"the start has {start.others} alternative{'s' if start.others > 1 else ''}"],
+    ),
+    # no other reason is left
+    Finding(Status.CURVED, lambda start: True, lambda start: ["the covariance of the start does not cover"]),
+)
+"""All findings against a start that is not clean."""
 
 
 def _slides(count: float) -> Iterator[int]:

@@ -27,7 +27,7 @@ from optloc.proof.nodes.node import (
     write_symmetric,
 )
 
-# The least range of which a logarithm is taken: that of a place at the station itself has none.
+# The least range with a logarithm: a place at the station itself has none.
 _LEAST = 1e-300
 
 
@@ -35,8 +35,8 @@ _LEAST = 1e-300
 def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound the logarithm of a range over a box (see `optloc.proof.nodes.node`).
 
-    With r' = r (1 + t) elsewhere in the box ``log r' = log r + t + (log(1 + t) - t)``, and the bracket is never
-    positive and falls with |t|. Where the box may touch the station the logarithm has no lower end.
+    With r' = r (1 + t) elsewhere in the box ``log r' = log r + t + (log(1 + t) - t)``. The bracket is never positive,
+    and falls with |t|. In a box that may touch the station the logarithm has no lower end.
     """
     h = triple(half, 0)
     r, u, least, most, far = range_form(line, sense, h)
@@ -59,7 +59,7 @@ def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: 
 def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
     """Bound how the logarithm of a range curves over a box (see `optloc.proof.nodes.node`).
 
-    Its gradient is g = u/r, u that of the range, and its Hessian that of the range over r less g g'.
+    With u the gradient and B the Hessian of the range, they are g = u/r and ``B/r - g g'``.
     """
     h = triple(half, 0)
     bound_logarithm(data, line, sense, half, turn)

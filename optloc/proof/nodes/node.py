@@ -53,8 +53,7 @@ FLAT, CONVEX, MIXED = range(3)
 GROWS, SCALED, DIFFERENCE, BALANCED = range(4)
 
 # Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, enclosure of the remainder and
-# its middle. And of a range over a piece of an atlas what its curvature asks for: all that `range_form` says, but for
-# the last number.
+# its middle. Of a range over a piece of an atlas its curvature needs more: all numbers of `range_form` except the last.
 PHI, SLOPE0, SLOPE1, SLOPE2, LOW, HIGH, BETWEEN, FORM, NODE_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 13
 # Columns of a table of second derivatives (J, CURVE_WIDTH): the Hessian's entries, bounds of the change of the gradient
 # and of the Hessian, and what the rows add to them: the force K'(K phi - w) on the node, its pull K'J, and how far the

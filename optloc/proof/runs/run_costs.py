@@ -15,6 +15,7 @@ from optloc.linear.normal import prior_parts, weighed
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.proof.batch import plainly
+from optloc.proof.groups import empty_groups
 from optloc.proof.nodes.level import height_numbers
 from optloc.proof.position_costs import (
     Columns,
@@ -35,7 +36,6 @@ from optloc.proof.scope import held_height
 from optloc.proof.search_space import (
     Cost,
     cost_of,
-    empty_groups,
 )
 
 # From a problem to its rows, and to those of few epochs.

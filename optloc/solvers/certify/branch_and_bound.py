@@ -130,9 +130,9 @@ def _text(corner: Corner) -> str:
 _MARGINS, _LEVEL = (LISTED_GAP, AMBIGUOUS_GAP, 0.0), 0.95
 # Rounds of proof and repair: every margin may be lowered and the region tried, with a few minima found in between.
 _ROUNDS = 6
-# Boxes for a proof, with up to so many nodes. Four arrivals and a measured height take 9 000 of the whole Earth. Of
-# 2 200 fixes of 55 mixtures 39 were open after 3 000 boxes, 20 after 8 000 in 1.3 times the time of all, and 11 after
-# 30 000 in 1.5 times. Plain Python takes a thousand times longer for each box: a budget of all fixes.
+# Boxes for a proof, with up to `_NODES` nodes. Four arrivals and a measured height take 9 000 of the whole Earth. Of
+# 2 200 fixes of 55 mixtures 39 were open after 3 000 boxes. After 8 000 it was 20, in 1.3 times the time of all. After
+# 30 000 it was 11, in 1.5 times. Plain Python takes a thousand times longer for each box: a budget of all fixes.
 _BUDGET, _NODES, _SLOW_BUDGET, _AT_LEAST = 30_000, 12, 2000, 5
 ALL_AROUND = 2
 """Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth,

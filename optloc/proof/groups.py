@@ -1,0 +1,122 @@
+"""Groups of nodes that correlated rows tie to each other, solved for what the rows say of each node."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, zero
+from optloc.compute.systems import invert
+from optloc.proof.nodes.node import RANGE
+
+# Nodes whose rows are tied to each other by less than this share count as independent: what the rounding of whitened
+# rows leaves of an entry of K'K that is zero.
+_APART = 1e-13
+# Share of its diagonal that a pivot of a group's rows must exceed, and how far ties may be from -1, 0 and 1: a group
+# whose covariance has lost more digits bounds nothing. Nor does one whose products may be off by more than `_BLURRED`,
+# half of the slack of an enclosure.
+_PIVOT, _TIED, _BLURRED = 1e-9, 1e-9, 5e-7
+# References of a group that needs none, and of one whose rows are too few.
+NONE, LOOSE = -1, -2
+
+
+class Groups(NamedTuple):
+    """Nodes in groups: rows say ``phi_j = n_j r_p + z_j + e_j`` of a node, r_p the reference range of its group.
+
+    Parameters
+    ----------
+    order : int array (3, J)
+        The nodes, group behind group, the reference last; sizes of the groups, ended by a zero; their references: a
+        node, NONE or LOOSE.
+    R : array (J, J)
+        Covariances of the errors e of each group but of its reference, in that order.
+    tie : array (J,)
+        Factors n_j by node: -1, 0 or 1.
+    """
+
+    order: Array
+    R: Array
+    tie: Array
+
+
+@compiled
+def empty_groups(J: int) -> Groups:
+    """Return room for groups of J nodes."""
+    return Groups(np.empty((3, J), np.int64), np.empty((J, J)), np.empty(J))
+
+
+@compiled
+def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
+    """Write the groups of nodes (codes `kinds`) whose rows have ``A = K'K`` (J, J)."""
+    J, order = kinds.shape[0], groups.order
+    first = number = zero()
+    for j in range(J):
+        order[0, j] = j
+    while first < J:
+        count = _gather(A, order[0], first)
+        order[1, number] = count
+        order[2, number] = _solve(kinds, A, order[0], first, count, groups.R, groups.tie)
+        first += count
+        number += 1
+    order[1, number:] = 0
+
+
+@compiled
+def _gather(A: Array, member: Array, first: int) -> int:
+    """Move the nodes that are tied to that at `first` behind it; return how many the group has."""
+    seen, end = first, first + 1
+    while seen < end:
+        j = member[seen]
+        seen += 1
+        for i in range(end, A.shape[0]):
+            m = member[i]
+            if A[j, m] * A[j, m] > _APART * _APART * A[j, j] * A[m, m]:
+                member[i], member[end] = member[end], m
+                end += 1
+    return int(end - first)
+
+
+@compiled
+def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Array, tie: Array) -> int:
+    """Solve the rows of a group for its nodes; return its reference, which is moved to the end."""
+    if _ties(kinds, A, member, first, count, count, R, tie):
+        return NONE
+    # The rows say differences only: any range may be the reference, the first one is.
+    for i in range(first, first + count):
+        if kinds[member[i]] == RANGE:
+            last, reference = first + count - 1, member[i]
+            member[i], member[last] = member[last], reference
+            return reference if _ties(kinds, A, member, first, count - 1, count, R, tie) else LOOSE
+    return LOOSE
+
+
+@compiled
+def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: int, R: Array, tie: Array) -> bool:
+    """Write the covariance of the errors, and how nodes follow the reference; False where rows say otherwise.
+
+    Where the group has more nodes than the `size` that are solved for, the last is the reference.
+    """
+    own = R[first : first + size, first : first + size]
+    for i in range(size):
+        for j in range(size):
+            own[i, j] = A[member[first + i], member[first + j]]
+    if size == 0 or not invert(own, size, _PIVOT):
+        return False
+    condition = 0.0  # at least the largest over the least eigenvalue of the rows scaled to one length
+    for i in range(size):
+        condition += A[member[first + i], member[first + i]] * own[i, i]
+    if not (size + 2) * 2.0**-52 * size * condition <= _BLURRED:
+        return False
+    for i in range(size, count):
+        tie[member[first + i]] = 0.0
+    for i in range(size):
+        factor = 0.0
+        for j in range(size if size < count else 0):
+            factor -= own[i, j] * A[member[first + j], member[first + size]]
+        nearest = 0.0 if abs(factor) < 0.5 else (1.0 if factor > 0.0 else -1.0)
+        if not abs(factor - nearest) <= _TIED or (nearest != 0.0 and kinds[member[first + i]] != RANGE):
+            return False
+        tie[member[first + i]] = nearest
+    return True
