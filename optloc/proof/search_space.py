@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put, put_rows
+from optloc.compute.jit import compiled, inlined, put_rows
 from optloc.compute.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
-from optloc.proof.atlas import Atlas, atlas_of
+from optloc.proof.atlas import Atlas, Minima
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, cube, digits, reaches_infinity, rounding
 from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
 from optloc.proof.groups import Groups, empty_groups, set_groups
@@ -154,8 +154,8 @@ class Box(NamedTuple):
         Ends of the part of the box that is left, about its centre.
     sense, gram, graph, lean : array (3, 3), (3, 3), (GRAPH_WIDTH,), (J,)
         Of a box on a surface: its own T and T'T, the graph of the surface, and slopes along the upward axis.
-    inside : Atlas
-        Of a box on a surface: its place in the inside of an atlas, whose cube is as large as the Earth.
+    inside : array (10, 3, 3)
+        Of a box on a surface: numbers of its place in the inside of an atlas, see `_inside_of`.
     """
 
     at: Array
@@ -172,7 +172,7 @@ class Box(NamedTuple):
     gram: Array
     graph: Array
     lean: Array
-    inside: Atlas
+    inside: Array
 
 
 @compiled
@@ -217,7 +217,7 @@ def empty_box(q: int, J: int) -> Box:
         np.empty((3, 3)),
         np.empty(GRAPH_WIDTH),
         np.empty(J),
-        atlas_of(np.zeros(3), LEAST_RADIUS, 3, 0),
+        np.empty((10, 3, 3)),
     )
 
 
@@ -368,8 +368,9 @@ def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
         box.half[2] = 0.0
         return False
     if chart.differs:
-        _set_inside(chart, box)
-        bound_pieces(box.inside, cost.kinds, cost.data, box.half, box.nodes)
+        inside = _inside_of(cost, chart, box)
+        _set_inside(inside, box)
+        bound_pieces(inside, cost.kinds, cost.data, box.half, box.nodes)
     else:
         bound_nodes(cost.kinds, cost.data, box.centre, box.sense, box.gram, box.half, box.line, box.nodes)
     fold_bounds(box.graph, box.lean, box.nodes)
@@ -377,11 +378,37 @@ def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
     return True
 
 
+@inlined
+def _inside_of(cost: Cost, chart: Chart, box: Box) -> Atlas:
+    """Return the atlas in whose inside a box on a surface lies: its cube is as large as the Earth.
+
+    It is made of views at each use. A record that a box held would be counted, array by array, in every call.
+    """
+    m = box.inside
+    numbers = m[9].reshape(9)
+    # nothing reads the minima: they have room of the right kinds
+    minima = Minima(cost.groups.order[0], m[0], m[:1], m[:1], m[0], m[:1])
+    return Atlas(
+        chart.middle,
+        LEAST_RADIUS,
+        3,
+        minima,
+        m[0, 0],
+        m[1],
+        numbers[:4],
+        numbers[4:8],
+        m[2],
+        m[0, 1],
+        m[0, 2],
+        m[3],
+        m[4],
+        m[5],
+    )
+
+
 @compiled
-def _set_inside(chart: Chart, box: Box) -> None:
-    """Set the centre of a box on a surface, and its axes, in the inside of the box's atlas."""
-    inside = box.inside
-    put(chart.middle, inside.middle)
+def _set_inside(inside: Atlas, box: Box) -> None:
+    """Set the centre of a box on a surface, and its axes, in the inside of an atlas."""
     inside.scale[0] = 1.0
     for m in range(3):
         inside.point[m] = (box.centre[m] - inside.middle[m]) / inside.radius
@@ -397,7 +424,7 @@ def curve_along(cost: Cost, chart: Chart, box: Box) -> None:
     box.half[2] = box.graph[SAG] + box.graph[SLIP]
     sense, gram, half, line, nodes, curves = box.sense, box.gram, box.half, box.line, box.nodes, box.curves
     if chart.differs:
-        curve_pieces(box.inside, cost.kinds, cost.data, half, nodes, curves)
+        curve_pieces(_inside_of(cost, chart, box), cost.kinds, cost.data, half, nodes, curves)
     else:
         curve_nodes(cost.kinds, cost.data, box.centre, sense, gram, half, line, box.solve, nodes, curves)
     fold_curves(box.graph, box.lean, nodes, curves)
