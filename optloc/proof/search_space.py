@@ -380,7 +380,7 @@ def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
 
 @inlined
 def _inside_of(cost: Cost, chart: Chart, box: Box) -> Atlas:
-    """Return the atlas in whose inside a box on a surface lies: its cube is as large as the Earth.
+    """Return the atlas whose inside holds a box on a surface: its cube is as large as the Earth.
 
     It is made of views at each use. A record that a box held would be counted, array by array, in every call.
     """
