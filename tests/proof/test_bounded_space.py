@@ -147,7 +147,7 @@ CELLS = [
 def check_cell(name, trials, seed):
     problem, truth = BY_NAME[name].drawn(trials, 5, seed)
     proven, fixes = counted(problem, truth, 12, np.random.default_rng([seed, 11]))
-    # a search found a minimum, or what is not determined is named: rows that say a direction alone are no place to prove
+    # a search found a minimum, or the reason names what is not determined: there a proof has no place to prove
     labels = [s.label for s in fixes.statuses]
     assert "disconnected" not in labels
     unique = sum(label not in ("unbounded", "singular geometry") for label in labels)
