@@ -87,6 +87,18 @@ def test_nothing_is_written_over_without_force_and_that_is_said_at_once(command,
     assert sorted(p.name for p in place.iterdir()) == sorted([*before, *WRITERS[command]])
 
 
+@pytest.mark.parametrize("command", ["fix", "check"])
+def test_a_place_is_refused_before_a_long_table_is_read(command, place, monkeypatch):
+    (place / "o.csv").write_text("kept")
+    monkeypatch.setattr(f"optloc.cli.{command}.read_problem", lambda *_, **__: pytest.fail("it was read"))
+    (place / "t.csv").write_text("epoch,station,range\n")
+    (place / "s.csv").write_text("name,x,y\n")
+    out = RUN.invoke(app, [command, "t.csv", "--stations", "s.csv", "--sigma", "1", "--unit", "m", "--out", "o.csv"])
+    assert out.exit_code == 2
+    assert "there is such a file already" in out.stderr
+    assert (place / "o.csv").read_text() == "kept"
+
+
 def test_every_command_that_writes_has_force():
     def commands(group, path=()):
         for name, one in group.commands.items():

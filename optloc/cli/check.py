@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +62,10 @@ def run_check(
     """Print a summary of a file and its health; the exit code is 1 where some epoch cannot be fixed."""
     asked = asked or Asked()
     # A file without measured values can be checked, too, before the campaign.
+    outputs = partial(claim_outputs, table=asked.out, picture=asked.plot, inputs=[file])
+    outputs()  # before a long table is read, and once it is known what else was read
     loaded = read_problem(file, table, values=False, quiet=quiet or as_json)
-    claim_outputs(table=asked.out, picture=asked.plot, inputs=[file])
+    outputs()
     found = summary(loaded)
     checked = _health(loaded, asked, quiet or as_json)
     told = _advice(loaded, checked)

@@ -17,7 +17,7 @@ from optloc.adequacy.elements import GROUPINGS, By, batch_of
 from optloc.adequacy.geometry import Advice
 from optloc.adequacy.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.outputs import together
+from optloc.base.outputs import claim, together
 from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
     FileFixes,
@@ -92,6 +92,7 @@ def run_fix(
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
+    claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read, and once its frame is known
     loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
