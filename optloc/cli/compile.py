@@ -203,12 +203,7 @@ PARTS: Mapping[str, Part] = {
             "optloc.placement.completions.exhaust",
         ),
     ),
-    "regions": Part(
-        "cells of regions",
-        "optloc.proof",
-        (_cover,),
-        tuple(f"optloc.proof.cover.cover_{w}" for w in ("near", "everywhere")),
-    ),
+    "regions": Part("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.cover.cover",)),
 }
 
 
