@@ -7,6 +7,7 @@ from typing import NamedTuple
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
 from optloc.proof.atlas import Atlas, position, set_centre, widen_around
+from optloc.proof.box import bound_nodes
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known
 from optloc.proof.curvature import curve_nodes
 from optloc.proof.everywhere import is_left
@@ -73,7 +74,7 @@ def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
     return is_bounded(cost, space.chart, box)
 
 
-@compiled
+@inlined
 def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array, size: int) -> int:
     """Bound the nodes of a cost over a box off the stack; return -1, or without bounds the size of the stack.
 
@@ -81,14 +82,17 @@ def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array,
     which the surface is no graph is halved.
     """
     set_box(space, box, piece)
+    chart, half, line = space.chart, box.half, box.line
     if space.far:
         if is_left(space.atlas, box, piece):
             return size
-    elif is_known(box.at, box.half, space.minima, space.sides):
+        bound_pieces(space.atlas, cost.kinds, cost.data, half, box.nodes)
+    elif is_known(box.at, half, space.minima, space.sides):
         return size
-    elif space.chart.surface.shape[0] > 0:
-        return lay_or_halve(cost, space.chart, box, stack, size)
-    set_nodes(space, cost, box)
+    elif chart.surface.shape[0] > 0:
+        return lay_or_halve(cost, chart, box, stack, size)
+    else:
+        bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.nodes)
     return -1
 
 
