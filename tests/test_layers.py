@@ -148,7 +148,8 @@ def test_no_loose_module():
 # back ends of studies (a part of methods before) and their trial, contours and the regions that they draw;
 # the digest of a kernel, and how numba is asked to compile; the engine: what its steps ask of rows, rows of ranges and
 # of tapes, linear rows beside squared ranges, what is admitted, plans, and parameter vectors; bounds out of reach; runs
-# whose epochs are lanes; the forms of biases; the rows of the scans of a run as arrays.
+# whose epochs are lanes; the forms of biases; the rows of the scans of a run as arrays; logarithms of ranges, groups of
+# nodes, and the space of a branch and bound (a part of the search of runs before).
 MODULES, LINES, BODY, RECURRING = 394, 600, 60, 20
 
 

@@ -188,12 +188,7 @@ PARTS: Mapping[str, Part] = {
             "optloc.proof.runs.state_search.prove_course",
         ),
     ),
-    "searches": Part(
-        "searches for starts",
-        "optloc.proof",
-        (_search,),
-        tuple(f"optloc.proof.best_first._search_{where}" for where in ("everywhere", "sides", "region")),
-    ),
+    "searches": Part("searches for starts", "optloc.proof", (_search,), ("optloc.proof.best_first.search_minima",)),
     "placements": Part(
         "placements of stations",
         "optloc.placement",
@@ -203,12 +198,7 @@ PARTS: Mapping[str, Part] = {
             "optloc.placement.completions.exhaust",
         ),
     ),
-    "regions": Part(
-        "cells of regions",
-        "optloc.proof",
-        (_cover,),
-        tuple(f"optloc.proof.cover.cover_{w}" for w in ("near", "everywhere")),
-    ),
+    "regions": Part("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.cover.cover",)),
 }
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.compute.jit import compiled, inlined, put, put_rows
 from optloc.proof.nodes.node import Triple, blend, inner, reach, triple, write
 
 
@@ -145,8 +145,11 @@ def one_more(atlas: Atlas) -> Atlas:
     minima = wider.minima
     for i in range(count):
         minima.home[i] = before.home[i]
-        minima.start[i], minima.axes[i], minima.back[i] = before.start[i], before.axes[i], before.back[i]
-        minima.sides[i], minima.core[i] = before.sides[i], before.core[i]
+        put(before.start[i], minima.start[i])
+        put(before.sides[i], minima.sides[i])
+        put_rows(before.axes[i], minima.axes[i])
+        put_rows(before.back[i], minima.back[i])
+        put_rows(before.core[i], minima.core[i])
     return wider
 
 

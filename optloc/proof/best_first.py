@@ -15,13 +15,12 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, zero
-from optloc.proof.atlas import atlas_of, first_minima, position, set_centre, widen_around, with_minima
+from optloc.compute.jit import FEW, compiled, enabled, inlined, plain, ready, usable, zero
+from optloc.proof.atlas import atlas_of, one_more
 from optloc.proof.batch import FIRST_BOXES, PLAIN_BOXES, SMALL, plainly, present_in
 from optloc.proof.box import (
     DEPTH,
     PIECE,
-    bound_nodes,
     cost_at,
     cube,
     cut_out,
@@ -36,16 +35,14 @@ from optloc.proof.box import (
     steepest_side,
     uncut,
 )
-from optloc.proof.convex_boxes import accuracy_floor_far, is_known, known_minima, set_minimum
+from optloc.proof.convex_boxes import accuracy_floor_far, known_minima, set_minimum
 from optloc.proof.curvature import clip_to_stationary
 from optloc.proof.descents import descend
-from optloc.proof.everywhere import is_left, leaves, push_pieces
-from optloc.proof.near import cut_side, lay_or_halve, region_of
-from optloc.proof.nodes.dispatch import bound_pieces
+from optloc.proof.everywhere import leaves, push_faces
+from optloc.proof.near import cut_side, region_of
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import (
     Box,
-    Chart,
     Cost,
     Known,
     chart_on,
@@ -53,9 +50,8 @@ from optloc.proof.search_space import (
     curve_box,
     empty_box,
     turned,
-    widen,
 )
-from optloc.proof.search_space import place as set_place
+from optloc.proof.space import Space, bound_or_halve, place_of
 from optloc.proof.surface import SIDES, reach_of_piece
 
 # Standard deviations within which two minima are one: descents end a thousandth of one from their minimum.
@@ -161,65 +157,143 @@ def _is_due(lows: int, low: bool, boxes: int) -> bool:
 
 
 @compiled
-def _bound(cost: Cost, box: Box, floor: float) -> tuple[float, float]:
-    """Return the bound of the cost over a box whose nodes are bounded, and the cost at its centre."""
-    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
-    low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
-    return low * low if low > 0.0 else 0.0, cost_at(cost.K, cost.w, box.nodes)
+def search_minima(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, region: Array, budget: int) -> tuple[int, int]:
+    """Look for minima: all around a surface, over all positions, or between corners.
 
-
-# All positions, to infinity.
+    All positions are searched where the cost stays finite at infinity. Otherwise the corners are an enclosure of the
+    positions that cost less than x (D,), or without one the region (2, D). Returns the number of minima that are
+    known, and the number of boxes.
+    """
+    around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
+    level, d, bent = cost_at(cost.K, cost.w, box.nodes) + aim.gap, x.shape[0], aim.surface.shape[0] > 0
+    far = not bent and aim.planes.shape[0] == 0 and reaches_infinity(cost.kinds, cost.K)
+    middle, radius = cube(cost.kinds, cost.data, x)
+    atlas, none, nowhere = atlas_of(middle, radius, d, 0), np.empty((0, 3)), np.full(d, nan)
+    stack, corners = np.zeros((2 * budget + 4 * (d + 1) + 6 * aim.points.shape[0], DEPTH)), np.empty((2, 3))
+    chart, count, boxes = around, zero(), zero()
+    for look in range(2 * SIDES if bent else 1):
+        most = min(_LOOK, budget - boxes) if bent and look < SIDES else budget - boxes
+        if bent:
+            chart = turned(cost, around, look % SIDES)
+            corners[0], corners[1] = -inf, inf
+            reach_of_piece(chart.surface, chart.origin, chart.sense, corners[0], corners[1])
+        elif not far and not region_of(cost, chart, box, sqrt(level), nowhere, nowhere, corners[0], corners[1]):
+            region_of(cost, chart, box, sqrt(level), region[0], region[1], corners[0], corners[1])
+        space = Space(far, atlas, chart, none, none)
+        if far:
+            size = push_faces(stack, d)
+        else:
+            size = push_around(stack, 0, corners[0], corners[1], np.zeros(3), 0)
+            space = _with_known(cost, space, near, aim, corners, count)
+        count, more = _search(cost, space, box, near, aim, corners, stack, size, most, count)
+        boxes += more
+    return count, boxes
 
 
 @compiled
-def _search_everywhere(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, budget: int) -> tuple[int, int]:
-    """Look for minima over all positions; return how many were met, and the boxes that it took."""
-    d, most = x.shape[0], aim.points.shape[0]
-    middle, radius = cube(cost.kinds, cost.data, x)
-    minima, at = atlas_of(middle, radius, d, most).minima, np.empty(d)
-    atlas, known = with_minima(middle, radius, d, first_minima(minima, 0)), 0
-    stack = np.zeros((2 * budget + 4 * (d + 1) + 6 * most, DEPTH))
-    size, boxes, lows, count, cheapest = push_pieces(stack, atlas), 0, 0, zero(), inf
+def _search(
+    cost: Cost,
+    space: Space,
+    box: Box,
+    near: Box,
+    aim: Aim,
+    corners: Array,
+    stack: Array,
+    size: int,
+    budget: int,
+    count: int,
+) -> tuple[int, int]:
+    """Look for minima in the boxes of a stack; return the number of minima that are known, and the number of boxes."""
+    at, boxes, lows, cheapest, floor = np.empty(aim.points.shape[1]), zero(), zero(), inf, _floor_of(cost, space)
     queue = [(0.0, i) for i in range(size)]
-    floor = accuracy_floor_far(cost, atlas)
+    while True:
+        found = _search_known(
+            cost, space, box, near, aim, at, stack, queue, floor, budget, size, count, boxes, lows, cheapest
+        )
+        size, more, boxes, lows, cheapest, low, side, piece = found
+        if more == count:
+            return count, boxes
+        count = more
+        if space.far:
+            space, more = _push_minimum(cost, space, near, at, stack, size)
+            _queue_up(queue, 0.0, size, more)
+            size = more
+        else:
+            space = _with_known(cost, space, near, aim, corners, count)
+        size = _split(space, box, stack, queue, size, side, low, piece)
+
+
+@compiled
+def _search_known(
+    cost: Cost,
+    space: Space,
+    box: Box,
+    near: Box,
+    aim: Aim,
+    at: Array,
+    stack: Array,
+    queue: list[tuple[float, int]],
+    floor: float,
+    budget: int,
+    size: int,
+    count: int,
+    boxes: int,
+    lows: int,
+    cheapest: float,
+) -> tuple[int, int, int, int, float, float, int, int]:
+    """Search until a minimum is new; return the numbers of the search, and bound, side and piece of a box to halve.
+
+    A loop that renews its space would count references to all arrays of the space at each box.
+    """
     while len(queue) > 0 and boxes < budget:
         before, i = heappop(queue)
-        level = _least(aim, count) + aim.gap
+        level, piece = _least(aim, count) + aim.gap, int(stack[i, PIECE])
         if before >= level:
             break
         boxes += 1
         pop(stack, i, box.at, box.half)
-        piece = int(stack[i, PIECE])
-        set_centre(atlas, piece, box.at)
-        if piece > 2 * d:
-            widen_around(atlas, piece - 2 * d - 1, box.half)
-        if is_left(atlas, box, piece):
+        left = bound_or_halve(space, cost, box, piece, stack, size)
+        if left >= 0:
+            _queue_up(queue, before, size, left)
+            size = left
             continue
-        bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
-        low, here = _bound(cost, box, floor)
-        if low >= level:
+        low, here, side = _look(cost, space, box, piece, level, floor)
+        if side < 0:
             continue
-        touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
-        if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
-            continue
-        position(atlas, at)
-        exact, side = piece <= 2 * d, steepest_side(box.half, box.rows, d)
-        if level < inf and here < _NEAR * (level + 1.0) and leaves(cost, atlas, box, touching, floor):
-            continue
+        place_of(space, box, at)
         lows, promising = lows + int(here < level), here < _HALF * cheapest
         cheapest = min(cheapest, here)
         if promising or _is_due(lows, here < level, boxes):
             more = _add(cost, near, aim, at, count, level)
-            trial = with_minima(middle, radius, d, first_minima(minima, known + 1))
-            if more > count and known < most and set_minimum(cost, near, trial, known, at, -inf, _POLISHED, inf):
-                known, atlas, first = known + 1, trial, size
-                core, sides = minima.core[known - 1], minima.sides[known - 1]
-                size = push_around(stack, size, core[0], core[1], sides, 2 * d + known)
-                _queue_up(queue, 0.0, first, size)
-            count = more
-        size = push_halves(stack, size, side, box.at, box.half, low, piece, exact)
-        _queue_up(queue, low, size - 2, size)
-    return count, boxes
+            if more > count:
+                return size, more, boxes, lows, cheapest, low, side, piece
+        size = _split(space, box, stack, queue, size, side, low, piece)
+    return size, count, boxes, lows, cheapest, 0.0, -1, 0
+
+
+@inlined
+def _split(
+    space: Space,
+    box: Box,
+    stack: Array,
+    queue: list[tuple[float, int]],
+    size: int,
+    side: int,
+    low: float,
+    piece: int,
+) -> int:
+    """Push the halves of the part of a box between the ends of its cut; return the size of the stack."""
+    if not cut_out(box.cut, box.at, box.half) > 0.0:
+        return size
+    exact = space.far and piece <= 2 * space.atlas.dimension
+    _queue_up(queue, low, size, size + 2)
+    return push_halves(stack, size, side, box.at, box.half, low, piece, exact)
+
+
+@compiled
+def _floor_of(cost: Cost, space: Space) -> float:
+    """Return the sizes that `optloc.proof.box.rounding` counts beside the nodes."""
+    return accuracy_floor_far(cost, space.atlas) if space.far else space.chart.floor
 
 
 @compiled
@@ -229,104 +303,68 @@ def _queue_up(queue: list[tuple[float, int]], low: float, first: int, last: int)
         heappush(queue, (low, i))
 
 
-# Planes, the surface of a height, and what encloses the cheap positions.
+@inlined
+def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: float) -> tuple[float, float, int]:
+    """Return the bound of the cost over a box whose nodes are bounded, the cost at its centre, and the side to halve.
+
+    The side is -1 where the box holds no minimum below a level. Otherwise the ends of the part that may hold one are
+    written.
+    """
+    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
+    low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
+    low, here = low * low if low > 0.0 else 0.0, cost_at(cost.K, cost.w, box.nodes)
+    if low >= level:
+        return low, here, -1
+    side = _side_far(cost, space, box, piece, level, here, floor) if space.far else _cut(cost, space, box, level, here)
+    return low, here, side
 
 
-@compiled
-def _search_chart(
-    cost: Cost, chart: Chart, box: Box, near: Box, aim: Aim, corners: Array, budget: int, count: int
-) -> tuple[int, int]:
-    """Look for minima between corners (2, 3) of search coordinates; return how many are known, and the boxes."""
-    bent, boxes, lows, cheapest = chart.surface.shape[0] > 0, 0, 0, inf
-    gram = box.gram if bent else chart.gram
-    stack, at = np.zeros((2 * budget + 8, DEPTH)), np.empty(aim.points.shape[1])
-    size = push_around(stack, 0, corners[0], corners[1], np.zeros(3), 0)
-    queue = [(0.0, i) for i in range(size)]
-    minima, sides, known = _around(cost, chart, near, aim, corners, count)
-    while len(queue) > 0 and boxes < budget:
-        before, i = heappop(queue)
-        level = _least(aim, count) + aim.gap
-        if before >= level:
-            break
-        boxes += 1
-        pop(stack, i, box.at, box.half)
-        set_place(chart.origin, chart.sense, box.at, box.centre)
-        widen(chart, box.centre, box.half)
-        if bent:
-            left = lay_or_halve(cost, chart, box, stack, size)
-            if left >= 0:
-                _queue_up(queue, before, size, left)
-                size = left
-                continue
-        else:
-            bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, gram, box.half, box.line, box.nodes)
-        low, here = _bound(cost, box, chart.floor)
-        if low >= level or is_known(box.at, box.half, minima[:known], sides[:known]):
-            continue
-        for k in range(at.shape[0]):
-            at[k] = box.centre[k]
-        side = _cut(cost, chart, box, gram, level, here < level)
-        lows, promising = lows + int(here < level), here < _HALF * cheapest
-        cheapest = min(cheapest, here)
-        if promising or _is_due(lows, here < level, boxes):
-            more = _add(cost, near, aim, at, count, level)
-            if more > count:
-                minima, sides, known = _around(cost, chart, near, aim, corners, more)
-            count = more
-        share = cut_out(box.cut, box.at, box.half)
-        if share > 0.0:
-            size = push_halves(stack, size, side, box.at, box.half, low, 0, False)
-            _queue_up(queue, low, size - 2, size)
-    return count, boxes
+@inlined
+def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here: float, floor: float) -> int:
+    """Return the side to halve of a box of the atlas, -1 where it holds no minimum; the box is not cut."""
+    atlas, d = space.atlas, space.atlas.dimension
+    touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
+    if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
+        return -1
+    if level < inf and here < _NEAR * (level + 1.0) and leaves(cost, atlas, box, touching, floor):
+        return -1
+    uncut(box.half, box.cut)
+    return int(steepest_side(box.half, box.rows, d))
 
 
-@compiled
-def _cut(cost: Cost, chart: Chart, box: Box, gram: Array, level: float, inside: bool) -> int:
+@inlined
+def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
     """Write the ends of the part of a box that may hold a minimum below a level; return the side to halve."""
+    chart = space.chart
+    gram = box.gram if chart.surface.shape[0] > 0 else chart.gram
     noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
     uncut(box.half, box.cut)
     if level < inf:
         flat = box.half[2] == 0.0
         shrink(cost.K, cost.weight, sqrt(level) + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
-    side = cut_side(cost.kinds, cost.K, gram, box.half, box.nodes, box.rows, inside)
+    side = cut_side(cost.kinds, cost.K, gram, box.half, box.nodes, box.rows, here < level)
     curve_box(cost, chart, box)
     clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
     return int(side)
 
 
 @compiled
-def _around(cost: Cost, chart: Chart, near: Box, aim: Aim, corners: Array, count: int) -> tuple[Array, Array, int]:
-    """Return the minima that are known in search coordinates (P, 3), convex boxes around them, and how many of them."""
+def _with_known(cost: Cost, space: Space, near: Box, aim: Aim, corners: Array, count: int) -> Space:
+    """Return search coordinates with the minima that are known, and convex boxes around them."""
     known = Known(aim.points[:count], 0, aim.planes, aim.surface)
-    minima, sides, number, _ = known_minima(cost, chart, near, known, corners[0], corners[1], 0.0, -inf, False)
-    return minima, sides, number
+    minima, sides, number, _ = known_minima(cost, space.chart, near, known, corners[0], corners[1], 0.0, -inf, False)
+    return Space(False, space.atlas, space.chart, minima[:number], sides[:number])
 
 
 @compiled
-def _search_sides(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, budget: int) -> tuple[int, int]:
-    """Look for minima all around the surface of a height."""
-    around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
-    corners, count, boxes = np.empty((2, 3)), zero(), zero()
-    for look in (_LOOK, budget):
-        for side in range(SIDES):
-            chart = turned(cost, around, side)
-            corners[0], corners[1] = -inf, inf
-            reach_of_piece(chart.surface, chart.origin, chart.sense, corners[0], corners[1])
-            most = min(look, budget - boxes)
-            count, more = _search_chart(cost, chart, box, near, aim, corners, most, count)
-            boxes += more
-    return count, boxes
-
-
-@compiled
-def _search_region(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, region: Array, budget: int) -> tuple[int, int]:
-    """Look for minima where positions cost less than x (D,), or where these are not enclosed in a region (2, D)."""
-    chart, _ = chart_on(cost, x, box, aim.planes, aim.surface)
-    corners, nowhere = np.empty((2, 3)), np.full(x.shape[0], nan)
-    level = cost_at(cost.K, cost.w, box.nodes) + aim.gap
-    if not region_of(cost, chart, box, sqrt(level), nowhere, nowhere, corners[0], corners[1]):
-        region_of(cost, chart, box, sqrt(level), region[0], region[1], corners[0], corners[1])
-    return _search_chart(cost, chart, box, near, aim, corners, budget, zero())
+def _push_minimum(cost: Cost, space: Space, near: Box, x: Array, stack: Array, size: int) -> tuple[Space, int]:
+    """Return the atlas with one more minimum x (D,), and push boxes around it; it stays the same if x is none."""
+    known, atlas = space.atlas.minima.home.shape[0], one_more(space.atlas)
+    if not set_minimum(cost, near, atlas, known, x, -inf, _POLISHED, inf):
+        return space, size
+    core, sides = atlas.minima.core[known], atlas.minima.sides[known]
+    size = push_around(stack, size, core[0], core[1], sides, 2 * atlas.dimension + 1 + known)
+    return Space(True, atlas, space.chart, space.minima, space.sides), size
 
 
 class Places(NamedTuple):
@@ -381,7 +419,7 @@ def find_minima(costs: PositionCosts, places: Places, gap: float, budget: int, m
 
     def search(i: int, budget: int) -> None:
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
-            points[i], boxes[i] = _search(costs.take(slice(i, i + 1)), places.take(i), gap, budget, most)
+            points[i], boxes[i] = _minima_of(costs.take(slice(i, i + 1)), places.take(i), gap, budget, most)
 
     asked = list(range(n))
     if n <= FEW and len(costs.kinds) <= SMALL and not ready(present_in):
@@ -391,7 +429,7 @@ def find_minima(costs: PositionCosts, places: Places, gap: float, budget: int, m
             for i in asked:
                 search(i, first)
         asked = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
-    if enabled() and all(usable(kernel, n) for kernel in (_search_everywhere, _search_sides, _search_region)):
+    if enabled() and usable(search_minima, n):
         mapped(lambda i: search(i, budget), asked)
         return points, boxes
     # Plain Python holds the interpreter: threads would wait for each other.
@@ -402,19 +440,14 @@ def find_minima(costs: PositionCosts, places: Places, gap: float, budget: int, m
     return points, boxes
 
 
-def _search(costs: PositionCosts, place: Places, gap: float, budget: int, most: int) -> tuple[Array, int]:
+def _minima_of(costs: PositionCosts, place: Places, gap: float, budget: int, most: int) -> tuple[Array, int]:
     """Return the minima (most, d) of one cost, and the boxes that it took; places without their first axis."""
     cost = present_in(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = cube(cost.kinds, cost.data, place.x)
     found, least = np.zeros((most, len(place.x))), np.full(most, inf)
     aim = Aim(place.planes, place.surface, gap, _AWAY * radius, found, least)
     box, near = empty_box(*cost.K.shape), empty_box(*cost.K.shape)
-    if len(place.surface):
-        _, boxes = _search_sides(cost, box, near, place.x, aim, budget)
-    elif not len(place.planes) and reaches_infinity(cost.kinds, cost.K):
-        _, boxes = _search_everywhere(cost, box, near, place.x, aim, budget)
-    else:
-        _, boxes = _search_region(cost, box, near, place.x, aim, place.region, budget)
+    _, boxes = search_minima(cost, box, near, place.x, aim, place.region, budget)
     order = np.argsort(least)
     points = np.full(found.shape, np.nan)
     good = order[least[order] < least.min() + gap]

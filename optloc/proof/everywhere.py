@@ -418,18 +418,23 @@ def is_listed(atlas: Atlas, x: Array) -> bool:
 @compiled
 def push_pieces(stack: Array, atlas: Atlas) -> int:
     """Push all faces of the cube, its inside, and on top of them the surroundings of known minima, the fix last."""
-    d = atlas.dimension
-    size = 2 * d + 1
-    for piece in range(size):
+    size = push_faces(stack, atlas.dimension)
+    for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
+        size = _push_core(stack, size, atlas, i)
+    return size
+
+
+@compiled
+def push_faces(stack: Array, d: int) -> int:
+    """Push all faces of the cube, and its inside; return the size of the stack."""
+    for piece in range(2 * d + 1):
         stack[piece] = 0.0
         for k in range(d):
             stack[piece, HALF + k] = 1.0
         if piece < 2 * d:
             stack[piece, CENTRE + d - 1] = stack[piece, HALF + d - 1] = 0.5
         stack[piece, PIECE] = piece
-    for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
-        size = _push_core(stack, size, atlas, i)
-    return size
+    return 2 * d + 1
 
 
 @compiled

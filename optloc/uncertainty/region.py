@@ -18,18 +18,14 @@ from optloc.linear.normal import covariance
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.proof.box import reaches_infinity
-from optloc.proof.cover import cost_of_point, cover_everywhere, cover_near, room
+from optloc.proof.cover import cover
 from optloc.proof.position_costs import position_costs
 from optloc.proof.scope import crowded, unsupported
-from optloc.proof.search_space import Chart as Axes
 from optloc.proof.search_space import Cost, cost_of, empty_box
 
 # Boxes of a cover at most, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, that of an
 # ellipsoid 10 %, after some 20 and 100 ms. Plain Python takes a thousand times longer for each.
 _MOST, _MOST_PLAIN = {2: 1000, 3: 8000}, 300
-# Share by which the level of a cover is higher, for the rounding of two ways to compute the cost of a fix.
-_EQUAL = 1e-9
 # Share of a cell by which it is taken larger where points are looked up, for the rounding of its inverse.
 _ROUNDED = 1e-7
 NOWHERE = "nothing encloses the positions of a cost this low"
@@ -214,30 +210,16 @@ def _cover(surface: Surface, threshold: float, boxes: int | None) -> tuple[Cells
         return None, False, why
     costs = position_costs(surface.problem)
     cost, x = _present(costs.kinds, costs.data[0], costs.K[0], costs.w[0]), np.array(surface.position)
-    box, d = empty_box(cost.K.shape[0], cost.K.shape[1]), len(x)
-    level = cost_of_point(cost, box, x) + threshold - surface.least
-    level += _EQUAL * (1.0 + level)
-    if costs.level[0] < level:
-        return None, False, TURNS
+    box, d = empty_box(*cost.K.shape), len(x)
     most = boxes or (_MOST[d] if enabled() else _MOST_PLAIN)
-    lists, endless = room(most), bool(reaches_infinity(cost.kinds, cost.K))
-    if endless and surface.kind != CARTESIAN:
-        return _far_cells(cost, x, level, most, lists)
-    axes = Axes(
-        np.zeros(3),
-        np.zeros((3, 3)),
-        np.zeros((3, 3)),
-        np.zeros((3, 3)),
-        np.zeros(3),
-        0.0,
-        np.zeros(0),
-        False,
-        np.zeros(3),
-    )
-    count, inside, _ = cover_near(cost, box, x, level, most, lists, axes)
-    if count >= 0:
-        return _near_cells(lists[2, :count], axes, d, inside), False, ""
-    return _far_cells(cost, x, level, most, lists) if endless else (None, False, NOWHERE)
+    base, edges, ends = np.zeros(3), np.zeros((2 * most, 1 + d, 1 + d)), np.zeros(2 * most)
+    above, bent = threshold - surface.least, surface.kind != CARTESIAN
+    count, inside, highest = cover(cost, box, x, above, most, bent, base, edges, ends)
+    if costs.level[0] < highest:
+        return None, False, TURNS
+    if count < 0:
+        return None, False, NOWHERE
+    return Cells(base[:d], edges[:count], inside), bool((ends[:count] <= highest).any()), ""
 
 
 def _present(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
@@ -245,24 +227,6 @@ def _present(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
     used = (K != 0.0).any(0)
     rows = (K != 0.0).any(1) | (w != 0.0)
     return cost_of(*(np.ascontiguousarray(each) for each in (kinds[used], data[used], K[rows][:, used], w[rows])))
-
-
-def _near_cells(boxes: Array, axes: Axes, d: int, inside: int) -> Cells:
-    """Return boxes of search coordinates as cells."""
-    at, half = boxes[:, 0:d], boxes[:, 3 : 3 + d]
-    edges = np.zeros((len(boxes), 1 + d, 1 + d))
-    sense = axes.sense[:d, :d]
-    edges[:, 0, :d], edges[:, 0, d] = at @ sense.T, 1.0
-    edges[:, 1:, :d] = half[:, :, None] * sense.T
-    return Cells(axes.origin[:d], edges, inside)
-
-
-def _far_cells(cost: Cost, x: Array, level: float, most: int, lists: Array) -> tuple[Cells, bool, str]:
-    d, box = len(x), empty_box(cost.K.shape[0], cost.K.shape[1])
-    cells, far = np.zeros((2 * most, 1 + d, 1 + d)), np.zeros(2 * most)
-    base = np.zeros(3)
-    count, inside, _ = cover_everywhere(cost, box, x, level, most, lists, cells, far, base)
-    return Cells(base[:d], cells[:count], inside), bool((far[:count] <= level).any()), ""
 
 
 # The inside: where rays from the fix leave the region.

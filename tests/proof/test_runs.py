@@ -19,8 +19,9 @@ from optloc.proof.position_costs import position_costs
 from optloc.proof.runs.prove import costs_of_runs
 from optloc.proof.runs.rows import blur_of, least_length, residual_at
 from optloc.proof.runs.run_costs import run_costs
-from optloc.proof.runs.search import Space, floor_of, set_curves, set_nodes, sum_at, tables_of
+from optloc.proof.runs.search import sum_at, tables_of
 from optloc.proof.search_space import chart_on
+from optloc.proof.space import Space, floor_of, set_curves, set_nodes
 from optloc.proof.surface import SLIP
 from optloc.solvers.certify.position_cost import surfaces_of
 

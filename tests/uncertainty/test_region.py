@@ -152,14 +152,12 @@ def test_other_unknowns_take_their_best():
 
 def test_what_the_proof_does_not_bound_has_rays_and_a_reason():
     place = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3], [9e3, 8e3]])
-    rows = (
-        measured("tdoa", a=[1, 2, 3], b=0, arrival_sigma=5.0),
-        measured("rss_difference", a=[1, 2, 3], b=0, sigma=0.1),
-    )
-    problem = optloc.simulate(assemble(place, *rows), [3e3, 4e3], 1)
+    problem = assemble(place, measured("range", a=np.arange(4), sigma=5.0))
+    problem = optloc.with_bias(problem, "scale", per="kind", form="scale", sigma=0.1)
+    problem = optloc.simulate(problem, [3e3, 4e3, 0.0], 1)
     region = likelihood_region(problem, optloc.solve(problem))
     assert region.cells is region.box is region.cone is None
-    assert "rss_difference rows are neither sums" in region.reason
+    assert "multiplies" in region.reason
     assert region.covers(region.points * 0.999999 + 0.000001 * region.surface.position).all()
 
 

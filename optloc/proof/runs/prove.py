@@ -35,11 +35,9 @@ from optloc.proof.runs.rows import (
 from optloc.proof.runs.run_costs import Courses, Run, Runs
 from optloc.proof.runs.search import (
     CAPACITY,
-    Space,
     Tables,
     blur_beside,
     cost_at_coordinates,
-    floor_of,
     search_run,
     sum_at,
     tables_of,
@@ -60,6 +58,7 @@ from optloc.proof.search_space import (
     widen,
     without_differences,
 )
+from optloc.proof.space import Space, floor_of
 from optloc.proof.surface import SIDES, is_one_side, reach_of_piece
 
 # Boxes around known minima on which the cost is convex.

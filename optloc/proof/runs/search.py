@@ -14,7 +14,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, put
 from optloc.compute.systems import inverse, positive_along
-from optloc.proof.atlas import Atlas, position, set_centre, widen_around
+from optloc.proof.atlas import set_centre
 from optloc.proof.box import (
     PIECE,
     cost_at,
@@ -27,11 +27,11 @@ from optloc.proof.box import (
     steepest_side,
     uncut,
 )
-from optloc.proof.convex_boxes import accuracy_floor_far, is_known
-from optloc.proof.curvature import G0, G1, G2, curve_nodes, has_no_infimum
-from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, is_left, is_listed
-from optloc.proof.near import Aim, lay_or_halve
-from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.convex_boxes import is_known
+from optloc.proof.curvature import G0, G1, G2, has_no_infimum
+from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, is_listed
+from optloc.proof.near import Aim
+from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
 from optloc.proof.runs.rows import (
     Sheet,
@@ -45,42 +45,11 @@ from optloc.proof.runs.rows import (
 )
 from optloc.proof.runs.run_costs import Run
 from optloc.proof.search_space import (
-    LINES,
     Box,
-    Chart,
-    Cost,
-    accuracy_floor,
-    curve_along,
     empty_box,
-    is_bounded,
-    place,
-    widen,
 )
+from optloc.proof.space import Space, bound_or_halve, floor_of, place_of, set_curves, set_nodes, set_place
 from optloc.proof.surface import SLIP
-
-# Where a search takes place, and boxes in it.
-
-
-class Space(NamedTuple):
-    """Where a run is searched: an atlas of all positions, or search coordinates around a fix.
-
-    Parameters
-    ----------
-    far : bool
-        Whether it is the atlas.
-    atlas : Atlas
-        The pieces, with known minima.
-    chart : Chart
-        The search coordinates, along planes or on a piece of a surface.
-    minima, sides : array (P, 3)
-        Known minima in these, and half-widths of boxes around them on which the cost is convex.
-    """
-
-    far: bool
-    atlas: Atlas
-    chart: Chart
-    minima: Array
-    sides: Array
 
 
 class Tables(NamedTuple):
@@ -100,36 +69,6 @@ def tables_of(run: Run) -> Tables:
 
 
 @compiled
-def floor_of(space: Space, cost: Cost) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes."""
-    if space.far:
-        return accuracy_floor_far(cost, space.atlas)
-    return accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, space.chart.origin, LINES)
-
-
-@compiled
-def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
-    """Bound the nodes of a cost over a box whose centre is set; return False where a surface is no graph over it."""
-    if space.far:
-        bound_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes)
-        return True
-    return is_bounded(cost, space.chart, box)
-
-
-@compiled
-def set_curves(space: Space, cost: Cost, box: Box) -> None:
-    """Bound second derivatives of the nodes over a box whose nodes are bounded."""
-    chart = space.chart
-    if space.far:
-        curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
-    elif chart.surface.shape[0] > 0:
-        curve_along(cost, chart, box)
-    else:
-        half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
-        curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
-
-
-@compiled
 def sum_at(run: Run, space: Space, tables: Tables, floor: float) -> tuple[float, float]:
     """Return the cost at the centre of a box that is set, and the norm of the rest of its Hessian's change.
 
@@ -142,16 +81,6 @@ def sum_at(run: Run, space: Space, tables: Tables, floor: float) -> tuple[float,
     here = residual_at(run.rows, box.nodes, sheet)
     noise = blur_of(run.rows, floor, box.nodes)
     return here, sum_up_rows(run.rows, box.half, box.nodes, box.curves, noise, sheet, box.sums)
-
-
-@compiled
-def place_of(space: Space, box: Box, x: Array) -> None:
-    """Write the position x (D,) of the centre of a box that is set."""
-    if space.far:
-        position(space.atlas, x)
-    else:
-        for k in range(x.shape[0]):
-            x[k] = box.centre[k]
 
 
 # The search.
@@ -205,7 +134,7 @@ def search_run(
         looks += 1
         pop(stack, size, small.at, small.half)
         piece = int(stack[size, PIECE])
-        left = _set_small(run, space, tables, piece, stack, size)
+        left = bound_or_halve(space, look, small, piece, stack, size)
         if left >= 0:
             size = left
             continue
@@ -231,40 +160,11 @@ def search_run(
             if here < aim.level and lows & (lows - 1) == 0:
                 if _descends(run, space, tables, aim.level, found):
                     return ANOTHER, looks, 0.0
-                _set_place(space, small, piece)
+                set_place(space, small, piece)
             if touching and _is_flat_out(run, space, tables, aim.level):
                 return INFINITE, looks, 0.0
         size = push_halves(stack, size, side, small.at, small.half, low, piece, space.far and piece <= 2 * d)
     return CLEAR, looks, aim.value
-
-
-@compiled
-def _set_small(run: Run, space: Space, tables: Tables, piece: int, stack: Array, size: int) -> int:
-    """Bound the nodes of few rows over a box; return -1, or where there is nothing to bound the size of the stack."""
-    small, bent = tables.small, space.chart.surface.shape[0] > 0
-    _set_place(space, small, piece)
-    if space.far:
-        if piece > 2 * space.atlas.dimension:
-            widen_around(space.atlas, piece - 2 * space.atlas.dimension - 1, small.half)
-        if is_left(space.atlas, small, piece):
-            return size
-    else:
-        widen(space.chart, small.centre, small.half)
-        if is_known(small.at, small.half, space.minima, space.sides):
-            return size
-        if bent:
-            return lay_or_halve(run.look, space.chart, small, stack, size)
-    set_nodes(space, run.look, small)
-    return -1
-
-
-@compiled
-def _set_place(space: Space, box: Box, piece: int) -> None:
-    """Set the centre of a box."""
-    if space.far:
-        set_centre(space.atlas, piece, box.at)
-    else:
-        place(space.chart.origin, space.chart.sense, box.at, box.centre)
 
 
 @compiled

@@ -1,0 +1,121 @@
+"""The space of a branch and bound: search coordinates around a fix, or an atlas of all positions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.atlas import Atlas, position, set_centre, widen_around
+from optloc.proof.box import bound_nodes
+from optloc.proof.convex_boxes import accuracy_floor_far, is_known
+from optloc.proof.curvature import curve_nodes
+from optloc.proof.everywhere import is_left
+from optloc.proof.near import lay_or_halve
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.search_space import LINES, Box, Chart, Cost, accuracy_floor, curve_along, is_bounded, place, widen
+
+
+class Space(NamedTuple):
+    """An atlas of all positions, or search coordinates around a fix.
+
+    Parameters
+    ----------
+    far : bool
+        Whether it is the atlas.
+    atlas : Atlas
+        The pieces, with known minima.
+    chart : Chart
+        The search coordinates, along planes or on a piece of a surface.
+    minima, sides : array (P, 3)
+        Known minima in these, and half-widths of boxes around them on which the cost is convex.
+    """
+
+    far: bool
+    atlas: Atlas
+    chart: Chart
+    minima: Array
+    sides: Array
+
+
+@compiled
+def floor_of(space: Space, cost: Cost) -> float:
+    """Return the sizes of what residuals are differences of, beside the nodes."""
+    if space.far:
+        return accuracy_floor_far(cost, space.atlas)
+    if space.chart.differs:  # its lines come from anywhere on a surface
+        return space.chart.floor
+    return accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, space.chart.origin, LINES)
+
+
+@inlined
+def set_place(space: Space, box: Box, piece: int) -> None:
+    """Set the centre of a box."""
+    if space.far:
+        set_centre(space.atlas, piece, box.at)
+    else:
+        place(space.chart.origin, space.chart.sense, box.at, box.centre)
+
+
+@inlined
+def set_box(space: Space, box: Box, piece: int) -> None:
+    """Set the centre of a box, and widen the box by the rounding of its centre."""
+    set_place(space, box, piece)
+    if not space.far:
+        widen(space.chart, box.centre, box.half)
+    elif piece > 2 * space.atlas.dimension:
+        widen_around(space.atlas, piece - 2 * space.atlas.dimension - 1, box.half)
+
+
+@compiled
+def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
+    """Bound the nodes of a cost over a box whose centre is set; return False where a surface is no graph over it."""
+    if space.far:
+        bound_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes)
+        return True
+    return is_bounded(cost, space.chart, box)
+
+
+@inlined
+def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array, size: int) -> int:
+    """Bound the nodes of a cost over a box off the stack; return -1, or without bounds the size of the stack.
+
+    A box in the surroundings of a known minimum is dropped. So is a box of another piece of a surface. A box over
+    which the surface is no graph is halved.
+    """
+    set_box(space, box, piece)
+    chart, half, line = space.chart, box.half, box.line
+    if space.far:
+        if is_left(space.atlas, box, piece):
+            return size
+        bound_pieces(space.atlas, cost.kinds, cost.data, half, box.nodes)
+    elif is_known(box.at, half, space.minima, space.sides):
+        return size
+    elif chart.surface.shape[0] > 0:
+        return lay_or_halve(cost, chart, box, stack, size)
+    else:
+        bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.nodes)
+    return -1
+
+
+@compiled
+def set_curves(space: Space, cost: Cost, box: Box) -> None:
+    """Bound second derivatives of the nodes over a box whose nodes are bounded."""
+    chart = space.chart
+    if space.far:
+        curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
+    elif chart.surface.shape[0] > 0:
+        curve_along(cost, chart, box)
+    else:
+        half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
+        curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
+
+
+@compiled
+def place_of(space: Space, box: Box, x: Array) -> None:
+    """Write the position x (D,) of the centre of a box that is set."""
+    if space.far:
+        position(space.atlas, x)
+    else:
+        for k in range(x.shape[0]):
+            x[k] = box.centre[k]
