@@ -40,7 +40,7 @@ class Space(NamedTuple):
 
 @compiled
 def floor_of(space: Space, cost: Cost) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes."""
+    """Return the sizes of measurements and coordinates in a residual, the nodes apart."""
     if space.far:
         return accuracy_floor_far(cost, space.atlas)
     if space.chart.differs:  # its lines come from anywhere on a surface
