@@ -358,7 +358,7 @@ def _with_known(cost: Cost, space: Space, near: Box, aim: Aim, corners: Array, c
 
 @compiled
 def _push_minimum(cost: Cost, space: Space, near: Box, x: Array, stack: Array, size: int) -> tuple[Space, int]:
-    """Return the atlas with one more minimum x (D,), and push boxes around it; it stays the same where x is no minimum."""
+    """Return the atlas with one more minimum x (D,), and push boxes around it; the same if x is no minimum."""
     known, atlas = space.atlas.minima.home.shape[0], one_more(space.atlas)
     if not set_minimum(cost, near, atlas, known, x, -inf, _POLISHED, inf):
         return space, size
