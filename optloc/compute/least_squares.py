@@ -15,6 +15,7 @@ from optloc.compute.pack import PackedRuns, coarseness
 from optloc.compute.sums import equations_at, packed, serves, sums_at
 from optloc.linear.constraints import Face, is_height
 from optloc.linear.equalities import Equalities
+from optloc.linear.folded import Folded
 from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
 from optloc.models.primitives import WGS84_A
 from optloc.problem.epochs import whole, windows
@@ -64,6 +65,7 @@ def refine(
     limit: int = 60,
     damped: bool = True,
     face: Face = (),
+    folded: Folded | None = None,
 ) -> Refined:
     """Return the local maximum-likelihood estimates next to given starts.
 
@@ -87,6 +89,8 @@ def refine(
     face : Face
         Constraints that hold with equality, also in every epoch of a run: steps follow their tangent space and are put
         back onto them.
+    folded : Folded, optional
+        Steps across a plane of symmetry of the problem, instead of a face.
 
     Returns
     -------
@@ -96,7 +100,7 @@ def refine(
     # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost; sixty steps are ten
     # times what fixes near their stations take.
     rules = Rules(float(tolerance), int(limit), bool(damped))
-    quick = None if face else _by_machine_code(problem, start, item, rules)
+    quick = None if face or folded else _by_machine_code(problem, start, item, rules)
     if quick is not None:
         return quick
     weights = None
@@ -107,7 +111,7 @@ def refine(
     if item is not None:
         problem = problem.take(item)
     if weights is not None:
-        return _iterate(problem, start, weights, rules, face)
+        return _iterate(problem, start, weights, rules, face, folded)
     for _ in range(WEIGHINGS):
         done = _remade(problem, start, rules, face)
         start = done.x
@@ -142,12 +146,15 @@ class _Weights:
         return equations_at(problem, x, self.matrices, at=self.at)
 
 
-def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules, face: Face) -> Refined:
+def _iterate(
+    problem: Problem, start: Array, weights: _Weights, rules: Rules, face: Face, folded: Folded | None = None
+) -> Refined:
     """Return the refinement with fixed weights."""
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         state = _State.begin(problem, start, weights)
-        active, part = np.arange(len(start)), _Part(problem, weights, face, _blur(problem, len(start)))
+        active = np.arange(len(start))
+        part = _Part(problem, weights, face, _blur(problem, len(start)), folded)
         for iteration in range(rules.limit):
             # The status until another is found: what still moves.
             moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
@@ -195,10 +202,17 @@ class _Part:
     weights: _Weights
     face: Face
     blur: Array
+    folded: Folded | None
 
     def take(self, items: Array) -> _Part:
         """Return some of them."""
-        return _Part(self.problem.take(items), self.weights.take(items), self.face, self.blur[items])
+        folded = None if self.folded is None else self.folded.take(items)
+        return _Part(self.problem.take(items), self.weights.take(items), self.face, self.blur[items], folded)
+
+    @property
+    def held(self) -> Equalities | Folded | None:
+        """Return what steps keep to, or None where they are free."""
+        return Equalities.of(self.problem, self.face) if self.face else self.folded
 
 
 # Roundings that lie between a measurement and its residual.
@@ -237,9 +251,9 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     now = state.equations if everything else _at(state.equations, active)
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
-    held = Equalities.of(part.problem, part.face) if part.face else None
+    held = part.held
     move, solvable = step(now, damping) if held is None else held.step(now, damping, here)
-    x = here + move if held is None else held.restore(here + move)
+    x = here + move if held is None else held.retract(here, move)
     after = part.weights.equations(part.problem, x)
     found = judge(
         now.cost,

@@ -55,6 +55,10 @@ class Equalities:
             return x
         return self._put(x, restore(self._single(x), self.each, self._states(x)))
 
+    def retract(self, x: Array, move: Array) -> Array:
+        """Return the vectors (M, size) that steps (M, size) from vectors lead to, on the equalities."""
+        return self.restore(x + move)
+
     def step(self, equations: Normal, damping: Array, x: Array) -> tuple[Array, Array]:
         """Return the damped steps (M, size) that keep the equalities to first order, and where they exist (M,).
 

@@ -36,7 +36,7 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, known_minima, set_minimum
-from optloc.proof.curvature import clip_to_stationary
+from optloc.proof.curvature import clip_to_minima
 from optloc.proof.descents import descend
 from optloc.proof.everywhere import leaves, push_faces
 from optloc.proof.near import cut_side, region_of
@@ -334,7 +334,7 @@ def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here
 
 @inlined
 def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
-    """Write the ends of the part of a box that may hold a minimum below a level; return the side to halve."""
+    """Write the ends of the part of a box that may hold a minimum below a level; return the side to halve, or -1."""
     chart = space.chart
     gram = box.gram if chart.surface.shape[0] > 0 else chart.gram
     noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
@@ -344,8 +344,8 @@ def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
         shrink(cost.K, cost.weight, sqrt(level) + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
     side = cut_side(cost.kinds, cost.K, gram, box.half, box.nodes, box.rows, here < level)
     curve_box(cost, chart, box)
-    clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
-    return int(side)
+    minima = clip_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+    return int(side) if minima else -1
 
 
 @compiled

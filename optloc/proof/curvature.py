@@ -39,6 +39,12 @@ from optloc.proof.nodes.node import (
 )
 from optloc.proof.nodes.range import curve_ranges
 
+DETERMINED = 1e-13
+"""Share of the best information below which rows do not determine a coordinate.
+
+Its square root, a ratio of standard deviations of three million, is beyond what doubles can tell.
+"""
+
 # How often in turn each component of the gradient is looked at: a second time took 3 % of the boxes, a third none.
 _SWEEPS = 2
 # Some units in the last place: what a sum of a few products is off by, relative to their sizes.
@@ -230,10 +236,8 @@ def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -
 
 
 @compiled
-def clip_to_stationary(
-    A: Array, half: Array, nodes: Array, curves: Array, sums: Array, cut: Array, solve: Array
-) -> None:
-    """Clip a box to where the gradient of f may vanish.
+def clip_to_minima(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, cut: Array, solve: Array) -> bool:
+    """Clip a box to where the gradient of f may vanish; return whether it may hold a minimum.
 
     Interval Newton: the gradient at c + s is ``g + H s``, H the mean of the Hessian between centre and s. Bounds of its
     change over t times the box are at most t times those over the box (`optloc.proof.nodes.node`), so the mean changes
@@ -248,7 +252,7 @@ def clip_to_stationary(
     solve : array (3, 3)
         Working memory.
     """
-    clip_newton(half, sums, spread_of(A, half, nodes, curves, sums), cut, solve)
+    return not has_no_infimum(3, False, half, sums, spread_of(A, half, nodes, curves, sums), cut, solve)
 
 
 @inlined
@@ -395,6 +399,38 @@ def _bends_down(sums: Array, ball: float, hessian: Array) -> bool:
             most += sums[at] * z + sums[C00 + at] * abs(z)
     size = abs(sums[H00]) + abs(sums[H11]) + abs(sums[H22])
     return bool(most < -1e-9 * size)  # by more than the rounding of the Hessian's entries
+
+
+@compiled
+def least_of(information: Array, dimension: int) -> float:
+    """Return the least entry of the diagonal of an information matrix."""
+    least = inf
+    for k in range(dimension):
+        least = min(least, information[k, k])
+    return least
+
+
+@compiled
+def bend_axes(sums: Array, axes: Array, information: Array, dimension: int) -> None:
+    """Take the second derivative of the cost along axes that the rows do not determine to first order.
+
+    On a plane of symmetry all first derivatives across it vanish.
+
+    Parameters
+    ----------
+    sums : array (SUMS,)
+        With the Hessian of f/2.
+    axes, information : array (3, 3)
+        Axes in columns, and the information along them on the diagonal; raised.
+    dimension : int
+        2 or 3.
+    """
+    for column in range(dimension):
+        bent = 0.0
+        for k in range(3):
+            for m in range(3):
+                bent += axes[k, column] * axes[m, column] * sums[entry(k, m)]
+        information[column, column] = max(information[column, column], bent)
 
 
 @compiled

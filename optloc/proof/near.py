@@ -29,7 +29,7 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.convex_boxes import is_known, known_minima
-from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
+from optloc.proof.curvature import G0, G1, G2, clip_to_minima, convex, curve_nodes, sum_up
 from optloc.proof.descents import descend
 from optloc.proof.enclosure import around_node, enclose
 from optloc.proof.nodes.node import (
@@ -175,8 +175,8 @@ def branch(
             else:
                 curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
             sum_up(K, w, weight, noise, nodes, curves, sums)
-            if sound:
-                clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
+            if sound and not clip_to_minima(A, half, nodes, curves, sums, cut, solve):
+                continue
             if here < aim.level and not is_empty(cut):
                 low_points += 1
                 # Early, then more and more seldom, and wherever a box holds one minimum at most.

@@ -13,7 +13,7 @@ from optloc.compute.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
 from optloc.proof.atlas import Atlas, Minima
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, cube, digits, reaches_infinity, rounding
-from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
+from optloc.proof.curvature import DETERMINED, G0, G1, G2, SUMS, bend_axes, convex, curve_nodes, least_of, sum_up
 from optloc.proof.groups import Groups, empty_groups, set_groups
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, size_of
 from optloc.proof.nodes.level import LEAST_RADIUS
@@ -35,9 +35,6 @@ from optloc.proof.surface import (
     unfold_slopes,
 )
 
-# Search coordinates along which the information is less than this share of the best are not determined by the rows:
-# the square root, a ratio of standard deviations of three million, is beyond what doubles can tell.
-_DETERMINED = 1e-13
 # Roundings of a coordinate on its way from search coordinates to metres: three products, three sums, and the sizes of
 # what they are rounded beside.
 _PLACED = 8.0 * 2.0**-52
@@ -257,10 +254,18 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         count = set_tangents(D, planes, surface, gram)
         principal_along(information, gram, count)
     most = max(information[0, 0], information[1, 1], information[2, 2])
+    if count == D and least_of(information, D) <= DETERMINED * most:
+        lengths = information.copy()  # what follows overwrites it
+        unit = np.eye(3)
+        curve_nodes(cost.kinds, cost.data, origin, unit, unit, box.half, box.line, information, nodes, curves)
+        sum_up(cost.K, cost.w, cost.weight, 0.0, nodes, curves, sums)
+        bend_axes(sums, gram, lengths, D)
+        for k in range(D):
+            information[k, k] = lengths[k, k]
     good, sense[:] = count > 0, 0.0
     for k in range(count):
         length = information[k, k]
-        good = good and length > _DETERMINED * most
+        good = good and length > DETERMINED * most
         root = sqrt(length) if length > 0.0 else 1.0
         for m in range(3):
             sense[m, k], back[k, m] = gram[m, k] / root, gram[m, k] * root

@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc.adequacy.shape import BENT
 from optloc.base.cache import Cache
 from optloc.base.records import take
 from optloc.base.types import Array, Motion, Status
@@ -25,6 +26,7 @@ from optloc.linear.vectors import vectors, without_biases
 from optloc.problem.fix import Active, Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
+from optloc.solvers.coplanar import join_sides
 from optloc.solvers.policy import WEAK, equal_cost
 from optloc.solvers.pool import PART, Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
@@ -92,7 +94,7 @@ def settle_directly(
     answer, steps = plan.run(load, z, threads)
     left = np.flatnonzero(~answer.settled)
     if not len(left):
-        return _pool(plan, _preferred(answer, problems_at), steps, began)
+        return _with_sides(_pool(plan, _preferred(answer, problems_at), steps, began), problems_at)
     # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
     some = problems_at(left)
     start = in_parts(some, lambda part, _: gtrs(part, None))
@@ -100,7 +102,7 @@ def settle_directly(
     more, again = plan.run(load.take(left), z[left], threads, np.where(alone[:, None], start.x[:, 0], np.nan))
     for whole, part in zip(answer, more, strict=True):
         whole[left] = part
-    pool = _pool(plan, _preferred(answer, problems_at), max(steps, again), began)
+    pool = _with_sides(_pool(plan, _preferred(answer, problems_at), max(steps, again), began), problems_at)
     lost = np.flatnonzero(~more.settled)
     if not len(lost):
         return pool
@@ -155,6 +157,20 @@ def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
         infinity=answer.infinity,
         free=answer.cost if plan.model.admission.level.shape[1] else None,
     )
+
+
+def _with_sides(pool: Pool, problems_at: Callable[[Array], Problem]) -> Pool:
+    """Return a settled pool in which both sides of the plane of the stations are one region, where they are."""
+    assert pool.curvature is not None
+    assert pool.curvature.kappa is not None
+    assert pool.plain is not None
+    with np.errstate(invalid="ignore"):
+        items = np.flatnonzero(~pool.plain | ~(pool.curvature.kappa[:, 0] <= BENT))
+    if not len(items):
+        return pool
+    some, own = problems_at(items), take(pool, items)
+    joined = join_sides(some, own)
+    return pool if joined is own else pool.merge(items, joined, joined.stages[-1])
 
 
 def active_of(plan: Plan, multiplier: Array) -> Array | None:

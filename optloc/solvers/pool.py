@@ -132,6 +132,8 @@ class Pool:
         looked.
     free : array (N,), optional
         Least cost without the inequalities, where there are some.
+    joined : bool array (N, q), optional
+        Minima that belong to the likelihood region of the best: no rivals of it.
     loss : str
         Name of the loss that doubts rows, or "" where all are believed.
     searched : bool array (N,), optional
@@ -167,6 +169,7 @@ class Pool:
     plain: Annotated[Array, Axes(0, empty=False)] | None = None
     infinity: Annotated[Array, Axes(0)] | None = None
     free: Annotated[Array, Axes(0)] | None = None
+    joined: Annotated[Array, Axes(1, slots=True, empty=False)] | None = None
     loss: str = ""
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None

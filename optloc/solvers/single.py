@@ -49,6 +49,7 @@ from optloc.solvers.certify.branch_and_bound import (
 )
 from optloc.solvers.certify.out_of_reach import Edges, Scratch, are_out_of_reach, edges_of, scratch
 from optloc.solvers.certify.position_cost import agrees, surfaces_of
+from optloc.solvers.coplanar import APART, normal_of
 from optloc.solvers.inequalities import Sight, sights
 from optloc.solvers.methods import Method
 from optloc.solvers.planned import active_of, direct_stages
@@ -154,6 +155,8 @@ class Single:
         Bounds that proofs show to be out of reach; None without bounds.
     sights : list of Sight
         Lines of sight that the Earth may block.
+    normal : array (d,), optional
+        Of the plane of all stations, where both sides of it are alike.
     absent : bool array (m,), optional
         Rows of weight zero, which may hold anything; None where all count.
     centre : array (d,)
@@ -176,6 +179,7 @@ class Single:
     upward: int | None
     edges: Edges | None
     sights: list[Sight]
+    normal: Array | None
     absent: Array | None
     centre: Array
     doubt: float
@@ -206,6 +210,8 @@ class Single:
             tied = self.plan.frame.geodetic and one.rival_cost - one.cost <= equal_cost(one.cost)
             if not one.settled or tied or not one.cost <= self.doubt:
                 return None
+        if self.normal is not None and self._is_near_plane(self.normal, answer):
+            return None
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
         if self.map is not None:
@@ -218,6 +224,13 @@ class Single:
             room.checked = self._agrees(fix, room)
             return fix if room.checked else None
         return fix
+
+    def _is_near_plane(self, normal: Array, answer: Answer) -> bool:
+        """Return whether a fix may be so near to the plane of the stations that both sides of it are one region."""
+        d = len(normal)
+        w = np.abs((answer.x[:, :d] - self.centre) @ normal)
+        variance = (answer.covariance[:, :d, :d] @ normal) @ normal
+        return not bool((w * w > APART * APART * variance).all())
 
     def _proves(self, affine: Affine, answer: Answer, found: list[Found], room: _Room) -> bool:
         """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
@@ -462,6 +475,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         upward[0] if upward else None,
         edges,
         sights(bare.flat()),
+        normal_of(bare.flat()),
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),
         largest(plan.dof, DOUBT),

@@ -22,6 +22,7 @@ from optloc.linear.vectors import hold_still, vectors
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
+from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
 from optloc.solvers.policy import DOUBT
@@ -374,7 +375,8 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=told, hidden=pool.hidden)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
-    return settle(problem, refined, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
+    settled = settle(problem, refined, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
+    return join_sides(problem, settled) if damped else settled
 
 
 def taylor(problem: Problem, pool: Pool | None) -> Pool:

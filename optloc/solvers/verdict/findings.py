@@ -146,7 +146,7 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
             improbable | bool(pool.refuted),
             np.nan if pool.infinity is None else pool.infinity - cost,
             quantile(COVERED, problem.dimension),
-            gap.min(1, initial=np.inf),
+            _apart(pool, gap).min(1, initial=np.inf),
             np.nan if kappa is None else kappa[:, 0],
             _is_unique(pool),
             False if pool.searched is None else pool.searched,
@@ -161,6 +161,11 @@ def marks_of(*numbers: Any) -> Any:
     for status_mark, test in _TESTS:
         marks = marks | test(evidence) * status_mark
     return marks
+
+
+def _apart(pool: Pool, gap: Array) -> Array:
+    """Return the gaps (N, r) of the minima outside the region of the best; infinite for the others."""
+    return gap if pool.joined is None else np.where(pool.joined[:, 1:], np.inf, gap)
 
 
 def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
@@ -366,7 +371,7 @@ def _name_infinity(finished: Finished, items: Array) -> Any:
 
 
 def _name_rivals(finished: Finished, items: Array) -> Any:
-    gaps = finished.gap[items].min(1).tolist()
+    gaps = _apart(finished.pool, finished.gap)[items].min(1).tolist()
     return np.array([ambiguity(finished.problem, gap) for gap in gaps], dtype=object)
 
 

@@ -40,7 +40,7 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
     """Return the curvature at vectors x (N, size) that lie on given faces (N,) of the constraints."""
     information, vector, ok = marginal(equations)
     covariance, regular = linalg.inverse(information)
-    weakest = _smallest_pivot(information)
+    weakest = smallest_pivot(information)
     active: Array = np.frompyfunc(lambda _: (), 1, 1)(np.arange(len(x)))
     sides = faces(problem) if problem.constraints else [()]
     for number in np.unique(face):
@@ -52,7 +52,7 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
         covariance[items], regular[items] = linalg.inverse_within(information[items], along)
         # what constraints hold is not open: the pivots are those along the face
         inner = np.swapaxes(along, -1, -2) @ information[items] @ along
-        weakest[items] = _smallest_pivot(inner) if inner.shape[-1] else 1.0
+        weakest[items] = smallest_pivot(inner) if inner.shape[-1] else 1.0
         active[items] = _multipliers(part, sides[number], x[items], vector[items])
     regular = ok & regular
     local = _local_covariance(problem, equations, covariance)
@@ -84,7 +84,7 @@ def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array
     return out
 
 
-def _smallest_pivot(information: Array) -> Array:
+def smallest_pivot(information: Array) -> Array:
     """Return the smallest squared pivot of the information scaled to a unit diagonal, (N,)."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
