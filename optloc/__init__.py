@@ -22,6 +22,7 @@ from optloc.problem.problem import Problem
 # Everything else loads when its name is first used: solvers, proofs and tables take half a second together.
 if TYPE_CHECKING:
     from optloc.adequacy.advice import advise, explained
+    from optloc.adequacy.coplanar import distance_from_plane
     from optloc.adequacy.evidence import Reliability, reliability
     from optloc.adequacy.geometry import Advice
     from optloc.adequacy.noise_level import CommonLevel, LateSignals
@@ -151,6 +152,7 @@ __all__ = [
     "constraints",
     "crlb",
     "crlb_course",
+    "distance_from_plane",
     "epochs",
     "explained",
     "frames",
@@ -239,6 +241,7 @@ _HOMES = {
     "solvers.running": "Running",
     "linear.least_squares_ranges": "reduce",
     "solvers.suspects.stage": "suspects",
+    "adequacy.coplanar": "distance_from_plane",
     "uncertainty.arc": "Arc trace_arc",
     "uncertainty.posterior": "Mixture Samples mixture samples",
     "uncertainty.radii": "Accuracy accuracy",

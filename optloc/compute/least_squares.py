@@ -15,7 +15,7 @@ from optloc.compute.pack import PackedRuns, coarseness
 from optloc.compute.sums import equations_at, packed, serves, sums_at
 from optloc.linear.constraints import Face, is_height
 from optloc.linear.equalities import Equalities
-from optloc.linear.folded import Folded
+from optloc.linear.mirror import Folded
 from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
 from optloc.models.primitives import WGS84_A
 from optloc.problem.epochs import whole, windows

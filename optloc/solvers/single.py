@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optloc.adequacy.coplanar import normal_of
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
@@ -49,7 +50,7 @@ from optloc.solvers.certify.branch_and_bound import (
 )
 from optloc.solvers.certify.out_of_reach import Edges, Scratch, are_out_of_reach, edges_of, scratch
 from optloc.solvers.certify.position_cost import agrees, surfaces_of
-from optloc.solvers.coplanar import APART, normal_of
+from optloc.solvers.coplanar import APART
 from optloc.solvers.inequalities import Sight, sights
 from optloc.solvers.methods import Method
 from optloc.solvers.planned import active_of, direct_stages

@@ -14,6 +14,7 @@ from optloc.base import linalg
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
+from optloc.linear.mirror import one_position
 from optloc.linear.redundancy import present_unknowns
 from optloc.linear.vectors import hold_still, vectors
 from optloc.models import MODELS
@@ -22,7 +23,7 @@ from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, begin, offer, pack
 from optloc.solvers.stages import explain_absence, fix_by, gtrs, lsr
-from optloc.solvers.starts.position import one_position, spread_of
+from optloc.solvers.starts.position import spread_of
 from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.starts.squared_range import Coordinates, lift_rows
 from optloc.solvers.verdict.judge import judge

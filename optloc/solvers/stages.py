@@ -17,6 +17,7 @@ from optloc.base.types import Array, Status
 from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
+from optloc.linear.mirror import mirror, one_position
 from optloc.linear.normal import decrement, step
 from optloc.linear.vectors import hold_still, vectors
 from optloc.problem.fix import Fix, Stage
@@ -29,14 +30,7 @@ from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, crowd_of, in_parts, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
-from optloc.solvers.starts.position import (
-    along_the_valley,
-    mirror,
-    one_position,
-    registrable,
-    spread_of,
-    subarray_starts,
-)
+from optloc.solvers.starts.position import along_the_valley, registrable, spread_of, subarray_starts
 from optloc.solvers.starts.registration import step_beside
 from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.verdict.judge import judge, standing

@@ -25,6 +25,7 @@ from optloc.calibration.rounds import starts_of
 from optloc.compute.least_squares import WEIGHINGS
 from optloc.compute.sums import equations_at
 from optloc.linear.evaluate import differentiate
+from optloc.linear.mirror import one_position
 from optloc.linear.normal import depends_on_place, prior_parts, step, weighed
 from optloc.linear.vectors import vectors
 from optloc.models import MODELS
@@ -34,7 +35,7 @@ from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import given, judge_points
 from optloc.solvers.pool import offer
-from optloc.solvers.starts.position import one_position, spread_of
+from optloc.solvers.starts.position import spread_of
 from optloc.solvers.verdict.judge import judge
 from optloc.study.draws import Drawn
 from optloc.study.networks import Found, Networks, each, from_truth, refined

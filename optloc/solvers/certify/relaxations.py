@@ -16,11 +16,11 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array
 from optloc.linear.least_squares_ranges import Ranges, ranges
+from optloc.linear.mirror import one_position
 from optloc.linear.vectors import hold_still
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import angle_bounds, bearings
-from optloc.solvers.starts.position import one_position
 
 TIGHT = 1e-3
 """A bound within this of the cost, relative to one plus the cost, leaves nothing to be found."""

@@ -11,6 +11,7 @@ from optloc.base.types import Array, Status
 from optloc.compute.least_squares import refine
 from optloc.linear.constraints import exact
 from optloc.linear.courses import elapsed
+from optloc.linear.mirror import one_position, rows_of_stations
 from optloc.linear.normal import depends_on_place, weighed
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.vectors import vectors
@@ -20,7 +21,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, pack
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
-from optloc.solvers.starts.position import one_position, registrable, rows_of_stations
+from optloc.solvers.starts.position import registrable
 from optloc.solvers.starts.registration import mirror_courses, split_epochs
 from optloc.solvers.verdict.judge import judge, standing
 

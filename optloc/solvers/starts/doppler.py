@@ -13,12 +13,13 @@ from optloc.base.linalg import whitening
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import block_links
+from optloc.linear.mirror import one_position
 from optloc.linear.vectors import vectors
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.noise import dense, variances
 from optloc.problem.problem import Problem
-from optloc.solvers.starts.position import known_height, one_position
+from optloc.solvers.starts.position import known_height
 
 _AXES = WGS84_A * np.array([1.0, 1.0, 1.0 - WGS84_F])
 

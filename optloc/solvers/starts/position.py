@@ -11,7 +11,7 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Band
 from optloc.linear.least_squares_ranges import Ranges, ranges
-from optloc.models import MODELS
+from optloc.linear.mirror import is_of_ranges, one_position, rows_of_stations
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.squared_range import Pick, candidates, every
@@ -52,42 +52,6 @@ def squared_range_starts(problem: Problem, pick: Pick) -> Array:
     for mask, points in parts:
         position[mask, : points.shape[1]] = points
     return position
-
-
-def mirror(problem: Problem, position: Array) -> Array:
-    """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
-    centre, axes, _ = plane_of_stations(problem)
-    # eigenvalues ascend: the stations spread least along the first vector
-    normal = axes[..., :, 0]
-    shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
-    across, middle = normal.reshape(shape), centre.reshape(shape)
-    return np.asarray(position - 2.0 * ((position - middle) * across).sum(-1, keepdims=True) * across)
-
-
-def plane_of_stations(problem: Problem) -> tuple[Array, Array, Array]:
-    """Return the plane (or line) that fits the stations of each problem best.
-
-    Stations that stay count where a row is present of them, those that move as they are.
-
-    Returns
-    -------
-    centre : array (N or 1, d)
-        Mean of the stations, metres.
-    axes : array (N or 1, d, d)
-        Unit vectors, in columns: the normal first, and the axis along which the stations spread most last.
-    thickness : array (N or 1,)
-        Greatest distance of a station from the plane, in units of the greatest from the centre.
-    """
-    places = problem.stations.places
-    flat = places if places.ndim == 3 else places[None]
-    share = np.ones((1, flat.shape[-2], 1))
-    if problem.stations.position.shape[-3] == 1:
-        share = ((problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T > 0.0).astype(float)[..., None]
-    centre = (share * flat).sum(-2, keepdims=True) / np.maximum(share.sum(-2, keepdims=True), 1.0)
-    away = share * (flat - centre)
-    _, axes = np.linalg.eigh(np.swapaxes(flat - centre, -1, -2) @ away)
-    off, size = np.abs(away @ axes[..., :, :1])[..., 0].max(-1), np.sqrt((away**2).sum(-1)).max(-1)
-    return centre[..., 0, :], axes, off / np.where(size > 0.0, size, 1.0)
 
 
 def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Array:
@@ -137,15 +101,6 @@ def subarray_starts(problem: Problem) -> Array:
     return np.concatenate(parts, axis=1)
 
 
-def rows_of_stations(problem: Problem) -> Array:
-    """Return which rows (s, m) each station takes part in."""
-    every, parts = np.arange(problem.stations.count)[:, None], []
-    for rows in problem.rows:
-        taken = MODELS[rows.kind].stations
-        parts.append(((rows.a == every) & (taken > 0)) | ((rows.b == every) & (taken > 1)))
-    return np.concatenate(parts, axis=1)
-
-
 # The size of a problem: numbers of order one are what solvers need.
 
 
@@ -167,14 +122,6 @@ def distance_of(problem: Problem, position: Array) -> Array:
         return np.asarray(np.sqrt((away**2).sum(-1)) / spread.reshape(-1, *extra))
 
 
-def one_position(problem: Problem) -> bool:
-    """Return whether a single position, seen from stations that stay, is all that needs a start."""
-    if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
-        return False
-    still = problem.stations.position.shape[-3] == 1 and problem.motions[0].order == 0
-    return still or problem.epochs == 1
-
-
 def over_ground(problem: Problem) -> bool:
     """Return whether one position on Earth is sought, and a row or a constraint may tell its height."""
     told = bool(problem.constraints) or any(rows.kind == "height" for rows in problem.rows)
@@ -188,12 +135,6 @@ def registrable(problem: Problem) -> bool:
     motion, moving = problem.motions[0], problem.stations.position.shape[-3] > 1
     differences = any(is_of_ranges(rows.kind) for rows in problem.rows)
     return differences and motion.known is None and motion.span == "run" and (moving or motion.order > 0)
-
-
-def is_of_ranges(kind: str) -> bool:
-    """Return whether a kind is a sum or a ratio of ranges."""
-    model = MODELS[kind]
-    return model.ranges is not None or (model.lifted is not None and not model.axes)
 
 
 # Starts from a known height: three ranges with one common unknown, or two known ranges, meet the ellipsoid.

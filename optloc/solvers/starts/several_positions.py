@@ -12,6 +12,7 @@ from optloc.base import linalg
 from optloc.base.types import Array, Band, Motion, Polygon, Stations
 from optloc.linear.constraints import is_exact, needs_velocity
 from optloc.linear.courses import elapsed
+from optloc.linear.mirror import one_position
 from optloc.linear.vectors import hold_still, vectors, without_biases
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, untied
@@ -20,7 +21,6 @@ from optloc.problem.layout import state_names
 from optloc.problem.noise import Block, Noise, group
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import course_starts, course_states
-from optloc.solvers.starts.position import one_position
 
 
 def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:

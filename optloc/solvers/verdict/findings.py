@@ -13,6 +13,7 @@ from optloc.base.linalg import centre_and_spread, centre_of_points
 from optloc.base.records import present, take
 from optloc.base.types import PRECEDENCE, Array, Certificate, Status
 from optloc.linear.constraints import faces
+from optloc.linear.mirror import one_position, rows_of_stations
 from optloc.linear.redundancy import largest
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.claims import GLOBAL, Claims, claim
@@ -20,7 +21,6 @@ from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, NOTICED, REFUTED
 from optloc.solvers.pool import Curvature, Pool
-from optloc.solvers.starts.position import one_position, rows_of_stations
 
 NO_PROOF = claim(
     Certificate(

@@ -12,6 +12,7 @@ from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import Face, face_names, faces, levels, tangent_at
+from optloc.linear.mirror import one_position
 from optloc.linear.normal import Normal, local_covariance, marginal
 from optloc.linear.vectors import vectors
 from optloc.linear.walks import walk_names
@@ -21,7 +22,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import lowest_sight
 from optloc.solvers.policy import AMBIGUOUS_GAP, FAR, FLAT, LISTED_GAP, SAME_PLACE, WEAK, equal_cost
 from optloc.solvers.pool import Curvature, Pool
-from optloc.solvers.starts.position import distance_of, one_position, spread_of
+from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.findings import centre_of
 
 # Information that is none: no square of a Jacobian is as small, and its root still has an inverse.
