@@ -1,7 +1,7 @@
 """How far a target is from the plane of all stations, both sides of which fit alike.
 
-The cost is one of the place in the plane and of q = w^2, the square of the distance. The law of w is that of the
-profile of the cost over q, which no Gaussian describes near the plane.
+The cost is one of the place in the plane and of q = w^2, the square of the distance. The law of w follows from
+the profile of the cost over q: near the plane no Gaussian describes it.
 """
 
 from __future__ import annotations
@@ -16,19 +16,22 @@ from optloc.base.types import Array
 from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.linear.mirror import Folded, is_of_ranges, one_position, plane_of_stations
-from optloc.linear.normal import depends_on_place, marginal
+from optloc.linear.normal import depends_on_place, marginal, prior_parts
+from optloc.models import MODELS
 from optloc.problem.chart import quantile
 from optloc.problem.fix import Fix
+from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 
 REGION_LEVEL = 0.95
-"""Probability of the interval of the distance from the plane, by which one region is told from two."""
+"""Probability of the interval of the distance from the plane, which separates one region from two."""
 JOINED = quantile(REGION_LEVEL, 1)
 """Cost on the plane, above the least, up to which both sides of it are one region."""
 
-# Share of the spread of the stations by which they may be off a plane: rounding of their coordinates.
-_COPLANAR = 1e-9
-# Share of the spread of the stations that stands for no distance: its square changes no range by a digit that counts.
+# Share of the spread of the stations by which they may be off a plane: rounding of their coordinates. And the share of
+# the noise: it changes a residual by a thousandth of a standard deviation at most.
+_COPLANAR, _UNHEARD = 1e-9, 1e-3
+# Share of the spread of the stations that counts as no distance: its square changes no range by a digit that counts.
 _NONE = 1e-6
 # Steps at most: the cost is nearly quadratic in q, and most take two.
 _STEPS = 100
@@ -37,7 +40,7 @@ _STEPS = 100
 _SETTLED, _PROFILED = 1e-7, 1e-2
 # Standard deviations of q at which the end of its interval is looked for first: of a Gaussian it is at two.
 _FIRST = 2.5
-# Fourfold steps away from the plane: as many lead a million spreads of the stations away.
+# Fourfold steps away from the plane: twelve lead a million spreads of the stations away.
 _FURTHER = 12
 # Steps towards an end at most, and the standard deviations that it may be off.
 _TRIALS, _CLOSE = 20, 1e-2
@@ -45,7 +48,7 @@ _TRIALS, _CLOSE = 20, 1e-2
 
 @dataclass(frozen=True, slots=True)
 class Across:
-    """N problems in coordinates whose last one is the distance from the plane of the stations.
+    """N problems in coordinates of which the last is the distance from the plane of the stations.
 
     Parameters
     ----------
@@ -68,14 +71,13 @@ class Across:
     def of(cls, problem: Problem) -> Across:
         """Return problems whose stations are coplanar."""
         count = problem.batch_shape[0]
-        centre, axes, _ = plane_of_stations(problem)
+        centre, axes, _, size = plane_of_stations(problem)
         centre, axes = np.broadcast_to(centre, (count, centre.shape[-1])), axes[..., ::-1]
         axes = np.broadcast_to(axes, (count, *axes.shape[-2:]))
         place = (problem.stations.position - centre[:, None, None]) @ axes[:, None]
         place[..., -1] = 0.0
         stations = replace(problem.stations, position=place)
         turned = replace(problem, stations=stations, constraints=())
-        size = np.sqrt((place**2).sum(-1)).max((-1, -2))
         return cls(turned, centre, axes, np.broadcast_to(np.where(size > 0.0, size, 1.0), (count,)))
 
     def take(self, items: Array) -> Across:
@@ -84,13 +86,13 @@ class Across:
 
     @property
     def part(self) -> slice:
-        """Return where the position stands among the unknowns."""
+        """Return the slice of the position in the vector of unknowns."""
         slot, _ = self.problem.layout.find("position")
         return slice(slot.start, slot.start + slot.size)
 
     @property
     def least(self) -> Array:
-        """Return the distances (N,) that stand for none, metres."""
+        """Return the distances (N,) that count as zero, metres."""
         return _NONE * self.size
 
     def to_plane(self, x: Array) -> Array:
@@ -110,7 +112,7 @@ class Across:
         return out
 
     def refine(self, x: Array, *, held: bool) -> tuple[Array, Array, Array]:
-        """Return where steps in the plane and in q end: vectors (N, size), costs and `Status` numbers (N,).
+        """Return the ends of steps in the plane and in q: vectors (N, size), costs and `Status` numbers (N,).
 
         Parameters
         ----------
@@ -145,17 +147,29 @@ def is_symmetric(problem: Problem) -> bool:
     """Return whether rows and priors of a problem are the same for mirror images in a plane of its stations."""
     if not one_position(problem) or depends_on_place(problem) or problem.stations.errors:
         return False
-    if any(name == "position" for name, *_ in problem.priors):
+    if any(name == "position" for name, _, _ in prior_parts(problem)):
         return False
     return problem.medium is None and all(is_of_ranges(rows.kind) for rows in problem.rows)
 
 
 def is_coplanar(problem: Problem) -> Array:
-    """Return whether all stations of each problem lie in one plane, or in the plane on one line, (N,)."""
+    """Return whether all stations of each problem lie in one plane, or in the plane on one line, (N,).
+
+    So do stations that are off it by far less than the noise.
+    """
     count = problem.batch_shape[0]
     if not is_symmetric(problem):
         return np.zeros(count, dtype=bool)
-    return np.broadcast_to(plane_of_stations(problem)[2] <= _COPLANAR, (count,))
+    _, _, off, size = plane_of_stations(problem)
+    return np.broadcast_to(off <= np.maximum(_COPLANAR * size, _UNHEARD * _noise(problem)), (count,))
+
+
+def _noise(problem: Problem) -> Array:
+    """Return the least standard deviation (N or 1,) of the ranges, metres; zero for other rows."""
+    if any(MODELS[rows.kind].ranges is None for rows in problem.rows):
+        return np.zeros(1)
+    sigma = np.sqrt(variances(problem.noise, problem.count))
+    return np.asarray(np.where(problem.weight > 0.0, sigma, np.inf).min(-1).reshape(-1))
 
 
 def normal_of(problem: Problem) -> Array | None:
@@ -168,8 +182,8 @@ def normal_of(problem: Problem) -> Array | None:
 def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tuple[float, float]:
     """Return the interval of the distance of a target from the plane that all stations lie in.
 
-    It holds the distances at which the least cost is below that of the fix plus a quantile of chi-square: the profile
-    likelihood. Both sides of the plane fit alike, so the distance has no sign.
+    It follows from the profile likelihood: in it the least cost is below the cost of the fix plus a quantile of
+    chi-square. Both sides of the plane fit alike, so the distance has no sign.
 
     Parameters
     ----------
@@ -254,7 +268,7 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
 
 
 def _spread_of_square(across: Across, x: Array) -> Array:
-    """Return standard deviations (N,) of q; where there are none, the squared sizes of the arrays."""
+    """Return standard deviations (N,) of q; the squared sizes of the arrays where q has no information."""
     covariance, _ = linalg.inverse(information_in_square(across, x)[0])
     own = across.part.stop - 1
     with np.errstate(invalid="ignore"):
@@ -272,12 +286,14 @@ def _beyond(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, 
         if not within.any():
             break
         far = np.where(within, 4.0 * far, far)
-        reached, cost = across.profile(reached, far)
+        there, found = across.profile(reached, far)
+        cost = np.where(within, found, cost)
+        reached = np.where((cost <= top)[:, None], there, reached)
     return np.where(cost <= top, np.inf, far), cost
 
 
 def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], first: Array) -> Array:
-    """Return the distances (N,) at which the profile of the cost is so much above its least: false position in q.
+    """Return the distances (N,) at which the profile of the cost reaches a rise: false position in q.
 
     What is followed is the root of the rise, which is nearly linear in q.
 
@@ -286,7 +302,7 @@ def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], fi
     across, x : Across, array (N, size)
         The problems, and their fixes.
     rise : float
-        Of the cost above that of the fix.
+        Of the cost above the fix.
     ends : tuple of array (N,)
         The q of the fix and its cost; a q whose cost is above the level, and this cost.
     first : array (N,)
@@ -301,11 +317,12 @@ def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], fi
     low, high, side = np.full(len(x), -wanted), np.sqrt(above - least) - wanted, np.zeros(len(x))
     q, reached = np.where((first > np.minimum(a, b)) & (first < np.maximum(a, b)), first, 0.5 * (a + b)), x
     for _ in range(_TRIALS):
-        reached, cost = across.profile(reached, np.sqrt(q))
+        there, cost = across.profile(reached, np.sqrt(q))
         now = np.where(np.isfinite(cost), np.sqrt(np.maximum(cost - least, 0.0)) - wanted, np.inf)
         if (np.abs(now) <= _CLOSE).all():
             break
         over = now > 0.0
+        reached = np.where(over[:, None], reached, there)
         # an end that stays twice in a row counts half
         low, high = np.where(over & (side > 0.0), 0.5 * low, low), np.where(~over & (side < 0.0), 0.5 * high, high)
         a, low = np.where(over, a, q), np.where(over, low, now)

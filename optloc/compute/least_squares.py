@@ -211,7 +211,7 @@ class _Part:
 
     @property
     def held(self) -> Equalities | Folded | None:
-        """Return what steps keep to, or None where they are free."""
+        """Return the constraints of steps; None for free steps."""
         return Equalities.of(self.problem, self.face) if self.face else self.folded
 
 

@@ -32,7 +32,7 @@ def is_of_ranges(kind: str) -> bool:
 
 
 def rows_of_stations(problem: Problem) -> Array:
-    """Return which rows (s, m) each station takes part in."""
+    """Return the mask (s, m) of the rows of each station."""
     every, parts = np.arange(problem.stations.count)[:, None], []
     for rows in problem.rows:
         taken = MODELS[rows.kind].stations
@@ -42,7 +42,7 @@ def rows_of_stations(problem: Problem) -> Array:
 
 def mirror(problem: Problem, position: Array) -> Array:
     """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
-    centre, axes, _ = plane_of_stations(problem)
+    centre, axes, _, _ = plane_of_stations(problem)
     # eigenvalues ascend: the stations spread least along the first vector
     normal = axes[..., :, 0]
     shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
@@ -50,7 +50,7 @@ def mirror(problem: Problem, position: Array) -> Array:
     return np.asarray(position - 2.0 * ((position - middle) * across).sum(-1, keepdims=True) * across)
 
 
-def plane_of_stations(problem: Problem) -> tuple[Array, Array, Array]:
+def plane_of_stations(problem: Problem) -> tuple[Array, Array, Array, Array]:
     """Return the plane (or line) that fits the stations of each problem best.
 
     Stations that stay count where a row is present of them, those that move as they are.
@@ -61,8 +61,8 @@ def plane_of_stations(problem: Problem) -> tuple[Array, Array, Array]:
         Mean of the stations, metres.
     axes : array (N or 1, d, d)
         Unit vectors, in columns: the normal first, and the axis along which the stations spread most last.
-    thickness : array (N or 1,)
-        Greatest distance of a station from the plane, in units of the greatest from the centre.
+    off, size : array (N or 1,)
+        Greatest distances of a station from the plane and from the centre, metres.
     """
     places = problem.stations.places
     flat = places if places.ndim == 3 else places[None]
@@ -73,7 +73,7 @@ def plane_of_stations(problem: Problem) -> tuple[Array, Array, Array]:
     away = share * (flat - centre)
     _, axes = np.linalg.eigh(np.swapaxes(flat - centre, -1, -2) @ away)
     off, size = np.abs(away @ axes[..., :, :1])[..., 0].max(-1), np.sqrt((away**2).sum(-1)).max(-1)
-    return centre[..., 0, :], axes, off / np.where(size > 0.0, size, 1.0)
+    return centre[..., 0, :], axes, off, size
 
 
 # Steps in the square of the distance from the plane.
@@ -88,7 +88,7 @@ class Folded:
     column : int
         The distance from the plane among the shared unknowns.
     least : array (M,)
-        The distance that stands for none, metres: so small that its square changes no range.
+        The distance that counts as zero, metres: so small that its square changes no range.
     held : bool
         Whether the target stays on the plane.
     """

@@ -11,7 +11,7 @@ from optloc.compute.jit import compiled, inlined, put
 from optloc.compute.systems import principal
 from optloc.proof.atlas import Atlas, home_of, infinity, set_centre
 from optloc.proof.box import J0, cost_at, linearise_rows, rounding
-from optloc.proof.curvature import DETERMINED, G0, G1, G2, NOISE0, bend_axes, convex, least_of, sum_up
+from optloc.proof.curvature import FAINT, G0, G1, G2, NOISE0, bend_axes, convex, least_of, sum_up
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, size_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE
 from optloc.proof.search_space import HIDDEN_REACH, Box, Chart, Cost, Known, is_convex, widen
@@ -309,7 +309,7 @@ def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
                 information[k, m] += box.rows[row, J0 + k] * box.rows[row, J0 + m]
     lengths, steep = information.copy(), 0.0
     principal(lengths, vectors)
-    if least_of(lengths, d) <= DETERMINED * max(lengths[0, 0], lengths[1, 1], lengths[2, 2]):
+    if least_of(lengths, d) <= FAINT * max(lengths[0, 0], lengths[1, 1], lengths[2, 2]):
         bend_axes(box.sums, vectors, lengths, d)
     axes[:], back[:] = 0.0, 0.0
     for k in range(d):

@@ -44,6 +44,8 @@ DETERMINED = 1e-13
 
 Its square root, a ratio of standard deviations of three million, is beyond what doubles can tell.
 """
+FAINT = 1e-6
+"""Share of the best information below which second derivatives may say more: stations that are nearly coplanar."""
 
 # How often in turn each component of the gradient is looked at: a second time took 3 % of the boxes, a third none.
 _SWEEPS = 2

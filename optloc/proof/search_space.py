@@ -13,7 +13,7 @@ from optloc.compute.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
 from optloc.proof.atlas import Atlas, Minima
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, cube, digits, reaches_infinity, rounding
-from optloc.proof.curvature import DETERMINED, G0, G1, G2, SUMS, bend_axes, convex, curve_nodes, least_of, sum_up
+from optloc.proof.curvature import DETERMINED, FAINT, G0, G1, G2, SUMS, bend_axes, convex, curve_nodes, least_of, sum_up
 from optloc.proof.groups import Groups, empty_groups, set_groups
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, size_of
 from optloc.proof.nodes.level import LEAST_RADIUS
@@ -254,7 +254,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         count = set_tangents(D, planes, surface, gram)
         principal_along(information, gram, count)
     most = max(information[0, 0], information[1, 1], information[2, 2])
-    if count == D and least_of(information, D) <= DETERMINED * most:
+    if count == D and least_of(information, D) <= FAINT * most:
         lengths = information.copy()  # what follows overwrites it
         unit = np.eye(3)
         curve_nodes(cost.kinds, cost.data, origin, unit, unit, box.half, box.line, information, nodes, curves)

@@ -1,7 +1,7 @@
 """Targets near the plane of all stations: both sides of it are two minima, or one region.
 
-The data tell mirror images apart only where the cost on the plane between them is clearly higher than theirs; else they
-are ends of one region.
+The data separate mirror images only if the cost on the plane between them is clearly higher. Otherwise both belong to
+one region.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from optloc.base import linalg
 from optloc.base.records import take
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
+from optloc.linear.constraints import TOLERANCE, exact, violation
 from optloc.problem.fix import Stage
 from optloc.problem.problem import Problem
+from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import LISTED_GAP, SAME_PLACE
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.verdict.minima import measure_curvature, smallest_pivot
@@ -34,9 +36,9 @@ def join_sides(problem: Problem, pool: Pool) -> Pool:
     problem : Problem
         N problems.
     pool : Pool
-        Settled. Where the cost on the plane is out of question it stays as it is.
+        Settled. Fixes far from the plane are returned unchanged. So are fixes whose two sides both break a constraint.
     """
-    if problem.constraints or not is_symmetric(problem):
+    if exact(problem) or not is_symmetric(problem):
         return pool
     items = np.flatnonzero(is_coplanar(problem) & np.isfinite(pool.x).all(-1).any(-1))
     items = items[_is_near(problem.take(items), take(pool, items))] if len(items) else items
@@ -48,14 +50,20 @@ def join_sides(problem: Problem, pool: Pool) -> Pool:
     if not len(good):
         return pool
     items, across, own, found = items[good], across.take(good), take(own, good), found.take(good)
-    fresh = _as_pool(problem.take(items), across, own, found)
-    joined = int((found.on_plane - found.cost[:, 0] <= JOINED).sum())
+    part = problem.take(items)
+    sides = _sides(part, across, found)
+    met = np.flatnonzero(np.isfinite(sides.cost[:, :2]).any(1))
+    if not len(met):
+        return pool
+    items, across, own, found, sides = items[met], across.take(met), take(own, met), found.take(met), sides.take(met)
+    fresh = _as_pool(problem.take(items), across, own, found, sides)
+    joined = int(_is_joined(found, sides).sum())
     stage = Stage("fold", f"{joined} of {len(items)} on both sides of the plane at once", perf_counter() - began)
     return pool.merge(items, fresh, stage)
 
 
 def _is_near(problem: Problem, pool: Pool) -> Array:
-    """Return where a fix may be near the plane, for its standard deviations, or is none yet, (N,)."""
+    """Return a mask (N,): the fix is within some standard deviations of the plane, or not finished."""
     assert pool.curvature is not None
     across = Across.of(problem)
     place, normal = pool.x[:, 0, across.part], across.axes[..., -1]
@@ -85,7 +93,7 @@ class _Found:
     on_plane: Array
 
     def take(self, items: Array) -> _Found:
-        """Return those of some problems."""
+        """Return some entries."""
         return _Found(self.x[items], self.cost[items], self.on_plane[items])
 
 
@@ -109,7 +117,7 @@ def _minima(across: Across, pool: Pool) -> _Found:
 
 
 def _distinct(across: Across, x: Array, cost: Array) -> Array:
-    """Return which minima (N, r), the cheapest first, are listed: near enough in cost, and no repetition."""
+    """Return a mask (N, r) of minima, the cheapest first: within the listed gap, and no repetition."""
     n = across.problem.layout.n_shared
     information, _ = information_in_square(across, np.where(np.isfinite(x[:, 0]), x[:, 0], 0.0))
     folded = np.array(x[..., :n])
@@ -125,34 +133,85 @@ def _distinct(across: Across, x: Array, cost: Array) -> Array:
     return keep
 
 
-def _as_pool(problem: Problem, across: Across, own: Pool, found: _Found) -> Pool:
-    """Return minima and their mirror images as a settled pool, in space."""
+@dataclass(frozen=True, slots=True)
+class _Sides:
+    """Minima on both sides of the plane: two slots for each of `_Found`, the likelier side first.
+
+    Parameters
+    ----------
+    x : array (N, 2r, size)
+        In space; NaN in empty slots.
+    cost : array (N, 2r)
+        Infinite in empty slots, and where a constraint or the Earth is in the way.
+    on_plane : bool array (N,)
+        Whether the first minimum is in the plane.
+    """
+
+    x: Array
+    cost: Array
+    on_plane: Array
+
+    def take(self, items: Array) -> _Sides:
+        """Return some entries."""
+        return _Sides(self.x[items], self.cost[items], self.on_plane[items])
+
+
+def _sides(problem: Problem, across: Across, found: _Found) -> _Sides:
+    """Return the minima that constraints admit, in space."""
     count, slots, size = found.x.shape
-    w = found.x[..., across.part.stop - 1]
     x, cost = np.full((count, 2 * slots, size), np.nan), np.full((count, 2 * slots), np.inf)
-    off = w > across.least[:, None]
+    off = found.x[..., across.part.stop - 1] > across.least[:, None]
+    # the upper side first, as the verdict has it
+    upward = np.where(across.axes[:, -1, -1] < 0.0, -1.0, 1.0)
     for slot in range(slots):
-        # the upper side first, as the verdict has it
-        upward = np.where(across.axes[:, -1, -1] < 0.0, -1.0, 1.0)
-        flat = np.where(off[:, slot, None], found.x[:, slot], _on_plane(across, found.x[:, slot]))
-        for side in (0, 1):
-            x[:, 2 * slot + side] = across.to_space(flat, upward if side == 0 else -upward)
+        flat = np.array(found.x[:, slot])
+        flat[~off[:, slot], across.part.stop - 1] = 0.0
+        for side, sense in ((0, upward), (1, -upward)):
+            at = across.to_space(flat, sense)
             there = np.isfinite(found.cost[:, slot]) & (off[:, slot] | (side == 0))
-            cost[:, 2 * slot + side] = np.where(there, found.cost[:, slot], np.inf)
-    x[~np.isfinite(cost)] = np.nan
-    joined = np.zeros(cost.shape, dtype=bool)
-    joined[:, :2] = (found.on_plane - found.cost[:, 0] <= JOINED)[:, None]
-    curvature = _curvature(problem, across, found, x[:, 0], joined[:, 0])
+            if there.any():
+                known = np.where(there[:, None], at, 0.0)
+                there &= (violation(problem, known) <= TOLERANCE) & ~is_hidden(problem, known)
+            x[there, 2 * slot + side], cost[there, 2 * slot + side] = at[there], found.cost[there, slot]
+    # of two sides that are one admitted, it comes first
+    swap = ~np.isfinite(cost[:, 0]) & np.isfinite(cost[:, 1])
+    x[swap, :2], cost[swap, :2] = x[swap, 1::-1], cost[swap, 1::-1]
+    return _Sides(x, cost, ~off[:, 0])
+
+
+def _is_joined(found: _Found, sides: _Sides) -> Array:
+    """Return a mask (N,): both sides of the plane are one region."""
+    both = np.isfinite(sides.cost[:, :2]).all(1) | sides.on_plane
+    return np.asarray(both & (found.on_plane - found.cost[:, 0] <= JOINED))
+
+
+def _as_pool(problem: Problem, across: Across, own: Pool, found: _Found, sides: _Sides) -> Pool:
+    """Return minima on both sides of the plane as a settled pool, together with minima on constraints."""
+    x, cost = sides.x, sides.cost
+    joined = _is_joined(found, sides)
+    pair = np.where(joined[:, None, None], x[:, :2], np.nan)
+    curvature = _curvature(problem, across, found, x[:, 0], joined)
+    face = np.zeros(cost.shape, dtype=int)
+    if problem.constraints:
+        held = _held(across, own, cost[:, 0])
+        x = np.concatenate([x, np.where(held[..., None], own.x, np.nan)], axis=1)
+        cost = np.concatenate([cost, np.where(held, own.cost, np.inf)], axis=1)
+        face = np.concatenate([face, np.where(held, own.face, 0)], axis=1)
+    order = np.argsort(~np.isfinite(cost), axis=1, kind="stable")[:, : int(np.isfinite(cost).sum(1).max())]
+    x = np.take_along_axis(x, order[..., None], axis=1)
+    cost, face = np.take_along_axis(cost, order, axis=1), np.take_along_axis(face, order, axis=1)
     code = np.where(np.isfinite(cost), np.int8(Status.OK), np.int8(Status.UNAVAILABLE))
-    blank = np.zeros(cost.shape, dtype=int)
-    plain = None if own.plain is None else np.zeros(count, dtype=bool)
-    return replace(own, x=x, cost=cost, code=code, face=blank, joined=joined, curvature=curvature, plain=plain)
+    plain = None if own.plain is None else np.zeros(len(x), dtype=bool)
+    return replace(own, x=x, cost=cost, code=code, face=face, pair=pair, curvature=curvature, plain=plain)
 
 
-def _on_plane(across: Across, x: Array) -> Array:
-    out = np.array(x)
-    out[:, across.part.stop - 1] = 0.0
-    return out
+def _held(across: Across, own: Pool, least: Array) -> Array:
+    """Return the minima (N, q) that a constraint holds off the plane, within the listed gap of the least cost (N,)."""
+    away = own.x[..., across.part] - across.centre[:, None]
+    w = np.abs((away * across.axes[:, None, :, -1]).sum(-1))
+    with np.errstate(invalid="ignore"):
+        near = (own.code == Status.OK) & (own.cost <= least[:, None] + LISTED_GAP)
+        return np.asarray((own.face > 0) & near & (w > across.least[:, None]))
 
 
 def _curvature(problem: Problem, across: Across, found: _Found, x: Array, joined: Array) -> Curvature:

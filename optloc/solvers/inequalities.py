@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.frames import Frame
+from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Status
 from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.engine.admission import GRAZE, GROUND, SATELLITE
-from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_held, violation
+from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_exact, is_held, levels, violation
 from optloc.linear.normal import marginal
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
@@ -332,8 +333,31 @@ def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
     """
     good = (violation(problem, x) <= TOLERANCE) & ~is_hidden(problem, x)
     if len(x) and len(face) > len(exact(problem)):
-        good &= is_held(problem, face, x, marginal(equations_at(problem, x))[1])
+        beside = _inwards(problem, face, x)
+        good &= is_held(problem, face, x, marginal(equations_at(problem, beside))[1])
     return np.asarray(good)
+
+
+# Outwards, the quantity of an upper bound grows, and the quantity of a lower bound falls.
+_SENSES: dict[str | int, float] = {"upper": 1.0, "lower": -1.0}
+# Share of the spread of the stations by which a point is moved off a face.
+_BESIDE = 1e-6
+
+
+def _inwards(problem: Problem, face: Face, x: Array) -> Array:
+    """Return points (N, size) a little inside of a face: on a plane of symmetry a saddle has no slope."""
+    gradients = levels(problem, face, x)[1]
+    sense = np.array([0.0 if is_exact(problem.constraints[i.constraint]) else _SENSES.get(i.side, 0.0) for i in face])
+    outwards = (sense[:, None] * gradients).sum(1)
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    length = np.sqrt((outwards[:, part] ** 2).sum(-1, keepdims=True))
+    _, spread = centre_and_spread(problem.stations.places)
+    out = np.array(x)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        step = _BESIDE * np.reshape(spread, (-1, 1)) * outwards[:, part] / length
+    out[:, part] -= np.where(np.isfinite(step), step, 0.0)
+    return out
 
 
 def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: Array, face: Array) -> Array:

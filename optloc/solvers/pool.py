@@ -132,8 +132,9 @@ class Pool:
         looked.
     free : array (N,), optional
         Least cost without the inequalities, where there are some.
-    joined : bool array (N, q), optional
-        Minima that belong to the likelihood region of the best: no rivals of it.
+    pair : array (N, 2, size), optional
+        Two minima that are mirror images and belong to one likelihood region: neither is a rival of the other; NaN
+        otherwise.
     loss : str
         Name of the loss that doubts rows, or "" where all are believed.
     searched : bool array (N,), optional
@@ -169,7 +170,7 @@ class Pool:
     plain: Annotated[Array, Axes(0, empty=False)] | None = None
     infinity: Annotated[Array, Axes(0)] | None = None
     free: Annotated[Array, Axes(0)] | None = None
-    joined: Annotated[Array, Axes(1, slots=True, empty=False)] | None = None
+    pair: Annotated[Array, Axes(2)] | None = None
     loss: str = ""
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None

@@ -8,7 +8,7 @@ from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.proof.box import is_empty, uncut
 from optloc.proof.convex_boxes import set_convex
-from optloc.proof.curvature import C00, SUMS, clip_to_stationary, convex, spread_of
+from optloc.proof.curvature import C00, SUMS, clip_to_minima, convex, spread_of
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges
 from optloc.proof.search_space import curve_box, is_convex
@@ -137,7 +137,7 @@ def test_no_box_around_a_stationary_point_is_excluded(d):
                 bound_box(cost, chart, box)
                 curve_box(cost, chart, box)
                 uncut(box.half, box.cut)
-                clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+                clip_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
                 none = is_empty(box.cut)
                 assert not (inside and none)
                 around += inside

@@ -14,7 +14,7 @@ from optloc.compute.systems import inverse
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.box import cube, is_empty, least_residual, linearise_rows, rounding, shrink, uncut
 from optloc.proof.convex_boxes import accuracy_floor_far
-from optloc.proof.curvature import clip_to_stationary, sum_up
+from optloc.proof.curvature import clip_to_minima, sum_up
 from optloc.proof.enclosure import enclose
 from optloc.proof.everywhere import leaves, prove_everywhere
 from optloc.proof.near import UNIQUE, VALUE
@@ -190,7 +190,7 @@ def check_stationary(rng, d):
     cost = made.cost
     filled(cost, chart, box)
     uncut(box.half, box.cut)
-    clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+    clip_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
     assert outside(box.cut, s) < 1e-9, made.names
     assert not is_empty(box.cut) or outside(box.cut, s) > -1e-9
     return bool(((box.cut[:3] > -box.half) | (box.cut[3:] < box.half)).any())

@@ -38,7 +38,13 @@ BENT_SENTENCE = {
     CURVED: "Gaussian neither in metres nor in inverse range",
 }
 """Sentences on a fix that is `curved`, by the kind of its chart."""
+BOTH_SIDES = (
+    "the stations lie in a plane, and the target is on either side or in it: `optloc.distance_from_plane` says how far"
+)
+"""Sentence on a fix whose two mirror images are one region."""
 _ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
+# Share of the distance of two mirror images by which a minimum may be off one of them and be the same.
+_SAME_END = 1e-3
 # Gaps to infinity below this come from rounding: the fix itself is as far away as counts.
 _NONE = 1e-6
 
@@ -165,7 +171,15 @@ def marks_of(*numbers: Any) -> Any:
 
 def _apart(pool: Pool, gap: Array) -> Array:
     """Return the gaps (N, r) of the minima outside the region of the best; infinite for the others."""
-    return gap if pool.joined is None else np.where(pool.joined[:, 1:], np.inf, gap)
+    if pool.pair is None or not gap.shape[1]:
+        return gap
+    first, second = pool.pair[:, :1], pool.pair[:, 1:]
+    best, others = pool.x[:, :1], pool.x[:, 1:]
+    with np.errstate(invalid="ignore"):
+        size = np.abs(first - second).max(-1)
+        one, two = (np.abs(best - end).max(-1) <= _SAME_END * size for end in (first, second))
+        other, another = (np.abs(others - end).max(-1) <= _SAME_END * size for end in (first, second))
+    return np.where((one & another) | (two & other), np.inf, gap)
 
 
 def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
@@ -389,7 +403,9 @@ def _name_shape(finished: Finished, items: Array) -> Any:
     assert curvature is not None
     assert curvature.kappa is not None
     inverse = chart_kind(*curvature.kappa[items].T) == INVERSE_RANGE
-    return np.where(inverse, np.array(BENT_SENTENCE[INVERSE_RANGE], dtype=object), BENT_SENTENCE[CURVED])
+    told = np.where(inverse, np.array(BENT_SENTENCE[INVERSE_RANGE], dtype=object), BENT_SENTENCE[CURVED])
+    pair = finished.pool.pair
+    return told if pair is None else np.where(np.isfinite(pair[items, 0]).all(-1), BOTH_SIDES, told)
 
 
 def _is_unsafe(evidence: Evidence) -> Any:
