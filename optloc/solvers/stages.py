@@ -28,6 +28,7 @@ from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, crowd_of, in_parts, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
+from optloc.solvers.starts.orientation import headings, oriented_starts, unwind
 from optloc.solvers.starts.position import (
     along_the_valley,
     mirror,
@@ -54,6 +55,13 @@ def start_with(word: str) -> Solver:
     """Return the stage that offers the candidates of all formulations which start fixes under a word of a method."""
 
     def start(problem: Problem, pool: Pool | None) -> Pool:
+        began, turned = perf_counter(), headings(problem)
+        if turned is not None:
+            x = oriented_starts(problem, turned, lambda part: begin(part, None).x)
+            return offer(problem, x, pool, word, began)
+        return begin(problem, pool)
+
+    def begin(problem: Problem, pool: Pool | None) -> Pool:
         began = perf_counter()
         # rays are the refinement's: what starts a fix knows straight lines
         whole, problem = problem, problem.straightened()
@@ -368,6 +376,8 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
         count("lsr", int(done.iterations.sum()))
+        turned = headings(problem)
+        x = x if turned is None else unwind(turned, x)
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
     # on the face without inequalities, number 0; `bound_pool` adds those on others
     inside, told = np.zeros(shape, dtype=int), pool.missing
