@@ -537,7 +537,7 @@ def cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
     kinds, data : array (J,), (J, width)
         Nodes that have stations.
     x : array (D,)
-        The fix. If it lies near the middle of the stations, the centre moves aside: the distance to the centre, which
+        The fix. If it is near the middle of the stations, the centre moves aside: the distance to the centre, which
         is taken off ranges, has no derivative there. If all stations are in one place, its distance is the only length.
     """
     low, high = np.full(3, inf), np.full(3, -inf)
