@@ -19,6 +19,7 @@ from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
 from optloc.problem.fix import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.solvers.layered import refine_in_layers, strata_of
 from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
 
@@ -183,10 +184,17 @@ Descend = Callable[[Problem, Array, Array, Face], tuple[Array, Array, Array]]
 _STARTS = 3
 
 
+# As many steps as `lsr` takes: minima on a face must be as finished as minima inside.
+_STEPS = 100
+
+
 def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
     """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts of problems `item` (M,)."""
-    # as many steps as `lsr` takes: what competes on a face must be as finished as what lies inside
-    done = refine(problem, start, item=item, face=face, limit=100)
+    strata = strata_of(problem, face)
+    if strata is None:
+        done = refine(problem, start, item=item, face=face, limit=_STEPS)
+    else:
+        done = refine_in_layers(problem, strata, start, item, face, _STEPS)
     return done.x, done.cost, done.status
 
 
