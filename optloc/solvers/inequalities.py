@@ -19,7 +19,7 @@ from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
 from optloc.problem.fix import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.solvers.layered import refine_in_layers, strata_of
+from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
 
@@ -236,7 +236,8 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     # where the cheapest is feasible it is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
         return kept
-    starts = _cheapest(pool, needy)
+    starts, strata = _cheapest(pool, needy), strata_of(problem)
+    starts = starts if strata is None else in_every_layer(strata, starts)
     # face 0 has no inequality: what lies on it is in the pool already
     on_faces = [_on_face(problem, sides, number, needy, starts, descend) for number in range(1, len(sides))]
     size, width = len(pool.x), starts.shape[1] * len(on_faces)

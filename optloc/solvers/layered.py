@@ -26,8 +26,8 @@ from optloc.solvers.starts.position import one_position
 _EDGE = 1e-6
 # Metres from the end of a layer within which a refinement has reached the end.
 _REACHED = 1e-3
-# Candidates of a pool that are tried in every layer, from the first. Closed forms give few places, and in each layer the
-# cost has few minima.
+# Candidates of a pool that are tried in every layer, from the first. Closed forms give few places, and in each layer
+# the cost has few minima.
 _TRIED = 3
 # Times that a refinement begins again from a border from which the cost falls inwards.
 _ROUNDS = 3
@@ -90,7 +90,9 @@ def in_every_layer(strata: Strata, x: Array) -> Array:
     return np.concatenate([x, more.reshape(len(x), -1, x.shape[-1])], axis=1)
 
 
-def refine_in_layers(problem: Problem, strata: Strata, start: Array, item: Array, face: Face, limit: int) -> Refined:
+def refine_in_layers(
+    problem: Problem, strata: Strata, start: Array, item: Array, face: Face, limit: int, *, cross: bool = False
+) -> Refined:
     """Return the minima in the layers of starts (M, size), or on the borders of these layers.
 
     A point on a border is no minimum of the whole where the cost falls on the other side. Its cost is then infinite,
@@ -110,6 +112,8 @@ def refine_in_layers(problem: Problem, strata: Strata, start: Array, item: Array
         Constraints that hold with equality.
     limit : int
         Steps of each refinement.
+    cross : bool
+        Whether a point from which the cost falls is moved to the other side, as unfinished, for a further refinement.
     """
     column, layer = strata.column, strata.layer(start[:, strata.column])
     limits = Limits(column, strata.low[layer], strata.high[layer])
@@ -130,7 +134,7 @@ def refine_in_layers(problem: Problem, strata: Strata, start: Array, item: Array
             break
     else:
         status[left] = Status.STALLED
-    _leave_falling(problem, strata, (x, cost, status), item)
+    _leave_falling(problem, strata, (x, cost, status), item, cross)
     return Refined(x, cost, status, steps, lambda: equations_at(problem.take(item), x))
 
 
@@ -156,8 +160,10 @@ def _pull(problem: Problem, face: Face, x: Array) -> Array:
     return np.asarray((np.linalg.pinv(np.swapaxes(gradients, -1, -2)) @ force[..., None])[:, -1, 0])
 
 
-def _leave_falling(problem: Problem, strata: Strata, found: tuple[Array, Array, Array], item: Array) -> None:
-    """Drop points on an interface from which the cost falls into the other layer, and choose a side for the others.
+def _leave_falling(
+    problem: Problem, strata: Strata, found: tuple[Array, Array, Array], item: Array, cross: bool
+) -> None:
+    """Drop or move points on an interface from which the cost falls on the other side; choose a side for the others.
 
     The chosen side has the larger variance of the depth. The slope of the cost away from a kink only narrows the law of
     the depth. So this covariance is not too small on either side.
@@ -172,6 +178,8 @@ def _leave_falling(problem: Problem, strata: Strata, found: tuple[Array, Array, 
         Vectors (M, size), costs (M,) and statuses (M,), which are changed.
     item : int array (M,)
         Problem of each vector.
+    cross : bool
+        Whether points are moved.
     """
     x, cost, status = found
     layer = strata.layer(x[:, strata.column])
@@ -186,11 +194,13 @@ def _leave_falling(problem: Problem, strata: Strata, found: tuple[Array, Array, 
     there, here = equations_at(part, other), equations_at(part, x[rows])
     force, near = marginal(there)[1][:, strata.column], equal_cost(cost[rows])
     falls = (there.cost < cost[rows] - near) | ((there.cost < cost[rows] + near) & (force * side > 0.0))
-    cost[rows[falls]], status[rows[falls]] = np.inf, Status.UNAVAILABLE
+    cost[rows[falls]] = there.cost[falls] if cross else np.inf
+    status[rows[falls]] = Status.MAX_ITERATIONS if cross else Status.UNAVAILABLE
     spreads = []
     for equations in (here, there):
         covariance, ok = linalg.inverse(marginal(equations)[0])
         variance = covariance[:, strata.column, strata.column]
         spreads.append(np.where(ok & np.isfinite(variance), variance, 0.0))
     moved = ~falls & (np.abs(there.cost - cost[rows]) <= near) & (spreads[1] > spreads[0])
+    moved |= falls & cross
     x[rows[moved]] = other[moved]
