@@ -27,6 +27,38 @@ WEIGHINGS = 2
 
 
 @dataclass(frozen=True, slots=True)
+class Limits:
+    """Ends of an unknown at which steps stop.
+
+    Parameters
+    ----------
+    column : int
+        Column of the unknown.
+    low, high : array (M,)
+        Least and greatest value in each refinement.
+    """
+
+    column: int
+    low: Array
+    high: Array
+
+    def take(self, items: Array) -> Limits:
+        """Return the limits of some refinements."""
+        return Limits(self.column, self.low[items], self.high[items])
+
+    def clip(self, x: Array) -> Array:
+        """Return vectors (M, size) with the unknown between its limits."""
+        out = np.array(x)
+        out[:, self.column] = np.clip(x[:, self.column], self.low, self.high)
+        return out
+
+    def reached(self, x: Array, within: float = 0.0) -> Array:
+        """Return -1 for vectors (M, size) at the low limit, 1 at the high limit, and 0 between them, (M,)."""
+        z = x[:, self.column]
+        return np.where(z - self.low <= within, -1, np.where(self.high - z <= within, 1, 0))
+
+
+@dataclass(frozen=True, slots=True)
 class Refined:
     """Where the refinement ended.
 
@@ -66,6 +98,7 @@ def refine(
     damped: bool = True,
     face: Face = (),
     folded: Folded | None = None,
+    limits: Limits | None = None,
 ) -> Refined:
     """Return the local maximum-likelihood estimates next to given starts.
 
@@ -91,6 +124,8 @@ def refine(
         back onto them.
     folded : Folded, optional
         Steps across a plane of symmetry of the problem, instead of a face.
+    limits : Limits, optional
+        Ends of an unknown of each start. A refinement that a step holds at an end stops there as stalled.
 
     Returns
     -------
@@ -100,7 +135,7 @@ def refine(
     # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost; sixty steps are ten
     # times what fixes near their stations take.
     rules = Rules(float(tolerance), int(limit), bool(damped))
-    quick = None if face or folded else _by_machine_code(problem, start, item, rules)
+    quick = None if face or folded or limits else _by_machine_code(problem, start, item, rules)
     if quick is not None:
         return quick
     weights = None
@@ -111,9 +146,9 @@ def refine(
     if item is not None:
         problem = problem.take(item)
     if weights is not None:
-        return _iterate(problem, start, weights, rules, face, folded)
+        return _iterate(problem, start, weights, rules, face, folded, limits)
     for _ in range(WEIGHINGS):
-        done = _remade(problem, start, rules, face)
+        done = _remade(problem, start, rules, face, limits)
         start = done.x
     return done
 
@@ -121,8 +156,8 @@ def refine(
 # By numpy: all problems of a batch side by side, those that are finished leave it.
 
 
-def _remade(problem: Problem, start: Array, rules: Rules, face: Face = ()) -> Refined:
-    return _iterate(problem, start, _Weights.of(problem, start), rules, face)
+def _remade(problem: Problem, start: Array, rules: Rules, face: Face = (), limits: Limits | None = None) -> Refined:
+    return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,14 +182,21 @@ class _Weights:
 
 
 def _iterate(
-    problem: Problem, start: Array, weights: _Weights, rules: Rules, face: Face, folded: Folded | None = None
+    problem: Problem,
+    start: Array,
+    weights: _Weights,
+    rules: Rules,
+    face: Face,
+    folded: Folded | None,
+    limits: Limits | None,
 ) -> Refined:
     """Return the refinement with fixed weights."""
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
+        start = start if limits is None else limits.clip(start)
         state = _State.begin(problem, start, weights)
         active = np.arange(len(start))
-        part = _Part(problem, weights, face, _blur(problem, len(start)), folded)
+        part = _Part(problem, weights, face, _blur(problem, len(start)), folded, limits)
         for iteration in range(rules.limit):
             # The status until another is found: what still moves.
             moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
@@ -203,11 +245,13 @@ class _Part:
     face: Face
     blur: Array
     folded: Folded | None
+    limits: Limits | None
 
     def take(self, items: Array) -> _Part:
         """Return some of them."""
         folded = None if self.folded is None else self.folded.take(items)
-        return _Part(self.problem.take(items), self.weights.take(items), self.face, self.blur[items], folded)
+        limits = None if self.limits is None else self.limits.take(items)
+        return _Part(self.problem.take(items), self.weights.take(items), self.face, self.blur[items], folded, limits)
 
     @property
     def held(self) -> Equalities | Folded | None:
@@ -254,6 +298,7 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     held = part.held
     move, solvable = step(now, damping) if held is None else held.step(now, damping, here)
     x = here + move if held is None else held.retract(here, move)
+    x = x if part.limits is None else part.limits.clip(x)
     after = part.weights.equations(part.problem, x)
     found = judge(
         now.cost,
@@ -269,6 +314,10 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     state.iterations[active] = iteration + 1
     _keep(state, active, found.better, x, after)
     state.damping[active], state.growth[active] = found.damping, found.growth
+    if part.limits is not None:
+        # a step that ends where it began is held: it moves along the limit, which is a face
+        pinned = (part.limits.reached(x) != 0) & (part.limits.reached(here) == part.limits.reached(x))
+        state.status[active[pinned]] = Status.STALLED
     state.status[active[found.small]] = Status.OK
     state.status[active[found.stuck]] = Status.STALLED
     if not rules.damped:

@@ -491,6 +491,10 @@ _BALANCED = 1e-12
 # Half-width of the cube, reaches of the stations: with a margin, so that no station touches a face, where lines to it
 # would vanish.
 _REACHES = 1.25
+# Reaches of the stations from their middle within which a fix moves the centre aside, and by how many. Convex boxes
+# around a fix, and boxes of low cost, end before they reach a centre that is a fifth of the array away. The direction
+# is oblique: on the line from the centre through the fix to a station, the difference of both ranges has no slope.
+_NEAR_CENTRE, _ASIDE = 0.1, (0.21, 0.13, 0.17)
 
 
 @compiled
@@ -533,7 +537,8 @@ def cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
     kinds, data : array (J,), (J, width)
         Nodes that have stations.
     x : array (D,)
-        The fix: where all stations are in one place, its distance is the only length there is.
+        The fix. If it is near the middle of the stations, the centre moves aside: the distance to the centre, which
+        is taken off ranges, has no derivative there. If all stations are in one place, its distance is the only length.
     """
     low, high = np.full(3, inf), np.full(3, -inf)
     for j in range(kinds.shape[0]):
@@ -543,10 +548,15 @@ def cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
     reach = 0.0
     for k in range(3):
         reach = max(reach, 0.5 * (high[k] - low[k]))
-    middle = 0.5 * (low + high)
+    middle, away = 0.5 * (low + high), 0.0
+    for k in range(x.shape[0]):
+        away = max(away, abs(x[k] - middle[k]))
     if not reach > 0.0:
+        reach = away
+    elif away < _NEAR_CENTRE * reach:
         for k in range(x.shape[0]):
-            reach = max(reach, abs(x[k] - middle[k]))
+            middle[k] += _ASIDE[k] * reach
+        reach *= 1.0 + _ASIDE[0]
     return middle, _REACHES * reach if reach > 0.0 else 1.0
 
 

@@ -20,6 +20,7 @@ from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
 from optloc.problem.fix import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import REFUTED
 from optloc.solvers.pool import Pool
 
@@ -184,10 +185,17 @@ Descend = Callable[[Problem, Array, Array, Face], tuple[Array, Array, Array]]
 _STARTS = 3
 
 
+# As many steps as `lsr` takes: minima on a face must be as finished as minima inside.
+_STEPS = 100
+
+
 def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
     """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts of problems `item` (M,)."""
-    # as many steps as `lsr` takes: what competes on a face must be as finished as what lies inside
-    done = refine(problem, start, item=item, face=face, limit=100)
+    strata = strata_of(problem, face)
+    if strata is None:
+        done = refine(problem, start, item=item, face=face, limit=_STEPS)
+    else:
+        done = refine_in_layers(problem, strata, start, item, face, _STEPS)
     return done.x, done.cost, done.status
 
 
@@ -229,7 +237,8 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     # where the cheapest is feasible it is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
         return kept
-    starts = _cheapest(pool, needy)
+    starts, strata = _cheapest(pool, needy), strata_of(problem)
+    starts = starts if strata is None else in_every_layer(strata, starts)
     # face 0 has no inequality: what lies on it is in the pool already
     on_faces = [_on_face(problem, sides, number, needy, starts, descend) for number in range(1, len(sides))]
     size, width = len(pool.x), starts.shape[1] * len(on_faces)

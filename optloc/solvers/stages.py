@@ -26,10 +26,12 @@ from optloc.proof.scope import unsupported
 from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
+from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, crowd_of, in_parts, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
+from optloc.solvers.starts.orientation import headings, oriented_starts, unwind
 from optloc.solvers.starts.position import along_the_valley, registrable, spread_of, subarray_starts
 from optloc.solvers.starts.registration import step_beside
 from optloc.solvers.starts.several_positions import from_pieces
@@ -49,6 +51,13 @@ def start_with(word: str) -> Solver:
     """Return the stage that offers the candidates of all formulations which start fixes under a word of a method."""
 
     def start(problem: Problem, pool: Pool | None) -> Pool:
+        began, turned = perf_counter(), headings(problem)
+        if turned is not None:
+            x = oriented_starts(problem, turned, lambda part: begin(part, None).x)
+            return offer(problem, x, pool, word, began)
+        return begin(problem, pool)
+
+    def begin(problem: Problem, pool: Pool | None) -> Pool:
         began = perf_counter()
         # rays are the refinement's: what starts a fix knows straight lines
         whole, problem = problem, problem.straightened()
@@ -135,8 +144,8 @@ def _without_halted(problem: Problem, pool: Pool) -> Pool:
     """Return a settled pool without the rivals at which an undamped step would lead on."""
     item, slot = pool.occupied
     item, slot = item[slot > 0], slot[slot > 0]
-    # constraints hold points that free steps would leave
-    if not len(item) or problem.constraints:
+    # constraints and interfaces hold points that free steps would leave
+    if not len(item) or problem.constraints or strata_of(problem) is not None:
         return pool
     at, x = equations_at(problem.take(item), pool.x[item, slot]), np.array(pool.x)
     with np.errstate(all="ignore"):
@@ -349,6 +358,10 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     if damped and pool.refined and not pool.unfinished:
         return pool  # nothing was added since
     began = perf_counter()
+    strata = strata_of(problem, exact(problem)) if damped else None
+    if strata is not None:
+        wider = offer(problem, pack(in_every_layer(strata, pool.x)), pool, "", began)
+        pool = replace(wider, stages=pool.stages)
     x, shape = pool.x.copy(), pool.x.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.NUMERICAL), dtype=np.int8)
     item, slot = pool.occupied
@@ -359,10 +372,15 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
         face = exact(problem) if damped else ()
         own = None if whole else item
         # a hundred steps by default: damped ones along a flat valley are short; what is unfinished then runs away
-        done = refine(problem, x[item, slot], item=own, damped=damped, limit=limit, face=face)
+        if strata is None:
+            done = refine(problem, x[item, slot], item=own, damped=damped, limit=limit, face=face)
+        else:
+            done = refine_in_layers(problem, strata, x[item, slot], item, face, limit)
         x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
         count("lsr", int(done.iterations.sum()))
+        turned = headings(problem)
+        x = x if turned is None else unwind(turned, x)
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
     # on the face without inequalities, number 0; `bound_pool` adds those on others
     inside, told = np.zeros(shape, dtype=int), pool.missing

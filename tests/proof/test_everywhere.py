@@ -1,5 +1,7 @@
 """Proofs for all positions: right about every minimum that is met, and there where enclosures fail."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from descent import levenberg
@@ -7,6 +9,7 @@ from proof.costs import WIDTH, beside, down_from, no_rivals
 from proof.sampling import many
 from scipy.optimize import least_squares, minimize_scalar
 
+from optloc import Status, assemble, measured, solve
 from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.batch import Asked, prove_all
@@ -373,3 +376,32 @@ def hessian_at(atlas, data, K, w, s):
             f = ((np.linalg.norm(x[:, None] - data[:, :3], axis=-1) @ K.T - w) ** 2).sum(-1)
             out[k, m] = f @ signs / 4e-6
     return out
+
+
+# Regular sets of stations: the fix lies at the middle of the stations, where the distance to the middle has a kink.
+def corners(count):
+    turn = 2.0 * np.pi * np.arange(count) / count
+    return 1e3 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+
+
+REGULAR = {f"{count} corners": corners(count) for count in range(3, 13)}
+REGULAR["cube"] = 1e3 * np.array(list(product((-1.0, 1.0), repeat=3)))
+REGULAR["octahedron"] = 1e3 * np.concatenate([np.eye(3), -np.eye(3)])
+
+
+@pytest.mark.parametrize("kind", ["range", "tdoa", "toa"])
+@pytest.mark.parametrize("name", REGULAR)
+def test_the_middle_of_a_regular_set_of_stations_is_proven(name, kind):
+    place = REGULAR[name]
+    n, d = place.shape
+    for away, noise in ((0.0, 0.0), (0.0, 1.0), (1e-3, 1.0), (1.0, 0.0), (90.0, 1.0), (110.0, 1.0)):
+        rng = np.random.default_rng(1)
+        ranges = np.linalg.norm(place - away, axis=1) + noise * rng.standard_normal(n)
+        if kind == "tdoa":
+            z, a, b = ranges[1:] - ranges[0], np.arange(1, n), np.zeros(n - 1, dtype=int)
+            rows = measured("tdoa", z, a=a, b=b, arrival_sigma=1.0)
+        else:
+            rows = measured(kind, ranges + 123.0 * (kind == "toa"), a=np.arange(n), sigma=1.0)
+        fix = solve(assemble(place, rows))
+        assert fix.status == Status.OK
+        assert np.linalg.norm(fix.position - np.full(d, away)) < 6.0

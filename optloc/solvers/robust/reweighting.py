@@ -16,6 +16,7 @@ from optloc.models import MODELS, wrap
 from optloc.problem.loss import LATE, Loss
 from optloc.problem.noise import Noise, variances, whiten
 from optloc.problem.problem import Problem
+from optloc.solvers.layered import refine_in_layers, strata_of
 
 # Rows of a correlated group are never quite absent while their weights are sought: their partners still foretell them.
 # At a millionth of its weight a row no longer counts in the sums, and one over it is far from overflow.
@@ -244,7 +245,11 @@ class _Step:
 
 
 def _step(problem: Problem, x: Array, last: Array, face: Face) -> _Step:
-    done = refine(problem, x, limit=_STEPS, face=face)
+    strata = strata_of(problem, face)
+    if strata is None:
+        done = refine(problem, x, limit=_STEPS, face=face)
+    else:
+        done = refine_in_layers(problem, strata, x, np.arange(len(x)), face, _STEPS, cross=True)
     information, _, _ = marginal(done.equations)
     n, apart = problem.layout.n_shared, done.x - x
 

@@ -1,0 +1,206 @@
+"""Fixes in layers of constant speed: a refinement in each layer, and minima on the interfaces between layers.
+
+Travel times have a kink, or a jump, at an interface. So each layer is a separate problem. Steps end at its borders, and
+along a border the depth is fixed. A point on an interface is a minimum if the cost grows into both layers, or if the
+other side costs more. The first case is the condition of Karush, Kuhn and Tucker on each side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.types import Array, Band, Status
+from optloc.compute.least_squares import Limits, Refined, refine
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import Face, Level, levels
+from optloc.linear.mirror import one_position
+from optloc.linear.normal import marginal
+from optloc.models.layers import Layers
+from optloc.problem.problem import Problem
+from optloc.solvers.policy import equal_cost
+
+# Metres from an interface at which a layer ends: above the rounding of coordinates, and far below what times resolve.
+_EDGE = 1e-6
+# Metres from the end of a layer within which a refinement has reached the end.
+_REACHED = 1e-3
+# Candidates of a pool that are tried in every layer, from the first. Closed forms give few places, and in each layer
+# the cost has few minima.
+_TRIED = 3
+# Times that a refinement begins again from a border from which the cost falls inwards.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Strata:
+    """The layers of constant speed in which the depth of a target is free.
+
+    Parameters
+    ----------
+    column : int
+        Column of the third coordinate of the target.
+    low, high : array (L,)
+        Ends of the layers in this coordinate, metres, the uppermost layer first; the last has no lower end.
+    """
+
+    column: int
+    low: Array
+    high: Array
+
+    def layer(self, z: Array) -> Array:
+        """Return the number of the layer (...) that holds third coordinates (...)."""
+        return np.asarray(np.clip(np.searchsorted(-self.low, -z), 0, len(self.low) - 1))
+
+    def inside(self, z: Array, layer: Array) -> Array:
+        """Return third coordinates (...) moved into given layers (...), off their ends by a quarter of the height."""
+        low, high = self.low[layer], self.high[layer]
+        # the last layer is taken to be as high as all others together
+        deep = np.maximum(self.high[0] - self.high[-1], 1.0)
+        height = np.where(np.isfinite(low), high - low, 2.0 * deep)
+        return np.asarray(np.clip(z, np.where(np.isfinite(low), low + 0.25 * height, -np.inf), high - 0.25 * height))
+
+
+def strata_of(problem: Problem, face: Face = ()) -> Strata | None:
+    """Return the layers of a problem of one position, or None where no interface divides it or its depth is fixed."""
+    medium = problem.medium
+    if not isinstance(medium, Layers) or medium.between != "constant" or len(medium.depth) == 1:
+        return None
+    if not one_position(problem) or any(_holds_depth(problem, level) for level in face):
+        return None
+    slot, _ = problem.layout.find("position")
+    tops = medium.surface - np.array(medium.depth)
+    high = tops - np.where(np.arange(len(tops)) > 0, _EDGE, 0.0)
+    return Strata(slot.start + 2, np.append(tops[1:] + _EDGE, -np.inf), high)
+
+
+def _holds_depth(problem: Problem, level: Level) -> bool:
+    band = problem.constraints[level.constraint]
+    if not isinstance(band, Band):
+        return False
+    return band.kind == "height" or (band.kind == "plane" and bool(np.any(band.coefficients[..., 2] != 0.0)))
+
+
+def in_every_layer(strata: Strata, x: Array) -> Array:
+    """Return starts (N, q, size), and the first starts of each problem moved into each layer."""
+    first, count = x[:, :_TRIED], len(strata.low)
+    more = np.repeat(first[:, :, None], count, axis=2)
+    more[..., strata.column] = strata.inside(more[..., strata.column], np.arange(count))
+    return np.concatenate([x, more.reshape(len(x), -1, x.shape[-1])], axis=1)
+
+
+def refine_in_layers(
+    problem: Problem, strata: Strata, start: Array, item: Array, face: Face, limit: int, *, cross: bool = False
+) -> Refined:
+    """Return the minima in the layers of starts (M, size), or on the borders of these layers.
+
+    A point on a border is no minimum of the whole where the cost falls on the other side. Its cost is then infinite,
+    and its status `unavailable`.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    strata : Strata
+        Their layers.
+    start : array (M, size)
+        Starts.
+    item : int array (M,)
+        Problem of each start.
+    face : Face
+        Constraints that hold with equality.
+    limit : int
+        Steps of each refinement.
+    cross : bool
+        Whether a point from which the cost falls is moved to the other side, as unfinished, for a further refinement.
+    """
+    column, layer = strata.column, strata.layer(start[:, strata.column])
+    limits = Limits(column, strata.low[layer], strata.high[layer])
+    x, steps = start.copy(), np.zeros(len(start), dtype=np.int32)
+    cost, status = np.full(len(x), np.inf), np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
+    left = np.arange(len(x))
+    for _ in range(_ROUNDS):
+        done = refine(problem, x[left], item=item[left], limit=limit, face=face, limits=limits.take(left))
+        x[left], cost[left], status[left] = done.x, done.cost, done.status
+        steps[left] += done.iterations
+        ended = left[limits.take(left).reached(x[left], _REACHED) != 0]
+        if not len(ended):
+            break
+        end, inwards = _along_border(problem, limits.take(ended), x[ended], item[ended], face, limit)
+        x[ended], cost[ended], status[ended] = end
+        left = ended[inwards]
+        if not len(left):
+            break
+    else:
+        status[left] = Status.STALLED
+    _leave_falling(problem, strata, (x, cost, status), item, cross)
+    return Refined(x, cost, status, steps, lambda: equations_at(problem.take(item), x))
+
+
+def _along_border(
+    problem: Problem, limits: Limits, x: Array, item: Array, face: Face, limit: int
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """Return the minima along the borders next to x (M, size), and a flag where the cost falls inwards (M,)."""
+    side = limits.reached(x, _REACHED)
+    z = np.where(side < 0, limits.low, limits.high)
+    normal = np.eye(problem.dimension)[2]
+    part = problem.take(item)
+    held = replace(part, constraints=(*part.constraints, Band("plane", z, z, normal, "interface")))
+    border = (*face, Level(len(part.constraints), "equal"))
+    done = refine(held, x, limit=limit, face=border)
+    pull = _pull(held, border, done.x)
+    return (done.x, done.cost, done.status), np.asarray((done.status == Status.OK) & (pull * side < 0.0))
+
+
+def _pull(problem: Problem, face: Face, x: Array) -> Array:
+    """Return the upward force of the cost (M,), minus half its slope, at minima along a face whose last level is z."""
+    gradients = levels(problem, face, x)[1]
+    force = marginal(equations_at(problem, x))[1]
+    return np.asarray((np.linalg.pinv(np.swapaxes(gradients, -1, -2)) @ force[..., None])[:, -1, 0])
+
+
+def _leave_falling(
+    problem: Problem, strata: Strata, found: tuple[Array, Array, Array], item: Array, cross: bool
+) -> None:
+    """Drop or move points on an interface from which the cost falls on the other side; choose a side for the others.
+
+    The chosen side has the larger variance of the depth. The slope of the cost away from a kink only narrows the law of
+    the depth. So this covariance is not too small on either side.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    strata : Strata
+        Their layers.
+    found : tuple of arrays
+        Vectors (M, size), costs (M,) and statuses (M,), which are changed.
+    item : int array (M,)
+        Problem of each vector.
+    cross : bool
+        Whether points are moved.
+    """
+    x, cost, status = found
+    layer = strata.layer(x[:, strata.column])
+    side = Limits(strata.column, strata.low[layer], strata.high[layer]).reached(x, _REACHED)
+    beside = layer - side
+    # the uppermost and the last layer end where no other begins
+    rows = np.flatnonzero((side != 0) & (status == Status.OK) & (beside >= 0) & (beside < len(strata.low)))
+    if not len(rows):
+        return
+    other, part, side = x[rows].copy(), problem.take(item[rows]), side[rows]
+    other[:, strata.column] = np.where(side > 0, strata.low[beside[rows]], strata.high[beside[rows]])
+    there, here = equations_at(part, other), equations_at(part, x[rows])
+    force, near = marginal(there)[1][:, strata.column], equal_cost(cost[rows])
+    falls = (there.cost < cost[rows] - near) | ((there.cost < cost[rows] + near) & (force * side > 0.0))
+    cost[rows[falls]] = there.cost[falls] if cross else np.inf
+    status[rows[falls]] = Status.MAX_ITERATIONS if cross else Status.UNAVAILABLE
+    spreads = []
+    for equations in (here, there):
+        covariance, ok = linalg.inverse(marginal(equations)[0])
+        variance = covariance[:, strata.column, strata.column]
+        spreads.append(np.where(ok & np.isfinite(variance), variance, 0.0))
+    moved = ~falls & (np.abs(there.cost - cost[rows]) <= near) & (spreads[1] > spreads[0])
+    moved |= falls & cross
+    x[rows[moved]] = other[moved]
