@@ -315,6 +315,7 @@ class Status(IntEnum):
     CURVED = 16
     UNREFINED = 17
     UNCHECKED = 18
+    TAILS = 19
 
     def __str__(self) -> str:
         """Return the label: what `print` shows."""
@@ -372,6 +373,7 @@ _SENTENCES: dict[Status, str] = {
     "optloc.likelihood_region.",
     Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
     Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
+    Status.TAILS: "The 95 % figures hold, as repeats of the measurement show; the 99.9 % region does not.",
 }
 
 PRECEDENCE = (
@@ -398,7 +400,7 @@ PRECEDENCE = (
 )
 """Which of all that applies to a fix is its status: the first of these."""
 
-NOTES = (Status.UNCHECKED,)
+NOTES = (Status.UNCHECKED, Status.TAILS)
 """Findings that are never a status: they stand beside one, `ok` included."""
 
 ANSWERED = (

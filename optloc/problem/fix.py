@@ -16,6 +16,9 @@ from optloc.problem.chart import Chart, Extent
 from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
 
+TOLD = 0.95
+"""Level up to which the regions of a fix with the finding `tails` hold."""
+
 _STATES = ("position", "velocity", "acceleration")
 # Sizes of stations and target together, beyond which a standard deviation of a position says nothing: a fix is not
 # Gaussian from one on, and what symmetry leaves open is wider by many decades.
@@ -486,6 +489,7 @@ class Fix:
         InvalidProblem
             Where no Gaussian covers: `optloc.likelihood_region` shows what does.
         """
+        self._demand_tails(level)
         return self._gaussian_chart().covers(points, level)
 
     def interval(self, extent: Extent, level: float = 0.95) -> tuple[Array, Array]:
@@ -503,14 +507,24 @@ class Fix:
         InvalidProblem
             Where no Gaussian covers: `optloc.likelihood_region` shows what does.
         """
+        self._demand_tails(level)
         return self._gaussian_chart().interval(extent, level)
+
+    def _demand_tails(self, level: float) -> None:
+        """Raise where regions of a level above 95 % do not cover."""
+        if level > TOLD and bool(self.has(Status.TAILS).any()):
+            raise InvalidProblem(
+                f"the regions of some fixes hold at {TOLD:g} but not at {level:g}",
+                "level",
+                "take fixes without the finding 'tails', or `optloc.likelihood_region`",
+            )
 
     def _gaussian_chart(self) -> Chart:
         if self.chart is None:
             raise InvalidProblem("a fix that is not of one position has no chart", "fix", "see its covariance")
         return self.chart
 
-    def require(self, allow: Iterable[Status | str] = (), *, redundancy: int = 0) -> Fix:
+    def require(self, allow: Iterable[Status | str] = (), *, redundancy: int = 0, level: float = 0.95) -> Fix:
         """Return the fix if every status in it is `ok` or allowed; raise NoSolution with the first that is not.
 
         Parameters
@@ -520,11 +534,13 @@ class Fix:
         redundancy : int
             Least degrees of freedom of a fix that passes. With 1 a wrong measurement is noticed, with 0, the default,
             fixes that nothing checks pass as well (`unchecked`).
+        level : float
+            Probability that the regions of a fix must hold. Above 0.95 a fix with the finding `tails` does not pass.
 
         Raises
         ------
         NoSolution
-            With the first fix of another status, else with the first of less redundancy.
+            With the first fix of another status, of less redundancy, or with `tails`.
         InvalidProblem
             For an unknown status or a redundancy that is no whole number.
         """
@@ -537,6 +553,9 @@ class Fix:
         weak = np.flatnonzero(np.ravel(self.dof) < wanted)
         if len(weak):
             raise NoSolution(None, self.flat()[int(weak[0])], _too_weak(self, weak, wanted))
+        tails = np.flatnonzero(np.ravel(self.has(Status.TAILS)))
+        if len(tails) and level > TOLD:
+            raise NoSolution(None, self.flat()[int(tails[0])], Status.TAILS.sentence)
         return self
 
     def flat(self) -> Fix:

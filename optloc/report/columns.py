@@ -20,6 +20,7 @@ Columns = dict[str, Array]
 """A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
 
 UNCHECKED = "no redundancy: a wrong measurement would not be noticed"
+TAILS = "the 95 % figures hold, the 99.9 % region does not"
 """The sentence beside the status of a fix that nothing checks."""
 
 _RATES = {"velocity": "v", "acceleration": "a"}
@@ -183,6 +184,8 @@ def _of_target(
     for name, numbers in {"cost": fix.cost, "dof": fix.dof, "p_value": np.asarray(fix.p_value)}.items():
         columns[name] = np.repeat(numbers, count)
     columns["unchecked"] = np.repeat(np.atleast_1d(fix.unchecked), count)
+    tails = fix.has(Status.TAILS)
+    columns |= {"tails": np.repeat(np.atleast_1d(tails), count)} if tails.any() else {}
     columns["alternatives"] = np.repeat(np.isfinite(fix.alternatives.gap).sum(-1), count)
     columns |= {"undetermined": np.array(lost, dtype=object)} if any(lost) else {}
     return columns | _repeat(count, **words)

@@ -22,6 +22,7 @@ from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Active, Fix, Suspect
 from optloc.problem.problem import Problem
 from optloc.report.columns import (
+    TAILS,
     UNCHECKED,
     Columns,
     active_of,
@@ -92,7 +93,8 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Shee
     """
     columns = fix_columns(fix) if columns is None else columns
     verdict, reason = Status(int(fix.code)), str(fix.reason[()] or "")
-    told = [("status", f"{verdict.label}; {UNCHECKED}" if fix.unchecked else verdict.label), ("", verdict.sentence)]
+    notes = [UNCHECKED] * fix.unchecked + [TAILS] * bool(fix.has(Status.TAILS))
+    told = [("status", "; ".join([verdict.label, *notes])), ("", verdict.sentence)]
     told += [("reason", reason)] if reason else []
     others = [one.label for one in fix.findings if one is not verdict and one not in NOTES]
     told += [("besides", ", ".join(others))] if others else []

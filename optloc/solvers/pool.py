@@ -52,6 +52,8 @@ class Curvature:
     kappa : array (N, 2), optional
         By how much the cost departs from that of a Gaussian three sigma away, in metres and in inverse range
         (`optloc.adequacy.shape`); NaN where nobody has looked.
+    repeats : array (N, 2), optional
+        Shares of repeated measurements whose ellipses hold (`optloc.solvers.verdict.repeats`); NaN if not tried.
     """
 
     covariance: Annotated[Array, Axes(2)]
@@ -61,6 +63,7 @@ class Curvature:
     active: Annotated[Array, Axes(0, empty=())] | None = None
     local: Annotated[Array, Axes(3)] | None = None
     kappa: Annotated[Array, Axes(1)] | None = None
+    repeats: Annotated[Array, Axes(1)] | None = None
 
 
 @dataclass(frozen=True, slots=True)

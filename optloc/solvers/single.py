@@ -28,7 +28,7 @@ from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer,
 from optloc.engine.shape import STRAIGHT
 from optloc.linear.constraints import is_exact, violation_names
 from optloc.linear.redundancy import largest
-from optloc.problem.chart import Chart, quantile
+from optloc.problem.chart import CARTESIAN, CURVED, Chart, quantile
 from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Alternatives, Fix, Stage
@@ -64,6 +64,7 @@ from optloc.solvers.verdict.findings import (
     chart_kind,
     marks_of,
 )
+from optloc.solvers.verdict.repeats import holds, is_repeatable, repeat
 
 # Beginnings of methods that go the short way, and whether they prove.
 _WORDS = {("gtrs", "lsr"): False, ("gtrs", "lsr", "certify"): True}
@@ -167,6 +168,8 @@ class Single:
         exceed the least.
     often : bool
         Whether it is worth loading machine code for.
+    repeatable : bool
+        Whether the measurement of a curved fix can be repeated.
     own : threading.local
         What each thread writes into.
     """
@@ -187,6 +190,7 @@ class Single:
     refuted: float
     region: float
     often: bool
+    repeatable: bool
     own: local = field(default_factory=local)
 
     def __call__(self, z: Array) -> Fix | None:
@@ -312,6 +316,8 @@ class Single:
             marks.append(marks_of(one.cost > self.refuted, more, self.region, gap, one.kappa, self.map is not None))
             kinds.append(chart_kind(one.kappa, one.kappa_far))
             gaps.append(ambiguity(self.problem, gap) if gap < AMBIGUOUS_GAP else "")
+        for i in self._held(answer, marks, room):
+            marks[i], kinds[i] = Status.TAILS.mark, CARTESIAN if kinds[i] == CURVED else kinds[i]
         told = _told(tuple(marks), tuple(kinds), tuple(gaps), shape)
         if told is None:
             return None
@@ -340,6 +346,15 @@ class Single:
             active=room.nothing if held is None else held.reshape(shape),
             **room.kept,
         )
+
+    def _held(self, answer: Any, marks: list[int], room: _Room) -> list[int]:
+        """Return the numbers of curved fixes whose 95 % figures hold when the measurement is repeated."""
+        items = [i for i, mark in enumerate(marks) if mark == Status.CURVED.mark]
+        if not items or not self.repeatable:
+            return []
+        many = self.problem.with_rows(z=room.z[items]).flat()
+        held = holds(repeat(many, answer.x[items], answer.covariance[items]))
+        return [i for i, good in zip(items, held, strict=True) if good]
 
     def _room(self, shape: tuple[int, ...]) -> _Room:
         """Return the arrays of this thread for so many problems."""
@@ -483,6 +498,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         largest(plan.dof, REFUTED),
         quantile(COVERED, d),
         often,
+        is_repeatable(bare.flat()),
     )
 
 

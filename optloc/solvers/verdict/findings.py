@@ -21,6 +21,7 @@ from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, NOTICED, REFUTED
 from optloc.solvers.pool import Curvature, Pool
+from optloc.solvers.verdict.repeats import holds, is_repeatable, repeat
 
 NO_PROOF = claim(
     Certificate(
@@ -68,6 +69,8 @@ class Evidence(NamedTuple):
         Whether the start was not safe.
     blind : bool
         Whether a search for suspects was asked for, and could not see one or tell which.
+    held : bool
+        Whether the 95 % ellipses of repeated measurements hold.
     """
 
     improbable: Any
@@ -78,6 +81,7 @@ class Evidence(NamedTuple):
     unique: Any
     searched: Any = False
     blind: Any = False
+    held: Any = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +161,7 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
             _is_unique(pool),
             False if pool.searched is None else pool.searched,
             blind,
+            repeats_hold(pool.curvature),
         )
     return marks.astype(np.int32)
 
@@ -236,7 +241,31 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     # far away a velocity may grow with the range: no least cost is left to compute
     if pool.loss or not one_position(problem) or problem.motions[0].order:
         return pool
-    return replace(pool, infinity=_infinity(problem, pool, good & _is_bent(pool), unseen))
+    pool = replace(pool, infinity=_infinity(problem, pool, good & _is_bent(pool), unseen))
+    return _with_repeats(problem, pool, good) if is_repeatable(problem) else pool
+
+
+def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
+    """Return a pool with the repeats of fixes against which only their shape speaks."""
+    assert pool.curvature is not None
+    cost = pool.cost[:, 0]
+    with np.errstate(invalid="ignore"):
+        gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
+    items = np.flatnonzero(good & (mark(problem, pool, gap) == Status.CURVED.mark))
+    if pool.pair is not None:  # no Gaussian describes both sides of a plane
+        items = items[np.isnan(pool.pair[items, 0]).any(-1)]
+    if not len(items):
+        return pool
+    shares = np.full((len(pool), 2), np.nan)
+    shares[items] = repeat(problem.take(items), pool.x[items, 0], pool.curvature.covariance[items])
+    return replace(pool, curvature=replace(pool.curvature, repeats=shares))
+
+
+def repeats_hold(curvature: Curvature | None) -> Any:
+    """Return whether repeats were tried and their ellipses hold, (N,) or False."""
+    if curvature is None or curvature.repeats is None:
+        return False
+    return holds(curvature.repeats)
 
 
 def _departure(problem: Problem, pool: Pool) -> Array:
@@ -327,6 +356,8 @@ def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature
     if curvature.kappa is not None:
         with np.errstate(invalid="ignore"):
             kind = chart_kind(curvature.kappa[:, 0], curvature.kappa[:, 1]).astype(np.int8)
+        # in metres the 95 % figures cover
+        kind[repeats_hold(curvature) & (kind == CURVED)] = CARTESIAN
     centre = centre_of(problem)
     centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
     return Chart(kind, x[:, part], covariance[:, part, part], centre)
@@ -419,7 +450,8 @@ FINDINGS = (
     Finding(Status.AMBIGUOUS, lambda e: e.gap < AMBIGUOUS_GAP, _name_rivals),
     Finding(Status.SEARCHED, _is_unsafe, _name_search),
     Finding(Status.UNPROVEN, lambda e: (_is_unsafe(e) ^ True) & ((e.unique ^ True) | e.blind), _name_proof),
-    Finding(Status.CURVED, lambda e: e.kappa > BENT, _name_shape),
+    Finding(Status.CURVED, lambda e: (e.kappa > BENT) & (e.held ^ True), _name_shape),
+    Finding(Status.TAILS, lambda e: (e.kappa > BENT) & e.held, lambda finished, items: ""),
 )
 """All findings against finished answers; the advice of each is `Status.sentence`."""
 _TESTS = tuple((finding.status.mark, finding.test) for finding in FINDINGS)
