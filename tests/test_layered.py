@@ -182,3 +182,24 @@ def test_a_kink_has_the_larger_variance_of_both_sides(seed, upside_down):
     assert np.abs(fix.position - np.r_[found.x, -4000.0]).max() < 0.1
     spread = [np.sqrt(np.linalg.inv(slope.T @ slope)[2, 2]) for _, slope in sides]
     assert fix.sigma()[2] == pytest.approx(max(spread), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_rays_that_graze_an_interface_give_the_depth_at_which_the_cost_is_larger_by_one(seed):
+    rng, turn = np.random.default_rng(seed), np.arange(8) * np.pi / 4.0
+    radius, tops, speed = rng.uniform(30e3, 60e3, 8), np.array([0.0, -5e3]), np.array([4e3, 6e3])
+    stations = np.c_[radius * np.cos(turn), radius * np.sin(turn), np.full(8, -10.0)]
+    # waves that come early leave no room below the interface
+    z = rays(tops, speed, stations, np.array([500.0, -800.0, -5e3]), 1)[0] + 0.05 * (rng.standard_normal(8) - 0.3)
+    table = Layers((0, 5e3), tuple(speed), "constant")
+    unit = table.unit_speed
+    rows = measured("range", z * unit, a=np.arange(8), sigma=0.05 * unit)
+    fix = solve(assemble(stations, rows, medium=table))
+    assert fix.status in (Status.UNPROVEN, Status.SEARCHED)
+    assert abs(fix.position[2] + 5e3) < 1e-3
+    case = (tops, speed, stations, z, 0.05, False)
+    found = [
+        2.0 * least_squares(lambda u, z=z: residuals(case, np.r_[u, z], 1)[0], fix.position[:2], x_scale=1e3).cost
+        for z in (-5e3 - 1e-6, -5e3 - fix.sigma()[2])
+    ]
+    assert 0.7 < found[1] - found[0] < 1.4

@@ -15,9 +15,9 @@ from optloc.base import linalg
 from optloc.base.types import Array, Band, Status
 from optloc.compute.least_squares import Limits, Refined, refine
 from optloc.compute.sums import equations_at
-from optloc.linear.constraints import Face, Level, levels
+from optloc.linear.constraints import Face, Level, exact, levels
 from optloc.linear.mirror import one_position
-from optloc.linear.normal import marginal
+from optloc.linear.normal import Normal, marginal
 from optloc.models.layers import Layers
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import equal_cost
@@ -144,13 +144,20 @@ def _along_border(
     """Return the minima along the borders next to x (M, size), and a flag where the cost falls inwards (M,)."""
     side = limits.reached(x, _REACHED)
     z = np.where(side < 0, limits.low, limits.high)
-    normal = np.eye(problem.dimension)[2]
     part = problem.take(item)
-    held = replace(part, constraints=(*part.constraints, Band("plane", z, z, normal, "interface")))
-    border = (*face, Level(len(part.constraints), "equal"))
+    held, border = _with_depth(part, z, face)
     done = refine(held, x, limit=limit, face=border)
     pull = _pull(held, border, done.x)
     return (done.x, done.cost, done.status), np.asarray((done.status == Status.OK) & (pull * side < 0.0))
+
+
+def _with_depth(problem: Problem, z: Array, face: Face) -> tuple[Problem, Face]:
+    """Return M problems with known third coordinates z (M,), and their face with this constraint."""
+    known = Band("plane", z, z, np.eye(3)[2], "interface")
+    return replace(problem, constraints=(*problem.constraints, known)), (
+        *face,
+        Level(len(problem.constraints), "equal"),
+    )
 
 
 def _pull(problem: Problem, face: Face, x: Array) -> Array:
@@ -204,3 +211,56 @@ def _leave_falling(
     moved = ~falls & (np.abs(there.cost - cost[rows]) <= near) & (spreads[1] > spreads[0])
     moved |= falls & cross
     x[rows[moved]] = other[moved]
+
+
+# The law of the depth next to an interface along which rays graze: the slope of the times is zero there, and J'J has no
+# information about the depth.
+
+# Metres of the first distance that is tried, and doublings: 100 km are beyond any layer.
+_FIRST, _DOUBLINGS = 1.0, 17
+
+
+def equations_in_layers(problem: Problem, x: Array) -> Normal:
+    """Return the normal equations at vectors x (N, size) for their covariances.
+
+    Where rays graze an interface, the standard deviation of the depth is the distance at which the cost is larger by 1.
+    """
+    at, face = equations_at(problem, x), exact(problem)
+    strata = strata_of(problem, face)
+    if strata is None:
+        return at
+    layer = strata.layer(x[:, strata.column])
+    limits = Limits(strata.column, strata.low[layer], strata.high[layer])
+    covariance, ok = linalg.inverse(marginal(at)[0])
+    deep = 2.0 * (strata.high[0] - strata.high[-1])
+    with np.errstate(invalid="ignore"):
+        known = ok & (covariance[:, strata.column, strata.column] < deep * deep)
+    rows = np.flatnonzero(~known & (limits.reached(x, _REACHED) != 0))
+    if not len(rows):
+        return at
+    apart = _rise_of_one(problem.take(rows), limits.take(rows), x[rows], at.cost[rows], face)
+    shared = np.array(at.shared)
+    shared[rows, strata.column, strata.column] += 1.0 / apart**2
+    return replace(at, shared=shared)
+
+
+def _rise_of_one(problem: Problem, limits: Limits, x: Array, cost: Array, face: Face) -> Array:
+    """Return the distance (M,) from a border to the depth at which the least cost is larger by one, in the layer."""
+    z, side = x[:, limits.column], limits.reached(x, _REACHED)
+    most = np.where(side > 0, z - limits.low, limits.high - z)
+    apart, found, before = np.minimum(_FIRST, most), np.zeros(len(x), dtype=bool), np.zeros(len(x))
+    for _ in range(_DOUBLINGS):
+        held, border = _with_depth(problem, z - side * apart, face)
+        done = refine(held, x, face=border)
+        x, rise = done.x, np.maximum(done.cost - cost, 0.0)
+        reached = ~found & (rise >= 1.0)
+        # between two distances the rise is a power of the distance, the second or more
+        with np.errstate(divide="ignore"):
+            power = np.maximum(np.log2(np.maximum(rise, 1.0) / before), 2.0)
+        apart = np.where(reached, apart * np.maximum(rise, 1.0) ** (-1.0 / power), apart)
+        before = rise
+        found |= reached | (apart >= most)
+        if found.all():
+            break
+        apart = np.where(found, apart, np.minimum(2.0 * apart, most))
+    return apart

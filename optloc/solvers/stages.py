@@ -20,13 +20,14 @@ from optloc.linear.constraints import exact
 from optloc.linear.mirror import mirror, one_position
 from optloc.linear.normal import decrement, step
 from optloc.linear.vectors import hold_still, vectors
+from optloc.models.layers import Layers
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
 from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
-from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
+from optloc.solvers.layered import equations_in_layers, in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, crowd_of, in_parts, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
@@ -265,7 +266,9 @@ def _answer(
     fix = judge(problem, pool)
     # where all that is known is hidden by the Earth, another minimum may be in sight
     hidden = np.zeros(len(fix.code), dtype=bool) if pool.hidden is None else pool.hidden != ""
-    lost = ~fix.answered & (hidden | ~np.isin(fix.code, _SETTLED))
+    # closed forms start with straight lines: in layers none of their starts need have a ray to every station
+    bent = isinstance(problem.medium, Layers) & (fix.code == Status.INFEASIBLE)
+    lost = ~fix.answered & (hidden | bent | ~np.isin(fix.code, _SETTLED))
     refuted = fix.answered & (fix.code == Status.MISFIT) & problem.frame.geodetic
     behind: Array = np.flatnonzero(refuted)
     lost[behind] = is_hidden(problem.take(behind), fix.x[behind]) if len(behind) else False
@@ -387,7 +390,8 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     refined = Pool(x, cost, code, inside, weights, pool.dof, pool.stages, missing=told, hidden=pool.hidden)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
-    settled = settle(problem, refined, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
+    stage = Stage("lsr" if damped else "taylor", detail, perf_counter() - began)
+    settled = settle(problem, refined, stage, equations_at if strata is None else equations_in_layers)
     return join_sides(problem, settled) if damped else settled
 
 
