@@ -9,23 +9,20 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, plain, put, usable, zero
+from optloc.compute.jit import compiled, enabled, plain, put, usable, worth_loading, zero
 from optloc.linear.normal import prior_parts
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import atlas_of, first_minima, with_minima
-from optloc.proof.batch import Answered, Asked, empty_answer, plainly
+from optloc.proof.batch import FIRST_BOXES, Answered, Asked, empty_answer, plainly
 from optloc.proof.box import bound_nodes, cube, digits
 from optloc.proof.convex_boxes import accuracy_floor_far, widen_core
 from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, COARSE, OTHER, STATIONARY, UNIQUE, VALUE
 from optloc.proof.position_costs import position_costs
-from optloc.proof.scaled.reduction import FACTOR, HERE, Scaled, blur_of, look_at, reduce_rows
+from optloc.proof.scaled.reduction import FACTOR, HERE, MOST, Scaled, blur_of, look_at, reduce_rows
 from optloc.proof.scaled.scaled_search import cost_near, search_scaled, set_scaled_minimum, tables_of
 from optloc.proof.search_space import COARSEST, LINES, accuracy_floor, chart_at, cost_of, equal_within
-
-# Boxes for a proof in plain Python, which takes a thousand times longer for each.
-_PLAINLY = 200
 
 
 class ScaledCosts(NamedTuple):
@@ -137,29 +134,32 @@ def prove_scaled(
 def prove_all_scaled(costs: ScaledCosts, asked: Asked) -> Answered:
     """Return the outcome of the proofs of n fixes of n problems, see `optloc.proof.batch.prove_all`.
 
-    Claims are about all positions: of a region nothing is proven.
+    Claims are about all positions: of a region nothing is proven. Few proofs begin in plain Python, because most of
+    them end before machine code is loaded.
     """
     n, d = asked.x.shape
     out, asked = empty_answer(n, d), Asked(*map(plainly, asked))
-    fast = enabled() and usable(prove_scaled, n)
+    out.everywhere[:] = True
 
-    def prove(i: int) -> None:
-        budget = int(asked.budget[i]) if fast else min(int(asked.budget[i]), max(1, _PLAINLY // n))
-        out.everywhere[i] = True
+    def prove(i: int, most: int) -> None:
         if not np.isnan(asked.region[i, 0, 0]):
             out.verdict[i], out.bound[i], out.gap[i] = BUDGET, -inf, asked.gaps[i, -1]
             return
-        others = asked.others[i, : asked.known[i]]
+        others, budget = asked.others[i, : asked.known[i]], min(int(asked.budget[i]), most)
         out.verdict[i], out.boxes[i], out.bound[i], out.gap[i], out.met[i] = prove_scaled(
             costs.one(i), asked.x[i], others, asked.gaps[i], float(asked.eps[i]), budget, out.rivals[i], out.found[i]
         )
 
-    if fast:
-        mapped(prove, range(n))
-    else:
+    left = list(range(n))
+    if not worth_loading(prove_scaled, n):
+        few = max(1, FIRST_BOXES // n)
         with plain(), np.errstate(all="ignore"):
-            for i in range(n):
-                prove(i)
+            for i in left:
+                prove(i, few)
+        # with more boxes a larger gap may be proven than with few, and minima may be met
+        left = [i for i in left if out.boxes[i] >= few and asked.budget[i] > few]
+    if left and enabled() and usable(prove_scaled, n):
+        mapped(lambda i: prove(i, int(asked.budget[i])), left)
     return out
 
 
@@ -183,15 +183,23 @@ def _evaluate(scaled: Scaled, x: Array, out: Array) -> None:
         bound_nodes(cost.kinds, cost.data, near.centre, axes, axes, near.half, near.line, near.nodes)
         floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, near.centre, LINES)
         reduce_rows(scaled, floor, near, tables.sheet)
-        tables.sheet.span[2] = inf
+        tables.sheet.span[MOST] = inf  # the best factor alone counts
         out[0, p], out[1, p] = tables.sheet.span[HERE], blur_of(scaled, tables.sheet)
 
 
 def costs_at_scaled(costs: ScaledCosts, x: Array) -> tuple[Array, Array]:
     """Return costs (n, P) at positions x (n, P, d) and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *x.shape[:2]))
-    for i, places in enumerate(x):
-        own = np.zeros((2, x.shape[1]))
-        _evaluate(costs.one(i), plainly(places), own)
-        out[:, i] = own
+
+    def evaluate() -> None:
+        for i, places in enumerate(x):
+            own = np.zeros((2, x.shape[1]))
+            _evaluate(costs.one(i), plainly(places), own)
+            out[:, i] = own
+
+    if worth_loading(_evaluate, len(x)):
+        evaluate()
+    else:
+        with plain(), np.errstate(all="ignore"):
+            evaluate()
     return out[0], out[1]
