@@ -105,3 +105,9 @@ def test_bad_speeds_of_locate_are_refused(speed):
 def test_locate_refuses_a_sigma_of_the_speed_for_lengths():
     with pytest.raises(InvalidProblem, match="no measurement is a time"):
         locate(PLACE, ranges=343.0 * TIMES, sigma=0.01, speed=(343.0, 5.0))
+
+
+def test_the_answer_shows_the_speed():
+    text = str(locate(PLACE, toa=TIMES, sigma=1e-5, speed=(343.0, 5.0)))
+    line = next(line for line in text.splitlines() if line.startswith("speed") and "m/s" in line and "true" in line)
+    assert "349.9" in line or "350" in line

@@ -20,7 +20,7 @@ from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Qua
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
 from optloc.files.columns import stem
 from optloc.files.declination import angle_of, date_of, declinations
-from optloc.files.propagation import is_time, scale_of
+from optloc.files.propagation import is_time
 from optloc.files.readings import CARTESIAN, COMPASS
 from optloc.files.roles import WORDS, worded
 from optloc.files.schema import FrameTable, StationsTable, Units
@@ -29,6 +29,7 @@ from optloc.files.table import Table, of_frame
 from optloc.linear import constraints
 from optloc.models import MODELS
 from optloc.models.medium import Medium
+from optloc.problem.bias import scale_of
 from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

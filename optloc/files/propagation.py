@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
 from optloc.base.units import SPEED_OF_LIGHT, sound_in_air, sound_in_water
 from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable, Units, join
 from optloc.models.medium import Atmosphere, Layers, Medium
+from optloc.problem.bias import SPEED, scale_of
 
 # Keys of each kind of medium.
 _MEDIA = {
@@ -89,9 +88,6 @@ def _positive(given: float | str, what: str, place: str) -> float:
 
 # A speed that is not quite known: the times are too long or too short by one factor, whose error is a scale.
 
-SPEED = "speed"
-"""Name of the scale of times by the stated speed."""
-
 
 def is_time(units: Units, unit: str | None, place: str) -> bool:
     """Return whether lengths are written as times, which the speed of the wave makes lengths."""
@@ -99,28 +95,6 @@ def is_time(units: Units, unit: str | None, place: str) -> bool:
         return False
     once, twice = (Units("length", speed=factor * units.speed).conversion(unit, place).factor for factor in (1.0, 2.0))
     return once != twice
-
-
-def scale_of(speed: float, sigma: float, rows: Sequence[Array], place: str) -> Bias:
-    """Return the scale of times for a stated speed with a sigma, with its prior.
-
-    Times multiplied by the stated speed are ranges times the stated over the true speed. This factor less one is the
-    scale. Its member has the name of the stated speed.
-
-    Parameters
-    ----------
-    speed, sigma : float
-        The stated speed and its standard deviation, metres per second.
-    rows : sequence of int array (m,)
-        Global numbers of the rows that are times.
-    place : str
-        Place to name.
-    """
-    touched = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
-    if not len(touched):
-        raise InvalidProblem("the speed has a sigma, but no measurement is a time", place, "leave the sigma out")
-    member, ones = np.zeros(len(touched), dtype=np.int64), np.ones(len(touched))
-    return Bias(SPEED, (f"{speed:g} m/s",), touched, member, ones, "scale", np.zeros(1), np.array([sigma / speed]))
 
 
 def speed_bias(
