@@ -134,7 +134,7 @@ def prove_scaled(
 def prove_all_scaled(costs: ScaledCosts, asked: Asked) -> Answered:
     """Return the outcome of the proofs of n fixes of n problems, see `optloc.proof.batch.prove_all`.
 
-    Claims are about all positions: of a region nothing is proven. Few proofs begin in plain Python, because most of
+    Claims are about all positions, whatever region is asked for. Few proofs begin in plain Python, because most of
     them end before machine code is loaded.
     """
     n, d = asked.x.shape
@@ -142,7 +142,7 @@ def prove_all_scaled(costs: ScaledCosts, asked: Asked) -> Answered:
     out.everywhere[:] = True
 
     def prove(i: int, most: int) -> None:
-        if not np.isnan(asked.region[i, 0, 0]):
+        if np.array_equal(asked.region[i], asked.fallback[i]):  # what is tried after all positions
             out.verdict[i], out.bound[i], out.gap[i] = BUDGET, -inf, asked.gaps[i, -1]
             return
         others, budget = asked.others[i, : asked.known[i]], min(int(asked.budget[i]), most)
