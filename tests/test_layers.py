@@ -151,7 +151,8 @@ def test_no_loose_module():
 # whose epochs are lanes; the forms of biases; the rows of the scans of a run as arrays; logarithms of ranges, groups of
 # nodes, and the space of a branch and bound (a part of the search of runs before); mirror images in the plane of the
 # stations, the distance from it, and both sides of it as one region;
-# starts of unknown headings; layers; repeats of a measurement.
+# starts of unknown headings; layers; repeats of a measurement; rows with unknown scales, and
+# proofs with an unknown factor: a box, its curvature, the search and the proof.
 MODULES, LINES, BODY, RECURRING = 400, 600, 60, 20
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optloc.adequacy.scaled_rows import cost_beyond_speed, has_scales, profile_by_rows
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
@@ -54,8 +55,9 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
             return equations.cost, equations.shared, equations.shared_vector
         along = _others(problem, x, part)
         move, _ = step(equations, np.zeros(equations.cost.shape), along)
-    # the model is quadratic: it falls by the product of step and slope
-    cost = equations.cost - decrement(equations, move, n)
+    # The model is quadratic: it falls by the product of step and slope. After one step this product is rounding. The
+    # sum of squares without it is never negative.
+    cost = equations.cost - decrement(equations, move, n) if passes == 1 else equations.cost
     information, vector, _ = marginal(equations)
     across = information[..., part, :] @ along
     turned = np.swapaxes(along, -1, -2)
@@ -273,7 +275,8 @@ def cost_at_infinity(problem: Problem, x: Array) -> Array:
         cost = sphere.look(tried)[0]
         best = np.argsort(cost, axis=0)[:_REFINED]
         starts = np.concatenate([own[None], np.take_along_axis(tried, best[..., None], axis=0)])
-        return np.asarray(sphere.descend(starts).min(0))
+        least = sphere.descend(starts).min(0)
+        return np.fmin(least, cost_beyond_speed(problem, x)) if has_scales(problem) else np.asarray(least)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +300,8 @@ class _Sphere:
         """Return costs (q, N) in directions (q, N, d), and information and vector of the position."""
         x = np.array(np.broadcast_to(self.x, (len(direction), *self.x.shape)))
         x[..., self.part] = self.centre + self.radius[:, None] * direction
-        cost, information, vector = profile(self.problem, x, self.x, 2)
+        own = profile_by_rows if has_scales(self.problem) else profile
+        cost, information, vector = own(self.problem, x, self.x, 2)
         if self.problem.constraints:
             broken = np.stack([violation(self.problem, one) for one in x])
             cost = np.where(broken > _BROKEN, np.inf, cost)

@@ -33,6 +33,7 @@ from optloc.compute.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
 from optloc.placement import SiteSelection, place
+from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -112,6 +113,12 @@ def _prove_runs() -> None:
     certify(problem, _plainly_solved(problem))
 
 
+def _prove_scaled() -> None:
+    problem = with_bias(_problem_of("toa"), "speed", form="scale", per="kind", sigma=0.05)
+    found = simulate(problem, np.append(_TARGET, np.zeros(problem.layout.size - 3)), 1, _FEW).flat()
+    certify(found, _plainly_solved(found))
+
+
 def _search() -> None:
     velocity = np.broadcast_to([50.0, -30.0, 0.0], _STATIONS.shape)
     moving = Stations(_STATIONS[None], tuple("ABCDEF"), velocity=velocity[None])
@@ -187,6 +194,12 @@ PARTS: Mapping[str, Part] = {
             "optloc.proof.runs.state_bounds.hessian_of_state",
             "optloc.proof.runs.state_search.prove_course",
         ),
+    ),
+    "speeds": Part(
+        "proofs with an unknown speed",
+        "optloc.proof",
+        (_prove_scaled,),
+        tuple(f"optloc.proof.scaled.scaled_proof.{name}" for name in ("prove_scaled", "_evaluate")),
     ),
     "searches": Part("searches for starts", "optloc.proof", (_search,), ("optloc.proof.best_first.search_minima",)),
     "placements": Part(

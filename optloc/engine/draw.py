@@ -264,7 +264,8 @@ def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, prob
     """Return the rows of problems as tapes, or None where they have none."""
     bare = problem.with_rows(z=np.zeros(problem.count))
     found = pack(bare, whiten(weighed(bare).noise, bare.weight))
-    return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts, bounded)
+    scaled = any(form_of(bias).enters == "scales" for bias in problem.biases)
+    return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts, bounded, scaled)
 
 
 def _is_bounded(one: Problem) -> bool:

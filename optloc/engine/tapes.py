@@ -61,6 +61,8 @@ class TapeRows(NamedTuple):
         Linear rows of other kinds than ranges.
     bounded : bool
         Whether the cost grows without bound at infinity.
+    scaled : bool
+        Whether unknown factors multiply rows: their columns are as long as ranges, and no search ends far away.
     """
 
     tables: Tables
@@ -69,6 +71,7 @@ class TapeRows(NamedTuple):
     base: Array
     lifts: Lifts
     bounded: bool
+    scaled: bool
 
 
 class TapeBlock(NamedTuple):
@@ -363,7 +366,7 @@ def measure_infinity(block: TapeBlock, room: Room) -> None:
 @compiled
 def search_infinity(model: Model, block: TapeBlock, room: Room) -> None:
     """Write to BEYOND what infinity costs: a search, for fixes that are bent."""
-    if block.rows.bounded:
+    if block.rows.bounded or block.rows.scaled:
         measure_infinity(block, room)
     else:
         search_sphere(model, block, room, block.spot)

@@ -20,6 +20,7 @@ from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Qua
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
 from optloc.files.columns import stem
 from optloc.files.declination import angle_of, date_of, declinations
+from optloc.files.propagation import is_time
 from optloc.files.readings import CARTESIAN, COMPASS
 from optloc.files.roles import WORDS, worded
 from optloc.files.schema import FrameTable, StationsTable, Units
@@ -28,6 +29,7 @@ from optloc.files.table import Table, of_frame
 from optloc.linear import constraints
 from optloc.models import MODELS
 from optloc.models.medium import Medium
+from optloc.problem.bias import scale_of
 from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -81,7 +83,7 @@ def locate(
     azimuth: str = COMPASS,
     declination: Any = None,
     frame: str = "cartesian",
-    speed: float | Medium = SPEED_OF_LIGHT,
+    speed: float | tuple[float, float] | Medium = SPEED_OF_LIGHT,
     method: str = "auto",
 ) -> Fix:
     """Return where something is from what receivers measured of it, in one call.
@@ -130,9 +132,10 @@ def locate(
         compass bearings.
     frame : "cartesian" or "ecef"
         What x, y, z of stations mean.
-    speed : float, Layers or Atmosphere
+    speed : float, (float, float), Layers or Atmosphere
         Propagation speed, m/s: light, or `optloc.units.sound_in_air` and `sound_in_water`; or `optloc.Layers` and
-        `optloc.Atmosphere`, through which rays bend.
+        `optloc.Atmosphere`, through which rays bend. A pair is a speed and its standard deviation: the speed is then
+        estimated with the position, from all measurements that are times.
     method : str
         As of `optloc.solve`.
 
@@ -165,7 +168,8 @@ def locate(
             raise InvalidProblem(f"{type(text).__name__} is no name", name, "give text, such as 'ns' for a unit")
     north = _North(azimuth, declination)
     _check_north(north, given)
-    problem = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, _speed(speed), north)
+    own, spread = _speed(speed), _speed_sigma(speed)
+    problem = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, own, spread, north)
     return solve(problem, method=method)
 
 
@@ -182,9 +186,21 @@ def _check_north(north: _North, given: Mapping[str, Any]) -> None:
         raise InvalidProblem("angles from the x axis have no declination", "declination", "leave it out")
 
 
+def _speed_sigma(given: Any) -> float | None:
+    """Return the standard deviation of a speed that is a pair."""
+    return float(given[1]) if isinstance(given, tuple | list) else None
+
+
 def _speed(given: Any) -> float | Medium:
     if isinstance(given, Medium):
         return given
+    if isinstance(given, tuple | list):
+        if len(given) != _PAIR:
+            raise InvalidProblem(
+                f"the speed has {len(given)} numbers", "speed", "give (speed, sigma), such as (343, 5)"
+            )
+        _speed(given[1])  # as positive as the speed
+        return _speed(given[0])
     if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
         advice = "give metres per second, optloc.Layers or optloc.Atmosphere"
         raise InvalidProblem("the speed is no positive number", "speed", advice)
@@ -206,21 +222,31 @@ def _problem_of(
     height: Any,
     frame: str,
     through: float | Medium,
+    spread: float | None,
     north: _North,
 ) -> Problem:
     """Return the problem of the arguments of `locate`."""
     medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
     places = _PLACES.call(_receivers, stations, latlon, frame)
-    rows = []
+    rows, timed = [], []
     for word, values in given.items():
         found = station_values(word, values, places.names, reference)
         own = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
-        step, spread = _SCALES.call(_scale, word, own, sigma, list(given), speed, convention)
-        made = _rows(word, found, spread, step, places, speed)
+        step, own_sigma = _SCALES.call(_scale, word, own, sigma, list(given), speed, convention)
+        made = _rows(word, found, own_sigma, step, places, speed)
+        timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), own, "unit"))
         rows.append(_from_north(made, north, own, places) if word == "bearings" else made)
     at = _heights(height, places, given)
-    return assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
+    problem = assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
+    return problem if spread is None else _with_speed(problem, speed, spread, timed)
+
+
+def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bool]) -> Problem:
+    """Return a problem with a scale of its times, from a speed with a standard deviation."""
+    ends = [(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
+    times = [np.arange(*end) for end, time in zip(ends, timed, strict=True) if time]
+    return replace(problem, biases=(*problem.biases, scale_of(speed, sigma, times, "speed")))
 
 
 def _scale(
@@ -231,6 +257,9 @@ def _scale(
     step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
     return step, _spread(_per_word(sigma, word, words, "sigma"), word, units, unit)
 
+
+# Numbers of a speed with its standard deviation.
+_PAIR = 2
 
 # Where the receivers are.
 

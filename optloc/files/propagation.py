@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Bias
 from optloc.base.units import SPEED_OF_LIGHT, sound_in_air, sound_in_water
-from optloc.files.schema import MediumTable, ProblemFile, SoundTable, Units, join
+from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable, Units, join
 from optloc.models.medium import Atmosphere, Layers, Medium
+from optloc.problem.bias import SPEED, scale_of
 
 # Keys of each kind of medium.
 _MEDIA = {
@@ -69,7 +73,53 @@ def _stated_speed(file: ProblemFile, source: str) -> float | None:
         return sound_in_water(given.celsius, salinity, given.depth) if water else sound_in_air(given.celsius)
     if given is None:
         return None
+    if isinstance(given, SpeedTable):
+        return _positive(given.value, "speed", place)
+    return _positive(given, "speed", place)
+
+
+def _positive(given: float | str, what: str, place: str) -> float:
+    """Return a speed or its sigma, metres per second; refuse zero and less."""
     speed = Units("speed").plain(given, "m/s", place)
     if not speed > 0.0:
-        raise InvalidProblem(f"the speed {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
+        raise InvalidProblem(f"the {what} {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
     return speed
+
+
+# A speed that is not quite known: the times are too long or too short by one factor, whose error is a scale.
+
+
+def is_time(units: Units, unit: str | None, place: str) -> bool:
+    """Return whether lengths are written as times, which the speed of the wave makes lengths."""
+    if units.quantity != "length":
+        return False
+    once, twice = (Units("length", speed=factor * units.speed).conversion(unit, place).factor for factor in (1.0, 2.0))
+    return once != twice
+
+
+def speed_bias(
+    file: ProblemFile, written: Sequence[tuple[Array, Units, str]], biases: Sequence[Bias], source: str
+) -> tuple[Bias, ...]:
+    """Return the scale of a speed that a file states with a sigma; nothing for a speed without one.
+
+    Parameters
+    ----------
+    file : ProblemFile
+        Settings.
+    written : sequence of (int array (m,), Units, str)
+        Global numbers of rows, the quantity of their values and the unit that they are written in.
+    biases : sequence of Bias
+        The other biases of the file.
+    source : str
+        Place to name.
+    """
+    given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
+    if not isinstance(given, SpeedTable):
+        return ()
+    if file.medium is not None:
+        raise InvalidProblem("the medium states the speed", place, "leave the sigma out")
+    if any(bias.name == SPEED for bias in biases):
+        raise InvalidProblem("the bias 'speed' is there twice", place, "leave [[biases]] 'speed' or the sigma out")
+    speed, sigma = _positive(given.value, "speed", place), _positive(given.sigma, "sigma", place)
+    rows = [numbers for numbers, units, unit in written if is_time(units, unit, place)]
+    return (scale_of(speed, sigma, rows, place),)

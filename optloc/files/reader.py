@@ -24,7 +24,7 @@ from optloc.files.measurements import (
     with_baseline,
     with_declination,
 )
-from optloc.files.propagation import medium_in, speed_of
+from optloc.files.propagation import medium_in, speed_bias, speed_of
 from optloc.files.roles import ASSUMED, azimuths_of, in_our_words
 from optloc.files.schema import (
     ConstraintTable,
@@ -248,6 +248,7 @@ def assemble(
     biases = [bias_of(b, rows, stations.names, epochs, stations.dimension, written, source) for b in file.biases]
     units = {bias.name: unit for bias, unit in biases if unit[0]}
     own = tuple(bias for bias, _ in biases)
+    own += speed_bias(file, written, own, source)
     problem = _problem(file, epochs, stations, rows, noise, own, frame, source, known or {}, more or {})
     # Noise that is left to the data needs fixes, so the whole problem: it comes last.
     problem, levels = with_noise(file, problem, source)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -373,6 +374,15 @@ class SoundTable(_Table):
     """Metres below the surface."""
 
 
+class SpeedTable(_Table):
+    """A speed that is not quite known."""
+
+    value: Amount
+    """The stated speed: metres per second, or text with a unit."""
+    sigma: Amount
+    """Its standard deviation, likewise."""
+
+
 class MediumTable(_Table):
     """What the waves come through where their speed is not one number: each row is then measured along its rays."""
 
@@ -410,8 +420,9 @@ class ProblemFile(_Table):
     """Version of the format: in 2, azimuths on Earth are compass bearings where nothing else is said."""
     title: str | None = None
     """What it is."""
-    propagation_speed: Annotated[float, Field(gt=0.0)] | str | SoundTable | None = None
+    propagation_speed: Annotated[float, Field(gt=0.0)] | str | SoundTable | SpeedTable | None = None
     """Metres per second, or text with a unit; or of sound: { medium = "air", celsius = 20.0 }. Light by default.
+    A speed with a sigma is estimated with the target: { value = 343.0, sigma = 5.0 }.
     Beside layers: the speed by which ranges in metres were made of times."""
     medium: MediumTable | None = None
     """Layers or air, where the speed is not one number."""
@@ -492,9 +503,17 @@ def conform(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
 
 
 def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: type[BaseModel]) -> InvalidProblem:
-    # Alternatives of a union each complain; the deepest complaint is the one about what was written.
+    # Alternatives of a union each complain. The table with the fewest complaints was meant, and its deepest complaint
+    # names the mistake.
+    found = error.errors()
+    counts = Counter(e["loc"][:2] for e in found if _is_alternative(e["loc"]))
     first = max(
-        error.errors(), key=lambda e: (e["type"] in {"extra_forbidden", "finite_number"}, len(_path(e["loc"], data)[0]))
+        found,
+        key=lambda e: (
+            -counts[e["loc"][:2]] if _is_alternative(e["loc"]) else -len(found),
+            e["type"] in {"extra_forbidden", "finite_number"},
+            len(_path(e["loc"], data)[0]),
+        ),
     )
     path, key = _path(first["loc"], data)
     template = _WHAT.get(first["type"])
@@ -510,6 +529,15 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: 
         known = [part.strip().strip("'") for part in str(first["ctx"]["expected"]).replace(" or ", ", ").split(",")]
         what, advice = f"{key} = {first['input']!r} is unknown", nearest(str(first["input"]), known)
     return InvalidProblem(what, join(source, *_spell(path)), advice)
+
+
+def _is_alternative(loc: tuple[int | str, ...]) -> bool:
+    """Return whether a complaint is about a key of one of several tables that the file may use in a place."""
+    return len(loc) > _IN_TABLE and str(loc[1]).endswith("Table")
+
+
+# Names before the key in the place of such a complaint: the key of the file, and the table.
+_IN_TABLE = 2
 
 
 def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:

@@ -24,6 +24,7 @@ from optloc.files.schema import (
     MeasurementsTable,
     PriorTable,
     SoundTable,
+    SpeedTable,
     StationsTable,
     Units,
     conform,
@@ -160,7 +161,7 @@ class SelectionFile(_Table):
     """Version of the format."""
     title: str | None = None
     """What it is."""
-    propagation_speed: float | str | SoundTable | None = None
+    propagation_speed: float | str | SoundTable | SpeedTable | None = None
     """As in a problem file."""
     frame: FrameTable = FrameTable()
     choice: ChoiceTable
@@ -293,7 +294,7 @@ def _settings(
         "format": 1,
         "title": file.title,
         "propagation_speed": file.propagation_speed
-        if not isinstance(file.propagation_speed, SoundTable)
+        if not isinstance(file.propagation_speed, SoundTable | SpeedTable)
         else file.propagation_speed.model_dump(),
         "frame": file.frame.model_dump(exclude_none=True),
         "stations": station | {"rows": rows},

@@ -425,3 +425,48 @@ def course(problem: Problem) -> tuple[Array, Array]:
     pull = -_GM * place / np.maximum(away, _RADIUS) ** 3
     fall = pull - 2.0 * np.cross(axis, speed) - np.cross(axis, np.cross(axis, place))
     return velocity, np.where(away > _RADIUS + _SKY, fall @ turn, 0.0)
+
+
+# A speed that is not quite known: the times are too long or too short by one factor, whose error is a scale.
+
+SPEED = "speed"
+"""Name of the scale of times by the stated speed."""
+
+
+def scale_of(speed: float, sigma: float, rows: Sequence[Array], place: str) -> Bias:
+    """Return the scale of times for a stated speed with a sigma, with its prior.
+
+    Times multiplied by the stated speed are ranges times the stated over the true speed. This factor less one is the
+    scale. Its member has the name of the stated speed.
+
+    Parameters
+    ----------
+    speed, sigma : float
+        The stated speed and its standard deviation, metres per second.
+    rows : sequence of int array (m,)
+        Global numbers of the rows that are times.
+    place : str
+        Place to name.
+    """
+    touched = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
+    if not len(touched):
+        raise InvalidProblem("the speed has a sigma, but no measurement is a time", place, "leave the sigma out")
+    member, ones = np.zeros(len(touched), dtype=np.int64), np.ones(len(touched))
+    return Bias(SPEED, (f"{speed:g} m/s",), touched, member, ones, "scale", np.zeros(1), np.array([sigma / speed]))
+
+
+def estimated_speed(name: str, member: str, value: float, sigma: float) -> tuple[float, float] | None:
+    """Return the speed and its sigma, metres per second, from the estimate of a scale by `scale_of`; None for others.
+
+    Parameters
+    ----------
+    name, member : str
+        Of a bias and of its member.
+    value, sigma : float
+        The estimated scale and its standard deviation.
+    """
+    number, _, unit = member.partition(" ")
+    if name != SPEED or unit != "m/s" or not value > -1.0:
+        return None
+    speed = float(number) / (1.0 + value)
+    return speed, speed * sigma / (1.0 + value)

@@ -147,7 +147,7 @@ _MULTIPLIES = f"multiplies what it touches, {_ADDS}"
 
 FORMS: dict[str, BiasForm] = {
     "offset": BiasForm("an offset"),
-    "scale": BiasForm("a scale error", "scales", "plain", beyond_proof=_MULTIPLIES),
+    "scale": BiasForm("a scale error", "scales", "plain"),
     "drift": BiasForm("a drift", rate=True, effects=_in_proportion_to_time),
     "rotation": BiasForm("a turn of its axes", "turns", "angle", beyond_proof=_MULTIPLIES),
     "time": BiasForm("a time along its course", "moves", "time", beyond_proof=f"moves stations, {_ADDS}"),

@@ -345,7 +345,7 @@ def has_no_infimum(
         return False
     if not touching:
         clip_newton(half, sums, ball, cut, solve)
-        return is_empty(cut) or _bends_down(sums, ball, solve)
+        return is_empty(cut) or bends_down(sums, ball, solve)
     ball *= sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2])
     for k in range(dimension):
         change = ball
@@ -377,7 +377,7 @@ def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
 
 
 @compiled
-def _bends_down(sums: Array, ball: float, hessian: Array) -> bool:
+def bends_down(sums: Array, ball: float, hessian: Array) -> bool:
     """Return whether the cost curves downwards along one direction all over a box, as around a saddle."""
     # No eigenvalue is less than an entry of the diagonal less those beside it (Gershgorin): the common case.
     a, b, c = abs(sums[H01]), abs(sums[H02]), abs(sums[H12])

@@ -37,7 +37,7 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
     noise = blur_at(cost, chart, box)
     curve_box(cost, chart, box)
     for _ in range(_STEPS):
-        length = _step(cost, box, damping)
+        length = newton_step(cost, box, damping)
         if not length >= 0.0:
             return float("inf")
         put(box.at, start)
@@ -61,7 +61,7 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
 
 
 @compiled
-def _step(cost: Cost, box: Box, damping: float) -> float:
+def newton_step(cost: Cost, box: Box, damping: float) -> float:
     """Write the damped step into the first row of box.solve; return its squared length in standard deviations.
 
     NaN where there is none.

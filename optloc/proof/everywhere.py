@@ -186,7 +186,7 @@ def search_everywhere(
         if here < value:
             position(atlas, found)
             return CHEAPER, boxes, 0.0, shown, met
-        touching = _touches(box, d - 1, infinity(atlas, piece))
+        touching = touches_infinity(box, d - 1, infinity(atlas, piece))
         # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
         sound = (whole or reaches(low, value)) and here < _NEAR * (level + 1.0)
         side = _side_of_rest(cost, atlas, box, touching, sqrt(max(level, 0.0)), noise, sound)
@@ -204,9 +204,9 @@ def search_everywhere(
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
         if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
-            waiting = _push_rest(aside, waiting, box, side, low, piece)
+            waiting = push_rest(aside, waiting, box, side, low, piece)
         else:
-            size = _push_rest(stack, size, box, side, low, piece)
+            size = push_rest(stack, size, box, side, low, piece)
 
 
 @compiled
@@ -291,7 +291,7 @@ def _meet(
     widen_core(wider, known, inf)
     for k in range(atlas.dimension):
         rivals[met, k] = found[k]
-    return met + 1, _push_core(stack, size, wider, known), wider
+    return met + 1, push_core(stack, size, wider, known), wider
 
 
 @inlined
@@ -302,7 +302,7 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: Chart, corners: Array, bo
     """
     faces = 2 * atlas.dimension
     pop(stack, row, box.at, box.half)
-    _end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
+    end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
     set_centre(atlas, piece, box.at)
     if piece > faces:
         widen_around(atlas, piece - faces - 1, box.half)
@@ -314,7 +314,7 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: Chart, corners: Array, bo
     clip_to_corners(atlas, chart.origin, chart.back, corners, box.half, box.cut)
     share = cut_out(box.cut, box.at, box.half)
     if 0.0 < share < 1.0:
-        _end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
+        end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
         set_centre(atlas, piece, box.at)
     return share > 0.0
 
@@ -331,7 +331,7 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
         if not share > 0.0:
             return False
         if share < 1.0:
-            _end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
+            end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
             set_centre(atlas, piece, box.at)
         if share > _SHRUNK:
             break
@@ -339,13 +339,13 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
 
 
 @compiled
-def _touches(box: Box, last: int, end: float) -> bool:
+def touches_infinity(box: Box, last: int, end: float) -> bool:
     """Return whether a box reaches infinity, where its last coordinate ends."""
     return bool(end > -inf and box.at[last] - end <= box.half[last])
 
 
 @compiled
-def _end_at_infinity(box: Box, last: int, end: float) -> None:
+def end_at_infinity(box: Box, last: int, end: float) -> None:
     """Take off a box what rounding has put beyond infinity, where the inverse range would be negative."""
     if end > -inf and box.at[last] - end < box.half[last]:
         box.half[last] = 0.5 * (box.at[last] - end + box.half[last]) * (1.0 + _BEYOND)
@@ -353,7 +353,7 @@ def _end_at_infinity(box: Box, last: int, end: float) -> None:
 
 
 @compiled
-def _push_rest(stack: Array, size: int, box: Box, side: int, low: float, piece: int) -> int:
+def push_rest(stack: Array, size: int, box: Box, side: int, low: float, piece: int) -> int:
     """Push what its cut leaves of a box, whole or halved across a side; return the size of the stack."""
     share = cut_out(box.cut, box.at, box.half)
     if 0.0 < share < _SHRUNK:
@@ -420,7 +420,7 @@ def push_pieces(stack: Array, atlas: Atlas) -> int:
     """Push all faces of the cube, its inside, and on top of them the surroundings of known minima, the fix last."""
     size = push_faces(stack, atlas.dimension)
     for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
-        size = _push_core(stack, size, atlas, i)
+        size = push_core(stack, size, atlas, i)
     return size
 
 
@@ -438,7 +438,7 @@ def push_faces(stack: Array, d: int) -> int:
 
 
 @compiled
-def _push_core(stack: Array, size: int, atlas: Atlas, i: int) -> int:
+def push_core(stack: Array, size: int, atlas: Atlas, i: int) -> int:
     """Push what is searched along the axes of minimum i; return the size of the stack."""
     low, last, piece = atlas.minima.core[i, 0].copy(), atlas.dimension - 1, 2 * atlas.dimension + 1 + i
     if low[last] == -inf:

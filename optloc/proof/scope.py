@@ -46,6 +46,8 @@ def _reasons(problem: Problem) -> Iterator[str]:
         yield from _beyond_courses(problem)
     yield from _beyond_rows(problem)
     yield from _beyond_biases(problem)
+    if is_scaled(problem):
+        yield from _beyond_scale(problem)
     yield from _beyond_stations(problem)
     yield from _beyond_constraints(problem)
     known = {"position", "velocity", *(bias.name for bias in problem.biases)}
@@ -106,6 +108,8 @@ def is_run(problem: Problem) -> bool:
 def crowded(problem: Problem) -> str:
     """Return why a problem is beyond what works with dense rows, in a sentence, or nothing where it is within."""
     number = _nodes(problem)
+    if is_scaled(problem):
+        return "a factor of the rows is unknown"
     return "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, over {MOST_DENSE}"
 
 
@@ -131,6 +135,33 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
             yield f"the {bias.form} {bias.name!r} {why}"
         elif bias.sigma is None and angular[bias.row].any():
             yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
+
+
+def is_scaled(problem: Problem) -> bool:
+    """Return whether an unknown factor multiplies rows; `optloc.proof.scaled` proves such fixes."""
+    return any(form_of(bias).enters == "scales" for bias in problem.biases)
+
+
+def _beyond_scale(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against a proof with an unknown factor: it covers one factor of all rows of one wave."""
+    scales = [bias for bias in problem.biases if form_of(bias).enters == "scales"]
+    name, models = scales[0].name, [MODELS[rows.kind] for rows in problem.rows]
+    if len(scales) > 1 or len(scales[0].members) > 1:
+        yield "there are several scales, and the proof takes a common scale"
+    elif len(scales[0].row) < problem.count or not (scales[0].coefficient == 1.0).all():
+        yield f"the scale {name!r} is of some of the rows only, and the proof takes a scale of all rows"
+    if any(model.ranges is None for model in models):
+        yield f"the scale {name!r} is of other rows than times and ranges"
+    elif any(sum(model.ranges or ()) != 0 and not model.emission for model in models):
+        yield f"the scale {name!r} is of ranges, and the proof takes arrivals and differences of ranges"
+    if problem.constraints:
+        yield f"the scale {name!r} comes with constraints, and its proof is for all positions"
+    if problem.stations.unknown_for:
+        yield f"the scale {name!r} comes with unknown station errors, which it multiplies"
+    if any(part == "position" for part, _, _ in prior_parts(problem)):
+        yield f"the scale {name!r} comes with a prior on the position"
+    if is_run(problem):
+        yield f"the scale {name!r} is of a long run, and the proof takes {MOST_DENSE} different ranges"
 
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:

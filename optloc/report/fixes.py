@@ -18,6 +18,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import visible
 from optloc.base.types import NOTES, Array, Status
 from optloc.bounds.observability import Observability
+from optloc.problem.bias import estimated_speed
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Active, Fix, Suspect
 from optloc.problem.problem import Problem
@@ -238,6 +239,9 @@ def bias_sheet(
         told = with_sigma(row["value"] / size, row["sigma"] / abs(size), unit)
         told = NOT_DETERMINED if row.get("undetermined") else told
         rows.append((row["name"], row["member"], told.strip(), share))
+        speed = estimated_speed(row["name"], row["member"], row["value"], row["sigma"])
+        if speed is not None and not row.get("undetermined"):
+            rows.append((row["name"], "true", with_sigma(*speed, "m/s").strip(), ""))
     if len(records) > _BIASES:
         rows.append(("...", f"{len(records) - _BIASES} more", "--json prints all", ""))
     return Sheet("Biases", ("name", "member", "estimate", "from data"), rows)

@@ -18,7 +18,7 @@ from optloc.problem.claims import GLOBAL, REGION, Claims, claim
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
-from optloc.proof.scope import is_run, unsupported
+from optloc.proof.scope import is_run, is_scaled, unsupported
 from optloc.solvers import stages
 from optloc.solvers.certify.admitted import certified, value_certified
 from optloc.solvers.certify.branch_and_bound import claims_before, tried_before
@@ -250,12 +250,12 @@ class Method:
     def __call__(self, problem: Problem, pool: Pool | None = None) -> Pool:
         """Return the pool of a flat batch of problems.
 
-        Problems beyond the scope of the proof, and runs, whose proof takes longer than all starts, take the last branch
-        alone.
+        Problems beyond the scope of the proof take the last branch alone. So do runs, whose proof takes longer than all
+        starts, and rows with an unknown factor, which closed forms take for one.
         """
         branches = list(self.branches)
         # its first branch would end without a proof, or with one that is made again, and be done for nothing
-        if len(branches) > 1 and (unsupported(problem) or is_run(problem)):
+        if len(branches) > 1 and (unsupported(problem) or is_run(problem) or is_scaled(problem)):
             branches = branches[-1:]
         pool = _run_through(branches[0], problem, pool)
         for branch in branches[1:]:

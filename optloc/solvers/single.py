@@ -36,7 +36,7 @@ from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_here
 from optloc.proof.near import OTHER, UNIQUE
 from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
-from optloc.proof.scope import is_run, unsupported
+from optloc.proof.scope import is_run, is_scaled, unsupported
 from optloc.proof.search_space import HIDDEN_REACH
 from optloc.proof.surface import UP
 from optloc.solvers.certify.branch_and_bound import (
@@ -468,7 +468,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         return None
     bare = _alone(problem)
     plan = None if bare.batch_shape else plan_of(bare)
-    if plan is None or (proves and (unsupported(bare) or is_run(bare))):
+    if plan is None or (proves and (unsupported(bare) or is_run(bare) or is_scaled(bare))):
         return None
     limited = proves and any(not is_exact(constraint) for constraint in bare.constraints)
     edges = edges_of(bare) if limited else None

@@ -23,7 +23,7 @@ from optloc.linear.vectors import hold_still, vectors
 from optloc.models.layers import Layers
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.scope import unsupported
+from optloc.proof.scope import is_scaled, unsupported
 from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
@@ -250,7 +250,7 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
     """
     if pool is None or pool.curvature is None:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
-    if not unsupported(problem):
+    if not (unsupported(problem) or is_scaled(problem)):
         pool = _answer(problem, pool, lambda part: _with_offsets(part, best_first_starts(part)), lambda why: {})
     elif moves_at_once(problem):
         pool = _answer(problem, pool, lambda part: _with_offsets(part, moving_starts(part)), lambda why: {})

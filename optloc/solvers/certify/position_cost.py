@@ -17,20 +17,29 @@ from optloc.proof.nodes.level import height_numbers
 from optloc.proof.position_costs import PositionCosts, position_costs
 from optloc.proof.runs.prove import costs_of_courses, costs_of_runs, prove_courses, prove_runs, runs_lack_code
 from optloc.proof.runs.run_costs import Courses, Runs, course_costs, run_costs
-from optloc.proof.scope import held_height, is_run
+from optloc.proof.scaled.scaled_proof import (
+    ScaledCosts,
+    costs_at_scaled,
+    prove_all_scaled,
+    scaled_costs,
+    scaled_lack_code,
+)
+from optloc.proof.scope import held_height, is_run, is_scaled
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 from optloc.solvers.starts.position import spread_of
 
 # Costs over the target's state: its position, with dense rows or sparse ones where there are many, or where it moves
 # its position and velocity.
 
-Costs = PositionCosts | Runs | Courses
+Costs = PositionCosts | ScaledCosts | Runs | Courses
 
 
 def eliminate_nuisance(problem: Problem) -> Costs:
     """Return the costs of a flat batch of problems over the target's state, all other unknowns at their best values."""
     if problem.motions[0].order > 0:
         return course_costs(problem)
+    if is_scaled(problem):
+        return scaled_costs(problem)
     return run_costs(problem) if is_run(problem) else position_costs(problem)
 
 
@@ -38,11 +47,15 @@ def prove(costs: Costs, asked: Asked) -> Answered:
     """Return the outcome of the proofs of n fixes of n problems by their costs."""
     if isinstance(costs, Courses):
         return prove_courses(costs, asked)
+    if isinstance(costs, ScaledCosts):
+        return prove_all_scaled(costs, asked)
     return prove_runs(costs, asked) if isinstance(costs, Runs) else prove_all(costs, asked)
 
 
 def lacks(costs: Costs, count: int) -> bool:
     """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
+    if isinstance(costs, ScaledCosts):
+        return scaled_lack_code(count)
     return lacks_code(count) if isinstance(costs, PositionCosts) else runs_lack_code(costs, count)
 
 
@@ -50,6 +63,8 @@ def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
     """Return position costs (N, P) of states (N, P, n) and the rounding of their residuals."""
     if isinstance(costs, Courses):
         return costs_of_courses(costs, states)
+    if isinstance(costs, ScaledCosts):
+        return costs_at_scaled(costs, states)
     return costs_of_runs(costs, states) if isinstance(costs, Runs) else costs_at(costs, states)
 
 

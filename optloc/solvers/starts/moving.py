@@ -22,7 +22,7 @@ from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, RATE, SLOPE0
 from optloc.proof.position_costs import PositionCosts, position_costs
-from optloc.proof.scope import is_run, unsupported
+from optloc.proof.scope import is_run, is_scaled, unsupported
 
 # Boxes for each problem, by its dimension; centres that are kept, the cheapest of them. In space 600 boxes missed the
 # best place of 10 emitters of 100, and 2 400 none.
@@ -42,7 +42,8 @@ def moves_at_once(problem: Problem) -> bool:
         return False
     if problem.epochs > 1 or exact(problem) or not any(slot.name == "velocity" for slot in problem.layout.shared):
         return False
-    return not unsupported(held(problem)) and not is_run(held(problem))
+    still = held(problem)
+    return not (unsupported(still) or is_run(still) or is_scaled(still))
 
 
 def held(problem: Problem) -> Problem:

@@ -8,6 +8,7 @@ from itertools import product
 
 import numpy as np
 
+from optloc.adequacy.scaled_rows import runs_backwards
 from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
@@ -185,7 +186,9 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
     equations : callable
         Maps (problem, x) to the `Normal` equations at vectors (N, size) of the cost that was minimised.
     """
-    pool = replace(pool, cost=np.where(np.isfinite(pool.cost), pool.cost, np.inf))
+    # a wave that runs backwards explains nothing
+    good = np.isfinite(pool.cost) & ~runs_backwards(problem, pool.x)
+    pool = replace(pool, cost=np.where(good, pool.cost, np.inf))
     pool, infinity = _without_runs_to_infinity(problem, pool)
     pool = _sort(pool)
     rows, best = np.arange(len(pool)), _choose(problem, pool)

@@ -1,0 +1,206 @@
+"""The cost over the position of rows with unknown scales, as a sum of squares, near by and infinitely far away.
+
+At a fixed position the rows are linear in all other unknowns. The column of an unknown scale is as long as the ranges.
+Far away normal equations lose the digits of this column that differ from the column of an emission time. This module
+projects the rows instead, and it subtracts nothing from a cost.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.linalg import span_of
+from optloc.base.types import Array
+from optloc.linear.evaluate import columns, differentiate
+from optloc.linear.normal import prior_parts, whitener_at
+from optloc.linear.walks import walks
+from optloc.models import MODELS
+from optloc.problem.forms import form_of
+from optloc.problem.noise import whiten_rows
+from optloc.problem.problem import Problem
+
+# Least share of a column that must remain after projection. Rounding leaves a hundredth of this share; ranges at ten
+# million spreads leave 1e-7.
+_EXPLAINED = 1e-13
+# Least scale error of ranges: the wave has no speed, and below it the wave would run backwards.
+_STILL = -1.0
+# Thickness of coplanar stations, as a share of their width: rounding of coordinates.
+_FLAT = 1e-9
+# Distance in spreads at which wave fronts are taken as paraboloids. Higher orders are 1e-8 of the bend there, and the
+# rounding of ranges as well.
+_DISTANT = 1e4
+
+
+def has_scales(problem: Problem) -> bool:
+    """Return whether unknown scales multiply rows, in a problem without walks."""
+    return not walks(problem) and any(form_of(bias).enters == "scales" for bias in problem.biases)
+
+
+def runs_backwards(problem: Problem, x: Array) -> Array:
+    """Return a mask (...) of the vectors whose unknown factor of ranges or times is zero or less."""
+    out = np.zeros(x.shape[:-1], dtype=bool)
+    for column, least in zip(*_scales(problem), strict=True):
+        out |= x[..., column] <= least
+    return out
+
+
+def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple[Array, Array, Array]:
+    """Return the least cost over all unknowns but the position, and its normal equations there.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one position.
+    x : array (q, N, size)
+        Positions, and where the search for the other unknowns begins.
+    at : array (N, size)
+        Where station errors of span "noise" are weighed.
+    passes : int
+        Number of steps of the other unknowns. The slope along the position depends on the scales.
+
+    Returns
+    -------
+    cost, information, vector
+        As in `optloc.adequacy.shape.profile`; factors of ranges are not negative.
+    """
+    slot, _ = problem.layout.find("position")
+    part, (scale, least) = np.arange(slot.start, slot.start + slot.size), _scales(problem)
+    rest = np.setdiff1d(np.arange(problem.layout.size), np.concatenate([part, scale]))
+    for _ in range(passes):
+        residual, design = _rows(problem, x, at)
+        others = design[..., rest]
+        basis, turned = span_of(others), np.linalg.pinv(others)
+        left, slope, along = (
+            _without(basis, residual[..., None]),
+            _without(basis, design[..., part]),
+            design[..., scale],
+        )
+        column = _without(basis, along)
+        long = np.sqrt((column**2).sum(-2)) > _EXPLAINED * np.sqrt((along**2).sum(-2))
+        move, left, held = _bounded(column * long[..., None, :], left, least - x[..., scale])
+        free = span_of(column * (long & ~held)[..., None, :])
+        slope = _without(free, slope)
+        x = np.array(x)
+        x[..., scale] += move
+        x[..., rest] += (turned @ (residual - (along @ move[..., None])[..., 0])[..., None])[..., 0]
+    cost, back = (left[..., 0] ** 2).sum(-1), np.swapaxes(slope, -1, -2)
+    return cost, back @ slope, (back @ left)[..., 0]
+
+
+def cost_beyond_speed(problem: Problem, x: Array) -> Array:
+    """Return the least cost (N,) of waves whose distance and unknown factor grow together, or infinity.
+
+    Stations in a plane of space, or on a line of the plane, see a wave from straight above as a paraboloid. Its bend
+    and tilt stay finite if the factor grows with the distance. A prior on the factor makes such waves expensive.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one position.
+    x : array (N, size)
+        Fixes.
+    """
+    out, free = np.full(len(x), np.inf), _without_prior(problem)
+    if problem.constraints or not len(free):
+        return out
+    centre, normal, tangents, spread, items = _planes_of(problem, len(x))
+    if not len(items):
+        return out
+    slot, _ = problem.layout.find("position")
+    part, some = np.arange(slot.start, slot.start + slot.size), problem.take(items)
+    for side in (-_DISTANT, _DISTANT):
+        there = np.array(x[items])
+        there[:, part] = centre + side * spread[:, None] * normal
+        residual, design = _rows(some, there, x[items])
+        for j in free:
+            touched = (design[..., j] != 0.0)[..., None]
+            tilt = np.where(touched, design[..., part] @ tangents, 0.0)
+            rest = np.setdiff1d(np.arange(design.shape[-1]), np.append(part, j))
+            basis = span_of(np.concatenate([design[..., rest], tilt], axis=-1))
+            column, left = _without(basis, design[..., [j]]), _without(basis, residual[..., None])
+            _, left, _ = _bounded(column, left, _STILL - there[:, [j]])
+            out[items] = np.fmin(out[items], (left[..., 0] ** 2).sum(-1))
+    return out
+
+
+def _without_prior(problem: Problem) -> Array:
+    """Return the columns of unknown factors of ranges that have no prior."""
+    scale, least = _scales(problem)
+    known = [columns(problem.layout, name, np.array([0]))[0] for name, _, _ in prior_parts(problem)]
+    return np.asarray(scale[(least == _STILL) & ~np.isin(scale, np.concatenate([np.zeros(0, dtype=int), *known]))])
+
+
+def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Return centre, normal, tangents (n, d, d - 1) and spread of coplanar stations, and the problems' numbers (n,)."""
+    places = problem.stations.places
+    places = np.broadcast_to(places, (count, *places.shape[-2:]))
+    centre, spread = linalg.centre_and_spread(places)
+    _, size, axes = np.linalg.svd(places - centre[:, None], full_matrices=True)
+    d = places.shape[-1]
+    flat = np.ones(count, dtype=bool) if size.shape[1] < d else size[:, -1] <= _FLAT * size[:, 0]
+    items = np.flatnonzero(flat)
+    axes = axes[items]
+    return centre[items], axes[:, -1], np.swapaxes(axes[:, : d - 1], -1, -2), spread[items], items
+
+
+def _scales(problem: Problem) -> tuple[Array, Array]:
+    """Return the columns (n,) of all unknown factors, and the least value of each."""
+    ranges = np.concatenate([np.full(rows.count, MODELS[rows.kind].ranges is not None) for rows in problem.rows])
+    found, least = [np.zeros(0, dtype=int)], [np.zeros(0)]
+    for bias in problem.biases:
+        if form_of(bias).enters == "scales":
+            own = columns(problem.layout, bias.name, np.array([0]))[0]
+            of_ranges = np.bincount(bias.member, ranges[bias.row], len(own)) > 0
+            found.append(own)
+            least.append(np.where(of_ranges, _STILL, -np.inf))
+    return np.concatenate(found), np.concatenate(least)
+
+
+def _rows(problem: Problem, x: Array, at: Array) -> tuple[Array, Array]:
+    """Return whitened residuals (..., r) and derivatives (..., r, size) of all rows and priors at vectors."""
+    layout, (residual, folded) = problem.layout, differentiate(problem, x)
+    n, length, total = layout.n_shared, layout.n_local, layout.size
+    design = np.zeros((*folded.shape[:-1], total))
+    design[..., :n] = folded[..., :n]
+    for j in range(length):
+        design[..., np.arange(problem.count), n + problem.epoch * length + j] = folded[..., n + j]
+    both = whiten_rows(whitener_at(problem, at), np.concatenate([residual[..., None], design], axis=-1))
+    parts = [both]
+    for name, mean, precision in prior_parts(problem):
+        shared = layout.find(name)[1]
+        for epoch in range(1 if shared else problem.epochs):
+            own = columns(layout, name, np.array([epoch]))[0]
+            root = np.swapaxes(np.linalg.cholesky(precision if shared else precision[..., 0, :, :]), -1, -2)
+            known = np.zeros((*x.shape[:-1], len(own), 1 + total))
+            known[..., 1 + own] = root
+            apart = (mean if shared else mean[..., 0, :]) - x[..., own]
+            known[..., 0] = (root @ apart[..., None])[..., 0]
+            parts.append(known)
+    both = np.concatenate(parts, axis=-2)
+    return both[..., 0], both[..., 1:]
+
+
+def _without(basis: Array, values: Array) -> Array:
+    """Return values (..., r, k) less their projection onto an orthonormal basis, twice because of rounding."""
+    back = np.swapaxes(basis, -1, -2)
+    once = values - basis @ (back @ values)
+    return np.asarray(once - basis @ (back @ once))
+
+
+def _bounded(column: Array, left: Array, least: Array) -> tuple[Array, Array, Array]:
+    """Return the best steps (..., n) of factors for residuals (..., r, 1), the residuals after them, and a mask.
+
+    Steps are at least `least` (..., n). The mask marks the factors that are held there; the others move again.
+    """
+    held = np.zeros(column.shape[:-2] + column.shape[-1:], dtype=bool)
+    move = np.zeros(held.shape)
+    for _ in range(1 + held.shape[-1]):
+        fixed = np.where(held, least, 0.0)
+        rest = left - column @ np.where(held, fixed, 0.0)[..., None]
+        move = np.where(held, fixed, (np.linalg.pinv(column * ~held[..., None, :]) @ rest)[..., 0])
+        below = ~held & (move < least)
+        if not below.any():
+            break
+        held |= below
+    return move, left - column @ move[..., None], held

@@ -1,0 +1,419 @@
+"""The search of all positions for minima of a cost with an unknown factor, in the pieces of an atlas."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined, zero
+from optloc.proof.atlas import Atlas, home_of, infinity, one_more, position, set_centre, widen_around
+from optloc.proof.box import (
+    DEPTH,
+    PIECE,
+    bound_nodes,
+    first_below,
+    is_empty,
+    last_above_zero,
+    least_left,
+    pop,
+    reaches,
+    share_left,
+    steepest_side,
+    take_back,
+)
+from optloc.proof.convex_boxes import accuracy_floor_far, set_axes, set_hull, widen_core
+from optloc.proof.curvature import curve_nodes, most_curved_side, sum_up
+from optloc.proof.descents import newton_step
+from optloc.proof.everywhere import (
+    ANOTHER,
+    CHEAPER,
+    CLEAR,
+    INFINITE,
+    SPENT,
+    end_at_infinity,
+    is_left,
+    is_listed,
+    push_core,
+    push_pieces,
+    push_rest,
+    touches_infinity,
+)
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled, slope_of
+from optloc.proof.scaled.reduction import (
+    HERE,
+    MOST,
+    Scaled,
+    Sheet,
+    bound_factor,
+    bound_rows,
+    clip_rows,
+    look_at,
+    reduce_rows,
+    sheet_of,
+)
+from optloc.proof.search_space import Box, Chart, Cost, empty_box, place
+
+# Boxes on the stack and boxes that wait, as in `optloc.proof.everywhere`.
+_CAPACITY, _SPARE = 2048, 8
+_WAITING = 3 * _CAPACITY // 4
+# Half-widths of a box at infinity, on a face and around a minimum, below which the cost there is taken from its centre.
+_TINY, _TINY_AROUND = 1e-5, 1e-3
+# The test for stationary points is made where the cost at the centre is within this number of levels.
+_NEAR = 10.0
+_SHRUNK = 0.5  # share of a box below which the rest is bounded again before it is halved
+
+
+class Tables(NamedTuple):
+    """Working memory: a box of the atlas with its sheet, one around a position, and rows without the factor."""
+
+    box: Box
+    sheet: Sheet
+    near: Box
+    look: Cost
+
+
+@compiled
+def tables_of(scaled: Scaled) -> Tables:
+    """Return tables for a cost."""
+    cost = scaled.cost
+    q, J = cost.K.shape
+    look = Cost(cost.kinds, cost.data, np.zeros((q, J)), np.zeros(q), cost.A, cost.weight, cost.groups)
+    return Tables(empty_box(q, J), sheet_of(scaled), empty_box(q, J), look)
+
+
+# The cost at a position, and descents.
+
+
+@compiled
+def cost_near(scaled: Scaled, chart: Chart, tables: Tables) -> float:
+    """Return the least cost over the factor at the centre of the box around a position; its sums are filled."""
+    near, cost = tables.near, scaled.cost
+    near.half[:] = 0.0
+    place(chart.origin, chart.sense, near.at, near.centre)
+    bound_nodes(cost.kinds, cost.data, near.centre, chart.sense, chart.gram, near.half, near.line, near.nodes)
+    reduce_rows(scaled, chart.floor, near, tables.sheet)
+    look_at(scaled, tables.sheet, near, tables.look)
+    curve_nodes(
+        cost.kinds,
+        cost.data,
+        near.centre,
+        chart.sense,
+        chart.gram,
+        near.half,
+        near.line,
+        near.solve,
+        near.nodes,
+        near.curves,
+    )
+    sum_up(tables.look.K, tables.look.w, cost.weight, 0.0, near.nodes, near.curves, near.sums)
+    return float(tables.sheet.span[HERE])
+
+
+# Steps of a descent, the length of the shortest in standard deviations, and damping, as in `optloc.proof.descents`.
+_STEPS, _CLOSE, _DAMPING, _LESS, _MORE, _LEAST = 40, 1e-3, 1e-6, 0.1, 10.0, 1e-4
+_SAME_COST = 1e-13
+
+
+@compiled
+def descend_scaled(scaled: Scaled, chart: Chart, tables: Tables) -> float:
+    """Move the box around a position to a minimum; return its cost, or infinity where none is reached."""
+    near = tables.near
+    now, damping, start = cost_near(scaled, chart, tables), _DAMPING, near.at.copy()
+    for _ in range(_STEPS):
+        length = newton_step(tables.look, near, damping)
+        if not length >= 0.0:
+            return inf
+        for k in range(3):
+            start[k] = near.at[k]
+            near.at[k] -= near.solve[0, k]
+        after = cost_near(scaled, chart, tables)
+        if after <= now + _SAME_COST * (1.0 + now):
+            now = after
+            if length < _CLOSE * _CLOSE:
+                return now
+            damping *= _LESS
+        else:
+            for k in range(3):
+                near.at[k] = start[k]
+            damping = max(_MORE * damping, _LEAST)
+            now = cost_near(scaled, chart, tables)
+    return inf
+
+
+# Known minima.
+
+# First half-widths of a convex box, standard deviations, and its growth; the surroundings that are searched along its
+# axes, as in `optloc.proof.convex_boxes`.
+_FIRST, _GROWTH, _WIDEST, _WIDER, _WIDE = 3.0, 2.0, 1e4, 3.0, 3.0
+
+
+@compiled
+def _convex(scaled: Scaled, tables: Tables, atlas: Atlas, i: int, half: Array, rho: float, margin: float) -> bool:
+    """Return whether the cost has one minimum on a box around minimum i."""
+    box, floor = tables.box, accuracy_floor_far(scaled.cost, atlas)
+    box.at[:] = 0.0
+    for k in range(3):
+        box.half[k] = half[k]
+    _fill(scaled, tables, atlas, 2 * atlas.dimension + 1 + i, floor)
+    if not bound_factor(scaled, rho, box, tables.sheet):
+        return True
+    curve_pieces(atlas, scaled.cost.kinds, scaled.cost.data, box.half, box.nodes, box.curves)
+    return is_convex_scaled(scaled, rho, margin, box, tables.sheet)
+
+
+@inlined
+def _fill(scaled: Scaled, tables: Tables, atlas: Atlas, piece: int, floor: float) -> None:
+    """Set the centre of a box, bound its nodes and reduce its rows."""
+    set_centre(atlas, piece, tables.box.at)
+    bound_pieces(atlas, scaled.cost.kinds, scaled.cost.data, tables.box.half, tables.box.nodes)
+    reduce_rows(scaled, floor, tables.box, tables.sheet)
+
+
+@compiled
+def set_scaled_minimum(
+    scaled: Scaled, tables: Tables, atlas: Atlas, i: int, x: Array, value: float, eps: float, rho: float
+) -> bool:
+    """Write a minimum and its surroundings into an atlas; return False if it is no minimum or costs too little.
+
+    Parameters
+    ----------
+    scaled, tables : Scaled, Tables
+        The cost, and working memory.
+    atlas, i, x, value, eps
+        As of `optloc.proof.convex_boxes.set_minimum`.
+    rho : float
+        Longest residual of interest.
+    """
+    minima, d, hull, floor = atlas.minima, atlas.dimension, np.zeros(3), accuracy_floor_far(scaled.cost, atlas)
+    piece = 2 * d + 1 + i
+    minima.home[i] = home_of(atlas, x, minima.start[i])
+    minima.axes[i, :], minima.back[i, :] = 0.0, 0.0
+    for k in range(3):
+        minima.axes[i, k, k] = minima.back[i, k, k] = 1.0
+    tables.box.at[:] = 0.0
+    tables.box.half[:] = 0.0
+    _fill(scaled, tables, atlas, piece, floor)
+    look_at(scaled, tables.sheet, tables.box, tables.look)
+    if not tables.sheet.span[HERE] >= value or not set_axes(tables.look, tables.box, atlas, i):
+        return False
+    if not _convex(scaled, tables, atlas, i, hull, rho, 0.0):
+        return False
+    margin = slope_of(tables.box, eps)
+    set_hull(atlas, i, hull, inf)
+    return _grow(scaled, tables, atlas, i, hull, rho, margin)
+
+
+@compiled
+def _grow(scaled: Scaled, tables: Tables, atlas: Atlas, i: int, hull: Array, rho: float, margin: float) -> bool:
+    """Write the sides of a convex box around minimum i, and its surroundings; return False where there is no box."""
+    sides, core, size = atlas.minima.sides[i], atlas.minima.core[i], _FIRST
+    while not _convex(scaled, tables, atlas, i, np.minimum(hull, size), rho, margin):
+        size *= 0.5
+        if size < 1e-6:
+            return False
+    while size < _WIDEST and _convex(scaled, tables, atlas, i, np.minimum(hull, _GROWTH * size), rho, margin):
+        size *= _GROWTH
+    for k in range(3):
+        sides[k] = min(hull[k], size)
+    for k in range(atlas.dimension):
+        trial = sides.copy()
+        trial[k] = min(_GROWTH * sides[k], hull[k])
+        while trial[k] > sides[k] and _convex(scaled, tables, atlas, i, trial, rho, margin):
+            sides[k] = trial[k]
+            trial[k] = min(_GROWTH * sides[k], hull[k])
+    for k in range(atlas.dimension):
+        core[1, k] = min(max(_WIDER * sides[k], _WIDE), hull[k])
+        core[0, k] = -core[1, k]
+    return True
+
+
+# The search.
+
+
+@compiled
+def search_scaled(
+    scaled: Scaled,
+    tables: Tables,
+    atlas: Atlas,
+    chart: Chart,
+    levels: Array,
+    eps: float,
+    budget: int,
+    rivals: Array,
+    found: Array,
+) -> tuple[int, int, float, int, int]:
+    """Search all positions for minima that cost less than a level, the lowest level first.
+
+    Parameters
+    ----------
+    scaled, tables : Scaled, Tables
+        The cost, and working memory.
+    atlas, chart, levels, eps, budget, rivals, found
+        As of `optloc.proof.everywhere.search_everywhere`.
+
+    Returns
+    -------
+    outcome, boxes, bound, shown, met
+        As of `optloc.proof.everywhere.search_everywhere`.
+    """
+    box, sheet, d, value = tables.box, tables.sheet, atlas.dimension, levels[-1]
+    stack, aside = np.empty((_CAPACITY, DEPTH)), np.empty((_CAPACITY, DEPTH))
+    size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
+    floor, first, now = accuracy_floor_far(scaled.cost, atlas), zero(), last_above_zero(levels)
+    if now < first:  # no cost is below zero
+        return CLEAR, 0, value, first, met
+    while True:
+        if size == 0:  # nothing below this level is left
+            if now <= first:
+                return CLEAR, boxes, value, now, met
+            now -= 1
+            size, waiting = take_back(stack, aside, waiting, levels[now])
+            continue
+        shown, level = now + 1, levels[first]
+        if boxes >= budget or size + _SPARE > _CAPACITY:
+            spent = shown == levels.shape[0]
+            return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
+        size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
+        low = _bound_of_row(scaled, tables, atlas, level, floor, stack, size)
+        if low == inf:
+            continue
+        here = sheet.span[HERE]
+        if here < value:
+            position(atlas, found)
+            return CHEAPER, boxes, 0.0, shown, met
+        touching = touches_infinity(box, d - 1, infinity(atlas, piece))
+        side = _side_of_rest(scaled, tables, atlas, touching, sqrt(max(level, 0.0)), here < _NEAR * (level + 1.0))
+        if side < 0:
+            continue
+        lows += int(here < level)
+        # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
+        if here < level and lows & (lows - 1) == 0:
+            cut, at, half = box.cut.copy(), box.at.copy(), box.half.copy()
+            met, size, atlas = _meet(scaled, tables, atlas, chart, levels, first, eps, stack, size, rivals, met, found)
+            if met < 0:
+                return ANOTHER, boxes, 0.0, shown, 0
+            for k in range(3):
+                box.at[k], box.half[k], box.cut[k], box.cut[3 + k] = at[k], half[k], cut[k], cut[3 + k]
+            set_centre(atlas, piece, box.at)
+        if touching and max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND):
+            first = first_below(levels, first, _at_infinity(scaled, tables, atlas, piece, floor))
+            if first > now:
+                return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
+        if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
+            waiting = push_rest(aside, waiting, box, side, low, piece)
+        else:
+            size = push_rest(stack, size, box, side, low, piece)
+
+
+@compiled
+def _bound_of_row(
+    scaled: Scaled, tables: Tables, atlas: Atlas, level: float, floor: float, stack: Array, row: int
+) -> float:
+    """Return a lower bound of the residual in a box of the stack, infinite where all costs exceed a level."""
+    box, piece, d = tables.box, int(stack[row, PIECE]), atlas.dimension
+    pop(stack, row, box.at, box.half)
+    end_at_infinity(box, d - 1, infinity(atlas, piece))
+    set_centre(atlas, piece, box.at)
+    if piece > 2 * d:
+        widen_around(atlas, piece - 2 * d - 1, box.half)
+    if is_left(atlas, box, piece):
+        return inf
+    bound_pieces(atlas, scaled.cost.kinds, scaled.cost.data, box.half, box.nodes)
+    reduce_rows(scaled, floor, box, tables.sheet)
+    if not bound_factor(scaled, sqrt(max(level, 0.0)), box, tables.sheet):
+        return inf
+    low = bound_rows(scaled, box, tables.sheet)
+    return inf if reaches(low, level) else low
+
+
+@compiled
+def _side_of_rest(scaled: Scaled, tables: Tables, atlas: Atlas, touching: bool, rho: float, sound: bool) -> int:
+    """Return the side across which to halve what of a box may hold a minimum; -1 for nothing of it."""
+    box, sheet, d = tables.box, tables.sheet, atlas.dimension
+    if not sheet.span[MOST] < inf:
+        for k in range(3):
+            box.cut[k], box.cut[3 + k] = -box.half[k], box.half[k]
+        return _widest(box.half)
+    clip_rows(scaled, rho, box, sheet)
+    if is_empty(box.cut):
+        return -1
+    side = int(steepest_side(box.half, box.rows, d))
+    if not sound or touching or share_left(box.cut, box.half) <= _SHRUNK:
+        return side
+    low, high = box.cut[:3].copy(), box.cut[3:].copy()
+    curve_pieces(atlas, scaled.cost.kinds, scaled.cost.data, box.half, box.nodes, box.curves)
+    box.sums[:] = 0.0
+    if not clip_stationary(scaled, rho, box, sheet):
+        return -1
+    for k in range(3):
+        box.cut[k], box.cut[3 + k] = max(box.cut[k], low[k]), min(box.cut[3 + k], high[k])
+    if is_empty(box.cut):
+        return -1
+    curved = most_curved_side(box.half, box.sums, d)
+    return int(curved if curved >= 0 else side)
+
+
+@inlined
+def _widest(half: Array) -> int:
+    """Return the widest side of a box."""
+    if half[0] >= half[1] and half[0] >= half[2]:
+        return 0
+    return 1 if half[1] >= half[2] else 2
+
+
+@compiled
+def _meet(
+    scaled: Scaled,
+    tables: Tables,
+    atlas: Atlas,
+    chart: Chart,
+    levels: Array,
+    first: int,
+    eps: float,
+    stack: Array,
+    size: int,
+    rivals: Array,
+    met: int,
+    found: Array,
+) -> tuple[int, int, Atlas]:
+    """Descend from the centre set; where that ends in another minimum, write it and push boxes around it.
+
+    Returns the number of rivals, -1 where one cannot be searched around; the size of the stack; the atlas.
+    """
+    d, near = atlas.dimension, tables.near
+    position(atlas, found)
+    for k in range(3):
+        near.at[k] = 0.0
+        for m in range(d):
+            near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
+    least = descend_scaled(scaled, chart, tables)
+    if not least < levels[first] or is_listed(atlas, near.centre):
+        return met, size, atlas
+    for m in range(d):
+        found[m] = near.centre[m]
+    known, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
+    slack, rho = max(0.5 * (least - value), 0.5 * eps), sqrt(max(levels[0], 0.0))
+    if met == rivals.shape[0] or not set_scaled_minimum(
+        scaled, tables, wider, known, found, value + 0.5 * slack, 0.5 * slack, rho
+    ):
+        return -1, size, atlas
+    widen_core(wider, known, inf)
+    for k in range(d):
+        rivals[met, k] = found[k]
+    return met + 1, push_core(stack, size, wider, known), wider
+
+
+@compiled
+def _at_infinity(scaled: Scaled, tables: Tables, atlas: Atlas, piece: int, floor: float) -> float:
+    """Return the cost at infinity next to the centre of a box that reaches there; its tables are lost."""
+    at = tables.box.at.copy()
+    at[atlas.dimension - 1] = infinity(atlas, piece)
+    set_centre(atlas, piece, at)
+    atlas.scale[0] = 0.0
+    bound_pieces(atlas, scaled.cost.kinds, scaled.cost.data, tables.box.half, tables.box.nodes)
+    reduce_rows(scaled, floor, tables.box, tables.sheet)
+    return float(tables.sheet.span[HERE])
