@@ -16,8 +16,8 @@ from optloc.linear.constraints import exact, violation_names
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
+from optloc.problem.chart import tail_probability
 from optloc.problem.epochs import by_epoch, separable
-from optloc.problem.fix import tail_probability
 from optloc.problem.noise import Block, Noise, variances
 from optloc.problem.problem import Problem
 

@@ -18,8 +18,7 @@ from optloc.linear.constraints import exact
 from optloc.linear.equalities import Equalities, spare_rows
 from optloc.models import MODELS
 from optloc.problem.bias import Per, family
-from optloc.problem.chart import quantile
-from optloc.problem.fix import tail_probability
+from optloc.problem.chart import quantile, tail_probability
 from optloc.problem.forms import FORMS, form_of
 from optloc.problem.problem import Problem
 

@@ -12,7 +12,7 @@ from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, toge
 from optloc.calibration.motions import bent
 from optloc.calibration.network import CLOCKED, Network
 from optloc.calibration.rounds import Ends, joined, rounds, starts_of
-from optloc.problem.fix import tail_probability
+from optloc.problem.chart import tail_probability
 from optloc.solvers.policy import REFUTED, equal_cost
 
 AGREEING = 3

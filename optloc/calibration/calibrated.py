@@ -26,7 +26,7 @@ from optloc.calibration.network import Network
 from optloc.calibration.outliers import PRICE, outliers
 from optloc.calibration.rounds import laid
 from optloc.engine.shape import STRAIGHT
-from optloc.problem.fix import tail_probability
+from optloc.problem.chart import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 from optloc.solvers.verdict.findings import Finding, objections
 

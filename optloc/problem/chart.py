@@ -127,6 +127,14 @@ def quantile(probability: float, dimension: int) -> float:
     return float(2.0 * gammaincinv(dimension / 2, probability))
 
 
+def tail_probability(cost: Array, dof: Array) -> Array:
+    """Return the chi-square probability (...) of a cost at least this large; NaN without redundancy or cost."""
+    from scipy.special import gammaincc
+
+    redundant = (dof > 0) & np.isfinite(cost)
+    return np.where(redundant, gammaincc(np.where(redundant, dof, 1) / 2, np.where(redundant, cost, 0.0) / 2), np.nan)
+
+
 @dataclass(frozen=True, slots=True)
 class Chart:
     """The coordinates in which fixes are Gaussian.

@@ -12,13 +12,11 @@ from optloc.base.errors import InvalidProblem, NoSolution, status_named
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
 from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Status, statuses_of
-from optloc.problem.chart import Chart, Extent
+from optloc.problem.chart import CARTESIAN, Chart, Extent, tail_probability
 from optloc.problem.claims import Claims
 from optloc.problem.layout import Layout
 
-TOLD = 0.95
-"""Level up to which the regions of a fix with the finding `tails` hold."""
-
+TOLD = 0.95  # level up to which the regions of a fix with the finding `tails` hold
 _STATES = ("position", "velocity", "acceleration")
 # Sizes of stations and target together, beyond which a standard deviation of a position says nothing: a fix is not
 # Gaussian from one on, and what symmetry leaves open is wider by many decades.
@@ -442,10 +440,7 @@ class Fix:
 
     @property
     def unchecked(self) -> Any:
-        """Return whether a single fix has no redundancy, a bool, or the bool array (...) of a batch.
-
-        Every set of measurements fits such a fix, a wrong one as well. Fixes without an answer are none of these.
-        """
+        """Return the mask (...) of answered fixes without redundancy, which every measurement fits; a bool of one."""
         out = np.asarray(self.answered & (self.dof <= 0))
         return bool(out) if self.shape == () else out
 
@@ -489,8 +484,7 @@ class Fix:
         InvalidProblem
             Where no Gaussian covers: `optloc.likelihood_region` shows what does.
         """
-        self._demand_tails(level)
-        return self._gaussian_chart().covers(points, level)
+        return self._gaussian_chart(level).covers(points, level)
 
     def interval(self, extent: Extent, level: float = 0.95) -> tuple[Array, Array]:
         """Return the ends (...) of an interval that holds the range, bearing, elevation or height of the target.
@@ -507,21 +501,17 @@ class Fix:
         InvalidProblem
             Where no Gaussian covers: `optloc.likelihood_region` shows what does.
         """
-        self._demand_tails(level)
-        return self._gaussian_chart().interval(extent, level)
+        return self._gaussian_chart(level).interval(extent, level)
 
-    def _demand_tails(self, level: float) -> None:
-        """Raise where regions of a level above 95 % do not cover."""
-        if level > TOLD and bool(self.has(Status.TAILS).any()):
-            raise InvalidProblem(
-                f"the regions of some fixes hold at {TOLD:g} but not at {level:g}",
-                "level",
-                "take fixes without the finding 'tails', or `optloc.likelihood_region`",
-            )
-
-    def _gaussian_chart(self) -> Chart:
+    def _gaussian_chart(self, level: float) -> Chart:
         if self.chart is None:
             raise InvalidProblem("a fix that is not of one position has no chart", "fix", "see its covariance")
+        if level > TOLD and bool((self.has(Status.TAILS) & (self.chart.kind == CARTESIAN)).any()):
+            told, advice = (
+                f"some regions hold at {TOLD:g} but not at {level:g}",
+                "take fixes without the finding 'tails'",
+            )
+            raise InvalidProblem(told, "level", advice)
         return self.chart
 
     def require(self, allow: Iterable[Status | str] = (), *, redundancy: int = 0, level: float = 0.95) -> Fix:
@@ -532,10 +522,9 @@ class Fix:
         allow : iterable of Status or str
             What passes beside `ok`, for instance ``("curved", "unproven")``.
         redundancy : int
-            Least degrees of freedom of a fix that passes. With 1 a wrong measurement is noticed, with 0, the default,
-            fixes that nothing checks pass as well (`unchecked`).
+            Least degrees of freedom of a fix that passes: with 1 a wrong measurement is noticed, 0 passes `unchecked`.
         level : float
-            Probability that the regions of a fix must hold. Above 0.95 a fix with the finding `tails` does not pass.
+            Probability that regions must hold. Above 0.95 a fix with the finding `tails` does not pass.
 
         Raises
         ------
@@ -548,13 +537,11 @@ class Fix:
         passing = [Status.OK, *(one if isinstance(one, Status) else status_named(one) for one in allow)]
         bad = np.flatnonzero(~np.isin(np.ravel(self.code), passing))
         if len(bad):
-            flat = self.flat()
-            raise NoSolution(None, flat[int(bad[0])])
+            raise NoSolution(None, self.flat()[int(bad[0])])
         weak = np.flatnonzero(np.ravel(self.dof) < wanted)
         if len(weak):
             raise NoSolution(None, self.flat()[int(weak[0])], _too_weak(self, weak, wanted))
-        tails = np.flatnonzero(np.ravel(self.has(Status.TAILS)))
-        if len(tails) and level > TOLD:
+        if level > TOLD and len(tails := np.flatnonzero(np.ravel(self.has(Status.TAILS)))):
             raise NoSolution(None, self.flat()[int(tails[0])], Status.TAILS.sentence)
         return self
 
@@ -601,14 +588,6 @@ _TELLER: list[Callable[[], Any]] = []
 def told_by(teller: Callable[[], Any]) -> None:
     """Say which module, loaded when it is needed, tells fixes in words and tables: `optloc.report.fixes`."""
     _TELLER[:] = [teller]
-
-
-def tail_probability(cost: Array, dof: Array) -> Array:
-    """Return the chi-square probability (...) of a cost at least this large; NaN without redundancy or cost."""
-    from scipy.special import gammaincc
-
-    redundant = (dof > 0) & np.isfinite(cost)
-    return np.where(redundant, gammaincc(np.where(redundant, dof, 1) / 2, np.where(redundant, cost, 0.0) / 2), np.nan)
 
 
 def _as_array(value: Any) -> Array:

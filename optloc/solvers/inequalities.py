@@ -17,7 +17,7 @@ from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_exact, i
 from optloc.linear.normal import marginal
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
-from optloc.problem.fix import tail_probability
+from optloc.problem.chart import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of

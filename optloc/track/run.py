@@ -13,8 +13,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.compute.filter import CODE, GENERAL, INNOVATION, PRESENT, REJECTED_ROWS, SPREAD, Filtering
+from optloc.problem.chart import tail_probability
 from optloc.problem.epochs import joined
-from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.track.dynamics import Dynamics

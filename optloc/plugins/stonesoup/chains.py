@@ -20,7 +20,8 @@ from optloc.compute.least_squares import Refined, refine
 from optloc.linear.normal import covariance, linearise
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.plugins.stonesoup.models import problem_of, rows_by_kind, values_of
-from optloc.problem.fix import Fix, tail_probability
+from optloc.problem.chart import tail_probability
+from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.prepared import prepare

@@ -15,9 +15,8 @@ from optloc.base.types import PRECEDENCE, Array, Certificate, Status
 from optloc.linear.constraints import faces
 from optloc.linear.mirror import one_position, rows_of_stations
 from optloc.linear.redundancy import largest
-from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
+from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile, tail_probability
 from optloc.problem.claims import GLOBAL, Claims, claim
-from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, NOTICED, REFUTED
 from optloc.solvers.pool import Curvature, Pool
