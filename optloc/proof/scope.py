@@ -152,8 +152,8 @@ def _beyond_scale(problem: Problem) -> Iterator[str]:
         yield f"the scale {name!r} is of some of the rows only, and the proof takes a scale of all rows"
     if any(model.ranges is None for model in models):
         yield f"the scale {name!r} is of other rows than times and ranges"
-    elif any(sum(model.ranges or ()) != 0 and not model.emission for model in models):
-        yield f"the scale {name!r} is of ranges, and the proof takes arrivals and differences of ranges"
+    elif scales[0].sigma is None and any(sum(model.ranges or ()) != 0 and not model.emission for model in models):
+        yield f"the scale {name!r} of ranges has no prior, so that nothing bounds the position"
     if problem.constraints:
         yield f"the scale {name!r} comes with constraints, and its proof is for all positions"
     if problem.stations.unknown_for:

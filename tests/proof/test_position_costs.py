@@ -185,7 +185,7 @@ def uncertain(problem, variance):
     ("problem", "what"),
     [
         (lambda: CASES["tdoa+fdoa-3d"].problem, "moves"),
-        (lambda: with_bias(tdoa(3), "scale", per="kind", form="scale", sigma=0.1), "multiplies"),
+        (lambda: with_bias(tdoa(3), "scale", per="station", form="scale", sigma=0.1), "several scales"),
         (lambda: with_bias(CASES["angles-3d"].problem, "north", per="kind", kind="azimuth"), "whole turns"),
         (lambda: uncertain(tdoa(3), [1.0, 2.0, 3.0]), "axis to axis"),
         (lambda: uncertain(CASES["groa-3d"].problem, [1.0, 1.0, 1.0]), "groa"),

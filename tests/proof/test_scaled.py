@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from proof.sampling import many
+from scipy.optimize import least_squares
 from waves import air, plate
 
 from optloc import Problem, assemble, measured, solve, with_bias
@@ -16,6 +17,7 @@ from optloc.proof.scaled.reduction import HERE, LEAST, MOST, bound_factor, bound
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, scaled_costs
 from optloc.proof.scaled.scaled_search import set_scaled_minimum, tables_of
 from optloc.proof.scope import unsupported
+from optloc.proof.search_space import chart_at
 from optloc.solvers.certify.position_cost import agrees
 
 PRIORS = [0.02, 0.1, 0.3, None]
@@ -56,7 +58,8 @@ class Look:
 
     def set_minimum(self, x, level):
         """Write axes around a minimum; return whether it is one."""
-        return set_scaled_minimum(self.scaled, self.tables, self.atlas, 0, x, 0.0, 1e-6, np.sqrt(level))
+        chart, _ = chart_at(self.scaled.cost, x, self.tables.near)
+        return set_scaled_minimum(self.scaled, self.tables, self.atlas, chart, 0, x, 0.0, 1e-6, np.sqrt(level))
 
     def fill(self, piece, at, half):
         """Set a box and bound its nodes and their curves."""
@@ -207,6 +210,30 @@ def test_most_scenes_are_proven_and_no_proof_is_wrong(rounds, seed):
     assert proven >= 0.9 * total if enabled() else proven >= 0
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_ranges_with_a_scale_are_proven_within_balls(d, seed):
+    """Ranges without an emission time grow without end: a prior on the scale encloses the position."""
+    rng, n = np.random.default_rng([seed, 13, d]), d + 3
+    for prior in (0.02, 0.05, 0.1, 0.15):
+        place, truth = rng.uniform(-10.0, 10.0, (n, d)), rng.uniform(-15.0, 15.0, d)
+        r = np.linalg.norm(place - truth, axis=1) * (1.0 + prior * np.clip(rng.standard_normal(), -2.0, 2.0))
+        z = r + 0.05 * rng.standard_normal(n)
+        rows = measured("range", a=np.arange(n), z=z, sigma=0.05)
+        fix = solve(with_bias(assemble(place, rows), "speed", form="scale", per="kind", sigma=prior))
+        assert fix.certificate.proof == "global"
+        assert fix.certificate.unique
+
+        def residual(y, place=place, z=z, prior=prior):
+            return np.append(((1.0 + y[d]) * np.linalg.norm(place - y[:d], axis=1) - z) / 0.05, y[d] / prior)
+
+        known = [fix.position, *(x[:d] for x in fix.alternatives.x if np.isfinite(x).all())]
+        for _ in range(8):
+            one = least_squares(residual, np.append(rng.uniform(-40.0, 40.0, d), 0.0), method="lm")
+            assert 2.0 * one.cost > fix.cost - 1e-3
+            if np.abs(one.grad).max() < 1e-2 and 2.0 * one.cost < fix.cost + 9.0 - 1e-3:
+                assert min(np.linalg.norm(one.x[:d] - x) for x in known) < 0.1
+
+
 def arrivals(**more):
     """Return a problem of arrivals in the plane with a scale, changed in one way."""
     place = np.random.default_rng(1).uniform(0.0, 10.0, (6, 2))
@@ -220,7 +247,7 @@ def test_problems_beyond_the_proof_are_named():
     assert "several scales" in unsupported(one.flat())
     place = np.random.default_rng(1).uniform(0.0, 10.0, (6, 2))
     ranges = assemble(place, measured("range", a=np.arange(6), z=np.full(6, 5.0), sigma=0.1))
-    assert "arrivals" in unsupported(with_bias(ranges, "speed", form="scale", per="kind").flat())
+    assert "no prior" in unsupported(with_bias(ranges, "speed", form="scale", per="kind").flat())
     mixed = assemble(
         place,
         measured("toa", a=np.arange(6), z=np.arange(6.0), sigma=0.1),

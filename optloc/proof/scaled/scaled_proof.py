@@ -10,19 +10,32 @@ import numpy as np
 from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, enabled, plain, put, usable, worth_loading, zero
+from optloc.compute.systems import invert
 from optloc.linear.normal import prior_parts
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
-from optloc.proof.atlas import atlas_of, first_minima, with_minima
+from optloc.proof.atlas import Atlas, atlas_of, first_minima, with_minima
 from optloc.proof.batch import FIRST_BOXES, Answered, Asked, empty_answer, plainly
-from optloc.proof.box import bound_nodes, cube, digits
+from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around, reaches_infinity
 from optloc.proof.convex_boxes import accuracy_floor_far, widen_core
-from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, UNBOUNDED
-from optloc.proof.near import BETTER, BUDGET, COARSE, OTHER, STATIONARY, UNIQUE, VALUE
+from optloc.proof.enclosure import SLACK, around_node
+from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, UNBOUNDED, push_pieces
+from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, STATIONARY, UNIQUE, VALUE
+from optloc.proof.nodes.node import RANGE
 from optloc.proof.position_costs import position_costs
 from optloc.proof.scaled.reduction import FACTOR, HERE, MOST, Scaled, blur_of, look_at, reduce_rows
-from optloc.proof.scaled.scaled_search import cost_near, search_scaled, set_scaled_minimum, tables_of
-from optloc.proof.search_space import COARSEST, LINES, accuracy_floor, chart_at, cost_of, equal_within
+from optloc.proof.scaled.scaled_search import (
+    CAPACITY,
+    Tables,
+    cost_near,
+    in_atlas,
+    search_scaled,
+    set_near_minimum,
+    set_scaled_minimum,
+    tables_of,
+)
+from optloc.proof.search_space import COARSEST, LINES, Chart, accuracy_floor, chart_at, cost_of, equal_within
+from optloc.proof.space import Space
 
 
 class ScaledCosts(NamedTuple):
@@ -94,6 +107,7 @@ def prove_scaled(
         As there.
     """
     cost, tables, D = scaled.cost, tables_of(scaled), x.shape[0]
+    far = reaches_infinity(cost.kinds, cost.K)
     chart, _ = chart_at(cost, x, tables.near)
     tables.near.at[:] = 0.0
     cost_near(scaled, chart, tables)
@@ -104,24 +118,27 @@ def prove_scaled(
     if not (good and tables.sheet.span[FACTOR] > 0.0):
         return STATIONARY, 0, -inf, gaps[0], 0
     middle, radius = cube(cost.kinds, cost.data, x)
-    atlas = atlas_of(middle, radius, D, 1 + (others.shape[0] if gaps[0] > 0.0 else 0))
-    most, noise = max(COARSEST, eps), max(noise, digits(cost.K) * accuracy_floor_far(cost, atlas))
+    atlas = atlas_of(middle, radius, D, (1 + (others.shape[0] if gaps[0] > 0.0 else 0)) if far else 0)
+    most, noise = max(COARSEST, eps), max(noise, digits(cost.K) * accuracy_floor_far(cost, atlas) if far else 0.0)
     eps = equal_within(eps, least, noise)
     if not eps <= most:
         return COARSE, 0, -inf, gaps[0], 0
-    levels = np.empty(gaps.shape[0])
+    levels, stack = np.empty(gaps.shape[0]), np.empty((CAPACITY, DEPTH))
     for k in range(gaps.shape[0]):
         levels[k] = least + gaps[k] if gaps[k] > 0.0 else least - eps
-    known, at, rho = zero(), np.empty(D), np.sqrt(max(levels[0], least))
-    for p in range(atlas.minima.home.shape[0]):
-        put(x if p == 0 else others[p - 1], at)
-        if set_scaled_minimum(scaled, tables, atlas, known, at, least - 0.5 * eps, 0.5 * eps, rho):
-            widen_core(atlas, known, inf)
-            known += 1
-        elif p == 0:
-            return STATIONARY, 0, -inf, gaps[0], 0
-    atlas = with_minima(middle, radius, D, first_minima(atlas.minima, known))
-    outcome, boxes, bound, shown, met = search_scaled(scaled, tables, atlas, chart, levels, eps, budget, rivals, found)
+    if far:
+        space, size = _with_minima(scaled, tables, atlas, chart, x, others, levels, least, eps, stack)
+    else:
+        first = _first_enclosed(scaled, levels, least)
+        if first == levels.shape[0]:
+            return OPEN, 0, -inf, gaps[0], 0
+        gaps, levels = gaps[first:], levels[first:]
+        space, size = _within_balls(scaled, tables, atlas, chart, x, others, levels, least, eps, stack)
+    if size == 0:
+        return STATIONARY, 0, -inf, gaps[0], 0
+    outcome, boxes, bound, shown, met = search_scaled(
+        scaled, tables, space, stack, size, levels, eps, budget, rivals, found
+    )
     if outcome == CLEAR:
         return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
     if outcome == CHEAPER:
@@ -129,6 +146,106 @@ def prove_scaled(
     if outcome == ANOTHER:
         return OTHER, boxes, bound, gaps[0], 0
     return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps), gaps[-1], 0
+
+
+@compiled
+def _with_minima(
+    scaled: Scaled,
+    tables: Tables,
+    atlas: Atlas,
+    chart: Chart,
+    x: Array,
+    others: Array,
+    levels: Array,
+    least: float,
+    eps: float,
+    stack: Array,
+) -> tuple[Space, int]:
+    """Return the atlas with known minima, and the number of boxes pushed: 0 where the fix is no minimum."""
+    known, at, rho = zero(), np.empty(x.shape[0]), np.sqrt(max(levels[0], least))
+    for p in range(atlas.minima.home.shape[0]):
+        put(x if p == 0 else others[p - 1], at)
+        if set_scaled_minimum(scaled, tables, atlas, chart, known, at, least - 0.5 * eps, 0.5 * eps, rho):
+            widen_core(atlas, known, inf)
+            known += 1
+        elif p == 0:
+            return in_atlas(atlas, chart), 0
+    own = with_minima(atlas.middle, atlas.radius, x.shape[0], first_minima(atlas.minima, known))
+    return in_atlas(own, chart), push_pieces(stack, own)
+
+
+# Ranges without an emission time: a prior keeps the factor from zero, and balls around the stations enclose the cheap
+# positions.
+
+# Share of the diagonal that a pivot must exceed, as in `optloc.proof.enclosure`.
+_PIVOT = 1e-9
+# Least factor of use: the balls of a smaller one are ten times larger.
+_SMALLEST = 0.1
+
+
+@compiled
+def _least_factor(scaled: Scaled, level: float) -> float:
+    """Return the least factor that the prior allows at a cost, negative without a prior."""
+    last = scaled.lift.shape[0] - 1
+    lift = scaled.lift[last]
+    return float((scaled.cost.w[last] - np.sqrt(level)) / lift * (1.0 - 1e-12)) if lift > 0.0 else -1.0
+
+
+@compiled
+def _first_enclosed(scaled: Scaled, levels: Array, least: float) -> int:
+    """Return the first level whose positions are enclosed, or the number of levels."""
+    for k in range(levels.shape[0]):
+        if _least_factor(scaled, max(levels[k], least)) >= _SMALLEST:
+            return k
+    return int(levels.shape[0])
+
+
+@compiled
+def _within_balls(
+    scaled: Scaled,
+    tables: Tables,
+    atlas: Atlas,
+    chart: Chart,
+    x: Array,
+    others: Array,
+    levels: Array,
+    least: float,
+    eps: float,
+    stack: Array,
+) -> tuple[Space, int]:
+    """Return search coordinates with known minima, and the number of boxes pushed: 0 without balls or a minimum.
+
+    A range times the factor is within ``rho sqrt(R_jj)`` of its least-squares value, with R the inverse of K'K.
+    """
+    cost, level = scaled.cost, max(levels[0], least)
+    rho, low, high, J = np.sqrt(level), np.full(3, -inf), np.full(3, inf), cost.kinds.shape[0]
+    R, none, hull = cost.A.copy(), np.empty((0, 3)), np.zeros(3)
+    for k in range(x.shape[0], 3):
+        low[k] = high[k] = 0.0
+    space = Space(False, atlas, chart, none, none)
+    if not invert(R, J, _PIVOT):
+        return space, 0
+    for j in range(J):
+        most = rho * np.sqrt(R[j, j]) * (1.0 + SLACK)
+        for m in range(J):
+            for i in range(cost.w.shape[0]):
+                most += R[j, m] * cost.K[i, m] * cost.w[i]
+        most = most * (1.0 + SLACK) / _least_factor(scaled, level)
+        around_node(RANGE, cost.data[j], 0.0, most, chart.origin, chart.back, low, high)
+    room, known = np.zeros((2, 1 + others.shape[0], 3)), zero()
+    space = Space(False, atlas, chart, room[0], room[1])
+    for p in range(1 + (others.shape[0] if levels.shape[0] > 1 else 0)):
+        for k in range(3):
+            room[0, known, k] = 0.0
+            for m in range(x.shape[0]):
+                room[0, known, k] += chart.back[k, m] * (others[p - 1, m] - x[m]) if p > 0 else 0.0
+            hull[k] = max(high[k] - room[0, known, k], room[0, known, k] - low[k], 0.0)
+        if set_near_minimum(scaled, tables, space, known, hull, least - 0.5 * eps, 0.5 * eps, rho):
+            known += 1
+        elif p == 0:
+            return space, 0
+    space = Space(False, atlas, chart, room[0, :known], room[1, :known])
+    return space, push_around(stack, 0, low, high, room[1, 0], 0)
 
 
 def prove_all_scaled(costs: ScaledCosts, asked: Asked) -> Answered:

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
-from optloc.proof.atlas import Atlas, home_of, infinity, one_more, position, set_centre, widen_around
+from optloc.proof.atlas import Atlas, home_of, infinity, one_more, set_centre
 from optloc.proof.box import (
     DEPTH,
     PIECE,
@@ -24,7 +24,7 @@ from optloc.proof.box import (
     steepest_side,
     take_back,
 )
-from optloc.proof.convex_boxes import accuracy_floor_far, set_axes, set_hull, widen_core
+from optloc.proof.convex_boxes import is_known, set_axes, set_hull, widen_core
 from optloc.proof.curvature import curve_nodes, most_curved_side, sum_up
 from optloc.proof.descents import newton_step
 from optloc.proof.everywhere import (
@@ -37,11 +37,10 @@ from optloc.proof.everywhere import (
     is_left,
     is_listed,
     push_core,
-    push_pieces,
     push_rest,
     touches_infinity,
 )
-from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled, slope_of
 from optloc.proof.scaled.reduction import (
     HERE,
@@ -55,11 +54,12 @@ from optloc.proof.scaled.reduction import (
     reduce_rows,
     sheet_of,
 )
-from optloc.proof.search_space import Box, Chart, Cost, empty_box, place
+from optloc.proof.search_space import Box, Chart, Cost, empty_box, place, widen
+from optloc.proof.space import Space, floor_of, place_of, set_box, set_curves, set_nodes, set_place
 
 # Boxes on the stack and boxes that wait, as in `optloc.proof.everywhere`.
-_CAPACITY, _SPARE = 2048, 8
-_WAITING = 3 * _CAPACITY // 4
+CAPACITY, _SPARE = 2048, 8
+_WAITING = 3 * CAPACITY // 4
 # Half-widths of a box at infinity, on a face and around a minimum, below which the cost there is taken from its centre.
 _TINY, _TINY_AROUND = 1e-5, 1e-3
 # The test for stationary points is made where the cost at the centre is within this number of levels.
@@ -83,6 +83,13 @@ def tables_of(scaled: Scaled) -> Tables:
     q, J = cost.K.shape
     look = Cost(cost.kinds, cost.data, np.zeros((q, J)), np.zeros(q), cost.A, cost.weight, cost.groups)
     return Tables(empty_box(q, J), sheet_of(scaled), empty_box(q, J), look)
+
+
+@compiled
+def in_atlas(atlas: Atlas, chart: Chart) -> Space:
+    """Return an atlas as the space of a search."""
+    none = np.empty((0, 3))
+    return Space(True, atlas, chart, none, none)
 
 
 # The cost at a position, and descents.
@@ -149,33 +156,35 @@ def descend_scaled(scaled: Scaled, chart: Chart, tables: Tables) -> float:
 # First half-widths of a convex box, standard deviations, and its growth; the surroundings that are searched along its
 # axes, as in `optloc.proof.convex_boxes`.
 _FIRST, _GROWTH, _WIDEST, _WIDER, _WIDE = 3.0, 2.0, 1e4, 3.0, 3.0
+_SMALLEST = 1e-6  # standard deviations: a smaller box holds only rounding
 
 
 @compiled
-def _convex(scaled: Scaled, tables: Tables, atlas: Atlas, i: int, half: Array, rho: float, margin: float) -> bool:
-    """Return whether the cost has one minimum on a box around minimum i."""
-    box, floor = tables.box, accuracy_floor_far(scaled.cost, atlas)
-    box.at[:] = 0.0
+def _convex(
+    scaled: Scaled, tables: Tables, space: Space, piece: int, at: Array, half: Array, rho: float, margin: float
+) -> bool:
+    """Return whether the cost has one minimum on a box around a minimum."""
+    box = tables.box
     for k in range(3):
-        box.half[k] = half[k]
-    _fill(scaled, tables, atlas, 2 * atlas.dimension + 1 + i, floor)
+        box.at[k], box.half[k] = at[k], half[k]
+    _fill(scaled, tables, space, piece, floor_of(space, scaled.cost))
     if not bound_factor(scaled, rho, box, tables.sheet):
         return True
-    curve_pieces(atlas, scaled.cost.kinds, scaled.cost.data, box.half, box.nodes, box.curves)
+    set_curves(space, scaled.cost, box)
     return is_convex_scaled(scaled, rho, margin, box, tables.sheet)
 
 
 @inlined
-def _fill(scaled: Scaled, tables: Tables, atlas: Atlas, piece: int, floor: float) -> None:
+def _fill(scaled: Scaled, tables: Tables, space: Space, piece: int, floor: float) -> None:
     """Set the centre of a box, bound its nodes and reduce its rows."""
-    set_centre(atlas, piece, tables.box.at)
-    bound_pieces(atlas, scaled.cost.kinds, scaled.cost.data, tables.box.half, tables.box.nodes)
+    set_place(space, tables.box, piece)
+    set_nodes(space, scaled.cost, tables.box)
     reduce_rows(scaled, floor, tables.box, tables.sheet)
 
 
 @compiled
 def set_scaled_minimum(
-    scaled: Scaled, tables: Tables, atlas: Atlas, i: int, x: Array, value: float, eps: float, rho: float
+    scaled: Scaled, tables: Tables, atlas: Atlas, chart: Chart, i: int, x: Array, value: float, eps: float, rho: float
 ) -> bool:
     """Write a minimum and its surroundings into an atlas; return False if it is no minimum or costs too little.
 
@@ -183,51 +192,92 @@ def set_scaled_minimum(
     ----------
     scaled, tables : Scaled, Tables
         The cost, and working memory.
+    chart : Chart
+        Search coordinates around the fix.
     atlas, i, x, value, eps
         As of `optloc.proof.convex_boxes.set_minimum`.
     rho : float
         Longest residual of interest.
     """
-    minima, d, hull, floor = atlas.minima, atlas.dimension, np.zeros(3), accuracy_floor_far(scaled.cost, atlas)
-    piece = 2 * d + 1 + i
+    minima, d, hull = atlas.minima, atlas.dimension, np.zeros(3)
+    space, piece = in_atlas(atlas, chart), 2 * d + 1 + i
     minima.home[i] = home_of(atlas, x, minima.start[i])
     minima.axes[i, :], minima.back[i, :] = 0.0, 0.0
     for k in range(3):
         minima.axes[i, k, k] = minima.back[i, k, k] = 1.0
     tables.box.at[:] = 0.0
     tables.box.half[:] = 0.0
-    _fill(scaled, tables, atlas, piece, floor)
+    _fill(scaled, tables, space, piece, floor_of(space, scaled.cost))
     look_at(scaled, tables.sheet, tables.box, tables.look)
     if not tables.sheet.span[HERE] >= value or not set_axes(tables.look, tables.box, atlas, i):
         return False
-    if not _convex(scaled, tables, atlas, i, hull, rho, 0.0):
+    if not _convex(scaled, tables, space, piece, np.zeros(3), hull, rho, 0.0):
         return False
-    margin = slope_of(tables.box, eps)
+    margin, sides, core = slope_of(tables.box, eps), minima.sides[i], minima.core[i]
     set_hull(atlas, i, hull, inf)
-    return _grow(scaled, tables, atlas, i, hull, rho, margin)
+    if not _grow(scaled, tables, space, piece, np.zeros(3), hull, rho, margin, sides):
+        return False
+    for k in range(d):
+        core[1, k] = min(max(_WIDER * sides[k], _WIDE), hull[k])
+        core[0, k] = -core[1, k]
+    return True
 
 
 @compiled
-def _grow(scaled: Scaled, tables: Tables, atlas: Atlas, i: int, hull: Array, rho: float, margin: float) -> bool:
-    """Write the sides of a convex box around minimum i, and its surroundings; return False where there is no box."""
-    sides, core, size = atlas.minima.sides[i], atlas.minima.core[i], _FIRST
-    while not _convex(scaled, tables, atlas, i, np.minimum(hull, size), rho, margin):
+def set_near_minimum(
+    scaled: Scaled, tables: Tables, space: Space, i: int, hull: Array, value: float, eps: float, rho: float
+) -> bool:
+    """Write the half-widths of a box around minimum i of search coordinates; return False if it is no minimum.
+
+    Parameters
+    ----------
+    scaled, tables, space : Scaled, Tables, Space
+        The cost, working memory, and search coordinates, in which the minimum is written.
+    i, hull : int, array (3,)
+        Which minimum, and half-widths beyond which nothing is searched.
+    value, eps, rho
+        As of `set_scaled_minimum`.
+    """
+    at, sides, shift = space.minima[i], space.sides[i], np.zeros(3)
+    if not _convex(scaled, tables, space, 0, at, np.zeros(3), rho, 0.0) or not tables.sheet.span[HERE] >= value:
+        return False
+    margin = slope_of(tables.box, eps)
+    if not _grow(scaled, tables, space, 0, at, hull, rho, margin, sides):
+        return False
+    widen(space.chart, tables.box.centre, shift)
+    for k in range(3):
+        sides[k] = max(sides[k] - shift[k], 0.0)
+    return True
+
+
+@compiled
+def _grow(
+    scaled: Scaled,
+    tables: Tables,
+    space: Space,
+    piece: int,
+    at: Array,
+    hull: Array,
+    rho: float,
+    margin: float,
+    sides: Array,
+) -> bool:
+    """Write the sides of a convex box around a minimum; return False where there is no box."""
+    size = _FIRST
+    while not _convex(scaled, tables, space, piece, at, np.minimum(hull, size), rho, margin):
         size *= 0.5
-        if size < 1e-6:
+        if size < _SMALLEST:
             return False
-    while size < _WIDEST and _convex(scaled, tables, atlas, i, np.minimum(hull, _GROWTH * size), rho, margin):
+    while size < _WIDEST and _convex(scaled, tables, space, piece, at, np.minimum(hull, _GROWTH * size), rho, margin):
         size *= _GROWTH
     for k in range(3):
         sides[k] = min(hull[k], size)
-    for k in range(atlas.dimension):
+    for k in range(space.atlas.dimension):
         trial = sides.copy()
         trial[k] = min(_GROWTH * sides[k], hull[k])
-        while trial[k] > sides[k] and _convex(scaled, tables, atlas, i, trial, rho, margin):
+        while trial[k] > sides[k] and _convex(scaled, tables, space, piece, at, trial, rho, margin):
             sides[k] = trial[k]
             trial[k] = min(_GROWTH * sides[k], hull[k])
-    for k in range(atlas.dimension):
-        core[1, k] = min(max(_WIDER * sides[k], _WIDE), hull[k])
-        core[0, k] = -core[1, k]
     return True
 
 
@@ -238,21 +288,26 @@ def _grow(scaled: Scaled, tables: Tables, atlas: Atlas, i: int, hull: Array, rho
 def search_scaled(
     scaled: Scaled,
     tables: Tables,
-    atlas: Atlas,
-    chart: Chart,
+    space: Space,
+    stack: Array,
+    size: int,
     levels: Array,
     eps: float,
     budget: int,
     rivals: Array,
     found: Array,
 ) -> tuple[int, int, float, int, int]:
-    """Search all positions for minima that cost less than a level, the lowest level first.
+    """Search the boxes of a stack for minima that cost less than a level, the lowest level first.
 
     Parameters
     ----------
     scaled, tables : Scaled, Tables
         The cost, and working memory.
-    atlas, chart, levels, eps, budget, rivals, found
+    space : Space
+        Where the boxes are: an atlas of all positions, or search coordinates around the fix.
+    stack, size : array (CAPACITY, DEPTH), int
+        The boxes.
+    levels, eps, budget, rivals, found
         As of `optloc.proof.everywhere.search_everywhere`.
 
     Returns
@@ -260,10 +315,9 @@ def search_scaled(
     outcome, boxes, bound, shown, met
         As of `optloc.proof.everywhere.search_everywhere`.
     """
-    box, sheet, d, value = tables.box, tables.sheet, atlas.dimension, levels[-1]
-    stack, aside = np.empty((_CAPACITY, DEPTH)), np.empty((_CAPACITY, DEPTH))
-    size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
-    floor, first, now = accuracy_floor_far(scaled.cost, atlas), zero(), last_above_zero(levels)
+    box, sheet, d, value = tables.box, tables.sheet, space.atlas.dimension, levels[-1]
+    aside, waiting, boxes, lows, met = np.empty((CAPACITY, DEPTH)), zero(), 0, 0, zero()
+    floor, first, now, end = floor_of(space, scaled.cost), zero(), last_above_zero(levels), -inf
     if now < first:  # no cost is below zero
         return CLEAR, 0, value, first, met
     while True:
@@ -274,33 +328,34 @@ def search_scaled(
             size, waiting = take_back(stack, aside, waiting, levels[now])
             continue
         shown, level = now + 1, levels[first]
-        if boxes >= budget or size + _SPARE > _CAPACITY:
+        if boxes >= budget or size + _SPARE > CAPACITY:
             spent = shown == levels.shape[0]
             return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
         size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
-        low = _bound_of_row(scaled, tables, atlas, level, floor, stack, size)
+        end = infinity(space.atlas, piece) if space.far else -inf
+        low = _bound_of_row(scaled, tables, space, level, floor, end, stack, size)
         if low == inf:
             continue
         here = sheet.span[HERE]
         if here < value:
-            position(atlas, found)
+            place_of(space, box, found)
             return CHEAPER, boxes, 0.0, shown, met
-        touching = touches_infinity(box, d - 1, infinity(atlas, piece))
-        side = _side_of_rest(scaled, tables, atlas, touching, sqrt(max(level, 0.0)), here < _NEAR * (level + 1.0))
+        touching = touches_infinity(box, d - 1, end)
+        side = _side_of_rest(scaled, tables, space, touching, sqrt(max(level, 0.0)), here < _NEAR * (level + 1.0))
         if side < 0:
             continue
         lows += int(here < level)
         # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
         if here < level and lows & (lows - 1) == 0:
             cut, at, half = box.cut.copy(), box.at.copy(), box.half.copy()
-            met, size, atlas = _meet(scaled, tables, atlas, chart, levels, first, eps, stack, size, rivals, met, found)
+            met, size, space = _meet(scaled, tables, space, levels, first, eps, stack, size, rivals, met, found)
             if met < 0:
                 return ANOTHER, boxes, 0.0, shown, 0
             for k in range(3):
                 box.at[k], box.half[k], box.cut[k], box.cut[3 + k] = at[k], half[k], cut[k], cut[3 + k]
-            set_centre(atlas, piece, box.at)
+            set_place(space, box, piece)
         if touching and max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND):
-            first = first_below(levels, first, _at_infinity(scaled, tables, atlas, piece, floor))
+            first = first_below(levels, first, _at_infinity(scaled, tables, space.atlas, piece, floor))
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
         if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
@@ -311,18 +366,16 @@ def search_scaled(
 
 @compiled
 def _bound_of_row(
-    scaled: Scaled, tables: Tables, atlas: Atlas, level: float, floor: float, stack: Array, row: int
+    scaled: Scaled, tables: Tables, space: Space, level: float, floor: float, end: float, stack: Array, row: int
 ) -> float:
     """Return a lower bound of the residual in a box of the stack, infinite where all costs exceed a level."""
-    box, piece, d = tables.box, int(stack[row, PIECE]), atlas.dimension
+    box, piece = tables.box, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
-    end_at_infinity(box, d - 1, infinity(atlas, piece))
-    set_centre(atlas, piece, box.at)
-    if piece > 2 * d:
-        widen_around(atlas, piece - 2 * d - 1, box.half)
-    if is_left(atlas, box, piece):
+    end_at_infinity(box, space.atlas.dimension - 1, end)
+    set_box(space, box, piece)
+    if is_left(space.atlas, box, piece) if space.far else is_known(box.at, box.half, space.minima, space.sides):
         return inf
-    bound_pieces(atlas, scaled.cost.kinds, scaled.cost.data, box.half, box.nodes)
+    set_nodes(space, scaled.cost, box)
     reduce_rows(scaled, floor, box, tables.sheet)
     if not bound_factor(scaled, sqrt(max(level, 0.0)), box, tables.sheet):
         return inf
@@ -331,9 +384,9 @@ def _bound_of_row(
 
 
 @compiled
-def _side_of_rest(scaled: Scaled, tables: Tables, atlas: Atlas, touching: bool, rho: float, sound: bool) -> int:
+def _side_of_rest(scaled: Scaled, tables: Tables, space: Space, touching: bool, rho: float, sound: bool) -> int:
     """Return the side across which to halve what of a box may hold a minimum; -1 for nothing of it."""
-    box, sheet, d = tables.box, tables.sheet, atlas.dimension
+    box, sheet, d = tables.box, tables.sheet, space.atlas.dimension
     if not sheet.span[MOST] < inf:
         for k in range(3):
             box.cut[k], box.cut[3 + k] = -box.half[k], box.half[k]
@@ -345,7 +398,7 @@ def _side_of_rest(scaled: Scaled, tables: Tables, atlas: Atlas, touching: bool, 
     if not sound or touching or share_left(box.cut, box.half) <= _SHRUNK:
         return side
     low, high = box.cut[:3].copy(), box.cut[3:].copy()
-    curve_pieces(atlas, scaled.cost.kinds, scaled.cost.data, box.half, box.nodes, box.curves)
+    set_curves(space, scaled.cost, box)
     box.sums[:] = 0.0
     if not clip_stationary(scaled, rho, box, sheet):
         return -1
@@ -369,8 +422,7 @@ def _widest(half: Array) -> int:
 def _meet(
     scaled: Scaled,
     tables: Tables,
-    atlas: Atlas,
-    chart: Chart,
+    space: Space,
     levels: Array,
     first: int,
     eps: float,
@@ -379,32 +431,33 @@ def _meet(
     rivals: Array,
     met: int,
     found: Array,
-) -> tuple[int, int, Atlas]:
+) -> tuple[int, int, Space]:
     """Descend from the centre set; where that ends in another minimum, write it and push boxes around it.
 
-    Returns the number of rivals, -1 where one cannot be searched around; the size of the stack; the atlas.
+    Returns the number of rivals, -1 where one cannot be searched around; the size of the stack; the space.
     """
-    d, near = atlas.dimension, tables.near
-    position(atlas, found)
+    atlas, chart, near, d = space.atlas, space.chart, tables.near, space.atlas.dimension
+    place_of(space, tables.box, found)
     for k in range(3):
         near.at[k] = 0.0
         for m in range(d):
             near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
     least = descend_scaled(scaled, chart, tables)
-    if not least < levels[first] or is_listed(atlas, near.centre):
-        return met, size, atlas
+    known = is_listed(atlas, near.centre) if space.far else is_known(near.at, near.half, space.minima, space.sides)
+    if not least < levels[first] or known:
+        return met, size, space
     for m in range(d):
         found[m] = near.centre[m]
-    known, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
+    if not space.far or met == rivals.shape[0]:
+        return -1, size, space
+    count, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
     slack, rho = max(0.5 * (least - value), 0.5 * eps), sqrt(max(levels[0], 0.0))
-    if met == rivals.shape[0] or not set_scaled_minimum(
-        scaled, tables, wider, known, found, value + 0.5 * slack, 0.5 * slack, rho
-    ):
-        return -1, size, atlas
-    widen_core(wider, known, inf)
+    if not set_scaled_minimum(scaled, tables, wider, chart, count, found, value + 0.5 * slack, 0.5 * slack, rho):
+        return -1, size, space
+    widen_core(wider, count, inf)
     for k in range(d):
         rivals[met, k] = found[k]
-    return met + 1, push_core(stack, size, wider, known), wider
+    return met + 1, push_core(stack, size, wider, count), in_atlas(wider, chart)
 
 
 @compiled
