@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from optloc import Status, assemble, measured, simulate, solve
+from optloc import Prior, Status, assemble, measured, simulate, solve
 from optloc.base.errors import InvalidProblem, NoSolution
 from optloc.base.types import Array
 from optloc.problem.problem import Problem
@@ -105,16 +107,29 @@ def test_most_of_a_long_valley_stays_curved() -> None:
     assert solve(simulate(problem, target, 3, 100)).has(Status.TAILS).mean() < 0.25
 
 
-def test_a_prior_is_not_repeated() -> None:
-    from optloc import Prior
+def test_priors_are_measurements_that_are_repeated() -> None:
+    """A prior on the position is one more row: the shares agree with those of another method."""
+    target, prior = np.array([3.0, 1.0]), np.diag([0.4, 0.1])
+    problem, _ = valley(3.0, 4.0)
+    held = replace(problem, priors=(Prior("position", target, prior),))
+    measured_once = simulate(held, target, 2)
+    fix = solve(measured_once)
+    shares = repeat(measured_once.flat(), fix.x[None], fix.cov[None])[0]
+    stations, sigma = problem.stations.position.reshape(-1, 2), np.radians(4.0)
+    rng, inside, count, root = np.random.default_rng(5), 0, 400, np.sqrt(np.diag(prior))
+    for truth in rng.multivariate_normal(fix.position, fix.covariance(), count):
+        line = truth - stations
+        z = np.arctan2(line[:, 1], line[:, 0]) + sigma * rng.standard_normal(3)
+        mean = truth + root * rng.standard_normal(2)
 
-    problem = bearings(np.array([2.0, 2.5]))
-    held = assemble(
-        CORNERS,
-        measured("azimuth", problem.z, a=np.arange(3), sigma=COARSE),
-        priors=[Prior("position", np.array([2.0, 2.5]), np.eye(2))],
-    )
-    assert not bool(solve(held).has(Status.TAILS))
+        def residual(x: Array, z: Array = z, mean: Array = mean) -> Array:
+            away = x - stations
+            return np.r_[(z - np.arctan2(away[:, 1], away[:, 0])) / sigma, (x - mean) / root]
+
+        done = least_squares(residual, truth)
+        off = done.x - truth
+        inside += off @ (done.jac.T @ done.jac) @ off <= INSIDE
+    assert shares[0] == pytest.approx(inside / count, abs=4.0 * np.sqrt(0.95 * 0.05 * (1 / 48 + 1 / 400)) + 0.02)
 
 
 def test_the_shares_that_are_enough_are_below_the_levels() -> None:

@@ -8,12 +8,13 @@ share of ellipses that hold their place decides.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
 
 from optloc.base import arrays, linalg
-from optloc.base.types import Array, Status
+from optloc.base.types import Array, Prior, Status
 from optloc.compute.least_squares import refine
 from optloc.linear.evaluate import predict
 from optloc.linear.mirror import one_position
@@ -22,6 +23,7 @@ from optloc.linear.simulate import draw, samples
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem.chart import quantile
+from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 
 LEVELS = (0.95, 0.999)
@@ -42,9 +44,12 @@ _PART = 2**15
 
 
 def is_repeatable(problem: Problem) -> bool:
-    """Return whether a measurement can be repeated from the rows alone: one position, no prior and no constraint."""
-    free = not problem.constraints and not prior_parts(problem) and not problem.stations.errors
-    return free and one_position(problem) and problem.motions[0].order == 0 and problem.medium is None
+    """Return whether a measurement can be repeated: one position, no constraint, priors on shared unknowns."""
+    free = not problem.constraints and not problem.stations.errors and problem.medium is None
+    walks = any(form_of(bias).steps is not None for bias in problem.biases)
+    if not free or walks or not one_position(problem) or problem.motions[0].order > 0:
+        return False
+    return all(problem.layout.find(name)[1] for name, _, _ in prior_parts(problem))
 
 
 def holds(shares: Array) -> Array:
@@ -80,8 +85,8 @@ def _parts(count: int) -> Iterator[Array]:
 def _shares(problem: Problem, x: Array, covariance: Array) -> Array:
     """Return the shares of a part of the batch."""
     each = np.repeat(np.arange(len(x)), _REPEATS)
-    truth, noise = _drawn(problem, x, covariance)
-    many = problem.take(each)
+    truth, noise, means = _drawn(problem, x, covariance)
+    many = _with_priors(problem.take(each), means)
     z = noise + np.asarray(predict(many, truth.view(arrays.Portable)))
     for rows, start in zip(many.rows, many.starts, strict=True):
         part = slice(start, start + rows.count)
@@ -103,14 +108,30 @@ def _shares(problem: Problem, x: Array, covariance: Array) -> Array:
     return np.stack([one.reshape(len(x), _REPEATS).mean(1) for one in held], axis=-1)
 
 
-def _drawn(problem: Problem, x: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return vectors (N r, size) drawn about fixes, and noise (N r, m) of their rows; the data of each are the seed."""
+def _with_priors(problem: Problem, means: dict[str, Array]) -> Problem:
+    """Return problems with the drawn means (N, p) of their priors."""
+    spreads = {name: linalg.inverse(precision)[0] for name, _, precision in prior_parts(problem)}
+    priors = tuple(Prior(name, means[name], spread) for name, spread in spreads.items())
+    return replace(problem, biases=tuple(replace(bias, sigma=None) for bias in problem.biases), priors=priors)
+
+
+def _drawn(problem: Problem, x: Array, covariance: Array) -> tuple[Array, Array, dict[str, Array]]:
+    """Return vectors (N r, size) drawn about fixes, noise (N r, m) of their rows, and means of their priors.
+
+    A prior is a measurement as well, so its mean is drawn about each vector. The data of a fix seed its draws.
+    """
     n, count = problem.layout.n_shared, problem.count
     truth, noise = np.repeat(x, _REPEATS, axis=0), np.empty((len(x) * _REPEATS, count))
     z = np.broadcast_to(problem.z, (len(x), count))
+    slots = {name: problem.layout.find(name)[0] for name, _, _ in prior_parts(problem)}
+    means = {name: np.empty((len(truth), slot.size)) for name, slot in slots.items()}
     for i in range(len(x)):
         rng = np.random.default_rng(crc32(np.ascontiguousarray(z[i]).tobytes()))
-        own = slice(i * _REPEATS, (i + 1) * _REPEATS)
+        own, one = slice(i * _REPEATS, (i + 1) * _REPEATS), problem.take(np.array([i]))
         truth[own, :n] += samples(covariance[i], (_REPEATS,), rng)
-        noise[own] = draw(problem.take(np.array([i])).noise, count, (_REPEATS,), rng)
-    return truth, noise
+        noise[own] = draw(one.noise, count, (_REPEATS,), rng)
+        for name, _, precision in prior_parts(one):
+            spread = linalg.inverse(np.reshape(precision, precision.shape[-2:]))[0]
+            at = slice(slots[name].start, slots[name].start + slots[name].size)
+            means[name][own] = truth[own, at] + samples(spread, (_REPEATS,), rng)
+    return truth, noise, means
