@@ -296,7 +296,7 @@ def test_the_file_of_the_manual_is_that_which_is_shipped(tmp_path):
     one, two = load(path), load(DEMO)
     assert one.structure == two.structure
     np.testing.assert_array_equal(one.z, two.z)
-    known = copied(tmp_path, lambda text: text.replace('[target]\nmotion = "static"\n', blocks("toml")[2]))
+    known = copied(tmp_path, lambda text: text.replace('[target]\nmotion = "static"\n', blocks("toml")[3]))
     assert load(known).motions[0].known.tolist() == [[[200e3, 300e3, 0.0]]]
 
 

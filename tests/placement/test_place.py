@@ -165,7 +165,7 @@ def test_simulated_fixes_tell_a_flat_array():
     sites, at = drawn(5, 6, 1)
     sites = np.vstack([np.column_stack([sites[:, :2], np.zeros(6)]), [0.0, 0.0, 30.0]])
     candidates = candidates_of(
-        SiteSelection(assemble(sites, measured("range", a=np.arange(7), sigma=0.3)), at, choose=4)
+        SiteSelection(assemble(sites, measured("range", a=np.arange(7), sigma=0.03)), at, choose=4)
     )
     flat = simulated(candidates, np.array([1, 1, 1, 1, 0, 0, 0]), 10)
     assert flat.ambiguous[0] > 0.3  # others say that they cannot tell

@@ -21,6 +21,7 @@ from optloc.linear.evaluate import columns, predict
 from optloc.linear.vectors import vectors
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
+from optloc.problem.forms import form_of
 from optloc.problem.layout import state_names
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
@@ -73,7 +74,9 @@ def headings(problem: Problem) -> Headings | None:
         count, tied = len(bias.members), any(prior.name == bias.name for prior in problem.priors)
         wide = np.broadcast_to(True if bias.sigma is None else bias.sigma > _WIDE, (count,))
         seen = np.bincount(bias.member, marked[bias.row], count) > 0
-        if bias.form != "offset" or tied or not (wide | seen).any() or not turns[bias.row].all():
+        form = form_of(bias)
+        constant = form.enters == "adds" and not form.rate and form.steps is None and form.values_at is None
+        if not constant or tied or not (wide | seen).any() or not turns[bias.row].all():
             continue
         touch = np.zeros((count, problem.count))
         touch[bias.member, bias.row] = bias.coefficient

@@ -250,7 +250,7 @@ def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
     cost = pool.cost[:, 0]
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
-    items = np.flatnonzero(good & (mark(problem, pool, gap) == Status.CURVED.mark))
+    items = np.flatnonzero(good & (pool.face[:, 0] == 0) & (mark(problem, pool, gap) == Status.CURVED.mark))
     if pool.pair is not None:  # no Gaussian describes both sides of a plane
         items = items[np.isnan(pool.pair[items, 0]).any(-1)]
     if not len(items):

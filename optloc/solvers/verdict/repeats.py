@@ -16,6 +16,7 @@ import numpy as np
 from optloc.base import arrays, linalg
 from optloc.base.types import Array, Prior, Status
 from optloc.compute.least_squares import refine
+from optloc.linear.constraints import exact
 from optloc.linear.evaluate import predict
 from optloc.linear.mirror import one_position
 from optloc.linear.normal import marginal, prior_parts
@@ -44,8 +45,11 @@ _PART = 2**15
 
 
 def is_repeatable(problem: Problem) -> bool:
-    """Return whether a measurement can be repeated: one position, no constraint, priors on shared unknowns."""
-    free = not problem.constraints and not problem.stations.errors and problem.medium is None
+    """Return whether a measurement can be repeated: one position, no equality, priors on shared unknowns.
+
+    Inequalities that hold no fix do not matter.
+    """
+    free = not exact(problem) and not problem.stations.errors and problem.medium is None
     walks = any(form_of(bias).steps is not None for bias in problem.biases)
     if not free or walks or not one_position(problem) or problem.motions[0].order > 0:
         return False
@@ -70,7 +74,7 @@ def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
     covariance : array (N, n, n)
         Of their shared unknowns.
     """
-    out = np.empty((len(x), len(LEVELS)))
+    out, problem = np.empty((len(x), len(LEVELS))), replace(problem, constraints=())
     for items in _parts(len(x)):
         out[items] = _shares(problem.take(items), x[items], covariance[items])
     return out
