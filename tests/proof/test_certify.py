@@ -166,7 +166,10 @@ def test_a_spent_budget_says_so_and_changes_nothing(monkeypatch):
     ("problem", "word"),
     [
         (lambda: CASES["tdoa+fdoa-3d"].problem, "moves"),
-        (lambda: with_bias(CASES["range-3d"].problem, "scale", per="kind", form="scale", sigma=1e-3), "'scale'"),
+        (
+            lambda: with_bias(CASES["range-3d"].problem, "scale", per="station", form="scale", sigma=1e-3),
+            "several scales",
+        ),
     ],
 )
 def test_what_the_proof_does_not_cover_is_unknown_and_named(problem, word):
