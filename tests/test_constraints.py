@@ -252,7 +252,9 @@ def test_an_edge_is_too_dear_only_where_all_of_it_is(side):
         ).cost.min()
         many = on.take(np.zeros(11, int))
         anywhere = rng.uniform(-9e3, 9e3, (11, 3, 3))
-        dear, boxes = _is_dear(many, eliminate_nuisance(flat.take(np.zeros(11, int))), anywhere, least * levels, 1)
+        dear, boxes = _is_dear(
+            many, np.full((2, 3), np.inf), eliminate_nuisance(flat.take(np.zeros(11, int))), anywhere, least * levels, 1
+        )
         assert not dear[levels > 1.0 + 1e-6].any()
         assert dear[levels < 0.8].all()
         assert (boxes > 0).any()

@@ -97,8 +97,8 @@ At 0.3 the 99.9 % ellipsoids hold 99.8 to 100 % of the truths; at 0.5 far fixes 
 theirs hold 79 to 92 %.
 """
 
-# Where it is looked at, standard deviations: 2 and 4 tell good covariances from bad ones as well.
-_AWAY = 3.0
+AWAY = 3.0
+"""Where the cost is looked at, standard deviations: 2 and 4 tell good covariances from bad ones as well."""
 # The cost there is no less than this share of a Gaussian's: beyond, one is as bad as another.
 _FLOOR = 1e-9
 # Variances that differ by less have no axes of their own: those turned by half a right angle are as good.
@@ -143,12 +143,12 @@ def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre:
     spread = covariance[:, part, part]
     precision, _ = linalg.inverse(spread)
     pull = covariance[:, :, part] @ (precision if not face else np.linalg.pinv(spread))  # of the others by the position
-    look = _Look(problem, x, pull, part, face)
+    look = Look(problem, x, pull, part, face)
     out = np.full((len(x), 2), np.inf)
     position, axes = x[:, part], _axes(spread)
     with np.errstate(all="ignore"):
-        moved = _AWAY * np.concatenate([axes, -axes], axis=1)
-        out[:, 0] = look.departs(moved, np.full(moved.shape[:2], _AWAY))
+        moved = AWAY * np.concatenate([axes, -axes], axis=1)
+        out[:, 0] = look.departs(moved, np.full(moved.shape[:2], AWAY))
         away = position - centre
         distance = np.sqrt((away**2).sum(-1))
         other = np.flatnonzero((out[:, 0] > _SETTLED) & (distance > 0.0)) if not face else np.zeros(0, dtype=int)
@@ -162,7 +162,7 @@ _SETTLED = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class Look:
     """The cost about a batch of fixes, and how the other unknowns follow the position there."""
 
     problem: Problem
@@ -171,9 +171,9 @@ class _Look:
     part: slice
     face: Face
 
-    def take(self, items: Array) -> _Look:
+    def take(self, items: Array) -> Look:
         """Return some fixes."""
-        return _Look(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
+        return Look(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
 
     def departs(self, moved: Array, sigmas: Array) -> Array:
         """Return the largest departure (N,) over displacements (N, k, d) of so many standard deviations (N, k)."""
@@ -218,13 +218,13 @@ def _axes(covariance: Array) -> Array:
 _EXACT = 1e-14
 
 
-def _in_inverse_range(look: _Look, centre: Array, covariance: Array) -> Array:
+def _in_inverse_range(look: Look, centre: Array, covariance: Array) -> Array:
     """Return the largest departure (N,) along the principal axes of the inverse-range chart."""
     position = look.x[:, look.part]
     chart = Chart(np.full(len(position), INVERSE_RANGE, dtype=np.int8), position, covariance, centre)
     axes = _axes(chart.spread)
-    sigmas = np.full((len(axes), 2 * axes.shape[1]), _AWAY)
-    y = _AWAY * np.concatenate([axes, -axes], axis=1)
+    sigmas = np.full((len(axes), 2 * axes.shape[1]), AWAY)
+    y = AWAY * np.concatenate([axes, -axes], axis=1)
     # a step across infinity ends just before it, and counts for as many sigmas as it has left
     share = np.where(y[..., -1] < 0.0, np.minimum(1.0, (1.0 - _NEAR_INFINITY) / np.maximum(-y[..., -1], 1e-300)), 1.0)
     y, sigmas = y * share[..., None], sigmas * share

@@ -271,14 +271,32 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
     out = np.ones(len(x), dtype=bool)
     for i, level in enumerate(face):
         constraint = problem.constraints[level.constraint]
+        if not is_exact(constraint):
+            out &= share[:, i] * outwards(problem, level) >= 0.0
         if isinstance(constraint, Polygon):
-            out &= share[:, i] * _turn(constraint.vertices) >= 0.0
             # where a polygon is not convex, its corner is admitted on both sides: costs fall along one of them
             here = [other.side for other in face if other.constraint == level.constraint]
             out &= len(here) < 2 or _turn(constraint.vertices) * _turn(_corner(constraint, here)) > 0.0
-        elif not is_exact(constraint):
-            out &= share[:, i] * (1.0 if level.side == "upper" else -1.0) >= 0.0
     return out
+
+
+def bounds(problem: Problem) -> Face:
+    """Return every single side of the inequalities of a problem, at the reference time."""
+    sides = (side for i, c in enumerate(problem.constraints) if not is_exact(c) for side in _sides(i, c))
+    return tuple(side[0] for side in sides if len(side) == 1)
+
+
+def outwards(problem: Problem, level: Level) -> float:
+    """Return 1 if the quantity of a level grows out of what its bound admits, -1 if it falls, 0 of an equality."""
+    constraint = problem.constraints[level.constraint]
+    if isinstance(constraint, Polygon):
+        return _turn(constraint.vertices)
+    return 0.0 if is_exact(constraint) else 1.0 if level.side == "upper" else -1.0
+
+
+def is_flat(problem: Problem, level: Level) -> bool:
+    """Return whether a level is a plane."""
+    return _kind(problem, level) == "plane"
 
 
 def _corner(region: Polygon, edges: list[str | int]) -> Array:

@@ -7,7 +7,7 @@ infinity is w = 0, a point like others. A distant emitter is curved in metres an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -15,8 +15,10 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.records import Axes
+from optloc.base.records import Axes, take
 from optloc.base.types import Array
+from optloc.models.primitives import wrap
+from optloc.problem.truncated import Truncated
 
 CARTESIAN, INVERSE_RANGE, CURVED = range(3)
 """Kinds of a chart: the Gaussian in metres covers, the one in (p, w) does, neither does."""
@@ -24,7 +26,10 @@ CARTESIAN, INVERSE_RANGE, CURVED = range(3)
 NAMES = ("cartesian", "inverse range", "curved")
 """What the kinds are called, in the order of their numbers."""
 
-Extent = Literal["range", "bearing", "elevation", "height"]
+TRUNCATED = "truncated"
+"""Name of a Cartesian chart where bounds cut the law off."""
+
+Extent = Literal["range", "bearing", "elevation", "height", "x", "y", "z"]
 
 # The region shows what a Gaussian cannot: a function of a higher floor, so the advice names it.
 _ADVICE = "ask `optloc.likelihood_region(problem, fix)` for the region that the data allow"
@@ -150,17 +155,24 @@ class Chart:
         The inverse of their information, square metres.
     centre : array (..., d)
         Mean of the stations, metres.
+    truncated : Truncated, optional
+        The normal laws that bounds cut off: for fixes in metres they replace `covariance`.
     """
 
     kind: Annotated[Array, Axes(0, empty=CURVED)]
     position: Annotated[Array, Axes(1)]
     covariance: Annotated[Array, Axes(2)]
     centre: Annotated[Array, Axes(1)]
+    truncated: Truncated | None = None
 
     @property
     def name(self) -> Any:
-        """Return the name of the kind of a single fix, or an array (...) of names of a batch."""
-        return np.array(NAMES)[self.kind]
+        """Return the name of the kind of a single fix, or an array (...) of names of a batch.
+
+        Where bounds cut off the law of a fix in metres it is "truncated".
+        """
+        names = np.array([*NAMES, TRUNCATED])
+        return names[self.kind] if self.truncated is None else np.where(self.cut_off, TRUNCATED, names[self.kind])[()]
 
     @property
     def distance(self) -> Array:
@@ -224,7 +236,8 @@ class Chart:
         -------
         array (...)
             Chi-square distributed for the truth; infinite behind the centre in the inverse-range chart, NaN for
-            curved fixes.
+            curved fixes. Where bounds cut the law off it is the chi-square value of the region of highest density
+            through the point, infinite beyond the bounds.
         """
         away = np.asarray(points) - self.position
         dy = self.to_chart(points) - self.mean
@@ -235,7 +248,28 @@ class Chart:
         form = (step * solved[..., 0]).sum(-1)
         inverse = self.kind == INVERSE_RANGE
         behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
-        return np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan)
+        form = np.array(np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan))
+        away = np.broadcast_to(away, (*form.shape, away.shape[-1]))
+        for i, law in self._cut_off():
+            mine = np.zeros(self.kind.shape, dtype=bool)
+            mine[i] = True
+            mine = np.broadcast_to(mine, form.shape)
+            form[mine] = law.distance_squared(away[mine])
+        return form
+
+    @property
+    def cut_off(self) -> Array:
+        """Return a flag (...) for each fix in metres whose law is cut off at bounds."""
+        if self.truncated is None:
+            return np.zeros(self.kind.shape, dtype=bool)
+        return np.asarray(self.truncated.cuts & (self.kind == CARTESIAN))
+
+    def _cut_off(self) -> Iterator[tuple[tuple[int, ...], Truncated]]:
+        """Yield the indices of fixes whose laws bounds cut off, and these."""
+        if self.truncated is not None:
+            for i in zip(*np.nonzero(np.atleast_1d(self.cut_off)), strict=True):
+                index = tuple(map(int, i)) if self.kind.shape else ()
+                yield index, take(self.truncated, index)
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
         """Return whether points (..., d), metres, lie in the regions that hold the truth with a given probability.
@@ -265,7 +299,7 @@ class Chart:
             "range": distance from the centre along the direction of the fix, metres; the far end is infinite where
             infinity is not excluded. "bearing": from the centre, radians from the first axis towards the second; the
             ends are not wrapped, and a turn apart where nothing is known. "elevation": radians above the plane of the
-            first two axes. "height": the last coordinate of three, metres.
+            first two axes. "height": the last coordinate of three, metres. "x", "y", "z": a coordinate, metres.
         level : float
             Probability that the interval contains the truth.
 
@@ -281,9 +315,41 @@ class Chart:
         if extent not in _EXTENTS:
             raise InvalidProblem(f"there is no interval of {extent!r}", "extent", nearest(str(extent), _EXTENTS))
         self._demand(f"interval of the {extent}")
-        if extent in {"elevation", "height"} and self.position.shape[-1] != 3:
-            raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "ask for range or bearing")
-        return _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1))))
+        if extent in {"elevation", "height", "z"} and self.position.shape[-1] != 3:
+            raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "ask for x, y, range or bearing")
+        low, high = map(np.array, _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1)))))
+        for i, law in self._cut_off():
+            low[i], high[i] = law.interval(self._number(extent, i), level)
+        return low, high
+
+    def mean_of(self, x: Array, covariance: Array, start: int) -> Array:
+        """Return the means (..., n) of the laws of fixes x (..., n) with covariances (..., n, n).
+
+        The position begins at entry `start`. The other unknowns follow it.
+        """
+        out, part = np.array(x), slice(start, start + self.position.shape[-1])
+        for i, law in self._cut_off():
+            own = covariance[i]
+            out[i] += own[:, part] @ np.linalg.pinv(own[part, part], hermitian=True) @ law.moments()[0]
+        return out
+
+    def _number(self, extent: Extent, i: tuple[int, ...]) -> Callable[[Array], Array]:
+        """Return the function from points, metres from fix i, to the number of an interval."""
+        start, centre = self.position[i], self.centre[i]
+        if extent in _COORDINATES:
+            j = _COORDINATES[extent]
+            return lambda away: np.asarray(start[j] + away[..., j])
+        if extent == "range":
+            return lambda away: distance_and_direction(start + away, centre)[0]
+        if extent == "elevation":
+            return lambda away: np.asarray(np.arcsin(distance_and_direction(start + away, centre)[1][..., 2]))
+        middle = np.arctan2(self.direction[i][1], self.direction[i][0])
+
+        def bearing(away: Array) -> Array:
+            there = start + away - centre
+            return np.asarray(middle + wrap(np.arctan2(there[..., 1], there[..., 0]) - middle))
+
+        return bearing
 
     def _demand(self, what: str) -> None:
         """Raise where no Gaussian covers."""
@@ -317,18 +383,25 @@ def _elevation(chart: Chart, z: float) -> tuple[Array, Array]:
     return np.maximum(middle + low, -0.5 * np.pi), np.minimum(middle + high, 0.5 * np.pi)
 
 
-def _height(chart: Chart, z: float) -> tuple[Array, Array]:
-    if (chart.kind != CARTESIAN).any():
-        raise InvalidProblem("the height of a fix that is not Gaussian in metres has no interval", "extent", _ADVICE)
-    width = z * np.sqrt(chart.covariance[..., 2, 2])
-    return chart.position[..., 2] - width, chart.position[..., 2] + width
+def _coordinate(j: int) -> Callable[[Chart, float], tuple[Array, Array]]:
+    def ends(chart: Chart, z: float) -> tuple[Array, Array]:
+        if (chart.kind != CARTESIAN).any():
+            what = "a coordinate of a fix that is not Gaussian in metres has no interval"
+            raise InvalidProblem(what, "extent", _ADVICE)
+        width = z * np.sqrt(chart.covariance[..., j, j])
+        return chart.position[..., j] - width, chart.position[..., j] + width
+
+    return ends
 
 
-_EXTENTS: dict[str, Callable[[Chart, float], tuple[Array, Array]]] = {
+_COORDINATES: dict[Extent, int] = {"x": 0, "y": 1, "z": 2, "height": 2}
+AXES: tuple[Extent, ...] = ("x", "y", "z")
+"""Extents that are coordinates."""
+_EXTENTS: dict[Extent, Callable[[Chart, float], tuple[Array, Array]]] = {
     "range": _range,
     "bearing": _bearing,
     "elevation": _elevation,
-    "height": _height,
+    **{name: _coordinate(j) for name, j in _COORDINATES.items()},
 }
 
 

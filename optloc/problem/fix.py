@@ -413,8 +413,11 @@ class Fix:
         return dict(_TELLER[0]().geojson_of(self, problem))
 
     def gaussian(self) -> tuple[Array, Array]:
-        """Return mean (..., n) and covariance (..., n, n) of the shared unknowns: an initial state for a tracker."""
-        return self.x[..., : self.layout.n_shared], self.cov
+        """Return mean (..., n) and covariance (..., n, n), cut off by bounds, of the unknowns: a start of a tracker."""
+        mean = self.x[..., : self.layout.n_shared]
+        if self.chart is None or self.chart.truncated is None:
+            return mean, self.cov
+        return self.chart.mean_of(mean, self.cov, self.layout.find("position")[0].start), self.cov
 
     @property
     def suspects(self) -> Any:
@@ -487,11 +490,11 @@ class Fix:
         return self._gaussian_chart(level).covers(points, level)
 
     def interval(self, extent: Extent, level: float = 0.95) -> tuple[Array, Array]:
-        """Return the ends (...) of an interval that holds the range, bearing, elevation or height of the target.
+        """Return the ends (...) of an interval that holds one number of the target.
 
         Parameters
         ----------
-        extent : "range", "bearing", "elevation" or "height"
+        extent : "range", "bearing", "elevation", "height", "x", "y" or "z"
             Seen from the middle of the stations; metres or radians, see `optloc.problem.chart.Chart.interval`.
         level : float
             Probability that the interval contains it.
@@ -507,11 +510,8 @@ class Fix:
         if self.chart is None:
             raise InvalidProblem("a fix that is not of one position has no chart", "fix", "see its covariance")
         if level > TOLD and bool((self.has(Status.TAILS) & (self.chart.kind == CARTESIAN)).any()):
-            told, advice = (
-                f"some regions hold at {TOLD:g} but not at {level:g}",
-                "take fixes without the finding 'tails'",
-            )
-            raise InvalidProblem(told, "level", advice)
+            told = f"some regions hold at {TOLD:g} but not at {level:g}"
+            raise InvalidProblem(told, "level", "take fixes without the finding 'tails'")
         return self.chart
 
     def require(self, allow: Iterable[Status | str] = (), *, redundancy: int = 0, level: float = 0.95) -> Fix:

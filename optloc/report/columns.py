@@ -12,7 +12,7 @@ from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status, statuses_of
 from optloc.bounds.observability import Observability
-from optloc.problem.chart import CURVED, INVERSE_RANGE
+from optloc.problem.chart import AXES, CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
 from optloc.problem.fix import Active, Explanation, Fix
 
@@ -338,6 +338,9 @@ def _chart_json(fix: Fix) -> dict[str, Any] | None:
     if chart.kind == INVERSE_RANGE:
         told |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
         told |= {"mean": chart.mean, "covariance": chart.spread}
+    if chart.cut_off:
+        told["mean"] = fix.gaussian()[0][: chart.position.shape[-1]]
+        told |= {f"{axis}95": fix.interval(axis) for axis in AXES[: chart.position.shape[-1]]}
     if chart.kind != CURVED and not fix.undetermined().any():
         told["range95"] = fix.interval("range")
     return told

@@ -19,7 +19,7 @@ from optloc.base.outputs import visible
 from optloc.base.types import NOTES, Array, Status
 from optloc.bounds.observability import Observability
 from optloc.problem.bias import estimated_speed
-from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
+from optloc.problem.chart import AXES, CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Active, Fix, Suspect
 from optloc.problem.problem import Problem
 from optloc.report.columns import (
@@ -194,8 +194,10 @@ def _accuracy(covariance: Array) -> list[tuple[str, str]]:
 
 def _extents(fix: Fix) -> list[tuple[str, str]]:
     """Return what covers where the ellipsoid in metres does not."""
-    if fix.chart is None or not fix.answered or fix.chart.kind == CARTESIAN:
+    if fix.chart is None or not fix.answered:
         return []
+    if fix.chart.kind == CARTESIAN:
+        return _coordinates(fix) if fix.chart.cut_off else []
     if fix.chart.kind != INVERSE_RANGE:
         return [("95 % region", "curved: the numbers behind ± do not cover; optloc.likelihood_region does")]
     low, high = (float(end) for end in fix.interval("range"))
@@ -204,6 +206,15 @@ def _extents(fix: Fix) -> list[tuple[str, str]]:
     if not fix.frame.geodetic:
         low, high = (float(np.degrees(end)) for end in fix.interval("bearing"))
         told.append(("95 % bearing", f"{low:.4g} to {high:.4g} deg from the first axis towards the second"))
+    return told
+
+
+def _coordinates(fix: Fix) -> list[tuple[str, str]]:
+    """Return intervals of the coordinates of a fix whose law bounds cut off: the fix is not in the middle of them."""
+    told = []
+    for axis in AXES[: fix.position.shape[-1]]:
+        low, high = (float(end) for end in fix.interval(axis))
+        told.append((f"95 % {axis}", f"{low:.6g} to {high:.6g} m, within the bounds"))
     return told
 
 

@@ -13,7 +13,7 @@ from optloc.base.types import Array, Status
 from optloc.compute.least_squares import refine
 from optloc.compute.sums import equations_at
 from optloc.engine.admission import GRAZE, GROUND, SATELLITE
-from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_exact, is_held, levels, violation
+from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_held, levels, outwards, violation
 from optloc.linear.normal import marginal
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
@@ -347,8 +347,6 @@ def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
     return np.asarray(good)
 
 
-# Outwards, the quantity of an upper bound grows, and the quantity of a lower bound falls.
-_SENSES: dict[str | int, float] = {"upper": 1.0, "lower": -1.0}
 # Share of the spread of the stations by which a point is moved off a face.
 _BESIDE = 1e-6
 
@@ -356,15 +354,15 @@ _BESIDE = 1e-6
 def _inwards(problem: Problem, face: Face, x: Array) -> Array:
     """Return points (N, size) a little inside of a face: on a plane of symmetry a saddle has no slope."""
     gradients = levels(problem, face, x)[1]
-    sense = np.array([0.0 if is_exact(problem.constraints[i.constraint]) else _SENSES.get(i.side, 0.0) for i in face])
-    outwards = (sense[:, None] * gradients).sum(1)
+    sense = np.array([outwards(problem, level) for level in face])
+    away = (sense[:, None] * gradients).sum(1)
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
-    length = np.sqrt((outwards[:, part] ** 2).sum(-1, keepdims=True))
+    length = np.sqrt((away[:, part] ** 2).sum(-1, keepdims=True))
     _, spread = centre_and_spread(problem.stations.places)
     out = np.array(x)
     with np.errstate(invalid="ignore", divide="ignore"):
-        step = _BESIDE * np.reshape(spread, (-1, 1)) * outwards[:, part] / length
+        step = _BESIDE * np.reshape(spread, (-1, 1)) * away[:, part] / length
     out[:, part] -= np.where(np.isfinite(step), step, 0.0)
     return out
 

@@ -54,6 +54,10 @@ class Curvature:
         (`optloc.adequacy.shape`); NaN where nobody has looked.
     repeats : array (N, 2), optional
         Shares of repeated measurements whose ellipses hold (`optloc.solvers.verdict.repeats`); NaN if not tried.
+    free : array (N, n, n), optional
+        Covariance without the inequalities that hold fixes; NaN where none does, or where it does not exist.
+    shift : array (N, n), optional
+        Mean without these inequalities by the quadratic model, less the fix; NaN likewise.
     """
 
     covariance: Annotated[Array, Axes(2)]
@@ -64,6 +68,8 @@ class Curvature:
     local: Annotated[Array, Axes(3)] | None = None
     kappa: Annotated[Array, Axes(1)] | None = None
     repeats: Annotated[Array, Axes(1)] | None = None
+    free: Annotated[Array, Axes(2)] | None = None
+    shift: Annotated[Array, Axes(1)] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.adequacy.coplanar import normal_of
+from optloc.adequacy.truncation import has_law, law_of
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
@@ -170,6 +171,8 @@ class Single:
         Whether it is worth loading machine code for.
     repeatable : bool
         Whether the measurement of a curved fix can be repeated.
+    limited : bool
+        Whether bounds may cut its law off.
     own : threading.local
         What each thread writes into.
     """
@@ -191,6 +194,7 @@ class Single:
     region: float
     often: bool
     repeatable: bool
+    limited: bool
     own: local = field(default_factory=local)
 
     def __call__(self, z: Array) -> Fix | None:
@@ -215,6 +219,8 @@ class Single:
             tied = self.plan.frame.geodetic and one.rival_cost - one.cost <= equal_cost(one.cost)
             if not one.settled or tied or not one.cost <= self.doubt:
                 return None
+        if self.limited and law_of(self.problem.flat(), answer.x, answer.covariance, np.zeros((n, shared))) is not None:
+            return None
         if self.normal is not None and self._is_near_plane(self.normal, answer):
             return None
         fixed = perf_counter()
@@ -499,6 +505,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         quantile(COVERED, d),
         often,
         is_repeatable(bare.flat()),
+        has_law(bare),
     )
 
 

@@ -87,6 +87,9 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
     Outline or None
         None where an ellipse covers, or nothing encloses the region.
     """
+    if fix.chart is not None and fix.chart.truncated is not None and fix.chart.cut_off:
+        line = fix.chart.truncated.outline(plane, level)
+        return Outline(([line if area(line) > 0.0 else line[::-1]],))
     if fix.chart is None or int(fix.chart.kind) not in (CURVED, INVERSE_RANGE) or not np.isfinite(fix.cov).all():
         return None
     if exact(problem):

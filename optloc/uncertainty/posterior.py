@@ -144,10 +144,15 @@ def around(surface: Surface, n: int, seed: int, prior: str = "jeffreys", within:
     """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`."""
     chart, inverse = surface.chart, surface.kind == INVERSE_RANGE
     start, spread = (chart.mean, chart.spread) if inverse else (chart.position, chart.covariance)
+    law = chart.truncated if chart.cut_off else None
+    if law is not None:  # the weights of what bounds cut off are zero
+        start, spread = start + law.shift, law.covariance
     _, points, log_proposal = student(len(start), n, seed)
     scale = np.sqrt(np.diagonal(spread))
     y = start + _WIDER * scale * (points @ np.linalg.cholesky(spread / np.outer(scale, scale)).T)
     good = y[:, -1] > _LEAST_W if inverse else np.ones(n, dtype=bool)
+    if law is not None:
+        good = law.admits(y - chart.position)
     y = np.where(good[:, None], y, start)
     position = chart.to_position(y) if inverse else y
     cost, information, _ = surface.look(position)
@@ -276,7 +281,9 @@ def _slices(surface: Surface, k: int, seed: int) -> Mixture:
     """Return the Gaussians of one minimum; their weights sum to one."""
     chart = surface.chart
     if surface.kind == CARTESIAN:
-        return Mixture(np.ones(1), chart.position[None], chart.covariance[None])
+        law = chart.truncated if chart.cut_off else None
+        mean = chart.position if law is None else chart.position + law.moments()[0]
+        return Mixture(np.ones(1), mean[None], chart.covariance[None])
     if surface.kind == CURVED:
         arc = trace_from(surface)
         drawn = along(arc, _SAMPLES, seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -328,7 +328,9 @@ class Surface:
         if not np.isfinite(fix.position).all() or not np.isfinite(fix.covariance()).all():
             raise InvalidProblem("the fix has no position with a covariance", "fix", "its status says why")
         kind = None if fix.chart is None or int(fix.chart.kind) == CURVED else int(fix.chart.kind)
-        return cls._about(problem, fix, fix.x, fix.cov, kind)
+        surface = cls._about(problem, fix, fix.x, fix.cov, kind)
+        law = None if fix.chart is None else fix.chart.truncated
+        return replace(surface, chart=replace(surface.chart, truncated=law))
 
     @classmethod
     def at(cls, problem: Problem, fix: Fix, x: Array) -> Surface:

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
+from optloc.adequacy.truncation import has_law
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import Axes, overwrite, take
 from optloc.base.types import Array, Status
@@ -104,9 +105,9 @@ def certified(
         new = _beside(part, own, minima)
         better = judge(part, new)
         changed = np.flatnonzero(_is_new(fix[items], better))
-        # of a fix that an inequality holds nothing is claimed: its covariance is that along the edge alone
         proven.write(items, told)
-        proven.write(items[~is_free(problem, fix, items)], unknown(HELD))
+        if not has_law(problem):  # the covariance of a fix that an inequality holds is that along the edge alone
+            proven.write(items[~is_free(problem, fix, items)], unknown(HELD))
         more += len(changed)
         pool = pool.merge(items[changed], take(new, changed))
         fix = overwrite(fix, items[changed], better[changed])
@@ -247,7 +248,8 @@ def _know_along(
     n, size = len(seeds), seeds.shape[-1]
     dear, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
     if len(face) > len(exact(problem)) and not unsupported(on_face(problem, face)):
-        dear, boxes = _is_dear(on_face(problem, face), costs, seeds, fix.cost + margin, effort)
+        limits = admitted(problem, problem.dimension)
+        dear, boxes = _is_dear(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
     least = np.full(n, margin)
     out = Along(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, fill(n, ""))
     rest = np.flatnonzero(~dear)
@@ -257,8 +259,10 @@ def _know_along(
     return overwrite(out, rest, replace(some, boxes=some.boxes + boxes[rest]))
 
 
-def _is_dear(on: Problem, costs: Costs, seeds: Array, level: Array, effort: int) -> tuple[Array, Array]:
+def _is_dear(on: Problem, limits: Array, costs: Costs, seeds: Array, level: Array, effort: int) -> tuple[Array, Array]:
     """Return whether all of a face, of equalities alone, costs at least a level (n,), and the boxes looked at (n,).
+
+    Beyond the limits (2, d) of the coordinates nothing is admitted.
 
     A proof says that nothing costs less than a place by more than so much: here by what the place costs above the
     level. So any place will do that costs more; it need be no minimum. The proof begins anew nearer to the minimum
@@ -273,7 +277,7 @@ def _is_dear(on: Problem, costs: Costs, seeds: Array, level: Array, effort: int)
         if not len(items):
             break
         part, own = on.take(items), costs.take(items)
-        answer = prove(own, _question(part, own, x[items], cost[items] - level[items], effort))
+        answer = prove(own, _question(part, limits, own, x[items], cost[items] - level[items], effort))
         boxes[items] += answer.boxes
         # where rounding is coarse a bound may be lower than what was asked for
         dear[items] = (answer.verdict == VALUE) & (answer.bound > level[items] - equal_cost(level[items]))
@@ -305,11 +309,12 @@ def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _question(on: Problem, costs: Costs, x: Array, less: Array, effort: int) -> Asked:
+def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: int) -> Asked:
     """Return the question whether nothing along a face costs less than vectors x (n, size) by more than `less` (n,)."""
     place = x[:, state_columns(on)]
     (n, d), value = place.shape, np.zeros(len(x))
     planes, surface = surfaces_of(on, place)
+    region = limits if np.isfinite(limits).all() else np.full_like(limits, np.nan)
     return Asked(
         x=place,
         others=np.zeros((n, 0, d)),
@@ -317,7 +322,7 @@ def _question(on: Problem, costs: Costs, x: Array, less: Array, effort: int) -> 
         hidden=np.zeros(n, dtype=np.int64),
         gaps=value[:, None],
         eps=less,
-        region=np.full((n, 2, d), np.nan),
+        region=np.repeat(region[None], n, axis=0),
         fallback=np.full((n, 2, d), np.nan),
         budget=budgets(n, costs.dense, effort),
         planes=planes,

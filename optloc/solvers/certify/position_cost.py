@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array, Band
+from optloc.base.types import Array, Band, Polygon
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact, is_exact
 from optloc.linear.normal import eliminated, step
@@ -185,7 +185,11 @@ def admitted(problem: Problem, n: int) -> Array:
     d = problem.dimension
     out = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
     for band in problem.constraints:
-        if not isinstance(band, Band) or band.lower.ndim or band.upper.ndim:
+        if isinstance(band, Polygon):
+            out[0, :2] = np.maximum(out[0, :2], band.vertices.min(0))
+            out[1, :2] = np.minimum(out[1, :2], band.vertices.max(0))
+            continue
+        if band.lower.ndim or band.upper.ndim:
             continue
         axis = np.flatnonzero(band.coefficients)
         if band.kind == "plane" and len(axis) == 1:

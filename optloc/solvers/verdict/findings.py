@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.adequacy.shape import BENT, cost_at_infinity, departure
+from optloc.adequacy.truncation import Law, departure_inwards, has_law, law_of
 from optloc.base.linalg import centre_and_spread, centre_of_points
 from optloc.base.records import present, take
 from optloc.base.types import PRECEDENCE, Array, Certificate, Status
@@ -18,6 +19,7 @@ from optloc.linear.redundancy import largest
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile, tail_probability
 from optloc.problem.claims import GLOBAL, Claims, claim
 from optloc.problem.problem import Problem
+from optloc.problem.truncated import Truncated
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, NOTICED, REFUTED
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.verdict.repeats import holds, is_repeatable, repeat
@@ -279,7 +281,38 @@ def _departure(problem: Problem, pool: Pool) -> Array:
     for number in np.unique(pool.face[:, 0]):
         items = np.flatnonzero(pool.face[:, 0] == number)
         out[items] = departure(problem.take(items), x[items], covariance[items], sides[number], centre[items])
+        if len(sides[number]) > len(sides[0]):
+            out[items] = np.fmax(out[items], _departure_inwards(problem.take(items), take(pool, items))[:, None])
     return out
+
+
+def _departure_inwards(problem: Problem, pool: Pool) -> Array:
+    """Return by how much the cost inwards of the bounds that hold fixes departs from a Gaussian's, (N,)."""
+    law = law_at(problem, pool)
+    if law is None:
+        return np.full(len(pool), np.inf)
+    assert pool.curvature is not None
+    assert pool.curvature.free is not None
+    held = np.isfinite(pool.curvature.free).all((-1, -2)) & law.sound & law.truncated.cuts
+    items, out = np.flatnonzero(held), np.full(len(pool), np.inf)
+    if len(items):
+        free, one = pool.curvature.free[items], take(law.truncated, items)
+        out[items] = departure_inwards(problem.take(items), pool.x[items, 0], free, one)
+    return out
+
+
+def law_at(problem: Problem, pool: Pool) -> Law | None:
+    """Return the normal laws of the best candidates that bounds cut off; None where no bound is near any."""
+    curvature = pool.curvature
+    # the covariance of a loss is no quadratic model beyond a bound
+    if curvature is None or pool.loss or not has_law(problem):
+        return None
+    covariance, shift = curvature.covariance, np.zeros((len(pool), problem.layout.n_shared))
+    if curvature.free is not None and curvature.shift is not None:
+        held = pool.face[:, 0] > 0
+        covariance = np.where(held[:, None, None], curvature.free, covariance)
+        shift = np.where(held[:, None], curvature.shift, shift)
+    return law_of(problem, pool.x[:, 0], covariance, shift)
 
 
 def _is_bent(pool: Pool) -> Array:
@@ -333,7 +366,9 @@ def reach_of(problem: Problem, x: Array) -> Array:
     return np.asarray(reach)
 
 
-def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature) -> Chart | None:
+def chart_of(
+    problem: Problem, x: Array, covariance: Array, curvature: Curvature, truncated: Truncated | None = None
+) -> Chart | None:
     """Return in which coordinates positions are Gaussian, or None for problems that do not share one.
 
     Parameters
@@ -346,6 +381,8 @@ def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature
         Of their shared unknowns.
     curvature : Curvature
         Examined; what was not is taken for curved.
+    truncated : Truncated, optional
+        Their laws where bounds cut these off.
     """
     if not problem.layout.shares("position"):
         return None
@@ -359,7 +396,7 @@ def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature
         kind[repeats_hold(curvature) & (kind == CURVED)] = CARTESIAN
     centre = centre_of(problem)
     centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
-    return Chart(kind, x[:, part], covariance[:, part, part], centre)
+    return Chart(kind, x[:, part], covariance[:, part, part], centre, truncated)
 
 
 def chart_kind(metres: Any, inverse: Any) -> Any:

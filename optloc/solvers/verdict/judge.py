@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from optloc.adequacy.advice import misfit_of
+from optloc.adequacy.truncation import covariance_of
 from optloc.base.records import overwrite, present, take
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
@@ -19,6 +20,7 @@ from optloc.models.layers import Layers
 from optloc.problem.claims import Claims, alike, choose, claim
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
+from optloc.problem.truncated import Truncated
 from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of, spread_of
@@ -31,6 +33,7 @@ from optloc.solvers.verdict.findings import (
     examine,
     explain,
     is_improbable,
+    law_at,
     mark,
     reach_of,
 )
@@ -358,17 +361,22 @@ def standing(pool: Pool, fix: Fix) -> Array:
 def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     """Return the fixes of settled pools as if all of them were finished and near; without a status where none is."""
     count, cost, proven = len(pool), pool.cost[:, 0], _claims(pool)
+    law = law_at(problem, pool)
+    covariance = curvature.covariance if law is None else _cut_off(problem, pool, law.truncated)
+    truncated = None if law is None else law.truncated
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
     marks, reason, chart = np.zeros(count, dtype=np.int32), fill(count, ""), None
+    if pool.plain is not None or truncated is not None:
+        chart = chart_of(problem, pool.x[:, 0], covariance, curvature, truncated)
     if pool.plain is not None:
-        marks, chart = mark(problem, pool, gap), chart_of(problem, pool.x[:, 0], curvature.covariance, curvature)
+        marks = mark(problem, pool, gap)
     code = first_status(marks)
     if pool.plain is not None:
         explain(Finished(problem, pool, gap, proven), code, reason)
     return Fix(
         pool.x[:, 0],
-        curvature.covariance,
+        covariance,
         problem.layout,
         problem.frame,
         code,
@@ -387,6 +395,19 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         np.full(count, np.nan) if pool.infinity is None else pool.infinity - cost,
         reach_of(problem, pool.x[:, 0]),
     )
+
+
+def _cut_off(problem: Problem, pool: Pool, law: Truncated) -> Array:
+    """Return the covariances (N, n, n) of the shared unknowns, cut off at bounds."""
+    curvature = pool.curvature
+    assert curvature is not None
+    out = np.array(curvature.covariance)
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    for i in np.flatnonzero(law.cuts):
+        free = out[i] if curvature.free is None or pool.face[i, 0] == 0 else curvature.free[i]
+        out[i] = covariance_of(take(law, i), free, part)
+    return out
 
 
 def _claims(pool: Pool) -> Claims:
@@ -418,7 +439,7 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
         reason=ruling.reason,
         claims=ruling.proven,
         cost=np.where(np.isfinite(fix.cost), fix.cost, np.nan),
-        chart=chart_of(problem, x, covariance, pool.curvature),
+        chart=chart_of(problem, x, covariance, pool.curvature, None if fix.chart is None else fix.chart.truncated),
     )
 
 

@@ -45,11 +45,16 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
     weakest = smallest_pivot(information)
     active: Array = np.frompyfunc(lambda _: (), 1, 1)(np.arange(len(x)))
     sides = faces(problem) if problem.constraints else [()]
+    free = shift = None
     for number in np.unique(face):
         if not sides[number]:
             continue
         items = np.flatnonzero(face == number)
         part = problem.take(items)
+        if len(sides[number]) > len(sides[0]):
+            if free is None or shift is None:
+                free, shift = np.full(covariance.shape, np.nan), np.full(vector.shape, np.nan)
+            free[items], shift[items] = _without_bounds(part, sides[0], x[items], information[items], vector[items])
         along = tangent_at(part, sides[number], x[items])
         covariance[items], regular[items] = linalg.inverse_within(information[items], along)
         # what constraints hold is not open: the pivots are those along the face
@@ -58,7 +63,23 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
         active[items] = _multipliers(part, sides[number], x[items], vector[items])
     regular = ok & regular
     local = _local_covariance(problem, equations, covariance)
-    return Curvature(covariance, information, regular, weakest, active, local)
+    return Curvature(covariance, information, regular, weakest, active, local, free=free, shift=shift)
+
+
+def _without_bounds(
+    problem: Problem, equalities: Face, x: Array, information: Array, vector: Array
+) -> tuple[Array, Array]:
+    """Return covariance (N, n, n), and mean less x (N, n), of the quadratic model that only equalities hold.
+
+    NaN where the data and the equalities leave a direction open.
+    """
+    if equalities:
+        covariance, regular = linalg.inverse_within(information, tangent_at(problem, equalities, x))
+    else:
+        covariance, regular = linalg.inverse(information)
+    regular &= smallest_pivot(information) >= WEAK if not equalities else True
+    covariance = np.where(regular[:, None, None], covariance, np.nan)
+    return covariance, (covariance @ vector[..., None])[..., 0]
 
 
 def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Array | None:

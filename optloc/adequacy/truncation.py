@@ -1,0 +1,206 @@
+"""Bounds at a fix or near it: the planes that cut its normal law off, and how Gaussian the cost is inwards of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.adequacy.shape import AWAY, Look
+from optloc.base.records import take
+from optloc.base.types import Array, Polygon
+from optloc.linear.constraints import Level, bounds, exact, is_exact, is_flat, levels, outwards
+from optloc.linear.mirror import one_position
+from optloc.problem.problem import Problem
+from optloc.problem.truncated import Truncated, factor_of
+
+# Standard deviations to a bound up to which the law is cut off: one farther away takes a thousandth of it.
+_NEAR = 3.0
+# The same up to which another bound of such a fix counts: beyond, there is nothing left to cut off.
+_REACH = 7.0
+# Share of a standard deviation by which a curved bound may depart from its plane three deviations away.
+_FLAT = 0.1
+# Share of a standard deviation up to which a fix is on a bound: refinement leaves less.
+_ON = 1e-3
+# Directions inwards that are shorter lie along other bounds.
+_ALONG = 1e-6
+
+
+def has_law(problem: Problem) -> bool:
+    """Return whether bounds may cut off the law of a position: one that stays, with inequalities about it."""
+    limited = any(not is_exact(constraint) for constraint in problem.constraints)
+    return limited and one_position(problem) and problem.motions[0].order == 0
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """The normal laws of N fixes, cut off.
+
+    Parameters
+    ----------
+    truncated : Truncated
+        Of the positions.
+    sound : bool array (N,)
+        Where the bounds are flat enough, or far away.
+    """
+
+    truncated: Truncated
+    sound: Array
+
+
+def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law | None:
+    """Return the normal laws of fixes cut off at the bounds near them; None where no bound is near any.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one static position.
+    x : array (N, size)
+        Fixes, or NaN.
+    covariance : array (N, n, n)
+        Of the shared unknowns without the inequalities.
+    shift : array (N, n)
+        Mean of the law without the inequalities, less the fix.
+    """
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    spread, sides = covariance[:, part, part], bounds(problem)
+    with np.errstate(all="ignore"):
+        values, normal = _planes(problem, sides, x, part)
+        sigma = np.sqrt(np.maximum(np.einsum("nhi,nij,nhj->nh", normal, spread, normal), 0.0))
+        # one that an equality holds where it is cuts nothing off
+        open_ones = (sigma > 0.0) & np.isfinite(values)
+        near = open_ones & (values <= _NEAR * sigma)
+        if not near.any():
+            return None
+        slack = np.where(near.any(1)[:, None] & open_ones & (values <= _REACH * sigma), np.maximum(values, 0.0), np.inf)
+        give = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
+    bent = np.isfinite(slack) & (give > _FLAT * sigma)
+    # a curved bound that is not reached bounds as little as one far away
+    held = slack <= _ON * sigma
+    slack = np.where(bent & ~held, np.inf, slack)
+    along, span = _edges(problem, sides, x, part)
+    truncated = Truncated(normal, slack, along, span, give, shift[:, part], spread)
+    return Law(truncated, ~(bent & held).any(1))
+
+
+def _planes(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
+    """Return distances (N, h) of fixes from bounds, metres, and the unit normals outwards (N, h, d)."""
+    values, gradients = levels(problem, sides, x)
+    sense = np.array([outwards(problem, side) for side in sides])
+    gradients = gradients[..., part] * sense[:, None]
+    size = np.sqrt((gradients**2).sum(-1))
+    good = size > 0.0
+    normal = np.where(good[..., None], gradients / np.where(good, size, 1.0)[..., None], 0.0)
+    return np.where(good, -sense * values / np.where(good, size, 1.0), np.inf), normal
+
+
+def _departures(
+    problem: Problem, sides: tuple[Level, ...], x: Array, spread: Array, values: Array, normal: Array, near: Array
+) -> Array:
+    """Return by how many metres near bounds (N, h) depart from their planes three deviations away."""
+    give, d = np.zeros(values.shape), spread.shape[-1]
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    curved = np.array([not is_flat(problem, side) for side in sides])
+    items = np.flatnonzero((near & curved).any(1))
+    if not len(items):
+        return give
+    own, part_of = problem.take(items), x[items]
+    steps = np.sqrt(np.maximum(np.diagonal(spread[items], axis1=-2, axis2=-1), 0.0))
+    worst = np.zeros((len(items), len(sides)))
+    for i in range(d):
+        for sign in (-AWAY, AWAY):
+            # the row of a covariance over its deviation is the step along which a coordinate changes most
+            step = sign * spread[items, i] / np.where(steps[:, i] > 0.0, steps[:, i], 1.0)[:, None]
+            moved = np.array(part_of)
+            moved[:, part] += step
+            there = _planes(own, sides, moved, part)[0]
+            plane = values[items] - (normal[items] * step[:, None]).sum(-1)
+            worst = np.maximum(worst, np.where(np.isfinite(there), np.abs(there - plane), np.inf))
+    give[items] = np.where(near[items] & curved, worst, 0.0)
+    return give
+
+
+def _edges(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
+    """Return unit vectors (N, h, d) along the edges of polygons, and where these end (N, h, 2), metres from the fix."""
+    n, d = len(x), part.stop - part.start
+    along, span = np.zeros((n, len(sides), d)), np.tile([-np.inf, np.inf], (n, len(sides), 1))
+    for i, side in enumerate(sides):
+        region = problem.constraints[side.constraint]
+        if isinstance(region, Polygon):
+            assert isinstance(side.side, int)
+            ends = region.vertices[[side.side, (side.side + 1) % len(region.vertices)]]
+            unit = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+            along[:, i, :2] = unit
+            span[:, i] = ((ends[None] - x[:, None, part.start : part.start + 2]) * unit).sum(-1)
+    return along, span
+
+
+def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Truncated) -> Array:
+    """Return by how much the cost inwards of the bounds that hold fixes departs from a Gaussian's, (N,).
+
+    ``|ln((f(x + s t) - f(x)) / q)|``, the largest over the directions t that leave one bound and keep to the others.
+    The step s is where the quadratic model has grown by q = 9, or where another bound ends it.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one static position.
+    x : array (N, size)
+        Fixes that bounds hold.
+    covariance : array (N, n, n)
+        Of the shared unknowns without the inequalities.
+    law : Truncated
+        Of the fixes.
+    """
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    d = slot.size
+    moved, grown = np.zeros((len(x), d, d)), np.ones((len(x), d))
+    for i in range(len(x)):
+        for k, (step, increase) in enumerate(_inward_steps(take(law, i))):
+            moved[i, k], grown[i, k] = step, increase
+    spread = covariance[:, part, part]
+    pull = covariance[:, :, part] @ np.linalg.pinv(spread, hermitian=True)
+    with np.errstate(all="ignore"):
+        return Look(problem, x, pull, part, exact(problem)).departs(moved, np.sqrt(grown))
+
+
+def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
+    """Return steps (d,) from one fix inwards of each bound that holds it, and by how much the model grows there."""
+    factor = factor_of(law.covariance)
+    turned = law.normal @ factor
+    sigma = np.sqrt((turned**2).sum(-1))
+    held = np.flatnonzero((law.slack <= _ON * sigma) & (sigma > 0.0) & _beside(law))[: factor.shape[0]]
+    unit = turned[held] / sigma[held, None]
+    middle = np.linalg.solve(factor.T @ factor, factor.T @ law.shift)
+    others = np.where(np.isin(np.arange(len(sigma)), held), np.inf, law.slack)
+    rest = replace(law, slack=others)
+    found = []
+    for k in range(len(held)):
+        beside = np.delete(unit, k, axis=0)
+        inward = -unit[k] + beside.T @ (np.linalg.pinv(beside.T) @ unit[k]) if len(beside) else -unit[k]
+        size = np.sqrt((inward**2).sum())
+        if size > _ALONG:
+            inward = inward / size
+            lean = float(inward @ middle)
+            end = float(rest.exits((factor @ inward)[None])[0])
+            length = min(lean + np.sqrt(lean**2 + AWAY**2), end)
+            found.append((length * (factor @ inward), max(length**2 - 2.0 * lean * length, 1e-300)))
+    return found
+
+
+def _beside(law: Truncated) -> Array:
+    """Return a flag (h,) for bounds without ends, and for edges with the fix between their ends."""
+    reach = _ON * np.sqrt(np.trace(law.covariance))
+    return np.asarray((law.span[:, 0] <= reach) & (law.span[:, 1] >= -reach))
+
+
+def covariance_of(law: Truncated, covariance: Array, part: slice) -> Array:
+    """Return the covariance (n, n) of the shared unknowns of one fix whose position is cut off.
+
+    The others follow the position as they do without the bounds; `part` says where it is among them.
+    """
+    pull = covariance[:, part] @ np.linalg.pinv(law.covariance, hermitian=True)
+    return np.asarray(covariance + pull @ (law.moments()[1] - law.covariance) @ pull.T)
