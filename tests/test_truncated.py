@@ -47,6 +47,13 @@ def test_moments_regions_and_intervals_are_those_of_samples(seed, d):
     assert ((points[:, 0] >= low) & (points[:, 0] <= high)).mean() == pytest.approx(0.95, abs=0.01)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 4, 6])
+def test_one_bound_in_closed_form_is_as_the_rays_have_it(seed):
+    law, _ = drawn_law(seed, 2 + seed // 4)
+    for one, other in zip(law.moments(), law.moments_by_rays(), strict=True):
+        np.testing.assert_allclose(one, other, atol=5e-3 * np.trace(law.covariance))
+
+
 def test_an_interval_reaches_the_bound_and_is_the_shortest():
     sigma, level = 2.0, 0.9
     law = half_spaces(np.array([[1.0, 0.0]]), np.zeros(1), np.array([1.0, 0.0]), np.diag([sigma**2, 1.0]))

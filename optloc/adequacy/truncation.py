@@ -198,9 +198,9 @@ def _beside(law: Truncated) -> Array:
 
 
 def covariance_of(law: Truncated, covariance: Array, part: slice) -> Array:
-    """Return the covariance (n, n) of the shared unknowns of one fix whose position is cut off.
+    """Return the covariances (N, n, n) of the shared unknowns of fixes whose positions are cut off.
 
     The others follow the position as they do without the bounds; `part` says where it is among them.
     """
-    pull = covariance[:, part] @ np.linalg.pinv(law.covariance, hermitian=True)
-    return np.asarray(covariance + pull @ (law.moments()[1] - law.covariance) @ pull.T)
+    pull = covariance[..., part] @ np.linalg.pinv(law.covariance, hermitian=True)
+    return np.asarray(covariance + pull @ (law.moments()[1] - law.covariance) @ np.swapaxes(pull, -1, -2))

@@ -404,9 +404,11 @@ def _cut_off(problem: Problem, pool: Pool, law: Truncated) -> Array:
     out = np.array(curvature.covariance)
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
-    for i in np.flatnonzero(law.cuts):
-        free = out[i] if curvature.free is None or pool.face[i, 0] == 0 else curvature.free[i]
-        out[i] = covariance_of(take(law, i), free, part)
+    items = np.flatnonzero(law.cuts)
+    free = out[items]
+    if curvature.free is not None:
+        free = np.where((pool.face[items, 0] > 0)[:, None, None], curvature.free[items], free)
+    out[items] = covariance_of(take(law, items), free, part)
     return out
 
 
