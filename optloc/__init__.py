@@ -76,6 +76,7 @@ if TYPE_CHECKING:
     from optloc.solvers.prepared import Prepared, prepare
     from optloc.solvers.robust.stage import rejected
     from optloc.solvers.running import Running
+    from optloc.solvers.status_shares import StatusShares, status_shares
     from optloc.solvers.suspects.stage import suspects
     from optloc.uncertainty.arc import Arc, trace_arc
     from optloc.uncertainty.posterior import Mixture, Samples, mixture, samples
@@ -140,6 +141,7 @@ __all__ = [
     "Stage",
     "Stations",
     "Status",
+    "StatusShares",
     "Suspect",
     "accuracy",
     "advise",
@@ -183,6 +185,7 @@ __all__ = [
     "simulate",
     "solve",
     "station_array",
+    "status_shares",
     "suspects",
     "trace_arc",
     "units",
@@ -239,6 +242,7 @@ _HOMES = {
     "solvers.prepared": "Prepared prepare",
     "solvers.robust.stage": "rejected",
     "solvers.running": "Running",
+    "solvers.status_shares": "StatusShares status_shares",
     "linear.least_squares_ranges": "reduce",
     "solvers.suspects.stage": "suspects",
     "adequacy.coplanar": "distance_from_plane",

@@ -25,6 +25,43 @@ _LEAST = (1e-3, 1.0)  # least side of a map, about 100 m in degrees, or 1 m: a s
 
 
 @dataclass(frozen=True, slots=True)
+class Grid:
+    """Places of a map, at one height.
+
+    Parameters
+    ----------
+    x, y : array (nx,), (ny,)
+        Longitude and latitude in degrees on Earth, else metres of the frame.
+    height : float
+        Above the ellipsoid on Earth, else the third coordinate; 0 in the plane; metres.
+    places : array (ny nx, d)
+        Metres, in the frame; x varies fastest.
+    slot : slice
+        Of the position among the shared unknowns.
+    stations : array (s, 2)
+        As x and y.
+    names : tuple of s str
+        Of the stations.
+    geodetic : bool
+        Whether x and y are degrees.
+    """
+
+    x: Array
+    y: Array
+    height: float
+    places: Array
+    slot: slice
+    stations: Array
+    names: tuple[str, ...]
+    geodetic: bool
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return the numbers of rows and columns of places."""
+        return len(self.y), len(self.x)
+
+
+@dataclass(frozen=True, slots=True)
 class BoundMap:
     """The bound of the position over a grid of places, at one height.
 
@@ -90,39 +127,46 @@ def bound_map(
     InvalidProblem
         Where no position or more than one is sought, or every epoch of a run has one of its own.
     """
-    slot = _slot(problem)
-    earth = problem.frame.geodetic and problem.dimension == 3 if geodetic is None else geodetic
-    east, north = np.meshgrid(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
-    places = _places(problem.frame, east.ravel(), north.ravel(), height, problem.dimension, earth)
+    grid = grid_of(problem, x, y, height, geodetic)
     single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
-    vectors = np.tile(np.asarray(truth, dtype=float), (len(places), 1))
-    vectors[:, slot] = places
+    vectors = np.tile(np.asarray(truth, dtype=float), (len(grid.places), 1))
+    vectors[:, grid.slot] = grid.places
     parts = []
-    for first in range(0, len(places), _AT_ONCE):
+    for first in range(0, len(vectors), _AT_ONCE):
         bound = np.asarray(crlb(single, vectors[first : first + _AT_ONCE]))
-        parts.append(bound[..., slot, slot])
+        parts.append(bound[..., grid.slot, grid.slot])
     covariance = np.concatenate(parts)
     # in east, north and up at each place: plan and height are of the place, not of the frame
-    axes = problem.frame.enu_axes(places)
+    axes = problem.frame.enu_axes(grid.places)
     variance = np.maximum(np.diagonal(axes @ covariance @ np.swapaxes(axes, -1, -2), axis1=-2, axis2=-1), 0.0)
-    plan, shape = np.sqrt(variance[:, :2].sum(-1)), east.shape
-    up = np.sqrt(variance[:, 2]) if problem.dimension == 3 else np.full(len(places), np.nan)
+    plan = np.sqrt(variance[:, :2].sum(-1))
+    up = np.sqrt(variance[:, 2]) if problem.dimension == 3 else np.full(len(vectors), np.nan)
+    return BoundMap(
+        grid.x,
+        grid.y,
+        grid.height,
+        np.sqrt(variance.sum(-1)).reshape(grid.shape),
+        plan.reshape(grid.shape),
+        up.reshape(grid.shape),
+        _deviation(problem),
+        grid.stations,
+        grid.names,
+        grid.geodetic,
+    )
+
+
+def grid_of(problem: Problem, x: Array, y: Array, height: float, geodetic: bool | None = None) -> Grid:
+    """Return the grid of a map; arguments and exceptions as of `bound_map`."""
+    slot = _slot(problem)
+    earth = problem.frame.geodetic and problem.dimension == 3 if geodetic is None else geodetic
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    east, north = np.meshgrid(x, y)
+    places = _places(problem.frame, east.ravel(), north.ravel(), height, problem.dimension, earth)
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     marks = map_coordinates(problem.frame, stations, earth)[:, :2]
     if earth:  # a map across the date line has longitudes beyond 180 degrees, and its stations have, too
         marks[:, 0] = (marks[:, 0] - np.mean(x) + 180.0) % 360.0 - 180.0 + np.mean(x)
-    return BoundMap(
-        np.asarray(x, dtype=float),
-        np.asarray(y, dtype=float),
-        float(height),
-        np.sqrt(variance.sum(-1)).reshape(shape),
-        plan.reshape(shape),
-        up.reshape(shape),
-        _deviation(problem),
-        marks,
-        problem.stations.names,
-        earth,
-    )
+    return Grid(x, y, float(height), places, slot, marks, problem.stations.names, earth)
 
 
 def _slot(problem: Problem) -> slice:

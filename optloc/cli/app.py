@@ -304,6 +304,8 @@ def simulate(
         "optloc crlb flight.toml --at 200e3,300e3,0 --plot bound.png",
         "optloc crlb site.toml --map bound.html --height '1200 m'",
         "optloc crlb site.toml --map bound.geojson --extent 11,11.5,47.6,48",
+        "optloc crlb site.toml --status --at 1200,800,50",
+        "optloc crlb site.toml --status --map share.png --height '1200 m'",
     ),
 )
 def crlb(
@@ -326,6 +328,9 @@ def crlb(
         str | None, typer.Option(metavar="X0,X1,Y0,Y1", help="Limits of the map: metres, or degrees on Earth.")
     ] = None,
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
+    status: Annotated[bool, typer.Option("--status", help="Simulate fixes, and give the share of each status.")] = False,
+    trials: Annotated[int | None, typer.Option(min=1, help="Fixes at each place; 200, or 50 of a map.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides the draws of --status.")] = 0,
     as_json: Json = False,
     outside: Outside = False,
     budget: Budget = None,
@@ -337,7 +342,18 @@ def crlb(
 
     Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs.
     With --map it is drawn over the place of the target instead.
+    With --status measurements are simulated, and the share of each status of their fixes is given, or mapped.
     """
+    if status:
+        from optloc.cli.crlb import run_status, run_status_map
+
+        if map_ is not None:
+            raise typer.Exit(
+                run_status_map(file, map_, at, height, extent, velocity, trials or 50, seed, geodetic=geodetic)
+            )
+        raise typer.Exit(
+            run_status(file, at, velocity, trials or 200, seed, geodetic=geodetic, as_json=as_json, quiet=quiet)
+        )
     # A map needs no truth: it is drawn around the stations, or the place of the fix.
     if map_ is not None:
         from optloc.cli.crlb import run_map

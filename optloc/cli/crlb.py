@@ -33,6 +33,8 @@ _LINES, _BOUNDS, _MEMBERS = 10, 30, 16
 _POINTS, _UNKNOWNS = 400, 100
 # Points along each side of a map: isolines are smooth, and the 9216 bounds take less than a second.
 _MAP_POINTS = 96
+# The same of a map of statuses, whose places need a hundred fixes each.
+_STATUS_POINTS = 24
 _UNITS = {"length": "m", "speed": "m/s"}
 _RMS = {True: " (rms)", False: ""}
 
@@ -300,17 +302,28 @@ def run_map(
         raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
     loaded = read(file, values=False)
     claim_outputs(out, inputs=[file])
-    problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
-    # One map: epochs apart are mapped as the first of them is.
-    problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
+    problem = _of_one_epoch(loaded.problem)
     truth = vector(problem, at, velocity, geodetic)
-    place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
-    x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
-    grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
-    found = bound_map(problem, truth, *grid, _height(problem, place, height))
+    grid, level = _grid(file, problem, at, truth, height, limits, _MAP_POINTS)
+    found = bound_map(problem, truth, *grid, level)
     what = "dilution of precision" if dilution else "bound of the position error"
     _write_map(found, out, f"{loaded.title}: {what}", dilution=dilution)
     return 0
+
+
+def _of_one_epoch(problem: Problem) -> Problem:
+    """Return a problem, of epochs that share nothing the first: they are mapped as it is."""
+    apart = by_epoch(problem) if separable(problem) else problem
+    return apart.flat().take(np.zeros(1, dtype=int)) if apart.batch_shape else apart
+
+
+def _grid(
+    file: Path, problem: Problem, at: str | None, truth: Array, height: str | None, limits: str | None, points: int
+) -> tuple[tuple[Array, Array], float]:
+    """Return the coordinates of a map, with a number of points along each side, and its height, metres."""
+    place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
+    x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
+    return (np.linspace(x0, x1, points), np.linspace(y0, y1, points)), _height(problem, place, height)
 
 
 def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
@@ -370,6 +383,83 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
     from optloc.report import map_page
 
     write_text(out, map_page(found, title))
+
+
+# The status of fixes.
+
+
+def run_status(
+    file: Path,
+    at: str | None,
+    velocity: str | None,
+    trials: int,
+    seed: int,
+    *,
+    geodetic: bool,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Print the shares of the statuses of simulated fixes at a truth or at the fix, and return the exit code."""
+    from optloc.solvers.status_shares import status_shares
+
+    loaded = read(file, values=False)
+    problem = _of_one_epoch(loaded.problem)
+    truth = vector(problem, at, velocity, geodetic)
+    if at is None and _sought(problem):
+        truth = _solve(file).reshape(-1, len(truth))[0]
+        if not np.isfinite(truth).all():
+            raise InvalidProblem("the file has no fix to simulate at", loaded.source, "give a place with --at")
+    found = status_shares(problem, truth, trials, seed)
+    if as_json:
+        told = dict(zip((one.label for one in found.statuses), found.share, strict=True))
+        made = {"file": loaded.source, "trials": trials, "seed": seed, "share": told, "covered95": found.covered}
+        write_text(Path("-"), dumps(made))
+    elif not quiet:
+        table = Table(title=f"{loaded.title}: status of {trials} simulated fixes", title_justify="left")
+        for name, side in (("status", "left"), ("share, %", "right"), ("standard error, %", "right")):
+            table.add_column(name, justify="right" if side == "right" else "left")
+        for status, share, error in zip(found.statuses, found.share, found.deviation, strict=True):
+            table.add_row(status.label, f"{100.0 * share:.1f}", f"{100.0 * error:.1f}")
+        console = Screen()
+        console.print(table)
+        if np.isfinite(found.covered):
+            console.print(
+                f"Of the ok fixes {100.0 * float(found.covered):.1f} % hold the true place in their 95 % region."
+            )
+    return 0
+
+
+def run_status_map(
+    file: Path,
+    out: Path,
+    at: str | None,
+    height: str | None,
+    limits: str | None,
+    velocity: str | None,
+    trials: int,
+    seed: int,
+    *,
+    geodetic: bool,
+) -> int:
+    """Write the map of the share of `ok` fixes of a file, and return the exit code."""
+    from optloc.plot import plot_status_map, status_geojson
+    from optloc.solvers.status_shares import status_map
+
+    ending = out.suffix.lower()
+    if ending not in (*PICTURES, ".geojson"):
+        advice = "use .png, .svg, .pdf or .geojson"
+        raise InvalidProblem(f"status maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
+    loaded = read(file, values=False)
+    claim_outputs(out, inputs=[file])
+    problem = _of_one_epoch(loaded.problem)
+    truth = vector(problem, at, velocity, geodetic)
+    grid, level = _grid(file, problem, at, truth, height, limits, _STATUS_POINTS)
+    found = status_map(problem, truth, *grid, level, trials=trials, seed=seed)
+    if ending == ".geojson":
+        write_text(out, dumps(status_geojson(found)))
+    else:
+        write_picture(plot_status_map(found, f"{loaded.title}: share of ok fixes"), out)
+    return 0
 
 
 # Draws.

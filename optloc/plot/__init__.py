@@ -3,7 +3,7 @@
 matplotlib is imported where it is used. Colours are those of Okabe and Ito, and every kind of point has its own mark.
 """
 
-from optloc.plot.bound_map import map_geojson, plot_bound_map
+from optloc.plot.bound_map import map_geojson, plot_bound_map, plot_status_map, status_geojson
 from optloc.plot.fixes import plot_fixes
 from optloc.plot.landscape import plot_convergence, plot_landscape
 from optloc.plot.residuals import plot_health, plot_residuals
@@ -22,6 +22,8 @@ __all__ = [
     "plot_health",
     "plot_landscape",
     "plot_residuals",
+    "plot_status_map",
     "plot_tracks",
     "save",
+    "status_geojson",
 ]

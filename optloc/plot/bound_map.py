@@ -1,4 +1,4 @@
-"""Maps of the Cramer-Rao bound as pictures and as isolines."""
+"""Maps of the Cramer-Rao bound and of the share of `ok` fixes, as pictures, isolines and places."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap
+from optloc.base.types import Array, Status
+from optloc.bounds.bound_map import BoundMap, Grid
 from optloc.plot.outlines import feature, line_geometry, point_geometry
 from optloc.plot.style import BLACK, GREY, apart, figure_class, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
+
+    from optloc.solvers.status_shares import StatusMap
 
 COLOURS = "GnBu"
 """Light to dark in one hue: legible in grey and without colour vision, and black lines stay visible."""
@@ -25,10 +28,17 @@ _STEPS = (1.0, 2.0, 5.0)
 _BETWEEN = {1.0: (1.2, 1.5), 2.0: (3.0,), 5.0: (7.0,)}
 # Levels at most: lines of more run into each other.
 _LEVELS = 9
+_NOT_ON_EARTH = (
+    "GeoJSON needs positions on Earth, but the frame is cartesian",
+    "map",
+    'give a [frame] of kind "geodetic", "ecef" or "enu"',
+)
 # Stations that are named.
 _NAMED = 12
 # Decimals of a degree of isolines: a tenth of a metre.
 _DIGITS = 6
+# Isolines of a share, percent: few fixes, half of them, most, nearly all.
+_SHARES = (10.0, 50.0, 90.0, 99.0)
 # Side of a map from which it is in kilometres, metres.
 _FAR = 5e3
 
@@ -59,24 +69,52 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
 
     values, name = _drawn(found, dilution=dilution)
     steps = levels(values)
-    scale = 1.0 if found.geodetic or max(np.ptp(found.x), np.ptp(found.y)) < _FAR else 1e-3
-    x, y = found.x * scale, found.y * scale
+    norm = LogNorm(steps[0], max(steps[-1], steps[0] * 2.0))
+    return _draw(found, values, steps, norm, name, title)
+
+
+def plot_status_map(found: StatusMap, title: str = "") -> Figure:
+    """Return a map of the share of `ok` fixes, with isolines and stations.
+
+    Parameters
+    ----------
+    found : StatusMap
+        The shares over a grid.
+    title : str
+        Title of the picture.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+    """
+    from matplotlib.colors import Normalize
+
+    values = 100.0 * found.shares.of(Status.OK)
+    return _draw(found.grid, values, list(_SHARES), Normalize(0.0, 100.0), "fixes with status ok (%)", title)
+
+
+def _draw(grid: BoundMap | Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
+    """Return a map of values (ny, nx) with isolines at steps."""
+    scale = 1.0 if grid.geodetic or max(np.ptp(grid.x), np.ptp(grid.y)) < _FAR else 1e-3
+    x, y = grid.x * scale, grid.y * scale
     # A degree of longitude is shorter than one of latitude: one scale on both axes, at the middle of the map.
-    squeeze = np.cos(np.radians(found.y.mean())) if found.geodetic else 1.0
+    squeeze = np.cos(np.radians(grid.y.mean())) if grid.geodetic else 1.0
     tall = float(np.clip(np.ptp(y) / (np.ptp(x) * squeeze), 0.4, 1.6))
     figure = figure_class()(figsize=(6.4, 0.9 + 5.2 * tall), layout="compressed")
     axes = figure.subplots()
-    norm = LogNorm(steps[0], max(steps[-1], steps[0] * 2.0))
     drawn = axes.pcolormesh(x, y, values, norm=norm, cmap=COLOURS, shading="nearest", rasterized=True)
-    lines = axes.contour(x, y, values, levels=steps, colors=BLACK, linewidths=0.8)
-    axes.clabel(lines, fmt=lambda value: f"{value:g}", fontsize=8)
-    _mark_stations(axes, found.stations * scale, found.names, x, y)
+    crossed = [step for step in steps if np.nanmin(values) < step < np.nanmax(values)]
+    if crossed:
+        lines = axes.contour(x, y, values, levels=crossed, colors=BLACK, linewidths=0.8)
+        axes.clabel(lines, fmt=lambda value: f"{value:g}", fontsize=8)
+    _mark_stations(axes, grid.stations * scale, grid.names, x, y)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
     axes.set_aspect(1.0 / squeeze)
-    unit = "deg" if found.geodetic else "m" if scale == 1.0 else "km"
-    axes.set_xlabel(f"{'longitude' if found.geodetic else 'x'} ({unit})")
-    axes.set_ylabel(f"{'latitude' if found.geodetic else 'y'} ({unit})")
+    unit = "deg" if grid.geodetic else "m" if scale == 1.0 else "km"
+    axes.set_xlabel(f"{'longitude' if grid.geodetic else 'x'} ({unit})")
+    axes.set_ylabel(f"{'latitude' if grid.geodetic else 'y'} ({unit})")
     bar = figure.colorbar(drawn, ax=axes, label=name, ticks=steps, format=lambda value, _: f"{value:g}", pad=0.02)
     bar.ax.minorticks_off()
     if title:
@@ -154,14 +192,37 @@ def map_geojson(found: BoundMap) -> dict[str, Any]:
         Where the frame is not on Earth, or matplotlib is missing.
     """
     if not found.geodetic:
-        advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
-        raise InvalidProblem("GeoJSON needs positions on Earth, but the frame is cartesian", "map", advice)
-    features = [
-        feature(point_geometry(place, _DIGITS), {"role": "station", "name": name})
-        for name, place in zip(found.names, found.stations, strict=True)
-    ]
+        raise InvalidProblem(*_NOT_ON_EARTH)
+    features = _station_features(found)
     for level, lines in isolines(found):
         if lines:
             about = {"role": "bound", "sigma_m": level, "height": found.height}
             features.append(feature(line_geometry(lines, _DIGITS), about))
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _station_features(grid: BoundMap | Grid) -> list[dict[str, Any]]:
+    return [
+        feature(point_geometry(place, _DIGITS), {"role": "station", "name": name})
+        for name, place in zip(grid.names, grid.stations, strict=True)
+    ]
+
+
+def status_geojson(found: StatusMap) -> dict[str, Any]:
+    """Return stations and places with the shares of all statuses as a GeoJSON feature collection (RFC 7946).
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth.
+    """
+    grid, shares = found.grid, found.shares
+    if not grid.geodetic:
+        raise InvalidProblem(*_NOT_ON_EARTH)
+    features = _station_features(grid)
+    for j, lat in enumerate(grid.y):
+        for i, lon in enumerate(grid.x):
+            told = {one.label: float(share) for one, share in zip(shares.statuses, shares.share[j, i], strict=True)}
+            about = {"role": "status", "height": grid.height, "trials": shares.trials, "share": told}
+            features.append(feature(point_geometry(np.array([lon, lat]), _DIGITS), about))
     return {"type": "FeatureCollection", "features": features}
