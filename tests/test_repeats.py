@@ -134,3 +134,17 @@ def test_priors_are_measurements_that_are_repeated() -> None:
 
 def test_the_shares_that_are_enough_are_below_the_levels() -> None:
     assert all(share < level for share, level in zip(ENOUGH, (0.95, 0.999), strict=True))
+
+
+def test_a_tracker_starts_from_the_covariance_that_repeats_inflate() -> None:
+    problem = simulate(*valley(5.0, 1.5), 0, 30)
+    many = solve(problem)
+    tails = many.has(Status.TAILS)
+    assert tails.sum() > 5
+    ratio = many.gaussian()[1][..., 0, 0] / many.cov[..., 0, 0]
+    assert (ratio[~tails & np.isfinite(ratio)] == 1.0).all()
+    assert (ratio[tails] >= 1.0).all()
+    assert ratio[tails].max() < 4.0  # 88 % of the ellipses hold
+    first = int(np.flatnonzero(tails)[0])
+    one = solve(problem.take(np.array([first])))
+    np.testing.assert_allclose(one.gaussian()[1][0], many.gaussian()[1][first], rtol=1e-6)

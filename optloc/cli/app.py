@@ -328,7 +328,9 @@ def crlb(
         str | None, typer.Option(metavar="X0,X1,Y0,Y1", help="Limits of the map: metres, or degrees on Earth.")
     ] = None,
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
-    status: Annotated[bool, typer.Option("--status", help="Simulate fixes, and give the share of each status.")] = False,
+    status: Annotated[
+        bool, typer.Option("--status", help="Simulate fixes, and give the share of each status.")
+    ] = False,
     trials: Annotated[int | None, typer.Option(min=1, help="Fixes at each place; 200, or 50 of a map.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides the draws of --status.")] = 0,
     as_json: Json = False,

@@ -157,6 +157,8 @@ class Chart:
         Mean of the stations, metres.
     truncated : Truncated, optional
         The normal laws that bounds cut off: for fixes in metres they replace `covariance`.
+    inflation : array (...), optional
+        Factors of the covariances of fixes with the finding `tails`, with which trackers start from them; else 1.
     """
 
     kind: Annotated[Array, Axes(0, empty=CURVED)]
@@ -164,6 +166,7 @@ class Chart:
     covariance: Annotated[Array, Axes(2)]
     centre: Annotated[Array, Axes(1)]
     truncated: Truncated | None = None
+    inflation: Annotated[Array, Axes(0, empty=1.0)] | None = None
 
     @property
     def name(self) -> Any:

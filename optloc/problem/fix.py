@@ -414,10 +414,12 @@ class Fix:
 
     def gaussian(self) -> tuple[Array, Array]:
         """Return mean (..., n) and covariance (..., n, n), cut off by bounds, of the unknowns: a start of a tracker."""
-        mean = self.x[..., : self.layout.n_shared]
-        if self.chart is None or self.chart.truncated is None:
-            return mean, self.cov
-        return self.chart.mean_of(mean, self.cov, self.layout.find("position")[0].start), self.cov
+        mean, cov = self.x[..., : self.layout.n_shared], self.cov
+        if self.chart is not None and self.chart.truncated is not None:
+            mean = self.chart.mean_of(mean, cov, self.layout.find("position")[0].start)
+        if self.chart is not None and self.chart.inflation is not None:
+            cov = cov * self.chart.inflation[..., None, None]
+        return mean, cov
 
     @property
     def suspects(self) -> Any:

@@ -52,8 +52,9 @@ class Curvature:
     kappa : array (N, 2), optional
         By how much the cost departs from that of a Gaussian three sigma away, in metres and in inverse range
         (`optloc.adequacy.shape`); NaN where nobody has looked.
-    repeats : array (N, 2), optional
-        Shares of repeated measurements whose ellipses hold (`optloc.solvers.verdict.repeats`); NaN if not tried.
+    repeats : array (N, 3), optional
+        Shares of repeated measurements whose ellipses hold, and the inflation with which 95 % would
+        (`optloc.solvers.verdict.repeats`); NaN if not tried.
     free : array (N, n, n), optional
         Covariance without the inequalities that hold fixes; NaN where none does, or where it does not exist.
     shift : array (N, n), optional

@@ -322,12 +322,14 @@ class Single:
             marks.append(marks_of(one.cost > self.refuted, more, self.region, gap, one.kappa, self.map is not None))
             kinds.append(chart_kind(one.kappa, one.kappa_far))
             gaps.append(ambiguity(self.problem, gap) if gap < AMBIGUOUS_GAP else "")
-        for i in self._held(answer, marks, room):
+        inflation = self._inflations(answer, marks, room)
+        for i in inflation:
             marks[i], kinds[i] = Status.TAILS.mark, CARTESIAN if kinds[i] == CURVED else kinds[i]
         told = _told(tuple(marks), tuple(kinds), tuple(gaps), shape)
         if told is None:
             return None
         x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
+        inflations = np.array([inflation.get(i, 1.0) for i in range(len(found))]).reshape(shape) if inflation else None
         held, alone = active_of(self.plan, answer.multiplier), all(one.rival_cost == inf for one in found)
         cost, claims, d = answer.cost.reshape(shape).copy(), room.claims, self.load.place.shape[-1]
         if self.map is not None:
@@ -346,21 +348,21 @@ class Single:
             cost=cost,
             stages=stages,
             marks=told.marks,
-            chart=Chart(told.kind, x[..., :d], covariance[..., :d, :d], room.centre),
+            chart=Chart(told.kind, x[..., :d], covariance[..., :d, :d], room.centre, inflation=inflations),
             infinity=answer.infinity.reshape(shape) - cost,
             alternatives=room.alone if alone else _rivals(answer, shape),
             active=room.nothing if held is None else held.reshape(shape),
             **room.kept,
         )
 
-    def _held(self, answer: Any, marks: list[int], room: _Room) -> list[int]:
-        """Return the numbers of curved fixes whose 95 % figures hold when the measurement is repeated."""
+    def _inflations(self, answer: Any, marks: list[int], room: _Room) -> dict[int, float]:
+        """Return the inflations of curved fixes, by number, whose 95 % figures hold when measurements are repeated."""
         items = [i for i, mark in enumerate(marks) if mark == Status.CURVED.mark]
         if not items or not self.repeatable:
-            return []
+            return {}
         many = self.problem.with_rows(z=room.z[items]).flat()
-        held = holds(repeat(many, answer.x[items], answer.covariance[items]))
-        return [i for i, good in zip(items, held, strict=True) if good]
+        found = repeat(many, answer.x[items], answer.covariance[items])
+        return {i: float(one[2]) for i, one, good in zip(items, found, holds(found), strict=True) if good}
 
     def _room(self, shape: tuple[int, ...]) -> _Room:
         """Return the arrays of this thread for so many problems."""

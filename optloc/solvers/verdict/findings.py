@@ -257,9 +257,9 @@ def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
         items = items[np.isnan(pool.pair[items, 0]).any(-1)]
     if not len(items):
         return pool
-    shares = np.full((len(pool), 2), np.nan)
-    shares[items] = repeat(problem.take(items), pool.x[items, 0], pool.curvature.covariance[items])
-    return replace(pool, curvature=replace(pool.curvature, repeats=shares))
+    found = np.full((len(pool), 3), np.nan)
+    found[items] = repeat(problem.take(items), pool.x[items, 0], pool.curvature.covariance[items])
+    return replace(pool, curvature=replace(pool.curvature, repeats=found))
 
 
 def repeats_hold(curvature: Curvature | None) -> Any:
@@ -394,9 +394,10 @@ def chart_of(
             kind = chart_kind(curvature.kappa[:, 0], curvature.kappa[:, 1]).astype(np.int8)
         # in metres the 95 % figures cover
         kind[repeats_hold(curvature) & (kind == CURVED)] = CARTESIAN
+    inflation = None if curvature.repeats is None else np.where(holds(curvature.repeats), curvature.repeats[:, 2], 1.0)
     centre = centre_of(problem)
     centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
-    return Chart(kind, x[:, part], covariance[:, part, part], centre, truncated)
+    return Chart(kind, x[:, part], covariance[:, part, part], centre, truncated, inflation)
 
 
 def chart_kind(metres: Any, inverse: Any) -> Any:

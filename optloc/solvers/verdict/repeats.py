@@ -56,14 +56,16 @@ def is_repeatable(problem: Problem) -> bool:
     return all(problem.layout.find(name)[1] for name, _, _ in prior_parts(problem))
 
 
-def holds(shares: Array) -> Array:
-    """Return whether the shares (N, 2) of repeats are enough, (N,); not where they are NaN."""
+def holds(found: Array) -> Array:
+    """Return a flag for repeats (N, 3) whose shares are large enough, (N,); False for NaN."""
     with np.errstate(invalid="ignore"):
-        return np.asarray((shares >= ENOUGH).all(-1))
+        return np.asarray((found[:, :2] >= ENOUGH).all(-1))
 
 
 def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
-    """Return the shares (N, 2) of repeats whose ellipses at `LEVELS` hold the place of the measurement.
+    """Return the shares of repeats whose ellipses at `LEVELS` hold their places, and an inflation, (N, 3).
+
+    The inflation is the factor of the covariance with which 95 % of the ellipses would hold; it is 1 or more.
 
     Parameters
     ----------
@@ -74,7 +76,7 @@ def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
     covariance : array (N, n, n)
         Of their shared unknowns.
     """
-    out, problem = np.empty((len(x), len(LEVELS))), replace(problem, constraints=())
+    out, problem = np.empty((len(x), len(LEVELS) + 1)), replace(problem, constraints=())
     for items in _parts(len(x)):
         out[items] = _shares(problem.take(items), x[items], covariance[items])
     return out
@@ -87,7 +89,7 @@ def _parts(count: int) -> Iterator[Array]:
 
 
 def _shares(problem: Problem, x: Array, covariance: Array) -> Array:
-    """Return the shares of a part of the batch."""
+    """Return the shares and inflations of a part of the batch."""
     each = np.repeat(np.arange(len(x)), _REPEATS)
     truth, noise, means = _drawn(problem, x, covariance)
     many = _with_priors(problem.take(each), means)
@@ -108,8 +110,12 @@ def _shares(problem: Problem, x: Array, covariance: Array) -> Array:
         form = (away * linalg.solve(spread[:, part, part], away[..., None])[0][..., 0]).sum(-1)
     # a repeat that ends nowhere holds nothing
     good = ok & regular & (done.status == Status.OK) & np.isfinite(form)
-    held = [good & (form <= quantile(level, problem.dimension)) for level in LEVELS]
-    return np.stack([one.reshape(len(x), _REPEATS).mean(1) for one in held], axis=-1)
+    form = np.where(good, form, np.inf).reshape(len(x), _REPEATS)
+    limits = [quantile(level, problem.dimension) for level in LEVELS]
+    shares = [(form <= limit).mean(1) for limit in limits]
+    # the place among 48 at which 95 % are no larger
+    last = np.sort(form, axis=1)[:, int(np.ceil(LEVELS[0] * _REPEATS)) - 1]
+    return np.stack([*shares, np.maximum(1.0, last / limits[0])], axis=-1)
 
 
 def _with_priors(problem: Problem, means: dict[str, Array]) -> Problem:
