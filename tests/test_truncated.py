@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import optloc
 from optloc import Status, assemble, constraints, measured, mixture, samples, solve, station_array
 from optloc.problem.chart import quantile
 from optloc.problem.truncated import Truncated
@@ -143,3 +144,42 @@ def test_a_batch_is_cut_off_as_each_of_its_fixes_is():
     np.testing.assert_allclose([low[0], high[0]], fix.interval("x"), rtol=1e-4)
     points = np.array([[8.0, 4.0], [9.5, 4.0]])
     np.testing.assert_array_equal(many[2].covers(points), fix.covers(points))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_box_without_any_bound_is_no_box(count):
+    rng, nowhere = np.random.default_rng(2), np.full(2, np.inf)
+    free, boxed = (ranged(np.random.default_rng(2), limits, np.zeros(2)) for limits in (None, (-nowhere, nowhere)))
+    z = free.z + 0.1 * rng.standard_normal((count, 6))
+    one, other = (solve(each.with_rows(z=z if count > 1 else z[0])) for each in (free, boxed))
+    np.testing.assert_array_equal(one.code, other.code)
+    np.testing.assert_allclose(one.cov, other.cov, rtol=1e-6)
+
+
+def test_a_batch_near_the_ground_is_judged_as_its_fixes_are():
+    """The short way of a few fixes at once leaves those near a bound to the long way."""
+    rng = np.random.default_rng(8)
+    place, truth = rng.uniform(-500.0, 500.0, (6, 3)) * [1.0, 1.0, 0.2], np.array([100.0, 50.0, 3.0])
+    z = np.linalg.norm(place - truth, axis=1) + 2.0 * rng.standard_normal((3, 6))
+    ground = constraints.box((-np.inf, -np.inf, 0.0), (np.inf, np.inf, np.inf))
+    problem = assemble(station_array(place), measured("range", z, a=np.arange(6), sigma=2.0), constraints=ground)
+    many = solve(problem)
+    for i in range(3):
+        alone = solve(problem.take(np.array([i])))
+        assert alone.code[0] == many.code[i]
+        np.testing.assert_allclose(alone.cov[0], many.cov[i], rtol=1e-6)
+        np.testing.assert_array_equal(alone[0].covers(truth), many[i].covers(truth))
+
+
+def test_a_fix_at_an_exact_height_covers_truths_of_its_surface():
+    rng, count = np.random.default_rng(4), 80
+    frame = optloc.Frame.enu(lat_deg=48.0, lon_deg=11.0)
+    place = rng.uniform(-3e3, 3e3, (6, 3)) * [1.0, 1.0, 0.1]
+    truth = frame.from_geodetic(*np.radians([48.01, 11.02]), 300.0)
+    z = np.linalg.norm(place - truth, axis=1) + 10.0 * rng.standard_normal((count, 6))
+    level = constraints.height(exactly=300.0)
+    rows = measured("range", z, a=np.arange(6), sigma=10.0)
+    fix = solve(assemble(station_array(place), rows, frame=frame, constraints=level))
+    inside = fix.covers(truth).mean()
+    assert 0.86 <= inside <= 1.0
+    assert not fix.covers(truth + np.array([0.0, 0.0, 300.0])).any()

@@ -18,7 +18,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.records import Axes, take
 from optloc.base.types import Array
 from optloc.models.primitives import wrap
-from optloc.problem.truncated import Truncated
+from optloc.problem.truncated import HELD, Truncated, is_along
 
 CARTESIAN, INVERSE_RANGE, CURVED = range(3)
 """Kinds of a chart: the Gaussian in metres covers, the one in (p, w) does, neither does."""
@@ -249,6 +249,8 @@ class Chart:
         step = np.where((self.kind == INVERSE_RANGE)[..., None], bent, away)
         solved, known = linalg.solve(np.broadcast_to(self.covariance, (*step.shape, step.shape[-1])), step[..., None])
         form = (step * solved[..., 0]).sum(-1)
+        if (held := self._is_held()).any():
+            form, known = self._along_surface(step, form, known & ~held)
         inverse = self.kind == INVERSE_RANGE
         behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
         form = np.array(np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan))
@@ -259,6 +261,29 @@ class Chart:
             mine = np.broadcast_to(mine, form.shape)
             form[mine] = law.distance_squared(away[mine])
         return form
+
+    def _is_held(self) -> Array:
+        """Return a flag (...) for covariances without a width in a direction: an equality holds the fix there."""
+        finite = np.asarray(np.isfinite(self.covariance).all((-1, -2)))
+        values = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance, np.eye(self.position.shape[-1])))
+        return np.asarray(values[..., 0] <= HELD * values[..., -1])
+
+    def _along_surface(self, step: Array, form: Array, known: Array) -> tuple[Array, Array]:
+        """Return squared distances (...) of steps (..., d), along the surfaces of equalities too, and whether known.
+
+        A surface has fewer degrees of freedom. The distance has the same probability in space.
+        """
+        from scipy.special import gammainc, gammaincinv
+
+        finite, d = np.asarray(np.isfinite(self.covariance).all((-1, -2))), step.shape[-1]
+        covariance = np.where(finite[..., None, None], self.covariance, 0.0)
+        inverse = np.linalg.pinv(covariance, HELD, hermitian=True)
+        projector = covariance @ inverse
+        rank = np.round(np.trace(projector, axis1=-2, axis2=-1))
+        within = (step * (inverse * step[..., None, :]).sum(-1)).sum(-1)
+        level = np.where(rank > 0, gammainc(np.maximum(rank, 1.0) / 2.0, within / 2.0), 0.0)
+        value = np.where(is_along(projector, step), 2.0 * gammaincinv(d / 2.0, level), np.inf)
+        return np.where(known, form, value), known | np.broadcast_to(finite, known.shape)
 
     @property
     def cut_off(self) -> Array:

@@ -18,6 +18,9 @@ from optloc.base.linalg import factor_semidefinite
 from optloc.base.records import Axes, take
 from optloc.base.types import Array
 
+HELD = 1e-13
+"""Share of the largest variance below which a variance is rounding: an equality holds that direction."""
+
 # Rays by the number of dimensions that the law has: the error of a probability is below 0.2 %, of a moment below 1 %.
 _RAYS = {2: 360, 3: 2500}
 # Nodes along a ray, and by how much the squared deviation grows along it: 45 leaves out 1e-10.
@@ -28,8 +31,9 @@ _SPREAD, _GOLDEN = 48, 0.6180339887498949
 _LEVELS = 96
 # Starts of intervals that are compared for the shortest.
 _STARTS = 200
-# Share of its variance below which what the coordinates before it leave of a coordinate is rounding.
-_HELD = 1e-12
+# Departure of a surface from its tangent plane, as a share of the distance: the Earth's at 100 km is 0.8 %. And metres
+# that are rounding of coordinates of its size.
+_BENT, _ROUNDED = 0.02, 1e-3
 # Rate at which a ray nears a bound, as a share of its step, below which it runs along it.
 _EXACT = 1e-12
 # Share of their width by which intervals may differ and count as alike: what the nodes leave open.
@@ -111,9 +115,7 @@ class Truncated:
         excess = np.maximum((away**2).sum(-1) - least, 0.0)
         level = np.interp(np.sqrt(excess), *rays.levels())
         value = np.where(level < 1.0, 2.0 * gammaincinv(d / 2, np.minimum(level, 1.0 - 1e-16)), np.inf)
-        size = np.sqrt(np.trace(self.covariance))
-        held = (np.abs(points - points @ rays.projector.T) <= _ON * size).all(-1)
-        return np.where(self.admits(points) & held, value, np.inf)
+        return np.where(self.admits(points) & is_along(rays.projector, points), value, np.inf)
 
     def admits(self, points: Array) -> Array:
         """Return a flag (...) for points (..., d), metres from the fix of one law, that the bounds admit."""
@@ -151,6 +153,20 @@ class Truncated:
         for end in (0, -1):  # among alike ones the interval that reaches a bound
             best = end if width[end] <= (1.0 + _ALIKE) * width.min() and np.isin(inner[end], ends) else best
         return float(low[best]), float(high[best])
+
+    def draw(self, n: int, seed: int) -> tuple[Array, Array]:
+        """Return n points (n, d) of one law, metres from the fix, and squared deviations (n,) less the fix's.
+
+        Systematic resampling of nodes along the rays: `seed` decides where it begins.
+        """
+        rays = self._rays()
+        place, weight = rays.spread()
+        share = np.cumsum(weight.ravel())
+        at = (np.random.default_rng(seed).random() + np.arange(n)) / n * share[-1]
+        chosen = np.searchsorted(share, at).clip(max=share.size - 1)
+        points = place.reshape(-1, place.shape[-1])[chosen]
+        away = (points - self.shift) @ rays.whitener.T
+        return points, (away**2).sum(-1) - (rays.middle**2).sum()
 
     def outline(self, plane: Array, level: float) -> Array:
         """Return the closed boundary (r, 2) of the region of highest density in a plane, metres from the fix.
@@ -259,6 +275,16 @@ class _Rays(NamedTuple):
         return float((share * end * _density(end * node, self.lean[:, None], self.rank)).sum())
 
 
+def is_along(projector: Array, points: Array) -> Array:
+    """Return a flag for points (..., d), metres from a fix, near the surface of the equalities that hold it, (...).
+
+    `projector` (..., d, d) projects onto the tangent plane; a surface may depart from its plane as the Earth does.
+    """
+    within = (projector * points[..., None, :]).sum(-1)
+    off = np.sqrt(((points - within) ** 2).sum(-1))
+    return np.asarray(off <= _BENT * np.sqrt((within**2).sum(-1)) + _ROUNDED)
+
+
 def _behind_one(law: Truncated) -> tuple[Array, Array]:
     """Return mean less fix (..., d) and covariance (..., d, d) of laws that the first of their bounds cuts off."""
     from scipy.special import log_ndtr
@@ -281,7 +307,7 @@ def _behind_one(law: Truncated) -> tuple[Array, Array]:
 def factor_of(covariance: Array) -> Array:
     """Return a matrix (d, rank) whose product with its transpose is a covariance (d, d) that may be singular."""
     lower = factor_semidefinite(covariance)
-    return np.asarray(lower[:, np.diagonal(lower) ** 2 > _HELD * np.diagonal(covariance)])
+    return np.asarray(lower[:, np.diagonal(lower) ** 2 > HELD * np.trace(covariance)])
 
 
 def _density(length: Array, lean: Array, rank: int) -> Array:

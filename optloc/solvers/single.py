@@ -219,7 +219,7 @@ class Single:
             tied = self.plan.frame.geodetic and one.rival_cost - one.cost <= equal_cost(one.cost)
             if not one.settled or tied or not one.cost <= self.doubt:
                 return None
-        if self.limited and law_of(self.problem.flat(), answer.x, answer.covariance, np.zeros((n, shared))) is not None:
+        if self.limited and self._is_near_bound(answer):
             return None
         if self.normal is not None and self._is_near_plane(self.normal, answer):
             return None
@@ -235,6 +235,12 @@ class Single:
             room.checked = self._agrees(fix, room)
             return fix if room.checked else None
         return fix
+
+    def _is_near_bound(self, answer: Answer) -> bool:
+        """Return whether a bound cuts the law of a fix off."""
+        many = self.problem.flat().take(np.zeros(len(answer.x), dtype=int))
+        free = np.zeros((len(answer.x), self.plan.shared))
+        return law_of(many, answer.x, answer.covariance, free) is not None
 
     def _is_near_plane(self, normal: Array, answer: Answer) -> bool:
         """Return whether a fix may be so near to the plane of the stations that both sides of it are one region."""

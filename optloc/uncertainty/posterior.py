@@ -12,6 +12,7 @@ from optloc.base.types import Array
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.problem.truncated import Truncated
 from optloc.uncertainty.arc import Arc, student, trace_from
 from optloc.uncertainty.region import Surface
 
@@ -143,16 +144,13 @@ def samples(
 def around(surface: Surface, n: int, seed: int, prior: str = "jeffreys", within: float | None = None) -> Samples:
     """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`."""
     chart, inverse = surface.chart, surface.kind == INVERSE_RANGE
+    if chart.truncated is not None and chart.cut_off:
+        return _within_bounds(surface, chart.truncated, n, seed, prior, within)
     start, spread = (chart.mean, chart.spread) if inverse else (chart.position, chart.covariance)
-    law = chart.truncated if chart.cut_off else None
-    if law is not None:  # the weights of what bounds cut off are zero
-        start, spread = start + law.shift, law.covariance
     _, points, log_proposal = student(len(start), n, seed)
     scale = np.sqrt(np.diagonal(spread))
     y = start + _WIDER * scale * (points @ np.linalg.cholesky(spread / np.outer(scale, scale)).T)
     good = y[:, -1] > _LEAST_W if inverse else np.ones(n, dtype=bool)
-    if law is not None:
-        good = law.admits(y - chart.position)
     y = np.where(good[:, None], y, start)
     position = chart.to_position(y) if inverse else y
     cost, information, _ = surface.look(position)
@@ -164,6 +162,18 @@ def around(surface: Surface, n: int, seed: int, prior: str = "jeffreys", within:
     if within is not None:
         good &= ((position - chart.centre) ** 2).sum(-1) <= within**2
     return weighed(position, np.where(good, log_weight, -np.inf), prior, within, not inverse or within is not None)
+
+
+def _within_bounds(surface: Surface, law: Truncated, n: int, seed: int, prior: str, within: float | None) -> Samples:
+    """Return samples of a fix whose law bounds cut off: drawn from the law, weighed by the cost."""
+    away, excess = law.draw(n, seed)
+    position, centre = surface.position + away, surface.chart.centre
+    cost, information, _ = surface.look(position)
+    log_weight = -0.5 * (cost - surface.least - excess)
+    if prior == "jeffreys":
+        log_weight += 0.5 * np.linalg.slogdet(information)[1]
+    good = np.ones(n, dtype=bool) if within is None else ((position - centre) ** 2).sum(-1) <= within**2
+    return weighed(position, np.where(good, log_weight, -np.inf), prior, within, True)
 
 
 def _scaled(information: Array, position: Array, centre: Array, inverse: bool) -> Array:

@@ -197,4 +197,4 @@ def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix,
     items = np.flatnonzero((asked.eps > equal_cost(level)) & (every.level > level))
     if len(items):
         out[items] = _are_shown(prove_all(every.take(items), asked.take(items)), level[items])
-    return np.asarray(out.reshape(-1, count).all(1))
+    return np.asarray(out.reshape(len(fix.x), count).all(1))
