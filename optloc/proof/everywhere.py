@@ -75,10 +75,10 @@ from optloc.proof.squares import Squares, bend_of, clip_to_squares, squares_of
 CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 # Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest;
 # and as many that wait. A box leaves two, and six slabs around a minimum that is met in it.
-_CAPACITY, _SPARE = 2048, 8
+CAPACITY, SPARE = 2048, 8
 # Boxes that may wait: where there are as many, those that follow are looked at in their turn, as if no lower level were
 # to be shown first. What is taken back leaves room for going into the depth.
-_WAITING = 3 * _CAPACITY // 4
+_WAITING = 3 * CAPACITY // 4
 # A box at infinity of this size whose cost is below the level is not split further: across it the cost is the same to
 # many digits, so no smaller one would be dropped either. Half-widths on a face, and around a minimum.
 _TINY, _TINY_AROUND = 1e-5, 1e-3
@@ -162,7 +162,7 @@ def search_everywhere(
         How many rivals there are.
     """
     box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
-    stack, aside, d = np.empty((_CAPACITY, DEPTH)), np.empty((_CAPACITY, DEPTH)), atlas.dimension
+    stack, aside, d = np.empty((CAPACITY, DEPTH)), np.empty((CAPACITY, DEPTH)), atlas.dimension
     size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
     floor, first, now, value = accuracy_floor_far(cost, atlas), zero(), last_above_zero(levels), levels[-1]
     if now < first:  # no cost is below zero
@@ -175,7 +175,7 @@ def search_everywhere(
             size, waiting = take_back(stack, aside, waiting, levels[now])
             continue
         shown, level = now + 1, levels[first]
-        if boxes >= budget or size + _SPARE > _CAPACITY:
+        if boxes >= budget or size + SPARE > CAPACITY:
             spent = shown == levels.shape[0]
             return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
         size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
@@ -199,14 +199,11 @@ def search_everywhere(
             if met < 0:
                 return ANOTHER, boxes, 0.0, shown, 0
             set_centre(atlas, piece, box.at)
-        if touching and max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND):
+        if touching and is_tiny(box, piece, d):
             first = first_below(levels, first, _at_infinity(cost, atlas, box, piece))
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
-        if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
-            waiting = push_rest(aside, waiting, box, side, low, piece)
-        else:
-            size = push_rest(stack, size, box, side, low, piece)
+        size, waiting = keep_rest(stack, size, aside, waiting, box, side, low, piece, levels[now])
 
 
 @compiled
@@ -336,6 +333,22 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
         if share > _SHRUNK:
             break
     return True
+
+
+@inlined
+def is_tiny(box: Box, piece: int, d: int) -> bool:
+    """Return whether a box at infinity is so small that the cost there is taken from its centre."""
+    return bool(max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND))
+
+
+@inlined
+def keep_rest(
+    stack: Array, size: int, aside: Array, waiting: int, box: Box, side: int, low: float, piece: int, level: float
+) -> tuple[int, int]:
+    """Push what its cut leaves of a box, or let it wait where it costs more than a level; return both sizes."""
+    if low > 0.0 and low * low >= level and waiting + SPARE <= _WAITING:
+        return size, push_rest(aside, waiting, box, side, low, piece)
+    return push_rest(stack, size, box, side, low, piece), waiting
 
 
 @compiled
@@ -572,13 +585,21 @@ def prove_atlas(
     outcome, boxes, bound, shown, met = search_everywhere(
         cost, atlas, chart, corners, squares, levels, eps, whole, budget, rivals, found
     )
+    return verdict_of(outcome, boxes, bound, shown, met, gaps, least - eps)
+
+
+@inlined
+def verdict_of(
+    outcome: int, boxes: int, bound: float, shown: int, met: int, gaps: Array, least: float
+) -> tuple[int, int, float, float, int]:
+    """Return what the outcome of a search proves, as `prove_everywhere` does; `least`: the lowest of the levels."""
     if outcome == CLEAR:
         return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
     if outcome == CHEAPER:
         return BETTER, boxes, bound, gaps[0], 0
     if outcome == ANOTHER:
         return OTHER, boxes, bound, gaps[0], 0
-    return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps), gaps[-1], 0
+    return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least), gaps[-1], 0
 
 
 @compiled

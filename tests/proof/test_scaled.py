@@ -13,7 +13,7 @@ from optloc.proof.box import cube
 from optloc.proof.convex_boxes import accuracy_floor_far
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled
-from optloc.proof.scaled.reduction import HERE, LEAST, MOST, bound_factor, bound_rows, clip_rows, reduce_rows
+from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_rows, reduce_rows
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, scaled_costs
 from optloc.proof.scaled.scaled_search import set_scaled_minimum, tables_of
 from optloc.proof.scope import unsupported
@@ -112,11 +112,11 @@ def test_no_point_of_a_box_is_below_its_bound(d, seed):
             cost, k = profiled(scene, look.places(piece, at, inside))
             assert sheet.span[HERE] == pytest.approx(cost[-1], rel=1e-6, abs=1e-6)
             level = cost.min() + 10.0 ** rng.uniform(-1.0, 2.0)
-            any_left = bound_factor(look.scaled, np.sqrt(level), box, sheet)
+            any_left = bound_factors(look.scaled, np.sqrt(level), box, sheet)
             assert any_left
             low = cost < level
-            assert (k[low] >= sheet.span[LEAST] * (1.0 - 1e-9)).all()
-            assert (k[low] <= sheet.span[MOST] * (1.0 + 1e-9)).all()
+            assert (k[low] >= sheet.least[0] * (1.0 - 1e-9)).all()
+            assert (k[low] <= sheet.most[0] * (1.0 + 1e-9)).all()
             bound = bound_rows(look.scaled, box, sheet)
             assert max(bound, 0.0) ** 2 <= cost.min() + 1e-9
             said += bound > 0.0
@@ -140,15 +140,15 @@ def test_minima_are_never_clipped_and_convex_boxes_are_convex(d, seed):
             half[:d] = 10.0 ** rng.uniform(-3.0, 1.5, d)  # standard deviations
             at[:d] = rng.uniform(-0.999, 0.999, d) * half[:d]
             box, sheet, rho = look.fill(2 * d + 1, at, half), look.tables.sheet, np.sqrt(float(fix.cost) + 25.0)
-            assert bound_factor(look.scaled, rho, box, sheet)
-            assert clip_stationary(look.scaled, rho, box, sheet)
+            assert bound_factors(look.scaled, rho, box, sheet)
+            assert clip_stationary(look.scaled, box, sheet)
             slack = 1e-9 * half[:d] + 1e-4
             assert (-at[:d] >= box.cut[:d] - slack).all()
             assert (-at[:d] <= box.cut[3 : 3 + d] + slack).all()
             clipped += (box.cut[3 : 3 + d] - box.cut[:d] < 1.9 * half[:d]).any()
             box = look.fill(2 * d + 1, at, half)
-            assert bound_factor(look.scaled, rho, box, sheet)
-            if is_convex_scaled(look.scaled, rho, 0.0, box, sheet):
+            assert bound_factors(look.scaled, rho, box, sheet)
+            if is_convex_scaled(look.scaled, 0.0, box, sheet):
                 convex += 1
                 # one minimum: the fix, which is in the box, is the cheapest of all points
                 cost, _ = profiled(scene, look.places(2 * d + 1, at, half * rng.uniform(-1, 1, (40, 3))))
