@@ -90,6 +90,10 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
     """Write derivatives of residual and factors, pulls, changes of derivatives, and reaches of the coordinates."""
     nodes, E, lean, back, third = box.nodes, sheet.E, sheet.lean, sheet.back, sheet.third
     (q, J), G = scaled.cost.K.shape, back.shape[0]
+    for j in range(J):
+        sheet.force[j] = 0.0
+        for i in range(q):
+            sheet.force[j] -= scaled.cost.K[i, j] * sheet.w[i]
     for m in range(3):
         sheet.reach[m] = box.half[m]
         for g in range(G):  # the sum of forces times slopes, and with the inverse of R, in memory that is free
@@ -100,7 +104,7 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
                 E[i, m] += factor_of(scaled, sheet, j) * sheet.K[i, j] * nodes[j, SLOPE0 + m]
         for j in range(J):
             if scaled.group[j] >= 0:
-                third[scaled.group[j], m] += _force(scaled, sheet, j) * nodes[j, SLOPE0 + m]
+                third[scaled.group[j], m] += sheet.force[j] * nodes[j, SLOPE0 + m]
         for g in range(G):
             for h in range(g + 1):
                 third[G + g, m] += back[h, g] * third[h, m]
@@ -121,15 +125,6 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _force(scaled: Scaled, sheet: Sheet, j: int) -> float:
-    """Return the pull of a node on the residual at the centre of a box."""
-    force = 0.0
-    for i in range(sheet.w.shape[0]):
-        force -= scaled.cost.K[i, j] * sheet.w[i]
-    return force
-
-
-@inlined
 def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: Sheet) -> float:
     """Return how far the coordinate of a factor may be from zero, at points whose factors are best."""
     nodes, half, G, reach = box.nodes, box.half, sheet.back.shape[0], sheet.spin[g] + noise
@@ -140,10 +135,11 @@ def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: Sheet) -> f
         reach += abs(sheet.pull[g, j]) * _greatest(sheet, scaled.group[j]) * size
     for h in range(G):
         for m in range(3):
+            if not half[m] > 0.0:
+                continue
             along = 0.0
             for j in range(nodes.shape[0]):
-                if scaled.group[j] == h:
-                    along += sheet.pull[g, j] * nodes[j, SLOPE0 + m]
+                along += sheet.pull[g, j] * nodes[j, SLOPE0 + m] * (1.0 if scaled.group[j] == h else 0.0)
             reach += _range_of(sheet, h) * abs(along) * half[m]
     return float(reach)
 
@@ -208,12 +204,14 @@ def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> fl
     for m in range(A.shape[0]):
         size = max(abs(nodes[m, LOW]), abs(nodes[m, HIGH]))
         rest += abs(A[j, m]) * _greatest(sheet, scaled.group[m]) * size
+    J = A.shape[0]
     for h in range(G):
         for k in range(3):
+            if not box.half[k] > 0.0:
+                continue
             along = 0.0
-            for m in range(A.shape[0]):
-                if scaled.group[m] == h:
-                    along += A[j, m] * nodes[m, SLOPE0 + k]
+            for m in range(J):
+                along += A[j, m] * nodes[m, SLOPE0 + k] * (1.0 if scaled.group[m] == h else 0.0)
             rest += _range_of(sheet, h) * abs(along) * box.half[k]
     return float(rest)
 
@@ -222,7 +220,7 @@ def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> fl
 def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> float:
     """Add the second derivatives of a node times its force to the sums; return what the change of them adds."""
     curves, sums, third, g, G = box.curves, box.sums, sheet.third, scaled.group[j], sheet.back.shape[0]
-    force, rest, linear = _force(scaled, sheet, j), _rest_of(scaled, noise, j, box, sheet), 0.0
+    force, rest, linear = sheet.force[j], _rest_of(scaled, noise, j, box, sheet), 0.0
     for n in range(3 + G):
         linear += abs(sheet.tie[j, n]) * sheet.reach[n]
     whole = abs(force) + linear + rest

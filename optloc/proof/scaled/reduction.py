@@ -73,14 +73,17 @@ class Sheet(NamedTuple):
         The inverse of R.
     best, least, most : array (G,)
         Factors at the centre as if they had no sign, and their ranges of interest.
-    swing : array (G, G + 1)
-        How much the columns of factors, and last the other nodes, may change each factor.
+    fall, rise : array (G, G + 1)
+        How much the change of the columns of factors, and last of the other nodes, adds to each factor at least and at
+        most, the least with its sign turned.
     spin : array (G,)
         Longest residual along each column of U.
     span : array (SPAN,)
         Numbers of the box.
     E, lean : array (q, 3), (G, 3)
         Derivatives of the residual along the offsets, and of the factors.
+    force : array (J,)
+        Pulls of the nodes on the residual at the centre, ``K'(residual)``.
     turn, tie : array (J, 3 + G), (J, 3 + G)
         Changes of the derivatives of the residual over a box as multiples of the rows, and pulls ``K'E``; the last of
         each belong to the factors.
@@ -104,11 +107,13 @@ class Sheet(NamedTuple):
     best: Array
     least: Array
     most: Array
-    swing: Array
+    fall: Array
+    rise: Array
     spin: Array
     span: Array
     E: Array
     lean: Array
+    force: Array
     turn: Array
     tie: Array
     cross: Array
@@ -136,10 +141,12 @@ def sheet_of(scaled: Scaled) -> Sheet:
         np.zeros(G),
         np.zeros(G),
         np.zeros((G, G + 1)),
+        np.zeros((G, G + 1)),
         np.zeros(G),
         np.zeros(SPAN),
         np.zeros((q, 3)),
         np.zeros((G, 3)),
+        np.zeros(J),
         np.zeros((J, 3 + G)),
         np.zeros((J, 3 + G)),
         np.zeros((G, 3 + G)),
@@ -293,29 +300,29 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> bool:
     So the greatest factors solve a system whose inverse has no negative entry, or they have priors.
     """
     G, least, most, spin = sheet.best.shape[0], sheet.least, sheet.most, sheet.spin
-    blur = digits(scaled.cost.K) * sheet.span[FLOOR]
+    blur, bounded = digits(scaled.cost.K) * sheet.span[FLOOR], True
     least[:], most[:], spin[:] = 0.0, inf, rho + blur
     _bound_by_priors(scaled, rho, sheet)
     for g in range(G):
         if not sheet.best[g] > -inf:
             return True
     _swing(scaled, blur, box, sheet)
-    if not _narrow(sheet, blur, True):
+    if not _solve_swing(sheet, blur):
         return False
-    bounded = True
     for g in range(G):
         bounded = bounded and most[g] < inf
     if not bounded:
         most[:] = inf
         return True
-    if not _narrow(sheet, blur, False):
+    if not _narrow(sheet, blur):
         return False
+    _set_slopes(scaled, box, sheet)
     for g in range(G):
         if not least[g] > 0.0:
             return True
     # Best factors: the residual is orthogonal to their columns, which are the less oblique to U the smaller the box is.
     _turn(scaled, rho + blur, box, sheet)
-    return _narrow(sheet, blur, False)
+    return _narrow(sheet, blur)
 
 
 @inlined
@@ -334,14 +341,15 @@ def _bound_by_priors(scaled: Scaled, rho: float, sheet: Sheet) -> None:
 @inlined
 def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
     """Write how much the change of each column of the rows over a box, and its rounding, may change the factors."""
-    nodes, half, swing, V = box.nodes, box.half, sheet.swing, sheet.V
+    nodes, half, V = box.nodes, box.half, sheet.V
     G, J = V.shape
     for g in range(G):
         for h in range(G + 1):
             fall = rise = s0 = s1 = s2 = 0.0
             for j in range(J):
                 pull = V[g, j]
-                if (scaled.group[j] + G + 1) % (G + 1) != h or pull == 0.0:
+                own = scaled.group[j] == h or (scaled.group[j] < 0 and h == G)
+                if not own or pull == 0.0:
                     continue
                 first, second = pull * nodes[j, LOW], pull * nodes[j, HIGH]
                 fall -= min(first, second, 0.0)
@@ -349,35 +357,39 @@ def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
                 s0 += pull * nodes[j, SLOPE0]
                 s1 += pull * nodes[j, SLOPE0 + 1]
                 s2 += pull * nodes[j, SLOPE0 + 2]
-            swing[g, h] = max(fall, rise) + abs(s0) * half[0] + abs(s1) * half[1] + abs(s2) * half[2]
+            both = abs(s0) * half[0] + abs(s1) * half[1] + abs(s2) * half[2]
             for m in range(g, G):
-                swing[g, h] += abs(sheet.back[g, m]) * blur
+                both += abs(sheet.back[g, m]) * blur
+            sheet.fall[g, h], sheet.rise[g, h] = fall + both, rise + both
 
 
 @inlined
 def _reach_of(sheet: Sheet, g: int, blur: float) -> float:
-    """Return how far a factor may be from the best at the centre by residuals and nodes without a factor."""
-    G, total = sheet.best.shape[0], sheet.swing[g, sheet.best.shape[0]]
-    for h in range(g, G):
+    """Return how far a factor may be from the best at the centre by residuals."""
+    total = 0.0
+    for h in range(g, sheet.best.shape[0]):
         total += abs(sheet.back[g, h]) * (sheet.spin[h] + blur)
-    return float(total)
+    return float(total + _ROUNDED * (abs(sheet.best[g]) + total))
 
 
 @inlined
-def _narrow(sheet: Sheet, blur: float, anew: bool) -> bool:
-    """Narrow the ranges of the factors; return False where one is empty. `anew`: their ends may be infinite."""
-    G, least, most = sheet.best.shape[0], sheet.least, sheet.most
-    good = not anew or _solve_swing(sheet, blur)
+def _narrow(sheet: Sheet, blur: float) -> bool:
+    """Narrow the ranges of the factors, which are bounded; return False where one is empty."""
+    G, least, most, fall, rise = sheet.best.shape[0], sheet.least, sheet.most, sheet.fall, sheet.rise
     for g in range(G):
-        away = _reach_of(sheet, g, blur)
+        reach = _reach_of(sheet, g, blur)
+        high, low = sheet.best[g] + reach + fall[g, G], sheet.best[g] - reach - rise[g, G]
         for h in range(G):
-            away += sheet.swing[g, h] * most[h] if sheet.swing[g, h] > 0.0 else 0.0
-        if away < inf:
-            away += _ROUNDED * (abs(sheet.best[g]) + away)
-            most[g], least[g] = min(most[g], sheet.best[g] + away), max(least[g], sheet.best[g] - away)
+            if h != g:
+                high += fall[g, h] * most[h] if fall[g, h] > 0.0 else 0.0
+                low -= rise[g, h] * most[h] if rise[g, h] > 0.0 else 0.0
+        if fall[g, g] < 1.0:
+            most[g] = min(most[g], high / (1.0 - fall[g, g]) * (1.0 + _ROUNDED))
+        if low > 0.0:
+            least[g] = max(least[g], low / (1.0 + rise[g, g]) * (1.0 - _ROUNDED))
         if not most[g] > least[g]:
             return False
-    return good
+    return True
 
 
 @inlined
@@ -386,12 +398,12 @@ def _solve_swing(sheet: Sheet, blur: float) -> bool:
 
     With positive pivots the inverse of 1 - N has no negative entry (an M-matrix). Elimination without pivoting.
     """
-    G, N, most = sheet.best.shape[0], sheet.swing, sheet.most
-    matrix, right = np.empty((G, G)), np.empty(G)
+    G, most = sheet.best.shape[0], sheet.most
+    matrix, right = sheet.cross, sheet.reach  # memory that is free
     for g in range(G):
-        right[g] = sheet.best[g] + _reach_of(sheet, g, blur)
+        right[g] = sheet.best[g] + _reach_of(sheet, g, blur) + sheet.fall[g, G]
         for h in range(G):
-            matrix[g, h] = (1.0 if g == h else 0.0) - N[g, h]
+            matrix[g, h] = (1.0 if g == h else 0.0) - sheet.fall[g, h]
     for p in range(G):
         if not (matrix[p, p] > _ROUNDED and right[p] < inf):
             return True
@@ -412,22 +424,28 @@ def _solve_swing(sheet: Sheet, blur: float) -> bool:
 
 
 @inlined
+def _set_slopes(scaled: Scaled, box: Box, sheet: Sheet) -> None:
+    """Write the derivatives of the columns of the factors along each coordinate, before their projection."""
+    K, nodes, J = scaled.cost.K, box.nodes, box.nodes.shape[0]
+    for i in range(K.shape[0]):
+        for column in range(J, sheet.K.shape[1]):
+            sheet.K[i, column] = 0.0
+        for j in range(J):
+            if scaled.group[j] >= 0:
+                for k in range(3):
+                    sheet.K[i, J + 3 * scaled.group[j] + k] += K[i, j] * nodes[j, SLOPE0 + k]
+
+
+@inlined
 def _turn(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
     """Write how long a residual along U may be whose factors are the best at their position."""
-    K, nodes, half, back = scaled.cost.K, box.nodes, box.half, sheet.back
-    (q, J), G = K.shape, back.shape[0]
+    nodes, half, back = box.nodes, box.half, sheet.back
+    J, G = nodes.shape[0], back.shape[0]
     sheet.spin[:] = 0.0
     for g in range(G):
         change = 0.0
-        for m in range(3):
-            square = 0.0
-            for i in range(q):
-                total = 0.0
-                for j in range(J):
-                    if scaled.group[j] == g:
-                        total += K[i, j] * nodes[j, SLOPE0 + m]
-                square += total * total
-            change += sqrt(square) * half[m]
+        for k in range(3):
+            change += _length_of(sheet, J + 3 * g + k) * half[k]
         for j in range(J):
             if scaled.group[j] == g:
                 change += scaled.cost.weight[j] * max(abs(nodes[j, LOW]), abs(nodes[j, HIGH]))
@@ -457,7 +475,7 @@ def bound_rows(scaled: Scaled, box: Box, sheet: Sheet) -> float:
         out[j, LOW], out[j, HIGH] = most * min(nodes[j, LOW], 0.0), most * max(nodes[j, HIGH], 0.0)
         sheet.weight[j] = scaled.cost.weight[j] if out[j, LOW] > -inf else _length_of(sheet, j)
     for g in range(G):
-        _add_range(scaled, g, box, sheet)
+        _add_range(g, box, sheet)
     linearise_rows(sheet.K, sheet.w, out, sheet.rows)
     low = least_residual(sheet.K, sheet.weight, size_of(sheet), box.half, out, sheet.rows)
     return float(low) if _has_signs(scaled, sheet) else -1.0
@@ -487,25 +505,24 @@ def _has_signs(scaled: Scaled, sheet: Sheet) -> bool:
 
 
 @inlined
-def _add_range(scaled: Scaled, g: int, box: Box, sheet: Sheet) -> None:
-    """Write the columns of the range of a factor, and by how much it may differ from the middle times the box."""
-    K, out, J = sheet.K, sheet.nodes, box.nodes.shape[0]
+def _add_range(g: int, box: Box, sheet: Sheet) -> None:
+    """Project the columns of the range of a factor; write by how much it may differ from the middle times the box."""
+    K, out, J, unit = sheet.K, sheet.nodes, box.nodes.shape[0], sheet.unit
     wide = 0.5 * (sheet.most[g] - sheet.least[g])
     for k in range(3):
-        column, square = J + 3 * g + k, 0.0
-        for i in range(K.shape[0]):
-            total = 0.0
-            for j in range(J):
-                if scaled.group[j] == g:
-                    total += K[i, j] * box.nodes[j, SLOPE0 + k]
-            K[i, column] = total
-            square += total * total
-        sheet.weight[column] = sqrt(square)
+        column = J + 3 * g + k
+        sheet.weight[column] = _length_of(sheet, column)
+        for h in range(unit.shape[1]):
+            along = 0.0
+            for i in range(K.shape[0]):
+                along += unit[i, h] * K[i, column]
+            for i in range(K.shape[0]):
+                K[i, column] -= unit[i, h] * along
         out[column, :] = 0.0
         out[column, LOW], out[column, HIGH] = -wide * box.half[k], wide * box.half[k]
 
 
-@compiled
+@inlined
 def is_bounded(sheet: Sheet) -> bool:
     """Return whether all factors are bounded, and independent at the centre of the box."""
     good = True
@@ -514,7 +531,7 @@ def is_bounded(sheet: Sheet) -> bool:
     return good
 
 
-@compiled
+@inlined
 def is_positive(sheet: Sheet) -> bool:
     """Return whether all factors are bounded and greater than zero."""
     good = is_bounded(sheet)
@@ -523,7 +540,7 @@ def is_positive(sheet: Sheet) -> bool:
     return good
 
 
-@compiled
+@inlined
 def size_of(sheet: Sheet) -> float:
     """Return the sizes that limit the accuracy of residuals at any factors of a box."""
     most = 1.0
@@ -532,7 +549,7 @@ def size_of(sheet: Sheet) -> float:
     return float(most * sheet.span[FLOOR])
 
 
-@compiled
+@inlined
 def blur_of(scaled: Scaled, sheet: Sheet) -> float:
     """Return a bound of the rounding errors of a residual (its length) in a box."""
     return float(digits(scaled.cost.K) * size_of(sheet))
