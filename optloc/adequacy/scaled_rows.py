@@ -30,8 +30,8 @@ _EXPLAINED = 1e-13
 _STILL = -1.0
 # Thickness of coplanar stations, as a share of their width: rounding of coordinates.
 _FLAT = 1e-9
-# Places beside the middle of coplanar stations from which descents begin, in spreads along each tangent, and steps.
-_BESIDE, _STEPS = (-1.0, 0.0, 1.0), 12
+# Offsets from the middle of coplanar stations from which descents begin, in spreads along each tangent, and steps.
+_OFFSETS, _STEPS = (-1.0, 0.0, 1.0), 12
 # Distance in spreads at which wave fronts are taken as paraboloids. Higher orders are 1e-8 of the bend there, and the
 # rounding of ranges as well.
 _DISTANT = 1e4
@@ -118,15 +118,15 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
         there = np.array(x[items])
         there[:, part] = centre + side * spread[:, None] * normal
         if len(free) == 1:
-            own = _beside_any(some, there, x[items], part, tangents, free[0])
+            own = _above_any_place(some, there, x[items], part, tangents, free[0])
         else:
-            own = _beside_all(some, there, x[items], part, tangents * spread[:, None, None])
+            own = _above_one_place(some, there, x[items], part, tangents * spread[:, None, None])
         out[items] = np.fmin(out[items], own)
     return out
 
 
-def _beside_any(problem: Problem, there: Array, at: Array, part: Array, tangents: Array, j: int) -> Array:
-    """Return the least cost (N,) of one free factor j beside distant places: any place is a tilt of the wave front."""
+def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array, j: int) -> Array:
+    """Return the least cost (N,) of distant waves with one free factor j. A place is a tilt of the wave front."""
     residual, design = _rows(problem, there, at)
     touched = (design[..., j] != 0.0)[..., None]
     tilt = np.where(touched, design[..., part] @ tangents, 0.0)
@@ -137,13 +137,13 @@ def _beside_any(problem: Problem, there: Array, at: Array, part: Array, tangents
     return np.asarray((left[..., 0] ** 2).sum(-1))
 
 
-def _beside_all(problem: Problem, there: Array, at: Array, part: Array, tangents: Array) -> Array:
-    """Return the least cost (N,) of several free factors beside distant places: all waves come from one place.
+def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array) -> Array:
+    """Return the least cost (N,) of distant waves with several free factors: all come from one place.
 
     Gauss-Newton along the tangents (N, d, d - 1), which are as long as a spread; steps are a spread at most.
     """
     count, along = tangents.shape[-1], np.swapaxes(tangents, -1, -2)
-    first = np.stack(np.meshgrid(*[_BESIDE] * count), axis=-1).reshape(-1, 1, count)
+    first = np.stack(np.meshgrid(*[_OFFSETS] * count), axis=-1).reshape(-1, 1, count)
     y, best = np.broadcast_to(first, (len(first), len(there), count)), np.full(len(there), np.inf)
     for _ in range(_STEPS):
         x = np.array(np.broadcast_to(there, (len(y), *there.shape)))
@@ -195,7 +195,7 @@ def _is_level(model: Model) -> bool:
 
 
 def _touch(problem: Problem, of_kind: Callable[[Model], bool]) -> Array:
-    """Return which unknown factors (n,) multiply rows of some kinds."""
+    """Return a mask (n,) of the unknown factors that multiply rows of some kinds."""
     rows = np.concatenate([np.full(rows.count, of_kind(MODELS[rows.kind])) for rows in problem.rows])
     own = [np.bincount(bias.member, rows[bias.row], len(bias.members)) > 0 for bias in _multiplying(problem)]
     return np.concatenate([np.zeros(0, dtype=bool), *own])

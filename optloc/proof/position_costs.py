@@ -316,14 +316,14 @@ def position_costs(problem: Problem) -> PositionCosts:
 
 
 def costs_of_groups(problem: Problem, group: Array) -> tuple[PositionCosts, Array]:
-    """Return costs as `position_costs`, with nodes of their own for each group of rows, and the nodes' groups (J,).
+    """Return costs as `position_costs` with separate nodes for each group of rows, and the groups (J,) of the nodes.
 
     Parameters
     ----------
     problem : Problem
         N problems whose rows are sums of ranges and logarithms of ranges.
     group : int array (m,)
-        Group of each row; -1 for rows whose nodes have no factor, as those of priors.
+        Group of each row; -1 for rows without a factor, such as priors.
     """
     kinds, numbers, K, w, level, own = _rows_of(problem, group)
     K, w = compress(K, w)

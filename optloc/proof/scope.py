@@ -22,7 +22,7 @@ MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 10_000, 24, 128
 # move (of 25 nodes of five epochs no box was looked at within the budget of dense rows; up to here plain Python begins
 # where there is no machine code), and of those that stay, whose batches share their rows.
 SHORT, MOST_DENSE = 24, 128
-# Unknown factors of rows: each box solves a system of so many, and each adds three columns to its rows.
+# Unknown factors of rows: each box solves a system of this size, and each factor adds three columns to its rows.
 MOST_FACTORS = 3
 
 

@@ -1,7 +1,8 @@
 """Second derivatives of a cost with unknown factors: boxes with one minimum, and boxes without a stationary point.
 
 The coordinates are offsets s and ``t = R (k - best - B s)``, with R and U as in `optloc.proof.scaled.reduction`. B is
-the derivative of the best factors. So the Hessian at the centre has no entry between s and t, and that of t is 1.
+the derivative of the best factors. So the Hessian at the centre has no entry between s and t, and its part along t is
+the identity.
 
 The statements are about points whose factors fit their position best, and are not zero. All minima are such points, and
 so is the cheapest point of each position.
@@ -66,7 +67,7 @@ def factor_of(scaled: Scaled, sheet: Sheet, j: int) -> float:
 
 @inlined
 def _range_of(sheet: Sheet, g: int) -> float:
-    """Return how far a factor may be from that at the centre; zero for no factor."""
+    """Return the largest distance of a factor from its value at the centre; zero for no factor."""
     return float(max(sheet.most[g] - sheet.best[g], sheet.best[g] - sheet.least[g])) if g >= 0 else 0.0
 
 
@@ -78,7 +79,7 @@ def _greatest(sheet: Sheet, g: int) -> float:
 
 @inlined
 def _change_of(box: Box, j: int) -> float:
-    """Return by how much a node may change over a box."""
+    """Return the largest change of a node over a box."""
     change = max(abs(box.nodes[j, LOW]), abs(box.nodes[j, HIGH]))
     for m in range(3):
         change += abs(box.nodes[j, SLOPE0 + m]) * box.half[m]
@@ -126,7 +127,7 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
 
 @inlined
 def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: Sheet) -> float:
-    """Return how far the coordinate of a factor may be from zero, at points whose factors are best."""
+    """Return the largest coordinate of a factor, at points whose factors are best."""
     nodes, half, G, reach = box.nodes, box.half, sheet.back.shape[0], sheet.spin[g] + noise
     for m in range(3):
         reach += abs(sheet.third[G + g, m]) * half[m]
@@ -198,7 +199,7 @@ def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: Sheet) -> f
 
 @inlined
 def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> float:
-    """Return by how much the force of a node may change over a box beside the linear part."""
+    """Return the change of the force of a node over a box without its linear part."""
     A, nodes, G = scaled.cost.A, box.nodes, sheet.back.shape[0]
     rest = scaled.cost.weight[j] * noise
     for m in range(A.shape[0]):

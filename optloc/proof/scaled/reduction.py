@@ -1,17 +1,16 @@
 """A box of a cost with unknown factors: they are projected out of the rows, and their ranges are bounded.
 
 The cost is ``f(x, k) = |sum_g k_g (K_g phi(x) + l_g) + K_0 phi(x) - w|^2`` with k >= 0. Each node belongs to one factor
-or to none. A prior on a factor is a row in which K is zero. At the centre c of a box ``a_g = K_g phi(c) + l_g`` are the
-columns of the factors, ``A = U R`` with U orthonormal, and ``P = 1 - U U'``. Then ``P A = 0``. So the cost at every x
-of the box and every k is at least
+or to none. A prior on a factor is a row in which K is zero. At the centre c of a box the columns of the factors are
+``a_g = K_g phi(c) + l_g``. With ``A = U R``, U orthonormal, and ``P = 1 - U U'`` follows ``P A = 0``. So no x of the
+box and no k cost less than
 
     |P (sum_g k_g K_g (phi(x) - phi(c)) + K_0 phi(x) - w)|^2.
 
 All bounds of rows therefore hold for the projected rows, with nodes times the factors in the middle of their ranges. By
 how much a factor may differ from the middle times the slopes of its nodes is one more node without slopes for each
-coordinate: its column is the projected derivative of the rows along that coordinate. The rows along U bound k, and the
-residual of the best factors at a position is orthogonal to their columns there, so that these ranges shrink with the
-box.
+coordinate: its column is the projected derivative of the rows along that coordinate. The rows along U bound k. At each
+position the residual of the best factors is orthogonal to their columns. So their ranges shrink with the box.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from optloc.proof.search_space import Box, Cost
 _PROJECTED = 4.0
 # Relative rounding of a bound of a factor.
 _ROUNDED = 1e-12
-# Share of a column that must remain beside the columns of other factors: less is rounding.
+# Share of a column that must remain without the columns of other factors: less is rounding.
 _DEPENDENT = 1e-10
 # Numbers of a box: the cost at its centre, and the sizes that limit the accuracy.
 HERE, FLOOR, SPAN = range(3)
@@ -61,8 +60,8 @@ class Sheet(NamedTuple):
     Parameters
     ----------
     K, w : array (q, J + 3 G), (q,)
-        Projected rows, and what is left of the measurements at the centre. The last columns are those of the ranges of
-        the factors along each coordinate.
+        Projected rows and residuals at the centre. The last columns belong to the ranges of the factors along each
+        coordinate.
     weight : array (J + 3 G,)
         Lengths of the columns of K: before the projection, after it for nodes without a lower end.
     nodes, rows : array (J + 3 G, NODE_WIDTH), (q, ROW_WIDTH)
@@ -74,8 +73,8 @@ class Sheet(NamedTuple):
     best, least, most : array (G,)
         Factors at the centre as if they had no sign, and their ranges of interest.
     fall, rise : array (G, G + 1)
-        How much the change of the columns of factors, and last of the other nodes, adds to each factor at least and at
-        most, the least with its sign turned.
+        Largest decrease and increase of each factor by the change of the columns of factors. The last column is that
+        by the nodes without a factor.
     spin : array (G,)
         Longest residual along each column of U.
     span : array (SPAN,)
@@ -85,8 +84,8 @@ class Sheet(NamedTuple):
     force : array (J,)
         Pulls of the nodes on the residual at the centre, ``K'(residual)``.
     turn, tie : array (J, 3 + G), (J, 3 + G)
-        Changes of the derivatives of the residual over a box as multiples of the rows, and pulls ``K'E``; the last of
-        each belong to the factors.
+        Changes of derivatives over a box as multiples of the rows, and pulls ``K'E``. The last columns belong to the
+        factors.
     cross : array (G, 3 + G)
         Changes of the entries of the Hessian that belong to the factors.
     third : array (3 + 2 G, 6)
@@ -275,7 +274,7 @@ def _project(scaled: Scaled, sheet: Sheet) -> None:
 
 @inlined
 def _forwards(sheet: Sheet) -> float:
-    """Return what it costs that factors are not negative: those that would be are zero, or all of them."""
+    """Return the cost of factors that are not negative: a negative best factor becomes zero, of several all do."""
     G, cost = sheet.best.shape[0], 0.0
     low = 0
     for g in range(G):
@@ -365,7 +364,7 @@ def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
 
 @inlined
 def _reach_of(sheet: Sheet, g: int, blur: float) -> float:
-    """Return how far a factor may be from the best at the centre by residuals."""
+    """Return the largest change of a factor by residuals."""
     total = 0.0
     for h in range(g, sheet.best.shape[0]):
         total += abs(sheet.back[g, h]) * (sheet.spin[h] + blur)

@@ -19,10 +19,11 @@ from optloc.proof.batch import FIRST_BOXES, Answered, Asked, empty_answer, plain
 from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around, reaches_infinity
 from optloc.proof.convex_boxes import accuracy_floor_far, widen_core
 from optloc.proof.enclosure import SLACK, around_node
-from optloc.proof.everywhere import CAPACITY, push_pieces, verdict_of
+from optloc.proof.everywhere import verdict_of
 from optloc.proof.groups import NONE, empty_groups
 from optloc.proof.near import BUDGET, COARSE, OPEN, STATIONARY, region_of
 from optloc.proof.nodes.node import RANGE
+from optloc.proof.pieces import CAPACITY, push_pieces
 from optloc.proof.position_costs import costs_of_groups, factors_of_rows
 from optloc.proof.scaled.reduction import HERE, Scaled, blur_of, look_at, reduce_rows
 from optloc.proof.scaled.scaled_search import (
@@ -260,7 +261,7 @@ def _without_factors(scaled: Scaled) -> Cost:
     R, groups = cost.A.copy(), empty_groups(columns)
     if columns == 0 or not invert(R, columns, _PIVOT):
         return cost
-    # One group of all: coordinates of a prior without correlation are groups of their own, and say nothing alone.
+    # One group of all nodes: each coordinate of a prior without correlation is a group, which bounds nothing alone.
     for j in range(columns):
         groups.order[0, j] = j
         for m in range(columns):
@@ -294,7 +295,7 @@ def _least_factor(scaled: Scaled, g: int, level: float) -> float:
 
 @compiled
 def _meet_balls(scaled: Scaled, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box that holds the balls of all ranges; return False where there are none.
+    """Write the corners of a box that holds the balls of all ranges; return False without balls.
 
     A range times the factor is within ``rho sqrt(R_jj)`` of its least-squares value, with R the inverse of K'K.
     """

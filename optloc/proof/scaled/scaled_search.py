@@ -27,14 +27,12 @@ from optloc.proof.box import (
 from optloc.proof.convex_boxes import is_known, set_axes, set_hull, widen_core
 from optloc.proof.curvature import curve_nodes, most_curved_side, sum_up
 from optloc.proof.descents import newton_step
-from optloc.proof.everywhere import (
-    ANOTHER,
+from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
+from optloc.proof.nodes.dispatch import bound_pieces
+from optloc.proof.pieces import (
     CAPACITY,
-    CHEAPER,
-    CLEAR,
-    INFINITE,
+    SHRUNK,
     SPARE,
-    SPENT,
     end_at_infinity,
     is_left,
     is_listed,
@@ -43,7 +41,6 @@ from optloc.proof.everywhere import (
     push_core,
     touches_infinity,
 )
-from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled, slope_of
 from optloc.proof.scaled.reduction import (
     HERE,
@@ -62,7 +59,6 @@ from optloc.proof.space import Space, floor_of, place_of, set_box, set_curves, s
 
 # The test for stationary points is made where the cost at the centre is within this number of levels.
 _NEAR = 10.0
-_SHRUNK = 0.5  # share of a box below which the rest is bounded again before it is halved
 
 
 class Tables(NamedTuple):
@@ -390,7 +386,7 @@ def _side_of_rest(scaled: Scaled, tables: Tables, space: Space, touching: bool, 
     if is_empty(box.cut):
         return -1
     side = int(steepest_side(box.half, sheet.rows, d))
-    if not sound or touching or share_left(box.cut, box.half) <= _SHRUNK:
+    if not sound or touching or share_left(box.cut, box.half) <= SHRUNK:
         return side
     low, high = box.cut[:3].copy(), box.cut[3:].copy()
     set_curves(space, scaled.cost, box)
