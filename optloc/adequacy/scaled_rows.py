@@ -28,6 +28,9 @@ _EXPLAINED = 1e-13
 # Least scale error of ranges: the wave has no speed, and below it the wave would run backwards. Of levels: power would
 # grow with the distance.
 _STILL = -1.0
+# Greatest exponent of a candidate: it grows with the distance, and differences of logarithms keep seven digits here.
+# Beyond, their rounding explains rows.
+_STEEP = 1e9
 # Thickness of coplanar stations, as a share of their width: rounding of coordinates.
 _FLAT = 1e-9
 # Offsets from the middle of coplanar stations from which descents begin, in spreads along each tangent, and steps.
@@ -43,10 +46,17 @@ def has_scales(problem: Problem) -> bool:
 
 
 def runs_backwards(problem: Problem, x: Array) -> Array:
-    """Return a mask (...) of the vectors whose unknown factor of ranges, times or levels is zero or less."""
-    out = np.zeros(x.shape[:-1], dtype=bool)
-    for column, least in zip(*_scales(problem), strict=True):
+    """Return a mask (...) of the vectors whose unknown factor of ranges, times or levels is zero or less.
+
+    Of candidates (N, K, size), the mask also has those whose exponent is of rounding (`_STEEP`), if another is not.
+    """
+    out, steep = np.zeros(x.shape[:-1], dtype=bool), np.zeros(x.shape[:-1], dtype=bool)
+    levels = _touch(problem, _is_level)
+    for column, least, level in zip(*_scales(problem), levels, strict=True):
         out |= x[..., column] <= least
+        steep |= level & (x[..., column] > _STEEP)
+    if x.ndim > 2 and steep.any():
+        out |= steep & (~(out | steep) & np.isfinite(x).all(-1)).any(-1, keepdims=True)
     return out
 
 

@@ -164,19 +164,19 @@ def _beyond_scale(problem: Problem) -> Iterator[str]:
 
 def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
     """Yield the reasons against kinds of rows with factors (m,), of which some have no prior."""
-    emitting = set[int]()
+    emitting, kinds = set[int](), {rows.kind for rows in problem.rows}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model, own = MODELS[rows.kind], {int(one) for one in factor[start : start + rows.count]}
         emitting |= own if model.emission else set()
         without_prior = any(free[one] for one in own)
         if model.ranges is None and {node for _, node in model.nodes} != {"log range"}:
             yield f"scales come with {rows.kind} rows, and the proof takes times, ranges and levels"
-        elif model.ranges is None and without_prior:
-            yield f"the scale of {rows.kind} rows has no prior: far away it grows with the distance, at a finite cost"
+        elif model.ranges is None and without_prior and (len(kinds) > 1 or len(own) > 1):
+            yield f"the scale of {rows.kind} rows has no prior, and other rows do not have it"
         elif without_prior and sum(model.ranges or ()) != 0 and not model.emission:
             yield f"the scale of {rows.kind} rows has no prior, so that nothing bounds the position"
-    if len(emitting) > 1:
-        yield "rows with different scales share an unknown emission time"
+    if len(emitting) > 1 and any(free[one] for one in emitting):
+        yield "rows with different scales share an unknown emission time, and a scale has no prior"
 
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:

@@ -159,16 +159,14 @@ def test_minima_are_never_clipped_and_convex_boxes_are_convex(d, seed):
 
 
 def _is_jointly_convex(scene, look, at, half, level, rng):
-    """Check midpoints: along offsets times the factor, and the factor, the cost is convex between best points."""
+    """Check midpoints: in the offsets and the factor the cost is convex between points with their best factors."""
     piece = 2 * look.d + 1
     if look.atlas.minima.home[0] != 2 * look.d:  # outside the cube offsets are those of a direction and inverse range
         return
-    centre = look.places(piece, at, np.zeros((1, 3)))[0]
     ends = np.stack([look.places(piece, at, half * rng.uniform(-1, 1, (20, 3))) for _ in range(2)])
     values, factors = zip(*(profiled(scene, end) for end in ends), strict=True)
     good = (values[0] < level) & (values[1] < level)
-    k = 0.5 * (factors[0] + factors[1])
-    middle = centre + 0.5 * sum(f[:, None] * (e - centre) for f, e in zip(factors, ends, strict=True)) / k[:, None]
+    k, middle = 0.5 * (factors[0] + factors[1]), 0.5 * (ends[0] + ends[1])
     r = np.linalg.norm(scene.place - middle[:, None], axis=-1) / scene.sigma
     z = scene.z / scene.sigma - (scene.z / scene.sigma).mean()
     own = ((k[:, None] * (r - r.mean(1, keepdims=True)) - z) ** 2).sum(1)
@@ -253,4 +251,13 @@ def test_problems_beyond_the_proof_are_named():
         measured("toa", a=np.arange(6), z=np.arange(6.0), sigma=0.1),
         measured("azimuth", a=np.arange(2), z=np.zeros(2), sigma=0.1),
     )
-    assert unsupported(with_bias(mixed, "speed", form="scale", per="kind", kind="toa").flat())
+    assert "azimuth" in unsupported(with_bias(mixed, "speed", form="scale", per="kind", kind="toa").flat())
+    levels = assemble(
+        place,
+        measured("rss_difference", a=np.arange(1, 6), b=np.zeros(5, dtype=int), z=np.arange(5.0), sigma=1.0),
+        measured("tdoa", a=np.arange(1, 6), b=np.zeros(5, dtype=int), z=np.arange(5.0), sigma=1.0),
+    )
+    free = with_bias(levels, "exponent", form="scale", per="kind", kind="rss_difference")
+    assert "rss_difference rows has no prior" in unsupported(free.flat())
+    many = with_bias(ranges, "each", form="scale", per="station", sigma=0.1)
+    assert "several scales (6)" in unsupported(many.flat())

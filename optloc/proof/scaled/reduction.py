@@ -225,9 +225,8 @@ def _orthogonalise(sheet: Sheet) -> None:
                     unit[i, g] -= along * unit[i, h]
         for i in range(q):
             left += unit[i, g] * unit[i, g]
-        length = sqrt(left)
-        good = good and length > _DEPENDENT * sqrt(whole)
-        per = 1.0 / length if length > 0.0 else 0.0
+        length, apart = sqrt(left), sqrt(left) > _DEPENDENT * sqrt(whole)
+        good, per = good and apart, 1.0 / length if apart else 0.0
         for i in range(q):
             unit[i, g] *= per
         for m in range(g):

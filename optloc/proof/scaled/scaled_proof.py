@@ -10,21 +10,18 @@ import numpy as np
 from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, enabled, plain, put, usable, worth_loading, zero
-from optloc.compute.systems import invert
 from optloc.linear.normal import prior_parts
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, with_minima
 from optloc.proof.batch import FIRST_BOXES, Answered, Asked, empty_answer, plainly
-from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around, reaches_infinity
+from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around
 from optloc.proof.convex_boxes import accuracy_floor_far, widen_core
-from optloc.proof.enclosure import SLACK, around_node
 from optloc.proof.everywhere import verdict_of
-from optloc.proof.groups import NONE, empty_groups
-from optloc.proof.near import BUDGET, COARSE, OPEN, STATIONARY, region_of
-from optloc.proof.nodes.node import RANGE
+from optloc.proof.near import BUDGET, COARSE, OPEN, STATIONARY
 from optloc.proof.pieces import CAPACITY, push_pieces
 from optloc.proof.position_costs import costs_of_groups, factors_of_rows
+from optloc.proof.scaled.enclosures import first_enclosed, stays_finite
 from optloc.proof.scaled.reduction import HERE, Scaled, blur_of, look_at, reduce_rows
 from optloc.proof.scaled.scaled_search import (
     Tables,
@@ -39,11 +36,9 @@ from optloc.proof.search_space import (
     COARSEST,
     LINES,
     Chart,
-    Cost,
     accuracy_floor,
     chart_at,
     cost_of,
-    empty_box,
     equal_within,
 )
 from optloc.proof.space import Space
@@ -131,7 +126,7 @@ def prove_scaled(
         As there.
     """
     cost, tables, D = scaled.cost, tables_of(scaled), x.shape[0]
-    far = _stays_finite(scaled)
+    far = stays_finite(scaled)
     chart, _ = chart_at(cost, x, tables.near)
     tables.near.at[:] = 0.0
     cost_near(scaled, chart, tables)
@@ -156,7 +151,7 @@ def prove_scaled(
         space, size = _with_minima(scaled, tables, atlas, chart, x, others, levels, least, eps, stack)
     else:
         low, high = np.zeros(3), np.zeros(3)
-        first = _first_enclosed(scaled, chart, x, levels, least, low, high)
+        first = first_enclosed(scaled, chart, x, levels, least, low, high)
         if first == levels.shape[0]:
             return OPEN, 0, -inf, gaps[0], 0
         gaps, levels = gaps[first:], levels[first:]
@@ -167,19 +162,6 @@ def prove_scaled(
         scaled, tables, space, stack, size, levels, eps, budget, rivals, found
     )
     return verdict_of(outcome, boxes, bound, shown, met, gaps, least - eps)
-
-
-@compiled
-def _stays_finite(scaled: Scaled) -> bool:
-    """Return whether the cost stays finite at infinity at any factors: the nodes of each factor are balanced."""
-    K = scaled.cost.K.copy()
-    for g in range(-1, scaled.lift.shape[1]):
-        for j in range(K.shape[1]):
-            for i in range(K.shape[0]):
-                K[i, j] = scaled.cost.K[i, j] if scaled.group[j] == g else 0.0
-        if not reaches_infinity(scaled.cost.kinds, K):
-            return False
-    return True
 
 
 @compiled
@@ -206,120 +188,6 @@ def _with_minima(
             return in_atlas(atlas, chart), 0
     own = with_minima(atlas.middle, atlas.radius, x.shape[0], first_minima(atlas.minima, known))
     return in_atlas(own, chart), push_pieces(stack, own)
-
-
-# Costs that grow without end: rows without a factor enclose the cheap positions, as a prior on the position does. Or
-# priors keep the factors from zero, and balls around the stations do.
-
-# Share of the diagonal that a pivot must exceed, as in `optloc.proof.enclosure`.
-_PIVOT = 1e-9
-# Least factor of use: the balls of a smaller one are ten times larger.
-_SMALLEST = 0.1
-
-
-@compiled
-def _first_enclosed(
-    scaled: Scaled, chart: Chart, x: Array, levels: Array, least: float, low: Array, high: Array
-) -> int:
-    """Return the first level whose positions are enclosed, or the number of levels; write the corners of their box."""
-    for k in range(levels.shape[0]):
-        level = max(levels[k], least)
-        if _enclose(_without_factors(scaled), chart, x, level, low, high) or _meet_balls(
-            scaled, chart, x, level, low, high
-        ):
-            return k
-    return int(levels.shape[0])
-
-
-@compiled
-def _without_factors(scaled: Scaled) -> Cost:
-    """Return the cost of the rows whose nodes have no factors."""
-    K, rows, columns = scaled.cost.K, zero(), zero()
-    row, column = np.zeros(K.shape[0], dtype=np.int64), np.zeros(K.shape[1], dtype=np.int64)
-    for j in range(K.shape[1]):
-        if scaled.group[j] < 0:
-            column[columns] = j
-            columns += 1
-    for i in range(K.shape[0]):
-        own, other = False, False
-        for j in range(K.shape[1]):
-            own = own or (scaled.group[j] < 0 and K[i, j] != 0.0)
-            other = other or (scaled.group[j] >= 0 and K[i, j] != 0.0)
-        if own and not other:
-            row[rows] = i
-            rows += 1
-    part, kinds = np.zeros((rows, columns)), np.zeros(columns, dtype=np.int64)
-    w, data = np.zeros(rows), np.zeros((columns, scaled.cost.data.shape[1]))
-    for j in range(columns):
-        kinds[j] = scaled.cost.kinds[column[j]]
-        data[j] = scaled.cost.data[column[j]]
-        for i in range(rows):
-            part[i, j] = K[row[i], column[j]]
-    for i in range(rows):
-        w[i] = scaled.cost.w[row[i]]
-    cost = cost_of(kinds, data, part, w)
-    R, groups = cost.A.copy(), empty_groups(columns)
-    if columns == 0 or not invert(R, columns, _PIVOT):
-        return cost
-    # One group of all nodes: each coordinate of a prior without correlation is a group, which bounds nothing alone.
-    for j in range(columns):
-        groups.order[0, j] = j
-        for m in range(columns):
-            groups.R[j, m] = R[j, m]
-    groups.tie[:], groups.order[1] = 0.0, 0
-    groups.order[1, 0], groups.order[2, 0] = columns, NONE
-    return Cost(kinds, data, part, w, cost.A, cost.weight, groups)
-
-
-@compiled
-def _enclose(cost: Cost, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box that holds all positions where a cost is below a level; return False for no box."""
-    q, J = cost.K.shape
-    if q == 0 or J == 0:
-        return False
-    box, none = empty_box(q, J), np.full(x.shape[0], np.nan)
-    chart_at(cost, x, box)
-    return region_of(cost, chart, box, np.sqrt(level), none, none, low, high)
-
-
-@compiled
-def _least_factor(scaled: Scaled, g: int, level: float) -> float:
-    """Return the least factor that its prior allows at a cost, negative without a prior; 1 for no factor."""
-    if g < 0:
-        return 1.0
-    G = scaled.lift.shape[1]
-    last = scaled.lift.shape[0] - G + g
-    lift = scaled.lift[last, g]
-    return float((scaled.cost.w[last] - np.sqrt(level)) / lift * (1.0 - 1e-12)) if lift > 0.0 else -1.0
-
-
-@compiled
-def _meet_balls(scaled: Scaled, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box that holds the balls of all ranges; return False without balls.
-
-    A range times the factor is within ``rho sqrt(R_jj)`` of its least-squares value, with R the inverse of K'K.
-    """
-    cost = scaled.cost
-    R, J, rho = cost.A.copy(), cost.kinds.shape[0], np.sqrt(level)
-    for g in range(scaled.lift.shape[1]):
-        if not _least_factor(scaled, g, level) >= _SMALLEST:
-            return False
-    for j in range(J):
-        if cost.kinds[j] != RANGE:
-            return False
-    low[:], high[:] = -inf, inf
-    for k in range(x.shape[0], 3):
-        low[k] = high[k] = 0.0
-    if not invert(R, J, _PIVOT):
-        return False
-    for j in range(J):
-        most = rho * np.sqrt(R[j, j]) * (1.0 + SLACK)
-        for m in range(J):
-            for i in range(cost.w.shape[0]):
-                most += R[j, m] * cost.K[i, m] * cost.w[i]
-        most = most * (1.0 + SLACK) / _least_factor(scaled, scaled.group[j], level)
-        around_node(RANGE, cost.data[j], 0.0, most, chart.origin, chart.back, low, high)
-    return True
 
 
 @compiled
