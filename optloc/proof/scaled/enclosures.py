@@ -20,7 +20,7 @@ from optloc.proof.search_space import Chart, Cost, chart_at, cost_of, empty_box
 
 @compiled
 def stays_finite(scaled: Scaled) -> bool:
-    """Return whether the cost stays finite at infinity at any factors, and they do: nodes of a factor are balanced.
+    """Return whether the cost and the factors stay finite at infinity: the nodes of each factor are balanced.
 
     Far away, levels with a free exponent have the cost of a linear field, because the exponent grows with the distance.
     """
@@ -216,8 +216,8 @@ def _meet_differences(scaled: Scaled, chart: Chart, x: Array, level: float, low:
 def _meet_field(scaled: Scaled, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box around a ball outside which levels with a free exponent cost too much; or False.
 
-    At distance D, ``log r_j = log D - u.s_j / D`` within ``(s_j / D)^2``, if no place s_j is farther than D/2 from the
-    middle. With ``q = k u / D`` and ``M = K s`` the residual is ``w + M q`` within |q| B / D. Here B is the sum of
+    Let places s_j be at most D/2 from the middle. Then ``log r_j`` is ``log D - u.s_j / D`` within ``(s_j / D)^2``.
+    With ``q = k u / D`` and ``M = K s`` the residual is ``w + M q`` within |q| B / D. Here B is the sum of
     ``|K_j| s_j^2``. Let r be the length of the best field, and m the least singular value of M. For
     ``D > B (|w| + r) / (m (r - rho))`` all q leave a residual longer than rho.
     """
