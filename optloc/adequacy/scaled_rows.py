@@ -63,21 +63,8 @@ def runs_backwards(problem: Problem, x: Array) -> Array:
 def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple[Array, Array, Array]:
     """Return the least cost over all unknowns but the position, and its normal equations there.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one position.
-    x : array (q, N, size)
-        Positions, and where the search for the other unknowns begins.
-    at : array (N, size)
-        Where station errors of span "noise" are weighed.
-    passes : int
-        Number of steps of the other unknowns. The slope along the position depends on the scales.
-
-    Returns
-    -------
-    cost, information, vector
-        As in `optloc.adequacy.shape.profile`; factors of ranges are not negative.
+    Arguments and results are those of `optloc.adequacy.shape.profile`. More passes make the slope along the position
+    exact, which depends on the scales. Factors of ranges, times and levels are not negative.
     """
     slot, _ = problem.layout.find("position")
     part, (scale, least) = np.arange(slot.start, slot.start + slot.size), _scales(problem)
