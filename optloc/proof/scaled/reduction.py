@@ -339,26 +339,25 @@ def _bound_by_priors(scaled: Scaled, rho: float, sheet: Sheet) -> None:
 @inlined
 def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
     """Write how much the change of each column of the rows over a box, and its rounding, may change the factors."""
-    nodes, half, V = box.nodes, box.half, sheet.V
+    nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third  # memory that is free
     G, J = V.shape
     for g in range(G):
+        slopes[: G + 1], sheet.fall[g], sheet.rise[g] = 0.0, 0.0, 0.0
+        for j in range(J):
+            pull, h = V[g, j], scaled.group[j] if scaled.group[j] >= 0 else G
+            if pull == 0.0:
+                continue
+            first, second = pull * nodes[j, LOW], pull * nodes[j, HIGH]
+            sheet.fall[g, h] -= min(first, second, 0.0)
+            sheet.rise[g, h] += max(first, second, 0.0)
+            for k in range(3):
+                slopes[h, k] += pull * nodes[j, SLOPE0 + k]
+        rounded = 0.0
+        for m in range(g, G):
+            rounded += abs(sheet.back[g, m]) * blur
         for h in range(G + 1):
-            fall = rise = s0 = s1 = s2 = 0.0
-            for j in range(J):
-                pull = V[g, j]
-                own = scaled.group[j] == h or (scaled.group[j] < 0 and h == G)
-                if not own or pull == 0.0:
-                    continue
-                first, second = pull * nodes[j, LOW], pull * nodes[j, HIGH]
-                fall -= min(first, second, 0.0)
-                rise += max(first, second, 0.0)
-                s0 += pull * nodes[j, SLOPE0]
-                s1 += pull * nodes[j, SLOPE0 + 1]
-                s2 += pull * nodes[j, SLOPE0 + 2]
-            both = abs(s0) * half[0] + abs(s1) * half[1] + abs(s2) * half[2]
-            for m in range(g, G):
-                both += abs(sheet.back[g, m]) * blur
-            sheet.fall[g, h], sheet.rise[g, h] = fall + both, rise + both
+            both = abs(slopes[h, 0]) * half[0] + abs(slopes[h, 1]) * half[1] + abs(slopes[h, 2]) * half[2] + rounded
+            sheet.fall[g, h], sheet.rise[g, h] = sheet.fall[g, h] + both, sheet.rise[g, h] + both
 
 
 @inlined
@@ -425,13 +424,13 @@ def _solve_swing(sheet: Sheet, blur: float) -> bool:
 def _set_slopes(scaled: Scaled, box: Box, sheet: Sheet) -> None:
     """Write the derivatives of the columns of the factors along each coordinate, before their projection."""
     K, nodes, J = scaled.cost.K, box.nodes, box.nodes.shape[0]
-    for i in range(K.shape[0]):
-        for column in range(J, sheet.K.shape[1]):
-            sheet.K[i, column] = 0.0
-        for j in range(J):
-            if scaled.group[j] >= 0:
-                for k in range(3):
-                    sheet.K[i, J + 3 * scaled.group[j] + k] += K[i, j] * nodes[j, SLOPE0 + k]
+    sheet.K[:, J:] = 0.0
+    for j in range(J):
+        for k in range(3):
+            slope, column = nodes[j, SLOPE0 + k], J + 3 * scaled.group[j] + k
+            if scaled.group[j] >= 0 and slope != 0.0:
+                for i in range(K.shape[0]):
+                    sheet.K[i, column] += K[i, j] * slope
 
 
 @inlined
@@ -443,7 +442,7 @@ def _turn(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
     for g in range(G):
         change = 0.0
         for k in range(3):
-            change += _length_of(sheet, J + 3 * g + k) * half[k]
+            change += _length_of(sheet, J + 3 * g + k) * half[k] if half[k] > 0.0 else 0.0
         for j in range(J):
             if scaled.group[j] == g:
                 change += scaled.cost.weight[j] * max(abs(nodes[j, LOW]), abs(nodes[j, HIGH]))
@@ -509,6 +508,9 @@ def _add_range(g: int, box: Box, sheet: Sheet) -> None:
     wide = 0.5 * (sheet.most[g] - sheet.least[g])
     for k in range(3):
         column = J + 3 * g + k
+        out[column, :] = 0.0
+        if not box.half[k] > 0.0:
+            continue
         sheet.weight[column] = _length_of(sheet, column)
         for h in range(unit.shape[1]):
             along = 0.0
@@ -516,7 +518,6 @@ def _add_range(g: int, box: Box, sheet: Sheet) -> None:
                 along += unit[i, h] * K[i, column]
             for i in range(K.shape[0]):
                 K[i, column] -= unit[i, h] * along
-        out[column, :] = 0.0
         out[column, LOW], out[column, HIGH] = -wide * box.half[k], wide * box.half[k]
 
 
