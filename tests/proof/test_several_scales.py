@@ -92,8 +92,8 @@ def test_minima_are_never_clipped_and_convex_boxes_are_convex(d, n, priors, leve
                 convex += 1
                 assert is_positive(sheet)
                 _check_midpoints(scene, look, at, half, rho**2, rng)
-    assert convex > COUNT // 12
-    assert clipped > COUNT // 12
+    assert convex >= COUNT // 12
+    assert clipped >= COUNT // 12
 
 
 def _check_midpoints(scene, look, at, half, level, rng):
