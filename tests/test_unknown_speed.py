@@ -81,6 +81,19 @@ def test_bad_speeds_of_files_are_refused(tmp_path, speed, words):
     assert words in str(told.value)
 
 
+@pytest.mark.parametrize(
+    ("speed", "keys"),
+    [
+        ("{ value = 343.0, sigma = 5.0, typo = 1.0 }", "sigma, value"),
+        ('{ medium = "air", celsius = 20.0, typo = 1.0 }', "celsius, depth, medium, salinity"),
+    ],
+)
+def test_unknown_keys_of_a_speed_list_the_keys_of_its_table(tmp_path, speed, keys):
+    with pytest.raises(InvalidProblem, match="unknown key 'typo'") as told:
+        load(written(tmp_path, speed))
+    assert keys in str(told.value)
+
+
 def test_a_sigma_needs_times_and_no_second_scale(tmp_path):
     with pytest.raises(InvalidProblem, match="no measurement is a time"):
         load(written(tmp_path, "{ value = 343.0, sigma = 5.0 }", unit="m"))

@@ -7,15 +7,17 @@ projects the rows instead, and it subtracts nothing from a cost.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from optloc.base import linalg
 from optloc.base.linalg import span_of
-from optloc.base.types import Array
+from optloc.base.types import Array, Bias
 from optloc.linear.evaluate import columns, differentiate
 from optloc.linear.normal import prior_parts, whitener_at
 from optloc.linear.walks import walks
-from optloc.models import MODELS
+from optloc.models import MODELS, Model
 from optloc.problem.forms import form_of
 from optloc.problem.noise import whiten_rows
 from optloc.problem.problem import Problem
@@ -23,10 +25,16 @@ from optloc.problem.problem import Problem
 # Least share of a column that must remain after projection. Rounding leaves a hundredth of this share; ranges at ten
 # million spreads leave 1e-7.
 _EXPLAINED = 1e-13
-# Least scale error of ranges: the wave has no speed, and below it the wave would run backwards.
+# Least scale error of ranges: the wave has no speed, and below it the wave would run backwards. Of levels: power would
+# grow with the distance.
 _STILL = -1.0
+# Greatest exponent of a candidate: it grows with the distance, and differences of logarithms keep seven digits here.
+# Beyond, their rounding explains rows.
+_STEEP = 1e9
 # Thickness of coplanar stations, as a share of their width: rounding of coordinates.
 _FLAT = 1e-9
+# Offsets from the middle of coplanar stations from which descents begin, in spreads along each tangent, and steps.
+_OFFSETS, _STEPS = (-1.0, 0.0, 1.0), 12
 # Distance in spreads at which wave fronts are taken as paraboloids. Higher orders are 1e-8 of the bend there, and the
 # rounding of ranges as well.
 _DISTANT = 1e4
@@ -34,35 +42,29 @@ _DISTANT = 1e4
 
 def has_scales(problem: Problem) -> bool:
     """Return whether unknown scales multiply rows, in a problem without walks."""
-    return not walks(problem) and any(form_of(bias).enters == "scales" for bias in problem.biases)
+    return not walks(problem) and bool(_multiplying(problem))
 
 
 def runs_backwards(problem: Problem, x: Array) -> Array:
-    """Return a mask (...) of the vectors whose unknown factor of ranges or times is zero or less."""
-    out = np.zeros(x.shape[:-1], dtype=bool)
-    for column, least in zip(*_scales(problem), strict=True):
+    """Return a mask (...) of the vectors whose unknown factor of ranges, times or levels is zero or less.
+
+    Of candidates (N, K, size), the mask also has those whose exponent is of rounding (`_STEEP`), if another is not.
+    """
+    out, steep = np.zeros(x.shape[:-1], dtype=bool), np.zeros(x.shape[:-1], dtype=bool)
+    levels = _touch(problem, _is_level)
+    for column, least, level in zip(*_scales(problem), levels, strict=True):
         out |= x[..., column] <= least
+        steep |= level & (x[..., column] > _STEEP)
+    if x.ndim > 2 and steep.any():
+        out |= steep & (~(out | steep) & np.isfinite(x).all(-1)).any(-1, keepdims=True)
     return out
 
 
 def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple[Array, Array, Array]:
     """Return the least cost over all unknowns but the position, and its normal equations there.
 
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems of one position.
-    x : array (q, N, size)
-        Positions, and where the search for the other unknowns begins.
-    at : array (N, size)
-        Where station errors of span "noise" are weighed.
-    passes : int
-        Number of steps of the other unknowns. The slope along the position depends on the scales.
-
-    Returns
-    -------
-    cost, information, vector
-        As in `optloc.adequacy.shape.profile`; factors of ranges are not negative.
+    Arguments and results are as for `optloc.adequacy.shape.profile`. More passes make the slope along the position
+    exact, which depends on the scales. Factors of ranges, times and levels are not negative.
     """
     slot, _ = problem.layout.find("position")
     part, (scale, least) = np.arange(slot.start, slot.start + slot.size), _scales(problem)
@@ -112,23 +114,51 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
     for side in (-_DISTANT, _DISTANT):
         there = np.array(x[items])
         there[:, part] = centre + side * spread[:, None] * normal
-        residual, design = _rows(some, there, x[items])
-        for j in free:
-            touched = (design[..., j] != 0.0)[..., None]
-            tilt = np.where(touched, design[..., part] @ tangents, 0.0)
-            rest = np.setdiff1d(np.arange(design.shape[-1]), np.append(part, j))
-            basis = span_of(np.concatenate([design[..., rest], tilt], axis=-1))
-            column, left = _without(basis, design[..., [j]]), _without(basis, residual[..., None])
-            _, left, _ = _bounded(column, left, _STILL - there[:, [j]])
-            out[items] = np.fmin(out[items], (left[..., 0] ** 2).sum(-1))
+        if len(free) == 1:
+            own = _above_any_place(some, there, x[items], part, tangents, free[0])
+        else:
+            own = _above_one_place(some, there, x[items], part, tangents * spread[:, None, None])
+        out[items] = np.fmin(out[items], own)
     return out
+
+
+def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array, j: int) -> Array:
+    """Return the least cost (N,) of distant waves with one free factor j. A place is a tilt of the wave front."""
+    residual, design = _rows(problem, there, at)
+    touched = (design[..., j] != 0.0)[..., None]
+    tilt = np.where(touched, design[..., part] @ tangents, 0.0)
+    rest = np.setdiff1d(np.arange(design.shape[-1]), np.append(part, j))
+    basis = span_of(np.concatenate([design[..., rest], tilt], axis=-1))
+    column, left = _without(basis, design[..., [j]]), _without(basis, residual[..., None])
+    _, left, _ = _bounded(column, left, _STILL - there[:, [j]])
+    return np.asarray((left[..., 0] ** 2).sum(-1))
+
+
+def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array) -> Array:
+    """Return the least cost (N,) of distant waves with several free factors: all come from one place.
+
+    Gauss-Newton along the tangents (N, d, d - 1), which are as long as a spread; steps are a spread at most.
+    """
+    count, along = tangents.shape[-1], np.swapaxes(tangents, -1, -2)
+    first = np.stack(np.meshgrid(*[_OFFSETS] * count), axis=-1).reshape(-1, 1, count)
+    y, best = np.broadcast_to(first, (len(first), len(there), count)), np.full(len(there), np.inf)
+    for _ in range(_STEPS):
+        x = np.array(np.broadcast_to(there, (len(y), *there.shape)))
+        x[..., part] += (tangents @ y[..., None])[..., 0]
+        cost, information, vector = profile_by_rows(problem, x, at, 2)
+        best = np.fmin(best, cost.min(0))
+        inner, pull = along @ information @ tangents, along @ vector[..., None]
+        move = (np.linalg.pinv(inner, hermitian=True) @ pull)[..., 0]
+        y = y + move / np.maximum(np.abs(move).max(-1, keepdims=True), 1.0)
+    return np.asarray(best)
 
 
 def _without_prior(problem: Problem) -> Array:
     """Return the columns of unknown factors of ranges that have no prior."""
     scale, least = _scales(problem)
+    levels = scale[~_touch(problem, lambda model: model.ranges is not None)]
     known = [columns(problem.layout, name, np.array([0]))[0] for name, _, _ in prior_parts(problem)]
-    return np.asarray(scale[(least == _STILL) & ~np.isin(scale, np.concatenate([np.zeros(0, dtype=int), *known]))])
+    return np.asarray(scale[(least == _STILL) & ~np.isin(scale, np.concatenate([levels, *known]))])
 
 
 def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array, Array]:
@@ -146,15 +176,26 @@ def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array
 
 def _scales(problem: Problem) -> tuple[Array, Array]:
     """Return the columns (n,) of all unknown factors, and the least value of each."""
-    ranges = np.concatenate([np.full(rows.count, MODELS[rows.kind].ranges is not None) for rows in problem.rows])
-    found, least = [np.zeros(0, dtype=int)], [np.zeros(0)]
-    for bias in problem.biases:
-        if form_of(bias).enters == "scales":
-            own = columns(problem.layout, bias.name, np.array([0]))[0]
-            of_ranges = np.bincount(bias.member, ranges[bias.row], len(own)) > 0
-            found.append(own)
-            least.append(np.where(of_ranges, _STILL, -np.inf))
-    return np.concatenate(found), np.concatenate(least)
+    falls = _touch(problem, lambda model: model.ranges is not None or _is_level(model))
+    own = [columns(problem.layout, bias.name, np.array([0]))[0] for bias in _multiplying(problem)]
+    return np.concatenate([np.zeros(0, dtype=int), *own]), np.where(falls, _STILL, -np.inf)
+
+
+def _multiplying(problem: Problem) -> list[Bias]:
+    """Return the biases that multiply rows."""
+    return [bias for bias in problem.biases if form_of(bias).enters == "scales"]
+
+
+def _is_level(model: Model) -> bool:
+    """Return whether a kind is of received power, which falls with the distance."""
+    return {node for _, node in model.nodes} == {"log range"}
+
+
+def _touch(problem: Problem, of_kind: Callable[[Model], bool]) -> Array:
+    """Return a mask (n,) of the unknown factors that multiply rows of some kinds."""
+    rows = np.concatenate([np.full(rows.count, of_kind(MODELS[rows.kind])) for rows in problem.rows])
+    own = [np.bincount(bias.member, rows[bias.row], len(bias.members)) > 0 for bias in _multiplying(problem)]
+    return np.concatenate([np.zeros(0, dtype=bool), *own])
 
 
 def _rows(problem: Problem, x: Array, at: Array) -> tuple[Array, Array]:

@@ -347,15 +347,10 @@ def crlb(
     With --status measurements are simulated, and the share of each status of their fixes is given, or mapped.
     """
     if status:
-        from optloc.cli.crlb import run_status, run_status_map
+        from optloc.cli.crlb import Simulated, run_status
 
-        if map_ is not None:
-            raise typer.Exit(
-                run_status_map(file, map_, at, height, extent, velocity, trials or 50, seed, geodetic=geodetic)
-            )
-        raise typer.Exit(
-            run_status(file, at, velocity, trials or 200, seed, geodetic=geodetic, as_json=as_json, quiet=quiet)
-        )
+        wanted = Simulated(map_, at, height, extent, velocity, trials, seed, geodetic)
+        raise typer.Exit(run_status(file, wanted, as_json=as_json, quiet=quiet))
     # A map needs no truth: it is drawn around the stations, or the place of the fix.
     if map_ is not None:
         from optloc.cli.crlb import run_map

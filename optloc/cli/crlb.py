@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -27,6 +27,9 @@ from optloc.problem.fix import Suspect
 from optloc.problem.layout import Layout, Slot, state_names
 from optloc.problem.problem import Problem
 
+if TYPE_CHECKING:
+    from optloc.solvers.status_shares import StatusShares
+
 # Lines of the table against time, and of the bounds and of their members: what a screen holds.
 _LINES, _BOUNDS, _MEMBERS = 10, 30, 16
 # Points of a course, as many as a picture shows apart; and unknowns beyond which nobody reads a curve of each.
@@ -35,6 +38,8 @@ _POINTS, _UNKNOWNS = 400, 100
 _MAP_POINTS = 96
 # The same of a map of statuses, whose places need a hundred fixes each.
 _STATUS_POINTS = 24
+# Simulated fixes at a place, whose shares are then known to 3 %, and at each place of a map, to 7 %.
+_TRIALS, _TRIALS_OF_A_MAP = 200, 50
 _UNITS = {"length": "m", "speed": "m/s"}
 _RMS = {True: " (rms)", False: ""}
 
@@ -388,60 +393,58 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
 # The status of fixes.
 
 
-def run_status(
-    file: Path,
-    at: str | None,
-    velocity: str | None,
-    trials: int,
-    seed: int,
-    *,
-    geodetic: bool,
-    as_json: bool,
-    quiet: bool,
-) -> int:
-    """Print the shares of the statuses of simulated fixes at a truth or at the fix, and return the exit code."""
+class Simulated(NamedTuple):
+    """The places at which fixes are simulated, as asked for: a map, or one place; and their number and seed."""
+
+    out: Path | None
+    at: str | None
+    height: str | None
+    limits: str | None
+    velocity: str | None
+    trials: int | None
+    seed: int
+    geodetic: bool
+
+
+def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool) -> int:
+    """Print the shares of the statuses of simulated fixes, or write their map, and return the exit code."""
+    loaded = read(file, values=False)
+    if wanted.out is not None:
+        _map_status(file, loaded, wanted, wanted.out)
+        return 0
     from optloc.solvers.status_shares import status_shares
 
-    loaded = read(file, values=False)
     problem = _of_one_epoch(loaded.problem)
-    truth = vector(problem, at, velocity, geodetic)
-    if at is None and _sought(problem):
+    truth = vector(problem, wanted.at, wanted.velocity, wanted.geodetic)
+    if wanted.at is None and _sought(problem):
         truth = _solve(file).reshape(-1, len(truth))[0]
         if not np.isfinite(truth).all():
             raise InvalidProblem("the file has no fix to simulate at", loaded.source, "give a place with --at")
-    found = status_shares(problem, truth, trials, seed)
+    found = status_shares(problem, truth, wanted.trials or _TRIALS, wanted.seed)
     if as_json:
-        told = dict(zip((one.label for one in found.statuses), found.share, strict=True))
-        made = {"file": loaded.source, "trials": trials, "seed": seed, "share": told, "covered95": found.covered}
-        write_text(Path("-"), dumps(made))
+        share = dict(zip((one.label for one in found.statuses), found.share, strict=True))
+        made = {"file": loaded.source, "trials": found.trials, "seed": wanted.seed, "share": share}
+        write_text(Path("-"), dumps(made | {"covered95": found.covered}))
     elif not quiet:
-        table = Table(title=f"{loaded.title}: status of {trials} simulated fixes", title_justify="left")
-        for name, side in (("status", "left"), ("share, %", "right"), ("standard error, %", "right")):
-            table.add_column(name, justify="right" if side == "right" else "left")
-        for status, share, error in zip(found.statuses, found.share, found.deviation, strict=True):
-            table.add_row(status.label, f"{100.0 * share:.1f}", f"{100.0 * error:.1f}")
-        console = Screen()
-        console.print(table)
-        if np.isfinite(found.covered):
-            console.print(
-                f"Of the ok fixes {100.0 * float(found.covered):.1f} % hold the true place in their 95 % region."
-            )
+        _show_status(found, loaded.title)
     return 0
 
 
-def run_status_map(
-    file: Path,
-    out: Path,
-    at: str | None,
-    height: str | None,
-    limits: str | None,
-    velocity: str | None,
-    trials: int,
-    seed: int,
-    *,
-    geodetic: bool,
-) -> int:
-    """Write the map of the share of `ok` fixes of a file, and return the exit code."""
+def _show_status(found: StatusShares, title: str) -> None:
+    table = Table(title=f"{title}: status of {found.trials} simulated fixes", title_justify="left")
+    table.add_column("status")
+    for name in ("share, %", "standard error, %"):
+        table.add_column(name, justify="right")
+    for status, share, error in zip(found.statuses, found.share, found.deviation, strict=True):
+        table.add_row(status.label, f"{100.0 * share:.1f}", f"{100.0 * error:.1f}")
+    console = Screen()
+    console.print(table)
+    if np.isfinite(found.covered):
+        console.print(f"Of the ok fixes {100.0 * float(found.covered):.1f} % hold the true place in their 95 % region.")
+
+
+def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> None:
+    """Write the map of the share of `ok` fixes of a file."""
     from optloc.plot import plot_status_map, status_geojson
     from optloc.solvers.status_shares import status_map
 
@@ -449,17 +452,16 @@ def run_status_map(
     if ending not in (*PICTURES, ".geojson"):
         advice = "use .png, .svg, .pdf or .geojson"
         raise InvalidProblem(f"status maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
-    loaded = read(file, values=False)
     claim_outputs(out, inputs=[file])
     problem = _of_one_epoch(loaded.problem)
-    truth = vector(problem, at, velocity, geodetic)
-    grid, level = _grid(file, problem, at, truth, height, limits, _STATUS_POINTS)
-    found = status_map(problem, truth, *grid, level, trials=trials, seed=seed)
+    truth = vector(problem, wanted.at, wanted.velocity, wanted.geodetic)
+    grid, level = _grid(file, problem, wanted.at, truth, wanted.height, wanted.limits, _STATUS_POINTS)
+    trials = wanted.trials or _TRIALS_OF_A_MAP
+    found = status_map(problem, truth, *grid, level, trials=trials, seed=wanted.seed)
     if ending == ".geojson":
         write_text(out, dumps(status_geojson(found)))
     else:
         write_picture(plot_status_map(found, f"{loaded.title}: share of ok fixes"), out)
-    return 0
 
 
 # Draws.

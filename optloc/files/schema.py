@@ -523,7 +523,7 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: 
         what = f"{key} = {first['input']!r} does not fit: {first['msg'][0].lower()}{first['msg'][1:]}"
     advice = None
     if first["type"] in {"extra_forbidden", "missing"}:
-        known = _keys(path, model)
+        known = _keys(path, model, first["loc"])
         advice = nearest(key, known) if first["type"] == "extra_forbidden" else "add it"
     if first["type"] == "literal_error":
         known = [part.strip().strip("'") for part in str(first["ctx"]["expected"]).replace(" or ", ", ").split(",")]
@@ -569,16 +569,17 @@ def _spell(path: list[int | str]) -> list[str]:
     return names
 
 
-def _keys(path: list[int | str], model: Any) -> list[str]:
-    """Return the keys that the table at a path of a schema may have."""
+def _keys(path: list[int | str], model: Any, loc: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table at a path of a schema; a complaint names the table where a place allows several."""
     for part in path:
         if isinstance(part, str) and part in getattr(model, "model_fields", {}):
-            model = _model_in(model.model_fields[part].annotation)
+            found = _models_in(model.model_fields[part].annotation)
+            model = next((table for table in found if table.__name__ in loc), found[0] if found else None)
     return sorted(model.model_fields)
 
 
-def _model_in(annotation: Any) -> Any:
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the tables that an annotation allows."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    found = [_model_in(inner) for inner in getattr(annotation, "__args__", ())]
-    return next((model for model in found if model is not None), None)
+        return [annotation]
+    return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]

@@ -38,8 +38,9 @@ from optloc.proof.box import (
 from optloc.proof.convex_boxes import accuracy_floor_far, known_minima, set_minimum
 from optloc.proof.curvature import clip_to_minima
 from optloc.proof.descents import descend
-from optloc.proof.everywhere import leaves, push_faces
+from optloc.proof.everywhere import leaves
 from optloc.proof.near import cut_side, region_of
+from optloc.proof.pieces import push_faces
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import (
     Box,

@@ -39,9 +39,9 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import set_minimum
 from optloc.proof.enclosure import enclose
-from optloc.proof.everywhere import push_faces
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW
+from optloc.proof.pieces import push_faces
 from optloc.proof.search_space import Box, Chart, Cost, chart_at, place
 from optloc.proof.space import Space, floor_of, set_box, set_place
 

@@ -12,7 +12,6 @@ from optloc.proof.atlas import (
     Atlas,
     atlas_of,
     clip_to_corners,
-    coordinates_on,
     first_minima,
     infinity,
     one_more,
@@ -20,12 +19,9 @@ from optloc.proof.atlas import (
     set_centre,
     widen_around,
     with_minima,
-    within,
 )
 from optloc.proof.box import (
-    CENTRE,
     DEPTH,
-    HALF,
     PIECE,
     cost_at,
     cube,
@@ -38,9 +34,6 @@ from optloc.proof.box import (
     least_residual,
     linearise_rows,
     pop,
-    push,
-    push_around,
-    push_halves,
     reaches,
     reaches_infinity,
     rounding,
@@ -55,6 +48,19 @@ from optloc.proof.curvature import has_no_infimum, most_curved_side, spread_of, 
 from optloc.proof.descents import descend
 from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.pieces import (
+    CAPACITY,
+    SHRUNK,
+    SPARE,
+    end_at_infinity,
+    is_left,
+    is_listed,
+    is_tiny,
+    keep_rest,
+    push_core,
+    push_pieces,
+    touches_infinity,
+)
 from optloc.proof.search_space import (
     COARSEST,
     HIDDEN_REACH,
@@ -73,30 +79,16 @@ from optloc.proof.squares import Squares, bend_of, clip_to_squares, squares_of
 # What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
 # infinity below the level.
 CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
-# Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest;
-# and as many that wait. A box leaves two, and six slabs around a minimum that is met in it.
-_CAPACITY, _SPARE = 2048, 8
-# Boxes that may wait: where there are as many, those that follow are looked at in their turn, as if no lower level were
-# to be shown first. What is taken back leaves room for going into the depth.
-_WAITING = 3 * _CAPACITY // 4
-# A box at infinity of this size whose cost is below the level is not split further: across it the cost is the same to
-# many digits, so no smaller one would be dropped either. Half-widths on a face, and around a minimum.
-_TINY, _TINY_AROUND = 1e-5, 1e-3
-# Points closer to a minimum than this are that minimum, standard deviations: a descent ends that near.
-_SAME = 1e-3
 # The test for stationary points is made where the cost at the centre is within so many levels: elsewhere the box is too
 # large, or its bound will do when it is halved. Over 8 fixes by range differences one level took four times as many
 # boxes; a test everywhere took a quarter more time for the same. Over 500 fixes of five stations ten and a hundred
 # levels took the same time.
 _NEAR = 10.0
-_SHRUNK = 0.5  # share of a box below which what is left is looked at before it is halved, as in `optloc.proof.near`
 # How often in turn a box is clipped to its squared rows, while that takes off half: from all of a face three times do.
 _LOOKS = 8
 # What ranges bend over a box, squared and over the level, from which on its squared rows are looked at. Over 100 fixes
 # of five stations a ninth took 4 % fewer boxes for twice as many looks, and ten times as much 8 % more.
 _BENT = 9.0
-_WITHIN = 1e-9  # as of `optloc.proof.atlas.within`
-_BEYOND = 1e-12  # what a sum of two rounds, and a thousand times that
 
 
 @compiled
@@ -162,7 +154,7 @@ def search_everywhere(
         How many rivals there are.
     """
     box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
-    stack, aside, d = np.empty((_CAPACITY, DEPTH)), np.empty((_CAPACITY, DEPTH)), atlas.dimension
+    stack, aside, d = np.empty((CAPACITY, DEPTH)), np.empty((CAPACITY, DEPTH)), atlas.dimension
     size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
     floor, first, now, value = accuracy_floor_far(cost, atlas), zero(), last_above_zero(levels), levels[-1]
     if now < first:  # no cost is below zero
@@ -175,7 +167,7 @@ def search_everywhere(
             size, waiting = take_back(stack, aside, waiting, levels[now])
             continue
         shown, level = now + 1, levels[first]
-        if boxes >= budget or size + _SPARE > _CAPACITY:
+        if boxes >= budget or size + SPARE > CAPACITY:
             spent = shown == levels.shape[0]
             return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
         size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
@@ -199,14 +191,11 @@ def search_everywhere(
             if met < 0:
                 return ANOTHER, boxes, 0.0, shown, 0
             set_centre(atlas, piece, box.at)
-        if touching and max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND):
+        if touching and is_tiny(box, piece, d):
             first = first_below(levels, first, _at_infinity(cost, atlas, box, piece))
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
-        if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
-            waiting = push_rest(aside, waiting, box, side, low, piece)
-        else:
-            size = push_rest(stack, size, box, side, low, piece)
+        size, waiting = keep_rest(stack, size, aside, waiting, box, side, low, piece, levels[now])
 
 
 @compiled
@@ -252,7 +241,7 @@ def _side_of_rest(cost: Cost, atlas: Atlas, box: Box, touching: bool, rho: float
     if is_empty(box.cut):
         return -1
     # What that leaves little of is looked at anew, which is cheaper.
-    if not sound or share_left(box.cut, box.half) <= _SHRUNK:
+    if not sound or share_left(box.cut, box.half) <= SHRUNK:
         return int(steepest_side(box.half, box.rows, atlas.dimension))
     if _clips_away(cost, atlas, box, touching, noise):
         return -1
@@ -333,52 +322,9 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
         if share < 1.0:
             end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
             set_centre(atlas, piece, box.at)
-        if share > _SHRUNK:
+        if share > SHRUNK:
             break
     return True
-
-
-@compiled
-def touches_infinity(box: Box, last: int, end: float) -> bool:
-    """Return whether a box reaches infinity, where its last coordinate ends."""
-    return bool(end > -inf and box.at[last] - end <= box.half[last])
-
-
-@compiled
-def end_at_infinity(box: Box, last: int, end: float) -> None:
-    """Take off a box what rounding has put beyond infinity, where the inverse range would be negative."""
-    if end > -inf and box.at[last] - end < box.half[last]:
-        box.half[last] = 0.5 * (box.at[last] - end + box.half[last]) * (1.0 + _BEYOND)
-        box.at[last] = end + box.half[last]
-
-
-@compiled
-def push_rest(stack: Array, size: int, box: Box, side: int, low: float, piece: int) -> int:
-    """Push what its cut leaves of a box, whole or halved across a side; return the size of the stack."""
-    share = cut_out(box.cut, box.at, box.half)
-    if 0.0 < share < _SHRUNK:
-        stack[push(stack, size, box.at, box.half, low) - 1, PIECE] = piece
-        return size + 1
-    return push_halves(stack, size, side, box.at, box.half, low, piece, False) if share > 0.0 else size
-
-
-@compiled
-def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
-    """Return whether a box lies in the convex box of a known minimum, or in one that is searched along its axes."""
-    d, minima = atlas.dimension, atlas.minima
-    for i in range(minima.home.shape[0]):
-        # A box around one minimum is left to those that come before it, never to itself.
-        if piece == 2 * d + 1 + i:
-            inside = True
-            for k in range(d):
-                inside = inside and abs(box.at[k]) + box.half[k] <= minima.sides[i, k] * (1.0 - _WITHIN)
-            if inside:
-                return True
-        else:
-            convex, searched = within(atlas, box.half, i)
-            if convex or (searched and (piece <= 2 * d or piece > 2 * d + 1 + i)):
-                return True
-    return False
 
 
 @compiled
@@ -397,53 +343,6 @@ def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, fo
     for m in range(d):
         found[m] = near.centre[m]
     return True
-
-
-@compiled
-def is_listed(atlas: Atlas, x: Array) -> bool:
-    """Return whether a position x (D,) lies in the convex box of a known minimum, or next to it."""
-    d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
-    for i in range(minima.home.shape[0]):
-        inside = coordinates_on(atlas, minima.home[i], x, u)
-        for k in range(d):
-            away = 0.0
-            for m in range(d):
-                away += minima.back[i, k, m] * (u[m] - minima.start[i, m])
-            inside = inside and abs(away) <= max(minima.sides[i, k], _SAME)
-        if inside:
-            return True
-    return False
-
-
-@compiled
-def push_pieces(stack: Array, atlas: Atlas) -> int:
-    """Push all faces of the cube, its inside, and on top of them the surroundings of known minima, the fix last."""
-    size = push_faces(stack, atlas.dimension)
-    for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
-        size = push_core(stack, size, atlas, i)
-    return size
-
-
-@compiled
-def push_faces(stack: Array, d: int) -> int:
-    """Push all faces of the cube, and its inside; return the size of the stack."""
-    for piece in range(2 * d + 1):
-        stack[piece] = 0.0
-        for k in range(d):
-            stack[piece, HALF + k] = 1.0
-        if piece < 2 * d:
-            stack[piece, CENTRE + d - 1] = stack[piece, HALF + d - 1] = 0.5
-        stack[piece, PIECE] = piece
-    return 2 * d + 1
-
-
-@compiled
-def push_core(stack: Array, size: int, atlas: Atlas, i: int) -> int:
-    """Push what is searched along the axes of minimum i; return the size of the stack."""
-    low, last, piece = atlas.minima.core[i, 0].copy(), atlas.dimension - 1, 2 * atlas.dimension + 1 + i
-    if low[last] == -inf:
-        low[last] = infinity(atlas, piece)
-    return push_around(stack, size, low, atlas.minima.core[i, 1], atlas.minima.sides[i], piece)
 
 
 @compiled
@@ -572,13 +471,21 @@ def prove_atlas(
     outcome, boxes, bound, shown, met = search_everywhere(
         cost, atlas, chart, corners, squares, levels, eps, whole, budget, rivals, found
     )
+    return verdict_of(outcome, boxes, bound, shown, met, gaps, least - eps)
+
+
+@inlined
+def verdict_of(
+    outcome: int, boxes: int, bound: float, shown: int, met: int, gaps: Array, least: float
+) -> tuple[int, int, float, float, int]:
+    """Return the results of `prove_everywhere` for the outcome of a search; `least` is the lowest level."""
     if outcome == CLEAR:
         return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
     if outcome == CHEAPER:
         return BETTER, boxes, bound, gaps[0], 0
     if outcome == ANOTHER:
         return OTHER, boxes, bound, gaps[0], 0
-    return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps), gaps[-1], 0
+    return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least), gaps[-1], 0
 
 
 @compiled

@@ -13,6 +13,7 @@ from optloc.base.types import Array
 from optloc.linear.evaluate import block_links, columns
 from optloc.linear.normal import prior_parts, weighed
 from optloc.models import MODELS, Model
+from optloc.problem.forms import form_of
 from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.dispatch import NODES, code_of, named, width
@@ -71,6 +72,22 @@ class Columns:
         self.row.append(row)
         self.column.append(column)
         self.coefficient.append(coefficient)
+
+    def split(self, group: Array) -> tuple[Columns, Array]:
+        """Return the same with nodes that rows of one group share, and the group of each node (J,).
+
+        Parameters
+        ----------
+        group : int array (m,)
+            Group of each row.
+        """
+        out, new = Columns(self.problem), dict[tuple[int, int], int]()
+        for row, column, coefficient in zip(self.row, self.column, self.coefficient, strict=True):
+            key = (column, int(group[row]))
+            if key not in new:
+                new[key] = out.add(self.kinds[column], self.data[column], self.station[column], self.epoch[column])
+            out.touch(row, new[key], coefficient)
+        return out, np.array([own for _, own in new])
 
     @property
     def design(self) -> Array:
@@ -293,13 +310,39 @@ def position_costs(problem: Problem) -> PositionCosts:
     problem : Problem
         N problems within the scope of the proof, see `optloc.proof.scope.unsupported`.
     """
-    kinds, numbers, K, w, level = _rows_of(problem)
+    kinds, numbers, K, w, level, _ = _rows_of(problem, np.zeros(problem.count, dtype=int))
     K, w = compress(K, w)
     return PositionCosts(kinds, data=mark_alone(kinds, numbers, K, w), K=K, w=w, level=level)
 
 
-def _rows_of(problem: Problem) -> tuple[Array, Array, Array, Array, Array]:
-    """Return kinds and numbers of the nodes, all rows over them with their measurements (N, q), and levels (N,)."""
+def costs_of_groups(problem: Problem, group: Array) -> tuple[PositionCosts, Array]:
+    """Return costs as `position_costs` with separate nodes for each group of rows, and the groups (J,) of the nodes.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems whose rows are sums of ranges and logarithms of ranges.
+    group : int array (m,)
+        Group of each row; -1 for rows without a factor, such as priors.
+    """
+    kinds, numbers, K, w, level, own = _rows_of(problem, group)
+    K, w = compress(K, w)
+    return PositionCosts(kinds, numbers, K, w, level), own
+
+
+def factors_of_rows(problem: Problem) -> Array:
+    """Return the unknown factor (m,) of each row, -1 for none and -2 for several or another multiple."""
+    out, first = np.full(problem.count, -1), 0
+    for bias in problem.biases:
+        if form_of(bias).enters == "scales":
+            several = (np.bincount(bias.row, minlength=problem.count) > 1) | (out != -1)
+            out[bias.row] = np.where(several[bias.row] | (bias.coefficient != 1.0), -2, first + bias.member)
+            first += len(bias.members)
+    return out
+
+
+def _rows_of(problem: Problem, group: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Return kinds and numbers of the nodes, rows over them, measurements (N, q), levels (N,), and groups of nodes."""
     problem = weighed(problem)
     others = Others.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
@@ -307,13 +350,15 @@ def _rows_of(problem: Problem) -> tuple[Array, Array, Array, Array, Array]:
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
     made = columns_of(problem, known)
+    made, own = made.split(group) if len(set(group.tolist())) > 1 else (made, np.full(len(made.kinds), group[0]))
     others = others.with_stations(problem, made)
     value = np.where(counts_from_measured(problem), 0.0, known)
     K, w = _projected(problem, made, others, value)
-    K, w = _with_rows_of(position_prior(problem, made), K, w)
+    prior = position_prior(problem, made)
+    K, w = _with_rows_of(prior, K, w)
     size, level = problem.batch_shape[0], turned_level(problem, others, known)
     w, level = np.broadcast_to(w, (size, w.shape[-1])), np.broadcast_to(level, (size,))
-    return np.array(made.kinds), made.numbers, K, w, level
+    return np.array(made.kinds), made.numbers, K, w, level, np.concatenate([own, np.full(len(prior), -1)])
 
 
 class Affine(NamedTuple):
@@ -369,7 +414,7 @@ def affine_costs(problem: Problem) -> Affine | None:
     """
     # an affine map is known by its images of zero and of the unit vectors
     probes = np.concatenate([np.zeros((1, problem.count)), np.eye(problem.count)])
-    kinds, numbers, K, w, level = _rows_of(problem.with_rows(z=probes))
+    kinds, numbers, K, w, level, _ = _rows_of(problem.with_rows(z=probes), np.zeros(problem.count, dtype=int))
     if np.isfinite(level).any() or len(K) > 1:
         return None
     base, slope = w[0].copy(), np.ascontiguousarray((w[1:] - w[0]).T)

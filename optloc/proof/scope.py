@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from optloc.base.types import Band
+from optloc.base.types import Array, Band
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
-from optloc.proof.position_costs import own_epochs
+from optloc.proof.position_costs import factors_of_rows, own_epochs
 
 # Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time: a
 # box of ten thousand nodes takes a millisecond, and plain Python takes a thousand times longer.
@@ -22,6 +22,8 @@ MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 10_000, 24, 128
 # move (of 25 nodes of five epochs no box was looked at within the budget of dense rows; up to here plain Python begins
 # where there is no machine code), and of those that stay, whose batches share their rows.
 SHORT, MOST_DENSE = 24, 128
+# Unknown factors of rows: each box solves a system of this size, and each factor adds three columns to its rows.
+MOST_FACTORS = 3
 
 
 def unsupported(problem: Problem) -> str:
@@ -138,30 +140,43 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
 
 
 def is_scaled(problem: Problem) -> bool:
-    """Return whether an unknown factor multiplies rows; `optloc.proof.scaled` proves such fixes."""
+    """Return whether unknown factors multiply rows; `optloc.proof.scaled` proves such fixes."""
     return any(form_of(bias).enters == "scales" for bias in problem.biases)
 
 
 def _beyond_scale(problem: Problem) -> Iterator[str]:
-    """Yield the reasons against a proof with an unknown factor: it covers one factor of all rows of one wave."""
+    """Yield the reasons against a proof with unknown factors: it covers a few, each of a group of rows."""
     scales = [bias for bias in problem.biases if form_of(bias).enters == "scales"]
-    name, models = scales[0].name, [MODELS[rows.kind] for rows in problem.rows]
-    if len(scales) > 1 or len(scales[0].members) > 1:
-        yield "there are several scales, and the proof takes a common scale"
-    elif len(scales[0].row) < problem.count or not (scales[0].coefficient == 1.0).all():
-        yield f"the scale {name!r} is of some of the rows only, and the proof takes a scale of all rows"
-    if any(model.ranges is None for model in models):
-        yield f"the scale {name!r} is of other rows than times and ranges"
-    elif scales[0].sigma is None and any(sum(model.ranges or ()) != 0 and not model.emission for model in models):
-        yield f"the scale {name!r} of ranges has no prior, so that nothing bounds the position"
+    name, count, factor = scales[0].name, sum(len(bias.members) for bias in scales), factors_of_rows(problem)
+    if count > MOST_FACTORS:
+        yield f"there are several scales ({count}), and the proof takes {MOST_FACTORS}"
+    elif (factor < -1).any():
+        yield "rows have several scales, or a multiple of one, and the proof takes one scale for each row"
+    free = np.concatenate([np.full(len(bias.members), bias.sigma is None) for bias in scales])
+    yield from _beyond_factors(problem, factor, [*free, False, False])
     if problem.constraints:
         yield f"the scale {name!r} comes with constraints, and its proof is for all positions"
     if problem.stations.unknown_for:
         yield f"the scale {name!r} comes with unknown station errors, which it multiplies"
-    if any(part == "position" for part, _, _ in prior_parts(problem)):
-        yield f"the scale {name!r} comes with a prior on the position"
     if is_run(problem):
         yield f"the scale {name!r} is of a long run, and the proof takes {MOST_DENSE} different ranges"
+
+
+def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
+    """Yield the reasons against kinds of rows with factors (m,), of which some have no prior."""
+    emitting, kinds = set[int](), {rows.kind for rows in problem.rows}
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        model, own = MODELS[rows.kind], {int(one) for one in factor[start : start + rows.count]}
+        emitting |= own if model.emission else set()
+        without_prior = any(free[one] for one in own)
+        if model.ranges is None and {node for _, node in model.nodes} != {"log range"}:
+            yield f"scales come with {rows.kind} rows, and the proof takes times, ranges and levels"
+        elif model.ranges is None and without_prior and (len(kinds) > 1 or len(own) > 1):
+            yield f"the scale of {rows.kind} rows has no prior, and other rows do not have it"
+        elif without_prior and sum(model.ranges or ()) != 0 and not model.emission:
+            yield f"the scale of {rows.kind} rows has no prior, so that nothing bounds the position"
+    if len(emitting) > 1 and any(free[one] for one in emitting):
+        yield "rows with different scales share an unknown emission time, and a scale has no prior"
 
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:

@@ -10,9 +10,9 @@ from optloc.proof.atlas import Atlas, position, set_centre, widen_around
 from optloc.proof.box import bound_nodes
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known
 from optloc.proof.curvature import curve_nodes
-from optloc.proof.everywhere import is_left
 from optloc.proof.near import lay_or_halve
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.pieces import is_left
 from optloc.proof.search_space import LINES, Box, Chart, Cost, accuracy_floor, curve_along, is_bounded, place, widen
 
 

@@ -11,8 +11,8 @@ from optloc.compute.jit import compiled, enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.box import least_residual
 from optloc.proof.curvature import spread_of, sum_up
-from optloc.proof.everywhere import is_left
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.pieces import is_left
 from optloc.proof.search_space import cost_of, empty_box
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="machine code")

@@ -20,10 +20,11 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, draw_in, is_elsewhere, set_axes, set_hull
 from optloc.proof.curvature import G0, LENGTH0, entry
-from optloc.proof.everywhere import CHEAPER, CLEAR, INFINITE, SPENT, UNBOUNDED, push_pieces
+from optloc.proof.everywhere import CHEAPER, CLEAR, INFINITE, SPENT, UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, Aim, region_of
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
+from optloc.proof.pieces import push_pieces
 from optloc.proof.runs.ground import Ground, axes_at, corners_on, over_ground, state_off, state_on
 from optloc.proof.runs.rows import (
     blur_of,

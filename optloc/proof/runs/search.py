@@ -29,10 +29,11 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import is_known
 from optloc.proof.curvature import G0, G1, G2, has_no_infimum
-from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, is_listed
+from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
 from optloc.proof.near import Aim
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
+from optloc.proof.pieces import is_listed
 from optloc.proof.runs.rows import (
     Sheet,
     blur_of,

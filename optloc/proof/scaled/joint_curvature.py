@@ -1,13 +1,11 @@
-"""Second derivatives of a cost with an unknown factor: boxes with one minimum, and boxes without a stationary point.
+"""Second derivatives of a cost with unknown factors: boxes with one minimum, and boxes without a stationary point.
 
-The coordinates are offsets times the factor, ``y = k s / k_c``, and the factor k. Then a node is the perspective of
-phi, ``k phi(c + k_c y / k)``. It is linear along the factor at the centre. Its slope along y depends on the position
-alone. The last coordinate is ``t = |a| (k - k_c) + u.J y``: the rows along u, with u and a as in
-`optloc.proof.scaled.reduction`. In these coordinates the Hessian at the centre has no entry between y and t, and the
-entry of t is 1.
+The coordinates are offsets s and ``t = R (k - best - B s)``, with R and U as in `optloc.proof.scaled.reduction`. B is
+the derivative of the best factors. So the Hessian at the centre has no entry between s and t, and its part along t is
+the identity.
 
-The statements are about points whose factor fits their position best. All minima are such points, and so is the
-cheapest point of each position.
+The statements are about points whose factors fit their position best, and are not zero. All minima are such points, and
+so is the cheapest point of each position.
 """
 
 from __future__ import annotations
@@ -16,207 +14,269 @@ from math import inf, sqrt
 
 from optloc.compute.jit import compiled, inlined
 from optloc.compute.systems import positive_along
-from optloc.proof.box import digits, uncut
-from optloc.proof.curvature import (
-    C00,
-    G0,
-    LENGTH0,
-    NOISE0,
-    bends_down,
-    clip_newton,
-    entry,
-)
-from optloc.proof.nodes.node import CHI, H00, H01, H02, H11, H12, H22, HIGH, LOW, SLOPE0, TURN0
-from optloc.proof.scaled.reduction import (
-    ALONG0,
-    FACTOR,
-    LEAST,
-    LENGTH,
-    MOST,
-    SHORTEST,
-    Scaled,
-    Sheet,
-    blur_of,
-    unscale,
-)
+from optloc.proof.box import digits, is_empty, uncut
+from optloc.proof.curvature import C00, G0, LENGTH0, NOISE0, bends_down, clip_newton, entry
+from optloc.proof.nodes.node import CHI, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, SLOPE0, TURN0
+from optloc.proof.scaled.reduction import Scaled, Sheet, blur_of, is_positive
 from optloc.proof.search_space import Box
 
 # Share of the information that its rounding is below: sums over some tens of rows and nodes.
 _ROUNDED = 1e-11
-# Rounds in which the offsets narrow the factor, and it them.
+# Rounds in which the offsets narrow the factors, and they them.
 _ROUNDS = 2
 
 
 @compiled
-def sum_scaled(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> tuple[float, float]:
-    """Fill Hessian, gradient and bounds of their change over a box; return the bound of the rest's norm, and of t.
-
-    Points count whose residuals are shorter than rho.
+def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> float:
+    """Fill Hessian, gradient and bounds of their change over a box; return the bound of the norm of the rest.
 
     Parameters
     ----------
     scaled : Scaled
         The cost.
-    rho : float
-        Longest residual of interest.
+    squares : bool
+        Whether the positive part of the change of ``E'E`` counts.
     box : Box
-        Its nodes and their curves are filled; the sums are written, but for bounds of the change of the Hessian.
+        Its nodes and their curves are filled; the sums are written.
     sheet : Sheet
-        Reduced rows with the range of the factor; derivatives and changes are written.
+        Reduced rows with the ranges of the factors; derivatives and changes are written.
     """
-    span, half = sheet.span, box.half
-    factor, least, most = span[FACTOR], span[LEAST], span[MOST]
-    if not (least > 0.0 and most < inf and span[LENGTH] > 0.0):
-        return inf, inf
-    _derive(scaled, box, sheet)
-    reach = _narrow(scaled, rho, box, sheet)
-    for m in range(3):
-        sheet.half[m] = half[m] * span[MOST] / factor
-    wide = sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2]) / (factor * span[LENGTH])
-    lean = factor * sqrt(span[ALONG0] ** 2 + span[ALONG0 + 1] ** 2 + span[ALONG0 + 2] ** 2)
-    return _sum_nodes(scaled, reach, wide, 1.0 + wide * lean, box, sheet), reach
+    if not is_positive(sheet):
+        return inf
+    for j in range(box.nodes.shape[0]):
+        if not (box.nodes[j, HIGH] - box.nodes[j, LOW] < inf and box.curves[j, CHI] < inf):
+            return inf
+    noise = blur_of(scaled, sheet)
+    box.sums[:], sheet.cross[:], sheet.third[:] = 0.0, 0.0, 0.0
+    _derive(scaled, noise, box, sheet)
+    _add_information(scaled, noise, box, sheet)
+    ball = 0.0
+    for j in range(box.nodes.shape[0]):
+        ball += _add_node(scaled, noise, j, box, sheet)
+    _add_third(box, sheet)
+    _add_mixed(scaled, box, sheet)
+    _add_changes(scaled, squares, box, sheet)
+    return float(ball + _ROUNDED * (box.sums[H00] + box.sums[H11] + box.sums[H22]))
 
 
 @inlined
-def _narrow(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> float:
-    """Return the reach of the last coordinate at points whose factor is best, and narrow the range of the factor to it.
+def factor_of(scaled: Scaled, sheet: Sheet, j: int) -> float:
+    """Return the factor of a node at the centre of a box."""
+    return float(sheet.best[scaled.group[j]]) if scaled.group[j] >= 0 else 1.0
 
-    There the residual is orthogonal to the column of the factor at the point. The angle between this column and u
-    bounds the residual along u: its sine times the length of the residual.
-    """
-    span, half, nodes, weight = sheet.span, box.half, box.nodes, scaled.cost.weight
-    factor, most, sine, bend, lean = span[FACTOR], span[MOST], 0.0, 0.0, 0.0
+
+@inlined
+def _range_of(sheet: Sheet, g: int) -> float:
+    """Return the largest distance of a factor from its value at the centre; zero for no factor."""
+    return float(max(sheet.most[g] - sheet.best[g], sheet.best[g] - sheet.least[g])) if g >= 0 else 0.0
+
+
+@inlined
+def _greatest(sheet: Sheet, g: int) -> float:
+    """Return the greatest value of a factor; 1 for no factor."""
+    return float(max(sheet.most[g], sheet.best[g])) if g >= 0 else 1.0
+
+
+@inlined
+def _change_of(box: Box, j: int) -> float:
+    """Return the largest change of a node over a box."""
+    change = max(abs(box.nodes[j, LOW]), abs(box.nodes[j, HIGH]))
     for m in range(3):
-        square = 0.0
-        for i in range(sheet.J.shape[0]):
-            square += sheet.J[i, m] * sheet.J[i, m]
-        sine += sqrt(square) * half[m] / factor
-        lean += abs(span[ALONG0 + m]) * half[m] * most
+        change += abs(box.nodes[j, SLOPE0 + m]) * box.half[m]
+    return float(change)
+
+
+@inlined
+def _derive(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
+    """Write derivatives of residual and factors, pulls, changes of derivatives, and reaches of the coordinates."""
+    nodes, E, lean, back, third = box.nodes, sheet.E, sheet.lean, sheet.back, sheet.third
+    (q, J), G = scaled.cost.K.shape, back.shape[0]
+    for j in range(J):
+        sheet.force[j] = 0.0
+        for i in range(q):
+            sheet.force[j] -= scaled.cost.K[i, j] * sheet.w[i]
+    for m in range(3):
+        sheet.reach[m] = box.half[m]
+        for g in range(G):  # the sum of forces times slopes, and with the inverse of R, in memory that is free
+            third[g, m] = third[G + g, m] = 0.0
+        for i in range(q):
+            E[i, m] = 0.0
+            for j in range(J):
+                E[i, m] += factor_of(scaled, sheet, j) * sheet.K[i, j] * nodes[j, SLOPE0 + m]
+        for j in range(J):
+            if scaled.group[j] >= 0:
+                third[scaled.group[j], m] += sheet.force[j] * nodes[j, SLOPE0 + m]
+        for g in range(G):
+            for h in range(g + 1):
+                third[G + g, m] += back[h, g] * third[h, m]
+            for i in range(q):
+                E[i, m] -= sheet.unit[i, g] * third[G + g, m]
+        for g in range(G):
+            lean[g, m] = 0.0
+            for h in range(g, G):
+                along = third[G + h, m]
+                for j in range(J):
+                    along += factor_of(scaled, sheet, j) * sheet.pull[h, j] * nodes[j, SLOPE0 + m]
+                lean[g, m] -= back[g, h] * along
+    for g in range(G):
+        sheet.reach[3 + g] = _reach_of(scaled, noise, g, box, sheet)
+    for j in range(J):
+        _set_turn(scaled, j, box, sheet)
+    third[:] = 0.0
+
+
+@inlined
+def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: Sheet) -> float:
+    """Return the largest coordinate of a factor, at points whose factors are best."""
+    nodes, half, G, reach = box.nodes, box.half, sheet.back.shape[0], sheet.spin[g] + noise
+    for m in range(3):
+        reach += abs(sheet.third[G + g, m]) * half[m]
     for j in range(nodes.shape[0]):
         size = max(abs(nodes[j, LOW]), abs(nodes[j, HIGH]))
-        sine += weight[j] * size
-        bend += abs(sheet.pull[j]) * size
-    blur = blur_of(scaled, sheet)
-    sine = (sine + blur) / span[SHORTEST] if span[SHORTEST] > 0.0 else 1.0
-    reach = rho * min(sine, 1.0) + most * bend + blur
-    apart = (reach + lean) / span[LENGTH] * (1.0 + _ROUNDED)
-    span[LEAST], span[MOST] = max(span[LEAST], factor - apart), min(most, factor + apart)
+        reach += abs(sheet.pull[g, j]) * _greatest(sheet, scaled.group[j]) * size
+    for h in range(G):
+        for m in range(3):
+            if not half[m] > 0.0:
+                continue
+            along = 0.0
+            for j in range(nodes.shape[0]):
+                along += sheet.pull[g, j] * nodes[j, SLOPE0 + m] * (1.0 if scaled.group[j] == h else 0.0)
+            reach += _range_of(sheet, h) * abs(along) * half[m]
     return float(reach)
 
 
 @inlined
-def _derive(scaled: Scaled, box: Box, sheet: Sheet) -> None:
-    """Write the derivatives of the rows, their pulls on the nodes and the changes of the nodes' gradients."""
-    K, nodes, curves, span, half = scaled.cost.K, box.nodes, box.curves, sheet.span, box.half
-    factor = span[FACTOR]
-    for i in range(K.shape[0]):
-        for m in range(3):
-            total = 0.0
-            for j in range(K.shape[1]):
-                total += sheet.K[i, j] * nodes[j, SLOPE0 + m]
-            sheet.J[i, m] = factor * total
-    for j in range(K.shape[1]):
-        change = max(abs(nodes[j, LOW]), abs(nodes[j, HIGH]))
-        for m in range(3):
-            change += curves[j, TURN0 + m] * half[m] if half[m] > 0.0 else 0.0
-            total = 0.0
-            for i in range(K.shape[0]):
-                total += sheet.K[i, j] * sheet.J[i, m]
-            sheet.tie[j, m] = total
-        change /= span[LENGTH]
-        sheet.turn[j, 3], sheet.tie[j, 3] = change, sheet.pull[j]
-        for m in range(3):
-            sheet.turn[j, m] = factor * (curves[j, TURN0 + m] + abs(span[ALONG0 + m]) * change)
+def _set_turn(scaled: Scaled, j: int, box: Box, sheet: Sheet) -> None:
+    """Write the pulls on a node, and how its multiples in the derivatives of the residual change over a box."""
+    nodes, g, G = box.nodes, scaled.group[j], sheet.back.shape[0]
+    change = _change_of(box, j)
+    for m in range(3):
+        total = 0.0
+        for i in range(sheet.E.shape[0]):
+            total += scaled.cost.K[i, j] * sheet.E[i, m]
+        sheet.tie[j, m] = total
+        turn = _greatest(sheet, g) * box.curves[j, TURN0 + m] + _range_of(sheet, g) * abs(nodes[j, SLOPE0 + m])
+        sheet.turn[j, m] = turn + (abs(sheet.lean[g, m]) * change if g >= 0 else 0.0)
+    for h in range(G):
+        sheet.tie[j, 3 + h] = sheet.pull[h, j]
+        sheet.turn[j, 3 + h] = abs(sheet.back[g, h]) * change if g >= 0 else 0.0
 
 
 @inlined
-def _sum_nodes(scaled: Scaled, reach: float, wide: float, grow: float, box: Box, sheet: Sheet) -> float:
-    """Write the sums of a box; return a bound of the norm of the change of the Hessian that no entry counts.
-
-    Along each coordinate the forces of the nodes change together, so that their Hessians are summed with their signs.
-    """
-    K, sums, third, turned = scaled.cost.K, box.sums, sheet.third, 0.0
-    factor, noise, longest = sheet.span[FACTOR], blur_of(scaled, sheet), 0.0
-    greatest = factor * factor / sheet.span[LEAST]
-    # By how much the square of the factor over k may differ from the factor.
-    stretch = factor * max(factor / sheet.span[LEAST] - 1.0, 1.0 - factor / sheet.span[MOST])
-    sums[:], sheet.cross[:], third[:] = 0.0, 0.0, 0.0
-    for i in range(K.shape[0]):
+def _add_information(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
+    """Add ``E'E`` and the gradient to the sums, and their rounding to the bounds of change."""
+    sums, E, weight, share, longest = box.sums, sheet.E, scaled.cost.weight, digits(scaled.cost.K), 0.0
+    for i in range(E.shape[0]):
         longest += sheet.w[i] * sheet.w[i]
         for k in range(3):
-            sums[G0 + k] -= sheet.J[i, k] * sheet.w[i]
+            sums[G0 + k] -= E[i, k] * sheet.w[i]
             for m in range(k, 3):
-                sums[entry(k, m)] += sheet.J[i, k] * sheet.J[i, m]
+                sums[entry(k, m)] += E[i, k] * E[i, m]
     longest = sqrt(longest)
     for k in range(3):
         sums[LENGTH0 + k] = sqrt(sums[entry(k, k)])
-    share = noise + digits(K) * longest
-    for j in range(K.shape[1]):
-        turned += _add_node(scaled, reach, share, greatest, grow, wide, j, box, sheet)
-    size = 0.0
-    for at in range(6):
-        change = abs(third[3, at]) * reach + third[5, at]
-        for m in range(3):
-            change += abs(third[m, at]) * sheet.half[m]
-        sums[at] += factor * third[4, at]
-        sums[C00 + at] += change * greatest + abs(third[4, at]) * stretch
-        size += (abs(third[4, at]) + change) * (1.0 if at in (H00, H11, H22) else 2.0)
-    _add_rounding(scaled, longest, noise, box, sheet)
-    turned += size * greatest * (grow * grow - 1.0 + grow * wide + wide * wide)
-    return float(turned + _ROUNDED * (sums[H00] + sums[H11] + sums[H22]))
-
-
-@inlined
-def _add_node(
-    scaled: Scaled,
-    reach: float,
-    blur: float,
-    greatest: float,
-    grow: float,
-    wide: float,
-    j: int,
-    box: Box,
-    sheet: Sheet,
-) -> float:
-    """Add the Hessian of a node times its force and its pulls to the sums; return what the change of it adds."""
-    K, A, nodes, curves, third = scaled.cost.K, scaled.cost.A, box.nodes, box.curves, sheet.third
-    force, rest, linear = 0.0, scaled.cost.weight[j] * blur, abs(sheet.pull[j]) * reach
-    for i in range(K.shape[0]):
-        force -= K[i, j] * sheet.w[i]
-    for m in range(3):
-        linear += abs(sheet.tie[j, m]) * sheet.half[m]
-    for m in range(K.shape[1]):
-        rest += abs(A[j, m]) * sheet.span[MOST] * max(abs(nodes[m, LOW]), abs(nodes[m, HIGH]))
-    for at in range(6):
-        own = curves[j, at]
-        for m in range(4):
-            third[m, at] += sheet.tie[j, m] * own
-        third[4, at] += force * own
-        third[5, at] += rest * abs(own)
-    turned = greatest * curves[j, CHI] * (grow * grow + grow * wide + wide * wide)
-    return float((abs(force) + linear + rest) * turned)
-
-
-@inlined
-def _add_rounding(scaled: Scaled, longest: float, noise: float, box: Box, sheet: Sheet) -> None:
-    """Add the rounding of derivatives to the bounds of the gradient and of the Hessian's change."""
-    K, weight, nodes, sums, share = scaled.cost.K, scaled.cost.weight, box.nodes, box.sums, digits(scaled.cost.K)
     for k in range(3):
         blur = 0.0
-        for j in range(K.shape[1]):
-            blur += share * weight[j] * sheet.span[FACTOR] * abs(nodes[j, SLOPE0 + k])
+        for j in range(weight.shape[0]):
+            g = scaled.group[j]
+            size = factor_of(scaled, sheet, j) * abs(box.nodes[j, SLOPE0 + k])
+            size += abs(sheet.lean[g, k] * box.nodes[j, PHI]) if g >= 0 else 0.0
+            blur += share * weight[j] * size
         sums[NOISE0 + k] = sums[LENGTH0 + k] * noise + blur * (longest + noise)
         for m in range(3):
             sums[C00 + entry(k, m)] += 2.0 * blur * (sums[LENGTH0 + m] + blur)
 
 
 @inlined
+def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: Sheet) -> float:
+    """Return the second derivative along two offsets of a node times its factor."""
+    own, g = factor_of(scaled, sheet, j) * box.curves[j, entry(k, m)], scaled.group[j]
+    if g < 0:
+        return float(own)
+    p = box.nodes[j]
+    return float(own + p[SLOPE0 + k] * sheet.lean[g, m] + p[SLOPE0 + m] * sheet.lean[g, k])
+
+
+@inlined
+def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> float:
+    """Return the change of the force of a node over a box without its linear part."""
+    A, nodes, G = scaled.cost.A, box.nodes, sheet.back.shape[0]
+    rest = scaled.cost.weight[j] * noise
+    for m in range(A.shape[0]):
+        size = max(abs(nodes[m, LOW]), abs(nodes[m, HIGH]))
+        rest += abs(A[j, m]) * _greatest(sheet, scaled.group[m]) * size
+    J = A.shape[0]
+    for h in range(G):
+        for k in range(3):
+            if not box.half[k] > 0.0:
+                continue
+            along = 0.0
+            for m in range(J):
+                along += A[j, m] * nodes[m, SLOPE0 + k] * (1.0 if scaled.group[m] == h else 0.0)
+            rest += _range_of(sheet, h) * abs(along) * box.half[k]
+    return float(rest)
+
+
+@inlined
+def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> float:
+    """Add the second derivatives of a node times its force to the sums; return what the change of them adds."""
+    curves, sums, third, g, G = box.curves, box.sums, sheet.third, scaled.group[j], sheet.back.shape[0]
+    force, rest, linear = sheet.force[j], _rest_of(scaled, noise, j, box, sheet), 0.0
+    for n in range(3 + G):
+        linear += abs(sheet.tie[j, n]) * sheet.reach[n]
+    whole = abs(force) + linear + rest
+    for k in range(3):
+        for m in range(k, 3):
+            at, second = entry(k, m), _second(scaled, j, k, m, box, sheet)
+            sums[at] += force * second
+            sums[C00 + at] += rest * abs(second)
+            for n in range(3 + G):
+                third[n, at] += sheet.tie[j, n] * second
+            if g >= 0:
+                third[3 + G + g, at] += force * curves[j, at]
+                turn = curves[j, TURN0 + k] * abs(sheet.lean[g, m]) + curves[j, TURN0 + m] * abs(sheet.lean[g, k])
+                sums[C00 + at] += (linear + rest) * _range_of(sheet, g) * abs(curves[j, at]) + whole * turn
+    if g >= 0:
+        for h in range(g, G):
+            for k in range(3):
+                size, turn = abs(box.nodes[j, SLOPE0 + k]), curves[j, TURN0 + k]
+                sheet.cross[h, k] += abs(sheet.back[g, h]) * (rest * size + whole * turn)
+    return float(whole * _greatest(sheet, g) * curves[j, CHI])
+
+
+@inlined
+def _add_third(box: Box, sheet: Sheet) -> None:
+    """Add what forces change in a straight line to the bounds of the Hessian's change; they change together."""
+    G = sheet.back.shape[0]
+    for at in range(6):
+        for n in range(3 + G):
+            box.sums[C00 + at] += abs(sheet.third[n, at]) * sheet.reach[n]
+        for g in range(G):
+            box.sums[C00 + at] += abs(sheet.third[3 + G + g, at]) * _range_of(sheet, g)
+
+
+@inlined
+def _add_mixed(scaled: Scaled, box: Box, sheet: Sheet) -> None:
+    """Add the same to the bounds of the change between offsets and factors."""
+    G = sheet.back.shape[0]
+    for h in range(G):
+        for k in range(3):
+            for n in range(3 + G):
+                total = 0.0
+                for j in range(box.nodes.shape[0]):
+                    if scaled.group[j] >= 0:
+                        own = sheet.back[scaled.group[j], h] * box.nodes[j, SLOPE0 + k]
+                        total += sheet.tie[j, n] * own
+                sheet.cross[h, k] += abs(total) * sheet.reach[n]
+
+
+@inlined
 def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> None:
-    """Add the change of ``J'J`` to the bounds of the Hessian's change; `squares`: the positive part of it as well."""
-    A, sums, turn, tie = scaled.cost.A, box.sums, sheet.turn, sheet.tie
+    """Add the change of ``E'E`` to the bounds of the Hessian's change; `squares`: the positive part of it as well."""
+    A, sums, turn, tie, G = scaled.cost.A, box.sums, sheet.turn, sheet.tie, sheet.back.shape[0]
     for j in range(A.shape[0]):
-        for k in range(4):
-            for m in range(k, 4):
+        for k in range(3 + G):
+            for m in range(k, 3 + G):
                 change = abs(tie[j, k]) * turn[j, m] + abs(tie[j, m]) * turn[j, k]
                 if squares:
                     for other in range(A.shape[0]):
@@ -224,58 +284,59 @@ def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> None:
                 if m < 3:
                     sums[C00 + entry(k, m)] += change
                 else:
-                    sheet.cross[k] += change
+                    sheet.cross[m - 3, k] += change
+                    if k >= 3 and k != m:
+                        sheet.cross[k - 3, m] += change
 
 
 @compiled
-def is_convex_scaled(scaled: Scaled, rho: float, margin: float, box: Box, sheet: Sheet) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` all over a box, at every factor of interest.
+def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: Sheet) -> bool:
+    """Return whether the Hessian of f/2 exceeds `margin` all over a box, at all factors of interest.
 
-    Then the box has one stationary point at most whose residual is shorter than rho.
+    Then the box has one stationary point at most, of those whose residual is as short as the ranges of factors say.
     """
-    ball, _ = sum_scaled(scaled, rho, box, sheet)
-    if not ball < inf:
+    away = sum_scaled(scaled, False, box, sheet) + margin
+    if not away < inf:
         return False
-    _add_changes(scaled, False, box, sheet)
-    sums, cross, away = box.sums, sheet.cross, ball + margin
-    d0 = sums[C00 + H00] + sums[C00 + H01] + sums[C00 + H02] + cross[0]
-    d1 = sums[C00 + H01] + sums[C00 + H11] + sums[C00 + H12] + cross[1]
-    d2 = sums[C00 + H02] + sums[C00 + H12] + sums[C00 + H22] + cross[2]
-    if not 1.0 - cross[0] - cross[1] - cross[2] - cross[3] - away > 0.0:
-        return False
+    sums, cross, G = box.sums, sheet.cross, sheet.back.shape[0]
+    d0 = sums[C00 + H00] + sums[C00 + H01] + sums[C00 + H02] + away
+    d1 = sums[C00 + H01] + sums[C00 + H11] + sums[C00 + H12] + away
+    d2 = sums[C00 + H02] + sums[C00 + H12] + sums[C00 + H22] + away
+    for g in range(G):
+        left = 1.0 - margin
+        for k in range(3 + G):
+            left -= cross[g, k]
+        if not left > 0.0:
+            return False
+        d0, d1, d2 = d0 + cross[g, 0], d1 + cross[g, 1], d2 + cross[g, 2]
     second, third = box.half[1] != 0.0 or sums[LENGTH0 + 1] != 0.0, box.half[2] != 0.0 or sums[LENGTH0 + 2] != 0.0
-    h0, h3, h5 = sums[H00] - d0 - away, sums[H11] - d1 - away, sums[H22] - d2 - away
+    h0, h3, h5 = sums[H00] - d0, sums[H11] - d1, sums[H22] - d2
     return positive_along(h0, sums[H01], sums[H02], h3, sums[H12], h5, second, third)
 
 
 @compiled
-def clip_stationary(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> bool:
-    """Clip a box to where a minimum with a residual shorter than rho may be; or return False for no such place.
+def clip_stationary(scaled: Scaled, box: Box, sheet: Sheet) -> bool:
+    """Clip a box to where a minimum with a short residual may be; or return False for no such place.
 
-    Interval Newton in the offsets, as `optloc.proof.curvature.clip_to_stationary`. The last coordinate of a stationary
-    point is as far from zero as the entries of its row change.
+    Interval Newton in the offsets, as `optloc.proof.curvature.clip_to_minima`. The coordinates of the factors of a
+    stationary point are as far from zero as the entries of their rows change.
     """
     uncut(box.half, box.cut)
-    ball, reach = sum_scaled(scaled, rho, box, sheet)
+    ball = sum_scaled(scaled, True, box, sheet)
     if not ball < inf:
         return True
-    _add_changes(scaled, True, box, sheet)
-    sums, cross, h, span = box.sums, sheet.cross, sheet.half, sheet.span
-    length = sqrt(h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
-    noise = blur_of(scaled, sheet)
+    sums, cross, reach, noise, G = box.sums, sheet.cross, sheet.reach, blur_of(scaled, sheet), sheet.back.shape[0]
     for _ in range(_ROUNDS):
-        own = cross[0] * h[0] + cross[1] * h[1] + cross[2] * h[2] + cross[3] * reach
-        reach = min(reach, 0.5 * (own + ball * (length + reach)) + noise)
+        for g in range(G):
+            own = 0.0
+            for k in range(3 + G):
+                own += cross[g, k] * reach[k]
+            reach[3 + g] = min(reach[3 + g], 0.5 * own + noise)
     for k in range(3):
-        sums[NOISE0 + k] += 0.5 * (cross[k] + ball) * reach
-    uncut(h, box.cut)
-    clip_newton(h, sums, ball, box.cut, box.solve)
-    if box.cut[0] > box.cut[3] or box.cut[1] > box.cut[4] or box.cut[2] > box.cut[5]:
-        return False
-    if bends_down(sums, ball, box.solve):
-        return False
-    unscale(box, box.half, span[FACTOR] / span[MOST], span[FACTOR] / span[LEAST])
-    return True
+        for g in range(G):
+            sums[NOISE0 + k] += 0.5 * cross[g, k] * reach[3 + g]
+    clip_newton(box.half, sums, ball, box.cut, box.solve)
+    return not is_empty(box.cut) and not bends_down(sums, ball, box.solve)
 
 
 @compiled

@@ -1,13 +1,16 @@
-"""A box of a cost with an unknown factor: the factor is projected out of the rows, and its range is bounded.
+"""A box of a cost with unknown factors: they are projected out of the rows, and their ranges are bounded.
 
-The cost is ``f(x, k) = |k (K phi(x) + lift) - w|^2`` with k >= 0. A prior on k is the last row, in which K is zero.
-At the centre c of a box, u is the direction of ``a = K phi(c) + lift``, and ``P = 1 - u u'``. Then ``P a = 0``.
-So the cost at every x of the box and every k is at least
+The cost is ``f(x, k) = |sum_g k_g (K_g phi(x) + l_g) + K_0 phi(x) - w|^2`` with k >= 0. Each node belongs to one factor
+or to none. A prior on a factor is a row in which K is zero. At the centre c of a box the columns of the factors are
+``a_g = K_g phi(c) + l_g``. With ``A = U R``, U orthonormal, and ``P = 1 - U U'`` follows ``P A = 0``. So no x of the
+box and no k cost less than
 
-    |k P K (phi(x) - phi(c)) - P w|^2.
+    |P (sum_g k_g K_g (phi(x) - phi(c)) + K_0 phi(x) - w)|^2.
 
-All bounds of rows therefore hold for the projected rows, with nodes times the greatest k. The rows along u bound k:
-``|k u.(K phi(x) + lift) - u.w| <= rho`` where the cost is at most rho^2.
+All bounds of rows therefore hold for the projected rows, with nodes times the factors in the middle of their ranges. By
+how much a factor may differ from the middle times the slopes of its nodes is one more node without slopes for each
+coordinate: its column is the projected derivative of the rows along that coordinate. The rows along U bound k. At each
+position the residual of the best factors is orthogonal to their columns. So their ranges shrink with the box.
 """
 
 from __future__ import annotations
@@ -19,31 +22,36 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
-from optloc.proof.box import digits, least_residual, linearise_rows, shrink, uncut
-from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, SLOPE0, SLOPE1, SLOPE2
+from optloc.proof.box import DIRECTION, ROW_WIDTH, digits, least_residual, linearise_rows, shrink, uncut
+from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, SLOPE0
 from optloc.proof.search_space import Box, Cost
 
 # Factor of the rounding of projected rows: each number goes through three more sums than in rows as they are.
 _PROJECTED = 4.0
-# Numbers of a box: the best factor at its centre, the least and greatest factor of interest, the cost at the centre,
-# the length of the column of the factor, the sizes that limit the accuracy, the slopes of the rows along u, and the
-# least length of the column over the box.
-FACTOR, LEAST, MOST, HERE, LENGTH, FLOOR, ALONG0, ALONG1, ALONG2, SHORTEST, SPAN = range(11)
+# Relative rounding of a bound of a factor.
+_ROUNDED = 1e-12
+# Share of a column that must remain without the columns of other factors: less is rounding.
+_DEPENDENT = 1e-10
+# Numbers of a box: the cost at its centre, and the sizes that limit the accuracy.
+HERE, FLOOR, SPAN = range(3)
 
 
 class Scaled(NamedTuple):
-    """A cost with an unknown factor of all rows.
+    """A cost with unknown factors.
 
     Parameters
     ----------
     cost : Cost
         Nodes, rows and measurements.
-    lift : array (q,)
-        Constant part of the column of the factor: zero, or in the last row the inverse of the prior's sigma.
+    lift : array (q, G)
+        Constant parts of the columns of the factors: not zero only in rows of priors.
+    group : int array (J,)
+        The factor of each node, -1 for none.
     """
 
     cost: Cost
     lift: Array
+    group: Array
 
 
 class Sheet(NamedTuple):
@@ -51,64 +59,107 @@ class Sheet(NamedTuple):
 
     Parameters
     ----------
-    K, w : array (q, J), (q,)
-        Projected rows and measurements.
-    nodes : array (J, NODE_WIDTH)
-        Nodes times the greatest factor, without their values.
-    unit, pull : array (q,), (J,)
-        Direction u, and ``K'u``.
+    K, w : array (q, J + 3 G), (q,)
+        Projected rows and residuals at the centre. The last columns belong to the ranges of the factors along each
+        coordinate.
+    weight : array (J + 3 G,)
+        Lengths of the columns of K: before the projection, after it for nodes without a lower end.
+    nodes, rows : array (J + 3 G, NODE_WIDTH), (q, ROW_WIDTH)
+        Nodes times factors, without their values; rows over them.
+    unit, pull, V : array (q, G), (G, J), (G, J)
+        U, ``U'K``, and ``R^-1 U'K``.
+    back : array (G, G)
+        The inverse of R.
+    best, least, most : array (G,)
+        Factors at the centre as if they had no sign, and their ranges of interest.
+    fall, rise : array (G, G + 1)
+        Largest decrease and increase of each factor by the change of the columns of factors. The last column is that
+        by the nodes without a factor.
+    spin : array (G,)
+        Longest residual along each column of U.
     span : array (SPAN,)
         Numbers of the box.
-    half : array (3,)
-        Half-widths of the offsets times the factor.
-    J : array (q, 3)
-        Projected derivatives of the residual.
-    turn, tie : array (J, 4), (J, 4)
-        Changes of the gradients of the nodes, and their pulls ``K'J``; the last of each belongs to the factor.
-    cross : array (4,)
-        Changes of the entries of the Hessian that belong to the factor.
-    third : array (6, 6)
-        Entries of sums of the nodes' Hessians: with their pulls along four coordinates, with their forces, and with
-        what else may change these.
+    E, lean : array (q, 3), (G, 3)
+        Derivatives of the residual along the offsets, and of the factors.
+    force : array (J,)
+        Pulls of the nodes on the residual at the centre, ``K'(residual)``.
+    turn, tie : array (J, 3 + G), (J, 3 + G)
+        Changes of derivatives over a box as multiples of the rows, and pulls ``K'E``. The last columns belong to the
+        factors.
+    cross : array (G, 3 + G)
+        Changes of the entries of the Hessian that belong to the factors.
+    third : array (3 + 2 G, 6)
+        Sums of the nodes' second derivatives: with their pulls along all coordinates, and of each factor with forces.
+    reach : array (3 + G,)
+        Half-widths of the box, and of the coordinates of the factors.
     """
 
     K: Array
     w: Array
+    weight: Array
     nodes: Array
+    rows: Array
     unit: Array
     pull: Array
+    V: Array
+    back: Array
+    best: Array
+    least: Array
+    most: Array
+    fall: Array
+    rise: Array
+    spin: Array
     span: Array
-    half: Array
-    J: Array
+    E: Array
+    lean: Array
+    force: Array
     turn: Array
     tie: Array
     cross: Array
     third: Array
+    reach: Array
 
 
 @compiled
 def sheet_of(scaled: Scaled) -> Sheet:
     """Return working memory for boxes of a cost."""
     q, J = scaled.cost.K.shape
+    G = scaled.lift.shape[1]
+    wide = J + 3 * G
     return Sheet(
-        np.zeros((q, J)),
+        np.zeros((q, wide)),
         np.zeros(q),
-        np.zeros((J, NODE_WIDTH)),
-        np.zeros(q),
-        np.zeros(J),
+        np.zeros(wide),
+        np.zeros((wide, NODE_WIDTH)),
+        np.zeros((q, ROW_WIDTH)),
+        np.zeros((q, G)),
+        np.zeros((G, J)),
+        np.zeros((G, J)),
+        np.zeros((G, G)),
+        np.zeros(G),
+        np.zeros(G),
+        np.zeros(G),
+        np.zeros((G, G + 1)),
+        np.zeros((G, G + 1)),
+        np.zeros(G),
         np.zeros(SPAN),
-        np.zeros(3),
         np.zeros((q, 3)),
-        np.zeros((J, 4)),
-        np.zeros((J, 4)),
-        np.zeros(4),
-        np.zeros((6, 6)),
+        np.zeros((G, 3)),
+        np.zeros(J),
+        np.zeros((J, 3 + G)),
+        np.zeros((J, 3 + G)),
+        np.zeros((G, 3 + G)),
+        np.zeros((3 + 2 * G, 6)),
+        np.zeros(3 + G),
     )
+
+
+# The centre of a box.
 
 
 @compiled
 def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: Sheet) -> None:
-    """Project the factor out of the rows at the centre of a box whose nodes are bounded.
+    """Project the factors out of the rows at the centre of a box whose nodes are bounded.
 
     Parameters
     ----------
@@ -119,134 +170,409 @@ def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: Sheet) -> None:
     box : Box
         Its nodes are filled.
     sheet : Sheet
-        Written, except the range of the factor.
+        Written, except the ranges of the factors. Without independent columns `best` is NaN.
+
+    Notes
+    -----
+    A logarithm without a lower end counts from its upper end, not from the centre, where it may be far below all
+    others. The cost at the centre is infinite then.
     """
-    K, w, lift, weight, nodes = scaled.cost.K, scaled.cost.w, scaled.lift, scaled.cost.weight, box.nodes
-    unit, pull, span = sheet.unit, sheet.pull, sheet.span
-    length, along, size = 0.0, 0.0, floor
-    for j in range(K.shape[1]):
+    K, weight, nodes, lift = scaled.cost.K, scaled.cost.weight, box.nodes, scaled.lift
+    (q, J), G, size, unit, w = K.shape, lift.shape[1], floor, sheet.unit, sheet.w
+    closed = True
+    for j in range(J):
+        if nodes[j, LOW] == -inf:
+            nodes[j, PHI] += nodes[j, HIGH]
+            nodes[j, HIGH], closed = 0.0, False
+    for j in range(J):
+        sheet.weight[j] = weight[j]
         size += weight[j] * abs(nodes[j, PHI])
-    for i in range(K.shape[0]):
-        total = lift[i]
-        size += abs(lift[i])
-        for j in range(K.shape[1]):
-            total += K[i, j] * nodes[j, PHI]
-        unit[i] = total
-        length += total * total
-    length = sqrt(length)
-    for i in range(K.shape[0]):
-        unit[i] = unit[i] / length if length > 0.0 else 0.0
-        along += unit[i] * w[i]
-    here = min(along, 0.0) ** 2  # the factor is not negative
-    for i in range(K.shape[0]):
-        sheet.w[i] = w[i] - unit[i] * along
-        here += sheet.w[i] * sheet.w[i]
-    for j in range(K.shape[1]):
-        total = 0.0
-        for i in range(K.shape[0]):
-            total += unit[i] * K[i, j]
-        pull[j] = total
-        for i in range(K.shape[0]):
-            sheet.K[i, j] = K[i, j] - unit[i] * total
-    for m in range(3):
-        total = 0.0
-        for j in range(K.shape[1]):
-            total += pull[j] * nodes[j, SLOPE0 + m]
-        span[ALONG0 + m] = total
-    span[FACTOR] = max(along, 0.0) / length if length > 0.0 else 0.0
-    span[HERE], span[LENGTH], span[FLOOR] = here, length, _PROJECTED * size
+    for i in range(q):
+        w[i] = scaled.cost.w[i]
+        for g in range(G):
+            unit[i, g] = lift[i, g]
+            size += abs(lift[i, g])
+        for j in range(J):
+            if scaled.group[j] < 0:
+                w[i] -= K[i, j] * nodes[j, PHI]
+            else:
+                unit[i, scaled.group[j]] += K[i, j] * nodes[j, PHI]
+    sheet.span[FLOOR] = _PROJECTED * size
+    _orthogonalise(sheet)
+    _project(scaled, sheet)
+    if not closed:
+        sheet.span[HERE] = inf
+
+
+@inlined
+def _orthogonalise(sheet: Sheet) -> None:
+    """Replace the columns of the factors by orthonormal ones, each projected twice, and write the inverse of R."""
+    unit, back, good = sheet.unit, sheet.back, True
+    q, G = unit.shape
+    back[:] = 0.0
+    for g in range(G):
+        whole = left = 0.0
+        for i in range(q):
+            whole += unit[i, g] * unit[i, g]
+        sheet.spin[:] = 0.0
+        for _ in range(2 if g > 0 else 0):
+            for h in range(g):
+                along = 0.0
+                for i in range(q):
+                    along += unit[i, h] * unit[i, g]
+                sheet.spin[h] += along
+                for i in range(q):
+                    unit[i, g] -= along * unit[i, h]
+        for i in range(q):
+            left += unit[i, g] * unit[i, g]
+        length, apart = sqrt(left), sqrt(left) > _DEPENDENT * sqrt(whole)
+        good, per = good and apart, 1.0 / length if apart else 0.0
+        for i in range(q):
+            unit[i, g] *= per
+        for m in range(g):
+            for h in range(m, g):
+                back[m, g] -= back[m, h] * sheet.spin[h] * per
+        back[g, g] = per
+    sheet.best[:] = 0.0 if good else np.nan
+
+
+@inlined
+def _project(scaled: Scaled, sheet: Sheet) -> None:
+    """Write the projected rows and measurements, the factors at the centre, and the cost there."""
+    K, unit, back, w, here = scaled.cost.K, sheet.unit, sheet.back, sheet.w, 0.0
+    (q, J), G = K.shape, unit.shape[1]
+    for g in range(G):
+        along = 0.0
+        for i in range(q):
+            along += unit[i, g] * w[i]
+        sheet.spin[g] = along
+        for i in range(q):
+            w[i] -= unit[i, g] * along
+    for g in range(G):
+        for h in range(g, G):
+            sheet.best[g] += back[g, h] * sheet.spin[h]
+    for i in range(q):
+        here += w[i] * w[i]
+        for j in range(J):
+            sheet.K[i, j] = K[i, j]
+    sheet.span[HERE] = here + _forwards(sheet)
+    for j in range(J):
+        for g in range(G):
+            total = 0.0
+            for i in range(q):
+                total += unit[i, g] * K[i, j]
+            sheet.pull[g, j] = total
+            for i in range(q):
+                sheet.K[i, j] -= unit[i, g] * total
+    for j in range(J):
+        for g in range(G):
+            sheet.V[g, j] = 0.0
+            for h in range(g, G):
+                sheet.V[g, j] += back[g, h] * sheet.pull[h, j]
+
+
+@inlined
+def _forwards(sheet: Sheet) -> float:
+    """Return the cost of factors that are not negative: a negative best factor becomes zero, of several all do."""
+    G, cost = sheet.best.shape[0], 0.0
+    low = 0
+    for g in range(G):
+        low += int(not sheet.best[g] >= 0.0)
+    if low == 0:
+        return 0.0
+    if G == 1:
+        return sheet.spin[0] ** 2 if sheet.back[0, 0] > 0.0 else 0.0
+    for g in range(G):
+        cost += sheet.spin[g] ** 2
+    return cost
+
+
+# Ranges of the factors.
 
 
 @compiled
-def bound_factor(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> bool:
-    """Write the range of the factor at which points of a box have residuals shorter than rho; False for no factor.
+def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> bool:
+    """Write the ranges of factors at which points of a box have residuals shorter than rho; False for no factors.
 
-    The rows are reduced. A last row without nodes is a prior, which bounds the factor as well.
+    The rows are reduced. ``k = best + R^-1 U'(residual) - R^-1 U'(change of the rows)``, and the change grows with k.
+    So the greatest factors solve a system whose inverse has no negative entry, or they have priors.
     """
-    half, nodes, span, pull, K = box.half, box.nodes, sheet.span, sheet.pull, scaled.cost.K
-    fall = rise = abs(span[ALONG0]) * half[0] + abs(span[ALONG1]) * half[1] + abs(span[ALONG2]) * half[2]
-    for j in range(nodes.shape[0]):
-        first, second = pull[j] * nodes[j, LOW], pull[j] * nodes[j, HIGH]
-        fall -= min(first, second, 0.0)
-        rise += max(first, second, 0.0)
-    blur = digits(K) * span[FLOOR]
-    along, low, high = span[FACTOR] * span[LENGTH], 0.0, inf
-    if span[FACTOR] == 0.0:  # its sign is not kept
-        along = 0.0
-        for i in range(K.shape[0]):
-            along += sheet.unit[i] * scaled.cost.w[i]
-    least, most = span[LENGTH] - fall - blur, span[LENGTH] + rise + blur
-    span[SHORTEST] = least
-    if least > 0.0:
-        high = (along + rho + blur) / least
-        low = max((along - rho - blur) / most, 0.0)
-    last = K.shape[0] - 1
-    if scaled.lift[last] > 0.0:
-        per = 1.0 / scaled.lift[last]
-        high = min(high, (scaled.cost.w[last] + rho) * per * (1.0 + 1e-12))
-        low = max(low, (scaled.cost.w[last] - rho) * per * (1.0 - 1e-12))
-    span[LEAST], span[MOST] = min(low, span[FACTOR]), max(high, span[FACTOR])
-    return high > low
+    G, least, most, spin = sheet.best.shape[0], sheet.least, sheet.most, sheet.spin
+    blur, bounded = digits(scaled.cost.K) * sheet.span[FLOOR], True
+    least[:], most[:], spin[:] = 0.0, inf, rho + blur
+    _bound_by_priors(scaled, rho, sheet)
+    for g in range(G):
+        if not sheet.best[g] > -inf:
+            return True
+    _swing(scaled, blur, box, sheet)
+    if not _solve_swing(sheet, blur):
+        return False
+    for g in range(G):
+        bounded = bounded and most[g] < inf
+    if not bounded:
+        most[:] = inf
+        return True
+    if not _narrow(sheet, blur):
+        return False
+    _set_slopes(scaled, box, sheet)
+    for g in range(G):
+        if not least[g] > 0.0:
+            return True
+    # Best factors: the residual is orthogonal to their columns, which are the less oblique to U the smaller the box is.
+    _turn(scaled, rho + blur, box, sheet)
+    return _narrow(sheet, blur)
+
+
+@inlined
+def _bound_by_priors(scaled: Scaled, rho: float, sheet: Sheet) -> None:
+    """Narrow the ranges of the factors to what the rows of priors allow: the last rows, one for each factor."""
+    lift, w = scaled.lift, scaled.cost.w
+    q, G = lift.shape
+    for g in range(G):
+        i = q - G + g
+        if lift[i, g] > 0.0:
+            per = 1.0 / lift[i, g]
+            sheet.most[g] = max((w[i] + rho) * per * (1.0 + _ROUNDED), 0.0)
+            sheet.least[g] = max((w[i] - rho) * per * (1.0 - _ROUNDED), 0.0)
+
+
+@inlined
+def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
+    """Write how much the change of each column of the rows over a box, and its rounding, may change the factors."""
+    nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third  # memory that is free
+    G, J = V.shape
+    for g in range(G):
+        slopes[: G + 1], sheet.fall[g], sheet.rise[g] = 0.0, 0.0, 0.0
+        for j in range(J):
+            pull, h = V[g, j], scaled.group[j] if scaled.group[j] >= 0 else G
+            if pull == 0.0:
+                continue
+            first, second = pull * nodes[j, LOW], pull * nodes[j, HIGH]
+            sheet.fall[g, h] -= min(first, second, 0.0)
+            sheet.rise[g, h] += max(first, second, 0.0)
+            for k in range(3):
+                slopes[h, k] += pull * nodes[j, SLOPE0 + k]
+        rounded = 0.0
+        for m in range(g, G):
+            rounded += abs(sheet.back[g, m]) * blur
+        for h in range(G + 1):
+            both = abs(slopes[h, 0]) * half[0] + abs(slopes[h, 1]) * half[1] + abs(slopes[h, 2]) * half[2] + rounded
+            sheet.fall[g, h], sheet.rise[g, h] = sheet.fall[g, h] + both, sheet.rise[g, h] + both
+
+
+@inlined
+def _reach_of(sheet: Sheet, g: int, blur: float) -> float:
+    """Return the largest change of a factor by residuals."""
+    total = 0.0
+    for h in range(g, sheet.best.shape[0]):
+        total += abs(sheet.back[g, h]) * (sheet.spin[h] + blur)
+    return float(total + _ROUNDED * (abs(sheet.best[g]) + total))
+
+
+@inlined
+def _narrow(sheet: Sheet, blur: float) -> bool:
+    """Narrow the ranges of the factors, which are bounded; return False where one is empty."""
+    G, least, most, fall, rise = sheet.best.shape[0], sheet.least, sheet.most, sheet.fall, sheet.rise
+    for g in range(G):
+        reach = _reach_of(sheet, g, blur)
+        high, low = sheet.best[g] + reach + fall[g, G], sheet.best[g] - reach - rise[g, G]
+        for h in range(G):
+            if h != g:
+                high += fall[g, h] * most[h] if fall[g, h] > 0.0 else 0.0
+                low -= rise[g, h] * most[h] if rise[g, h] > 0.0 else 0.0
+        if fall[g, g] < 1.0:
+            most[g] = min(most[g], high / (1.0 - fall[g, g]) * (1.0 + _ROUNDED))
+        if low > 0.0:
+            least[g] = max(least[g], low / (1.0 + rise[g, g]) * (1.0 - _ROUNDED))
+        if not most[g] > least[g]:
+            return False
+    return True
+
+
+@inlined
+def _solve_swing(sheet: Sheet, blur: float) -> bool:
+    """Bound the greatest factors by ``(1 - N) k <= best + reach``; return False where that has no solution k >= 0.
+
+    With positive pivots the inverse of 1 - N has no negative entry (an M-matrix). Elimination without pivoting.
+    """
+    G, most = sheet.best.shape[0], sheet.most
+    matrix, right = sheet.cross, sheet.reach  # memory that is free
+    for g in range(G):
+        right[g] = sheet.best[g] + _reach_of(sheet, g, blur) + sheet.fall[g, G]
+        for h in range(G):
+            matrix[g, h] = (1.0 if g == h else 0.0) - sheet.fall[g, h]
+    for p in range(G):
+        if not (matrix[p, p] > _ROUNDED and right[p] < inf):
+            return True
+        for g in range(p + 1, G):
+            share = matrix[g, p] / matrix[p, p]
+            for h in range(p, G):
+                matrix[g, h] -= share * matrix[p, h]
+            right[g] -= share * right[p]
+    for p in range(G - 1, -1, -1):
+        for h in range(p + 1, G):
+            right[p] -= matrix[p, h] * right[h]
+        right[p] /= matrix[p, p]
+        if right[p] < 0.0:
+            return False
+        right[p] *= 1.0 + _ROUNDED
+        most[p] = min(most[p], right[p])
+    return True
+
+
+@inlined
+def _set_slopes(scaled: Scaled, box: Box, sheet: Sheet) -> None:
+    """Write the derivatives of the columns of the factors along each coordinate, before their projection."""
+    K, nodes, J = scaled.cost.K, box.nodes, box.nodes.shape[0]
+    sheet.K[:, J:] = 0.0
+    for j in range(J):
+        for k in range(3):
+            slope, column = nodes[j, SLOPE0 + k], J + 3 * scaled.group[j] + k
+            if scaled.group[j] >= 0 and slope != 0.0:
+                for i in range(K.shape[0]):
+                    sheet.K[i, column] += K[i, j] * slope
+
+
+@inlined
+def _turn(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
+    """Write how long a residual along U may be whose factors are the best at their position."""
+    nodes, half, back = box.nodes, box.half, sheet.back
+    J, G = nodes.shape[0], back.shape[0]
+    sheet.spin[:] = 0.0
+    for g in range(G):
+        change = 0.0
+        for k in range(3):
+            change += _length_of(sheet, J + 3 * g + k) * half[k] if half[k] > 0.0 else 0.0
+        for j in range(J):
+            if scaled.group[j] == g:
+                change += scaled.cost.weight[j] * max(abs(nodes[j, LOW]), abs(nodes[j, HIGH]))
+        for h in range(g, G):
+            sheet.spin[h] += abs(back[g, h]) * change
+    for h in range(G):
+        sheet.spin[h] = rho * min(sheet.spin[h] * (1.0 + _ROUNDED), 1.0)
+
+
+# Bounds of the residual.
 
 
 @compiled
 def bound_rows(scaled: Scaled, box: Box, sheet: Sheet) -> float:
-    """Return a lower bound of the residual over a box whose factor is bounded, negative where it says nothing."""
-    most, nodes, out = sheet.span[MOST], box.nodes, sheet.nodes
-    if not most < inf:
+    """Return a lower bound of the residual over a box whose factors are bounded, negative where it says nothing."""
+    nodes, out, G = box.nodes, sheet.nodes, sheet.best.shape[0]
+    if not is_bounded(sheet):
         return -1.0
-    for j in range(nodes.shape[0]):
+    J = nodes.shape[0]
+    for j in range(J):
+        g = scaled.group[j]
+        most = sheet.most[g] if g >= 0 else 1.0
+        middle = 0.5 * (sheet.least[g] + most) if g >= 0 else 1.0
         out[j, PHI] = 0.0
-        out[j, SLOPE0], out[j, SLOPE1] = most * nodes[j, SLOPE0], most * nodes[j, SLOPE1]
-        out[j, SLOPE2] = most * nodes[j, SLOPE2]
+        for k in range(3):
+            out[j, SLOPE0 + k] = middle * nodes[j, SLOPE0 + k]
         out[j, LOW], out[j, HIGH] = most * min(nodes[j, LOW], 0.0), most * max(nodes[j, HIGH], 0.0)
-    linearise_rows(sheet.K, sheet.w, out, box.rows)
-    return float(least_residual(sheet.K, scaled.cost.weight, _size_of(sheet), box.half, out, box.rows))
+        sheet.weight[j] = scaled.cost.weight[j] if out[j, LOW] > -inf else _length_of(sheet, j)
+    for g in range(G):
+        _add_range(g, box, sheet)
+    linearise_rows(sheet.K, sheet.w, out, sheet.rows)
+    low = least_residual(sheet.K, sheet.weight, size_of(sheet), box.half, out, sheet.rows)
+    return float(low) if _has_signs(scaled, sheet) else -1.0
 
 
 @inlined
-def _size_of(sheet: Sheet) -> float:
-    """Return the sizes that limit the accuracy of residuals at any factor of a box."""
-    return float(max(1.0, sheet.span[MOST]) * sheet.span[FLOOR])
+def _length_of(sheet: Sheet, j: int) -> float:
+    """Return the length of a projected column."""
+    square = 0.0
+    for i in range(sheet.K.shape[0]):
+        square += sheet.K[i, j] * sheet.K[i, j]
+    return sqrt(square)
 
 
-@compiled
+@inlined
+def _has_signs(scaled: Scaled, sheet: Sheet) -> bool:
+    """Return whether nodes without a lower end add to the residual along the direction of its bound, rounding apart."""
+    good = True
+    for j in range(scaled.cost.K.shape[1]):
+        if sheet.nodes[j, LOW] == -inf:
+            total = square = 0.0
+            for i in range(sheet.K.shape[0]):
+                total += sheet.K[i, j] * sheet.rows[i, DIRECTION]
+                square += sheet.rows[i, DIRECTION] ** 2
+            good = good and -total > digits(sheet.K) * scaled.cost.weight[j] * sqrt(square)
+    return good
+
+
+@inlined
+def _add_range(g: int, box: Box, sheet: Sheet) -> None:
+    """Project the columns of the range of a factor; write by how much it may differ from the middle times the box."""
+    K, out, J, unit = sheet.K, sheet.nodes, box.nodes.shape[0], sheet.unit
+    wide = 0.5 * (sheet.most[g] - sheet.least[g])
+    for k in range(3):
+        column = J + 3 * g + k
+        out[column, :] = 0.0
+        if not box.half[k] > 0.0:
+            continue
+        sheet.weight[column] = _length_of(sheet, column)
+        for h in range(unit.shape[1]):
+            along = 0.0
+            for i in range(K.shape[0]):
+                along += unit[i, h] * K[i, column]
+            for i in range(K.shape[0]):
+                K[i, column] -= unit[i, h] * along
+        out[column, LOW], out[column, HIGH] = -wide * box.half[k], wide * box.half[k]
+
+
+@inlined
+def is_bounded(sheet: Sheet) -> bool:
+    """Return whether all factors are bounded, and independent at the centre of the box."""
+    good = True
+    for g in range(sheet.best.shape[0]):
+        good = good and sheet.most[g] < inf and sheet.best[g] > -inf
+    return good
+
+
+@inlined
+def is_positive(sheet: Sheet) -> bool:
+    """Return whether all factors are bounded and greater than zero."""
+    good = is_bounded(sheet)
+    for g in range(sheet.best.shape[0]):
+        good = good and sheet.least[g] > 0.0 and sheet.best[g] > 0.0
+    return good
+
+
+@inlined
+def size_of(sheet: Sheet) -> float:
+    """Return the sizes that limit the accuracy of residuals at any factors of a box."""
+    most = 1.0
+    for g in range(sheet.best.shape[0]):
+        most = max(most, sheet.most[g] if sheet.most[g] < inf else abs(sheet.best[g]))
+    return float(most * sheet.span[FLOOR])
+
+
+@inlined
 def blur_of(scaled: Scaled, sheet: Sheet) -> float:
     """Return a bound of the rounding errors of a residual (its length) in a box."""
-    most = sheet.span[MOST] if sheet.span[MOST] < inf else sheet.span[FACTOR]
-    return float(digits(scaled.cost.K) * max(1.0, most) * sheet.span[FLOOR])
+    return float(digits(scaled.cost.K) * size_of(sheet))
 
 
 @compiled
 def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
     """Write the ends of what is left of a box where residuals may be shorter than rho; its rows are bounded."""
     uncut(box.half, box.cut)
-    if not sheet.span[MOST] < inf:
+    if not is_bounded(sheet):
         return
     noise, flat = blur_of(scaled, sheet), box.half[2] == 0.0
-    shrink(sheet.K, scaled.cost.weight, rho + noise, box.half, flat, sheet.nodes, box.rows, box.cut, box.solve)
-    unscale(box, box.half, 1.0, sheet.span[MOST] / sheet.span[LEAST] if sheet.span[LEAST] > 0.0 else inf)
-
-
-@inlined
-def unscale(box: Box, half: Array, least: float, most: float) -> None:
-    """Turn ends of offsets times a factor into ends of offsets, which are between `least` and `most` as large."""
-    for k in range(3):
-        low, high = box.cut[k], box.cut[3 + k]
-        if low > high:
-            continue
-        low = low * (least if low > 0.0 else most) if low != 0.0 else 0.0
-        high = high * (least if high < 0.0 else most) if high != 0.0 else 0.0
-        box.cut[k], box.cut[3 + k] = max(low, -half[k]), min(high, half[k])
+    shrink(sheet.K, sheet.weight, rho + noise, box.half, flat, sheet.nodes, sheet.rows, box.cut, box.solve)
 
 
 @compiled
 def look_at(scaled: Scaled, sheet: Sheet, box: Box, look: Cost) -> None:
-    """Write rows that are the cost, its slope and information at a point whose rows are reduced, without the factor."""
-    factor = sheet.span[FACTOR]
+    """Write rows that are the cost, its slope and information at a point whose rows are reduced, without factors."""
+    J = box.nodes.shape[0]
     for i in range(sheet.K.shape[0]):
         total = sheet.w[i]
-        for j in range(sheet.K.shape[1]):
+        for j in range(J):
+            g = scaled.group[j]
+            factor = max(sheet.best[g], 0.0) if g >= 0 else 1.0
             look.K[i, j] = factor * sheet.K[i, j]
             total += look.K[i, j] * box.nodes[j, PHI]
         look.w[i] = total

@@ -1,4 +1,4 @@
-"""The proof of a fix of a cost with an unknown factor: no position costs less, and no other minimum is within a gap."""
+"""The proof of a fix of a cost with unknown factors: no position costs less, and no other minimum is within a gap."""
 
 from __future__ import annotations
 
@@ -10,22 +10,20 @@ import numpy as np
 from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, enabled, plain, put, usable, worth_loading, zero
-from optloc.compute.systems import invert
 from optloc.linear.normal import prior_parts
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, with_minima
 from optloc.proof.batch import FIRST_BOXES, Answered, Asked, empty_answer, plainly
-from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around, reaches_infinity
+from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around
 from optloc.proof.convex_boxes import accuracy_floor_far, widen_core
-from optloc.proof.enclosure import SLACK, around_node
-from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, UNBOUNDED, push_pieces
-from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, STATIONARY, UNIQUE, VALUE
-from optloc.proof.nodes.node import RANGE
-from optloc.proof.position_costs import position_costs
-from optloc.proof.scaled.reduction import FACTOR, HERE, MOST, Scaled, blur_of, look_at, reduce_rows
+from optloc.proof.everywhere import verdict_of
+from optloc.proof.near import BUDGET, COARSE, OPEN, STATIONARY
+from optloc.proof.pieces import CAPACITY, push_pieces
+from optloc.proof.position_costs import costs_of_groups, factors_of_rows
+from optloc.proof.scaled.enclosures import first_enclosed, stays_finite
+from optloc.proof.scaled.reduction import HERE, Scaled, blur_of, look_at, reduce_rows
 from optloc.proof.scaled.scaled_search import (
-    CAPACITY,
     Tables,
     cost_near,
     in_atlas,
@@ -34,19 +32,27 @@ from optloc.proof.scaled.scaled_search import (
     set_scaled_minimum,
     tables_of,
 )
-from optloc.proof.search_space import COARSEST, LINES, Chart, accuracy_floor, chart_at, cost_of, equal_within
+from optloc.proof.search_space import (
+    COARSEST,
+    LINES,
+    Chart,
+    accuracy_floor,
+    chart_at,
+    cost_of,
+    equal_within,
+)
 from optloc.proof.space import Space
 
 
 class ScaledCosts(NamedTuple):
-    """The costs of a flat batch of N problems over the position, with one unknown factor of all rows.
+    """The costs of a flat batch of N problems over the position, with unknown factors of rows.
 
     Parameters
     ----------
     kinds, data, K, w, level
-        As of `optloc.proof.position_costs.PositionCosts`; a prior on the factor is the last row.
-    lift : array (q,)
-        Constant part of the column of the factor, see `optloc.proof.scaled.reduction.Scaled`.
+        As of `optloc.proof.position_costs.PositionCosts`; priors on the factors are the last rows.
+    lift, group : array (q, G), int array (J,)
+        As of `optloc.proof.scaled.reduction.Scaled`.
     """
 
     kinds: Array
@@ -55,6 +61,7 @@ class ScaledCosts(NamedTuple):
     w: Array
     level: Array
     lift: Array
+    group: Array
 
     @property
     def dense(self) -> float:
@@ -72,32 +79,44 @@ class ScaledCosts(NamedTuple):
     def one(self, i: int) -> Scaled:
         """Return the cost of one problem."""
         data, K = self.data[i if len(self.data) > 1 else 0], self.K[i if len(self.K) > 1 else 0]
-        return Scaled(cost_of(self.kinds, plainly(data), plainly(K), plainly(self.w[i])), self.lift)
+        return Scaled(cost_of(self.kinds, plainly(data), plainly(K), plainly(self.w[i])), self.lift, self.group)
 
 
 def scaled_costs(problem: Problem) -> ScaledCosts:
-    """Return the costs of a flat batch of problems whose rows have one unknown factor, see `optloc.proof.scope`."""
-    costs = position_costs(problem)
-    name = next(bias.name for bias in problem.biases if form_of(bias).enters == "scales")
-    prior = [(mean, precision) for own, mean, precision in prior_parts(problem) if own == name]
-    root, mean = (float(np.sqrt(prior[0][1].item())), float(np.ravel(prior[0][0])[0])) if prior else (0.0, 0.0)
-    K = np.concatenate([costs.K, np.zeros((len(costs.K), 1, costs.K.shape[2]))], axis=1)
-    w = np.concatenate([costs.w, np.full((len(costs.w), 1), root * (1.0 + mean))], axis=1)
-    lift = np.zeros(K.shape[1])
-    lift[-1] = root
-    return ScaledCosts(plainly(costs.kinds), costs.data, K, w, costs.level, lift)
+    """Return the costs of a flat batch of problems whose rows have unknown factors, see `optloc.proof.scope`."""
+    costs, group = costs_of_groups(problem, factors_of_rows(problem))
+    root, known = _priors(problem, len(costs.w))
+    G, (rows, J) = len(root), costs.K.shape[1:]
+    K = np.concatenate([costs.K, np.zeros((len(costs.K), G, J))], axis=1)
+    lift = np.zeros((rows + G, G))
+    lift[rows + np.arange(G), np.arange(G)] = root
+    w = np.concatenate([costs.w, root * known], axis=1)
+    return ScaledCosts(plainly(costs.kinds), costs.data, K, w, costs.level, lift, plainly(group))
+
+
+def _priors(problem: Problem, count: int) -> tuple[Array, Array]:
+    """Return the inverse standard deviations (G,) of the factors, zero without a prior, and their means (N, G)."""
+    root, known = [], []
+    given = {name: (mean, precision) for name, mean, precision in prior_parts(problem)}
+    for bias in problem.biases:
+        if form_of(bias).enters == "scales":
+            n = len(bias.members)
+            mean, precision = given.get(bias.name, (np.zeros(n), np.zeros((n, n))))
+            root.append(np.sqrt(np.diagonal(precision, axis1=-2, axis2=-1).reshape(-1, n)[0]))
+            known.append(np.broadcast_to(1.0 + mean, (count, n)))
+    return np.concatenate(root), np.concatenate(known, axis=1)
 
 
 @compiled
 def prove_scaled(
     scaled: Scaled, x: Array, others: Array, gaps: Array, eps: float, budget: int, rivals: Array, found: Array
 ) -> tuple[int, int, float, float, int]:
-    """Prove of a cost with an unknown factor what `optloc.proof.everywhere.prove_everywhere` proves of a cost.
+    """Prove of a cost with unknown factors what `optloc.proof.everywhere.prove_everywhere` proves of a cost.
 
     Parameters
     ----------
     scaled : Scaled
-        The cost; without its factor it stays finite at infinity (`optloc.proof.box.reaches_infinity`).
+        The cost.
     x, others, gaps, eps, budget, rivals, found
         As there; others (P, D) are the known minima.
 
@@ -107,7 +126,7 @@ def prove_scaled(
         As there.
     """
     cost, tables, D = scaled.cost, tables_of(scaled), x.shape[0]
-    far = reaches_infinity(cost.kinds, cost.K)
+    far = stays_finite(scaled)
     chart, _ = chart_at(cost, x, tables.near)
     tables.near.at[:] = 0.0
     cost_near(scaled, chart, tables)
@@ -115,7 +134,9 @@ def prove_scaled(
     chart, good = chart_at(tables.look, x, tables.near)
     tables.near.at[:] = 0.0
     least, noise = cost_near(scaled, chart, tables), blur_of(scaled, tables.sheet)
-    if not (good and tables.sheet.span[FACTOR] > 0.0):
+    for g in range(scaled.lift.shape[1]):
+        good = good and tables.sheet.best[g] > 0.0
+    if not good:
         return STATIONARY, 0, -inf, gaps[0], 0
     middle, radius = cube(cost.kinds, cost.data, x)
     atlas = atlas_of(middle, radius, D, (1 + (others.shape[0] if gaps[0] > 0.0 else 0)) if far else 0)
@@ -129,23 +150,18 @@ def prove_scaled(
     if far:
         space, size = _with_minima(scaled, tables, atlas, chart, x, others, levels, least, eps, stack)
     else:
-        first = _first_enclosed(scaled, levels, least)
+        low, high = np.zeros(3), np.zeros(3)
+        first = first_enclosed(scaled, chart, x, levels, least, low, high)
         if first == levels.shape[0]:
             return OPEN, 0, -inf, gaps[0], 0
         gaps, levels = gaps[first:], levels[first:]
-        space, size = _within_balls(scaled, tables, atlas, chart, x, others, levels, least, eps, stack)
+        space, size = _in_box(scaled, tables, atlas, chart, x, others, levels, least, eps, low, high, stack)
     if size == 0:
         return STATIONARY, 0, -inf, gaps[0], 0
     outcome, boxes, bound, shown, met = search_scaled(
         scaled, tables, space, stack, size, levels, eps, budget, rivals, found
     )
-    if outcome == CLEAR:
-        return UNIQUE if gaps[shown] > 0.0 else VALUE, boxes, bound, gaps[shown], met
-    if outcome == CHEAPER:
-        return BETTER, boxes, bound, gaps[0], 0
-    if outcome == ANOTHER:
-        return OTHER, boxes, bound, gaps[0], 0
-    return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps), gaps[-1], 0
+    return verdict_of(outcome, boxes, bound, shown, met, gaps, least - eps)
 
 
 @compiled
@@ -174,34 +190,8 @@ def _with_minima(
     return in_atlas(own, chart), push_pieces(stack, own)
 
 
-# Ranges without an emission time: a prior keeps the factor from zero, and balls around the stations enclose the cheap
-# positions.
-
-# Share of the diagonal that a pivot must exceed, as in `optloc.proof.enclosure`.
-_PIVOT = 1e-9
-# Least factor of use: the balls of a smaller one are ten times larger.
-_SMALLEST = 0.1
-
-
 @compiled
-def _least_factor(scaled: Scaled, level: float) -> float:
-    """Return the least factor that the prior allows at a cost, negative without a prior."""
-    last = scaled.lift.shape[0] - 1
-    lift = scaled.lift[last]
-    return float((scaled.cost.w[last] - np.sqrt(level)) / lift * (1.0 - 1e-12)) if lift > 0.0 else -1.0
-
-
-@compiled
-def _first_enclosed(scaled: Scaled, levels: Array, least: float) -> int:
-    """Return the first level whose positions are enclosed, or the number of levels."""
-    for k in range(levels.shape[0]):
-        if _least_factor(scaled, max(levels[k], least)) >= _SMALLEST:
-            return k
-    return int(levels.shape[0])
-
-
-@compiled
-def _within_balls(
+def _in_box(
     scaled: Scaled,
     tables: Tables,
     atlas: Atlas,
@@ -211,27 +201,12 @@ def _within_balls(
     levels: Array,
     least: float,
     eps: float,
+    low: Array,
+    high: Array,
     stack: Array,
 ) -> tuple[Space, int]:
-    """Return search coordinates with known minima, and the number of boxes pushed: 0 without balls or a minimum.
-
-    A range times the factor is within ``rho sqrt(R_jj)`` of its least-squares value, with R the inverse of K'K.
-    """
-    cost, level = scaled.cost, max(levels[0], least)
-    rho, low, high, J = np.sqrt(level), np.full(3, -inf), np.full(3, inf), cost.kinds.shape[0]
-    R, none, hull = cost.A.copy(), np.empty((0, 3)), np.zeros(3)
-    for k in range(x.shape[0], 3):
-        low[k] = high[k] = 0.0
-    space = Space(False, atlas, chart, none, none)
-    if not invert(R, J, _PIVOT):
-        return space, 0
-    for j in range(J):
-        most = rho * np.sqrt(R[j, j]) * (1.0 + SLACK)
-        for m in range(J):
-            for i in range(cost.w.shape[0]):
-                most += R[j, m] * cost.K[i, m] * cost.w[i]
-        most = most * (1.0 + SLACK) / _least_factor(scaled, level)
-        around_node(RANGE, cost.data[j], 0.0, most, chart.origin, chart.back, low, high)
+    """Return search coordinates with known minima, and the number of boxes pushed: 0 where the fix is no minimum."""
+    rho, hull = np.sqrt(max(levels[0], least)), np.zeros(3)
     room, known = np.zeros((2, 1 + others.shape[0], 3)), zero()
     space = Space(False, atlas, chart, room[0], room[1])
     for p in range(1 + (others.shape[0] if levels.shape[0] > 1 else 0)):
@@ -287,7 +262,7 @@ def scaled_lack_code(count: int) -> bool:
 
 @compiled
 def _evaluate(scaled: Scaled, x: Array, out: Array) -> None:
-    """Write the least cost over the factor at positions x (P, D), and the rounding of its residual, to out (2, P)."""
+    """Write the least cost over the factors at positions x (P, D), and the rounding of its residual, to out (2, P)."""
     tables, axes, cost = tables_of(scaled), np.eye(3), scaled.cost
     near = tables.near
     for k in range(x.shape[1], 3):
@@ -300,7 +275,7 @@ def _evaluate(scaled: Scaled, x: Array, out: Array) -> None:
         bound_nodes(cost.kinds, cost.data, near.centre, axes, axes, near.half, near.line, near.nodes)
         floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, near.centre, LINES)
         reduce_rows(scaled, floor, near, tables.sheet)
-        tables.sheet.span[MOST] = inf  # the best factor alone counts
+        tables.sheet.most[:] = inf  # the best factors alone count
         out[0, p], out[1, p] = tables.sheet.span[HERE], blur_of(scaled, tables.sheet)
 
 

@@ -1,4 +1,4 @@
-"""The search of all positions for minima of a cost with an unknown factor, in the pieces of an atlas."""
+"""The search of all positions for minima of a cost with an unknown factors, in the pieces of an atlas."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from optloc.proof.box import (
 from optloc.proof.convex_boxes import is_known, set_axes, set_hull, widen_core
 from optloc.proof.curvature import curve_nodes, most_curved_side, sum_up
 from optloc.proof.descents import newton_step
-from optloc.proof.everywhere import (
-    ANOTHER,
-    CHEAPER,
-    CLEAR,
-    INFINITE,
-    SPENT,
+from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
+from optloc.proof.nodes.dispatch import bound_pieces
+from optloc.proof.pieces import (
+    CAPACITY,
+    SHRUNK,
+    SPARE,
     end_at_infinity,
     is_left,
     is_listed,
+    is_tiny,
+    keep_rest,
     push_core,
-    push_rest,
     touches_infinity,
 )
-from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled, slope_of
 from optloc.proof.scaled.reduction import (
     HERE,
-    MOST,
     Scaled,
     Sheet,
-    bound_factor,
+    bound_factors,
     bound_rows,
     clip_rows,
+    is_bounded,
     look_at,
     reduce_rows,
     sheet_of,
@@ -57,18 +57,12 @@ from optloc.proof.scaled.reduction import (
 from optloc.proof.search_space import Box, Chart, Cost, empty_box, place, widen
 from optloc.proof.space import Space, floor_of, place_of, set_box, set_curves, set_nodes, set_place
 
-# Boxes on the stack and boxes that wait, as in `optloc.proof.everywhere`.
-CAPACITY, _SPARE = 2048, 8
-_WAITING = 3 * CAPACITY // 4
-# Half-widths of a box at infinity, on a face and around a minimum, below which the cost there is taken from its centre.
-_TINY, _TINY_AROUND = 1e-5, 1e-3
 # The test for stationary points is made where the cost at the centre is within this number of levels.
 _NEAR = 10.0
-_SHRUNK = 0.5  # share of a box below which the rest is bounded again before it is halved
 
 
 class Tables(NamedTuple):
-    """Working memory: a box of the atlas with its sheet, one around a position, and rows without the factor."""
+    """Working memory: a box of the atlas with its sheet, one around a position, and rows without factors."""
 
     box: Box
     sheet: Sheet
@@ -97,7 +91,7 @@ def in_atlas(atlas: Atlas, chart: Chart) -> Space:
 
 @compiled
 def cost_near(scaled: Scaled, chart: Chart, tables: Tables) -> float:
-    """Return the least cost over the factor at the centre of the box around a position; its sums are filled."""
+    """Return the least cost over the factors at the centre of the box around a position; its sums are filled."""
     near, cost = tables.near, scaled.cost
     near.half[:] = 0.0
     place(chart.origin, chart.sense, near.at, near.centre)
@@ -168,10 +162,10 @@ def _convex(
     for k in range(3):
         box.at[k], box.half[k] = at[k], half[k]
     _fill(scaled, tables, space, piece, floor_of(space, scaled.cost))
-    if not bound_factor(scaled, rho, box, tables.sheet):
+    if not bound_factors(scaled, rho, box, tables.sheet):
         return True
     set_curves(space, scaled.cost, box)
-    return is_convex_scaled(scaled, rho, margin, box, tables.sheet)
+    return is_convex_scaled(scaled, margin, box, tables.sheet)
 
 
 @inlined
@@ -328,7 +322,7 @@ def search_scaled(
             size, waiting = take_back(stack, aside, waiting, levels[now])
             continue
         shown, level = now + 1, levels[first]
-        if boxes >= budget or size + _SPARE > CAPACITY:
+        if boxes >= budget or size + SPARE > CAPACITY:
             spent = shown == levels.shape[0]
             return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
         size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
@@ -354,14 +348,11 @@ def search_scaled(
             for k in range(3):
                 box.at[k], box.half[k], box.cut[k], box.cut[3 + k] = at[k], half[k], cut[k], cut[3 + k]
             set_place(space, box, piece)
-        if touching and max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND):
+        if touching and is_tiny(box, piece, d):
             first = first_below(levels, first, _at_infinity(scaled, tables, space.atlas, piece, floor))
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
-        if low > 0.0 and low * low >= levels[now] and waiting + _SPARE <= _WAITING:
-            waiting = push_rest(aside, waiting, box, side, low, piece)
-        else:
-            size = push_rest(stack, size, box, side, low, piece)
+        size, waiting = keep_rest(stack, size, aside, waiting, box, side, low, piece, levels[now])
 
 
 @compiled
@@ -377,7 +368,7 @@ def _bound_of_row(
         return inf
     set_nodes(space, scaled.cost, box)
     reduce_rows(scaled, floor, box, tables.sheet)
-    if not bound_factor(scaled, sqrt(max(level, 0.0)), box, tables.sheet):
+    if not bound_factors(scaled, sqrt(max(level, 0.0)), box, tables.sheet):
         return inf
     low = bound_rows(scaled, box, tables.sheet)
     return inf if reaches(low, level) else low
@@ -387,20 +378,20 @@ def _bound_of_row(
 def _side_of_rest(scaled: Scaled, tables: Tables, space: Space, touching: bool, rho: float, sound: bool) -> int:
     """Return the side across which to halve what of a box may hold a minimum; -1 for nothing of it."""
     box, sheet, d = tables.box, tables.sheet, space.atlas.dimension
-    if not sheet.span[MOST] < inf:
+    if not is_bounded(sheet):
         for k in range(3):
             box.cut[k], box.cut[3 + k] = -box.half[k], box.half[k]
         return _widest(box.half)
     clip_rows(scaled, rho, box, sheet)
     if is_empty(box.cut):
         return -1
-    side = int(steepest_side(box.half, box.rows, d))
-    if not sound or touching or share_left(box.cut, box.half) <= _SHRUNK:
+    side = int(steepest_side(box.half, sheet.rows, d))
+    if not sound or touching or share_left(box.cut, box.half) <= SHRUNK:
         return side
     low, high = box.cut[:3].copy(), box.cut[3:].copy()
     set_curves(space, scaled.cost, box)
     box.sums[:] = 0.0
-    if not clip_stationary(scaled, rho, box, sheet):
+    if not clip_stationary(scaled, box, sheet):
         return -1
     for k in range(3):
         box.cut[k], box.cut[3 + k] = max(box.cut[k], low[k]), min(box.cut[3 + k], high[k])

@@ -1,0 +1,134 @@
+"""Boxes on the pieces of an atlas: the stacks of a search, the ends at infinity, and the known minima among them."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.atlas import Atlas, coordinates_on, infinity, within
+from optloc.proof.box import CENTRE, HALF, PIECE, cut_out, push, push_around, push_halves
+from optloc.proof.search_space import Box
+
+# Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest;
+# and as many that wait. A box leaves two, and six slabs around a minimum that is met in it.
+CAPACITY, SPARE = 2048, 8
+# Boxes that may wait: where there are as many, those that follow are looked at in their turn, as if no lower level were
+# to be shown first. What is taken back leaves room for going into the depth.
+_WAITING = 3 * CAPACITY // 4
+# A box at infinity of this size whose cost is below the level is not split further: across it the cost is the same to
+# many digits, so no smaller one would be dropped either. Half-widths on a face, and around a minimum.
+_TINY, _TINY_AROUND = 1e-5, 1e-3
+# Points closer to a minimum than this are that minimum, standard deviations: a descent ends that near.
+_SAME = 1e-3
+SHRUNK = 0.5  # share of a box below which what is left is looked at before it is halved, as in `optloc.proof.near`
+_WITHIN = 1e-9  # as of `optloc.proof.atlas.within`
+_BEYOND = 1e-12  # what a sum of two rounds, and a thousand times that
+
+
+@inlined
+def is_tiny(box: Box, piece: int, d: int) -> bool:
+    """Return whether a box at infinity is so small that the cost there is taken from its centre."""
+    return bool(max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND))
+
+
+@inlined
+def keep_rest(
+    stack: Array, size: int, aside: Array, waiting: int, box: Box, side: int, low: float, piece: int, level: float
+) -> tuple[int, int]:
+    """Push what its cut leaves of a box, or let it wait where it costs more than a level; return both sizes."""
+    if low > 0.0 and low * low >= level and waiting + SPARE <= _WAITING:
+        return size, push_rest(aside, waiting, box, side, low, piece)
+    return push_rest(stack, size, box, side, low, piece), waiting
+
+
+@compiled
+def touches_infinity(box: Box, last: int, end: float) -> bool:
+    """Return whether a box reaches infinity, where its last coordinate ends."""
+    return bool(end > -inf and box.at[last] - end <= box.half[last])
+
+
+@compiled
+def end_at_infinity(box: Box, last: int, end: float) -> None:
+    """Take off a box what rounding has put beyond infinity, where the inverse range would be negative."""
+    if end > -inf and box.at[last] - end < box.half[last]:
+        box.half[last] = 0.5 * (box.at[last] - end + box.half[last]) * (1.0 + _BEYOND)
+        box.at[last] = end + box.half[last]
+
+
+@compiled
+def push_rest(stack: Array, size: int, box: Box, side: int, low: float, piece: int) -> int:
+    """Push what its cut leaves of a box, whole or halved across a side; return the size of the stack."""
+    share = cut_out(box.cut, box.at, box.half)
+    if 0.0 < share < SHRUNK:
+        stack[push(stack, size, box.at, box.half, low) - 1, PIECE] = piece
+        return size + 1
+    return push_halves(stack, size, side, box.at, box.half, low, piece, False) if share > 0.0 else size
+
+
+@compiled
+def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
+    """Return whether a box lies in the convex box of a known minimum, or in one that is searched along its axes."""
+    d, minima = atlas.dimension, atlas.minima
+    for i in range(minima.home.shape[0]):
+        # A box around one minimum is left to those that come before it, never to itself.
+        if piece == 2 * d + 1 + i:
+            inside = True
+            for k in range(d):
+                inside = inside and abs(box.at[k]) + box.half[k] <= minima.sides[i, k] * (1.0 - _WITHIN)
+            if inside:
+                return True
+        else:
+            convex, searched = within(atlas, box.half, i)
+            if convex or (searched and (piece <= 2 * d or piece > 2 * d + 1 + i)):
+                return True
+    return False
+
+
+@compiled
+def is_listed(atlas: Atlas, x: Array) -> bool:
+    """Return whether a position x (D,) lies in the convex box of a known minimum, or next to it."""
+    d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
+    for i in range(minima.home.shape[0]):
+        inside = coordinates_on(atlas, minima.home[i], x, u)
+        for k in range(d):
+            away = 0.0
+            for m in range(d):
+                away += minima.back[i, k, m] * (u[m] - minima.start[i, m])
+            inside = inside and abs(away) <= max(minima.sides[i, k], _SAME)
+        if inside:
+            return True
+    return False
+
+
+@compiled
+def push_pieces(stack: Array, atlas: Atlas) -> int:
+    """Push all faces of the cube, its inside, and on top of them the surroundings of known minima, the fix last."""
+    size = push_faces(stack, atlas.dimension)
+    for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
+        size = push_core(stack, size, atlas, i)
+    return size
+
+
+@compiled
+def push_faces(stack: Array, d: int) -> int:
+    """Push all faces of the cube, and its inside; return the size of the stack."""
+    for piece in range(2 * d + 1):
+        stack[piece] = 0.0
+        for k in range(d):
+            stack[piece, HALF + k] = 1.0
+        if piece < 2 * d:
+            stack[piece, CENTRE + d - 1] = stack[piece, HALF + d - 1] = 0.5
+        stack[piece, PIECE] = piece
+    return 2 * d + 1
+
+
+@compiled
+def push_core(stack: Array, size: int, atlas: Atlas, i: int) -> int:
+    """Push what is searched along the axes of minimum i; return the size of the stack."""
+    low, last, piece = atlas.minima.core[i, 0].copy(), atlas.dimension - 1, 2 * atlas.dimension + 1 + i
+    if low[last] == -inf:
+        low[last] = infinity(atlas, piece)
+    return push_around(stack, size, low, atlas.minima.core[i, 1], atlas.minima.sides[i], piece)
