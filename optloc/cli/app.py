@@ -31,6 +31,9 @@ from optloc.cli.options import (
     Html,
     Json,
     LateFromData,
+    MapExtent,
+    MapHeight,
+    MapPath,
     Method,
     NoiseFromData,
     Out,
@@ -41,6 +44,10 @@ from optloc.cli.options import (
     ProblemPath,
     Quiet,
     RescaleNoise,
+    SimulatedFixes,
+    StatusShares,
+    TruePlace,
+    TrueVelocity,
     Verbose,
     allowed,
     constraints,
@@ -304,34 +311,23 @@ def simulate(
         "optloc crlb flight.toml --at 200e3,300e3,0 --plot bound.png",
         "optloc crlb site.toml --map bound.html --height '1200 m'",
         "optloc crlb site.toml --map bound.geojson --extent 11,11.5,47.6,48",
-        "optloc crlb site.toml --status --at 1200,800,50",
         "optloc crlb site.toml --status --map share.png --height '1200 m'",
     ),
 )
 def crlb(
     file: ProblemPath,
-    at: Annotated[
-        str | None, typer.Option(metavar="X,Y[,Z]", help="Position of the target, metres; the fix by default.")
-    ] = None,
-    velocity: Annotated[str | None, typer.Option(metavar="X,Y[,Z]", help="Velocity of a moving target, m/s.")] = None,
+    at: TruePlace = None,
+    velocity: TrueVelocity = None,
     geodetic: Geodetic = False,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw the bound of a run against time.")
     ] = None,
-    map_: Annotated[
-        Path | None, typer.Option("--map", metavar="OUT", help="Map it: .png, .svg, .pdf, .geojson, or .html.")
-    ] = None,
-    height: Annotated[
-        str | None, typer.Option(metavar="H", help="Height of the map, such as '1640 ft'; that of --at or of the fix.")
-    ] = None,
-    extent: Annotated[
-        str | None, typer.Option(metavar="X0,X1,Y0,Y1", help="Limits of the map: metres, or degrees on Earth.")
-    ] = None,
+    map_: MapPath = None,
+    height: MapHeight = None,
+    extent: MapExtent = None,
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
-    status: Annotated[
-        bool, typer.Option("--status", help="Simulate fixes, and give the share of each status.")
-    ] = False,
-    trials: Annotated[int | None, typer.Option(min=1, help="Fixes at each place; 200, or 50 of a map.")] = None,
+    status: StatusShares = False,
+    trials: SimulatedFixes = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides the draws of --status.")] = 0,
     as_json: Json = False,
     outside: Outside = False,

@@ -412,3 +412,22 @@ AmbiguityDraws = Annotated[
 PlacementMap = Annotated[
     Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw the bound before and after.")
 ]
+
+
+# Of bounds and shares of statuses, at a place or over a map.
+
+TruePlace = Annotated[
+    str | None, typer.Option(metavar="X,Y[,Z]", help="Position of the target, metres; the fix by default.")
+]
+TrueVelocity = Annotated[str | None, typer.Option(metavar="X,Y[,Z]", help="Velocity of a moving target, m/s.")]
+MapPath = Annotated[
+    Path | None, typer.Option("--map", metavar="OUT", help="Map it: .png, .svg, .pdf, .geojson, or .html.")
+]
+MapHeight = Annotated[
+    str | None, typer.Option(metavar="H", help="Height of the map, such as '1640 ft'; that of --at or of the fix.")
+]
+MapExtent = Annotated[
+    str | None, typer.Option(metavar="X0,X1,Y0,Y1", help="Limits of the map: metres, or degrees on Earth.")
+]
+StatusShares = Annotated[bool, typer.Option("--status", help="Simulate fixes, and give the share of each status.")]
+SimulatedFixes = Annotated[int | None, typer.Option(min=1, help="Fixes at each place; 200, or 50 of a map.")]
