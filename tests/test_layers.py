@@ -152,8 +152,9 @@ def test_no_loose_module():
 # nodes, and the space of a branch and bound (a part of the search of runs before); mirror images in the plane of the
 # stations, the distance from it, and both sides of it as one region;
 # starts of unknown headings; layers; repeats of a measurement; rows with unknown scales, and
-# proofs with an unknown factor: a box, its curvature, the search and the proof.
-MODULES, LINES, BODY, RECURRING = 406, 600, 60, 20
+# proofs with an unknown factor: a box, its curvature, the search and the proof; knowledge in every status, and the
+# directions that data allow.
+MODULES, LINES, BODY, RECURRING = 409, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():
