@@ -17,6 +17,22 @@ LEVEL = 0.95
 """Probability of all intervals and cones."""
 
 
+WITHOUT_PLACE = (
+    Status.UNBOUNDED,
+    Status.STALLED,
+    Status.MAX_ITERATIONS,
+    Status.SINGULAR_GEOMETRY,
+    Status.TOO_FEW_ROWS,
+    Status.DISCONNECTED,
+    Status.UNAVAILABLE,
+    Status.NUMERICAL,
+)
+"""Statuses whose position is no place: a direction is shown instead."""
+
+# Angle between corners of an arc, radians: 2 degrees are seen at no scale that shows the whole.
+_CORNER = np.radians(2.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Quantity:
     """One number that the data determine.
@@ -123,6 +139,8 @@ class Determined:
     ----------
     origin : array (d,)
         Middle of the stations that rows are present of, metres: directions and ranges are seen from it.
+    level : array (d, d)
+        Rows: the axes of azimuth 0 and of a quarter turn and, in space, the upward axis; east, north and up on Earth.
     north : bool
         Whether azimuths count from east towards north, so that they are bearings as well.
     directions : tuple of Direction
@@ -138,6 +156,7 @@ class Determined:
     """
 
     origin: Array
+    level: Array
     north: bool = False
     directions: tuple[Direction, ...] = ()
     quantities: tuple[Quantity, ...] = ()
@@ -149,15 +168,40 @@ class Determined:
         """Return whether there are directions, numbers or a curve."""
         return bool(self.directions or self.quantities) or self.curve is not None
 
+    def wedge(self, one: Direction, reach: float, *, whole: bool = False) -> Array:
+        """Return the plan of a cone from its least to its greatest range, a closed line (k, d), metres, anticlockwise.
+
+        Parameters
+        ----------
+        one : Direction
+            Of these.
+        reach : float
+            Where the wedge is cut off if its range has no end, metres.
+        whole : bool
+            Whether it begins in the middle of the stations, whatever its least range.
+        """
+        low, high = one.azimuth[1], min(one.azimuth[2], one.azimuth[1] + 2.0 * np.pi)
+        near, far = one.range[1], one.range[2] if one.mixed else max(reach, 2.0 * one.range[1])
+        # of slant ranges the plan has the shortest and the longest
+        steep = np.cos(np.array(one.elevation[1:])) if one.elevation else np.ones(2)
+        level = one.elevation and one.elevation[1] <= 0.0 <= one.elevation[2]
+        near, far = 0.0 if whole else near * max(float(steep.min()), 0.0), far * (1.0 if level else float(steep.max()))
+        turn = np.linspace(low, high, max(2, int(np.ceil((high - low) / _CORNER)) + 1))
+        arc = np.stack([np.cos(turn), np.sin(turn)], axis=-1) @ self.level[:2]
+        return np.asarray(self.origin + np.concatenate([far * arc, near * arc[::-1], far * arc[:1]]))
+
+    def ray(self, one: Direction, reach: float) -> Array:
+        """Return the line (2, d) from the middle of the stations along a direction, metres; see `wedge`."""
+        far = one.range[2] if one.mixed else max(reach, 2.0 * one.range[1])
+        return np.stack([self.origin, self.origin + far * one.vector])
+
     def to_dict(self) -> dict[str, Any]:
-        """Return all of it as plain numbers, texts and lists: metres and degrees."""
+        """Return all of it as plain numbers, texts and lists: metres and degrees, None for infinity."""
         return {
             "level": LEVEL,
             "origin": self.origin.tolist(),
             "directions": [self._direction(one) for one in self.directions],
-            "quantities": [
-                {"name": q.name, "value": q.value, "interval": [q.low, q.high], "unit": q.unit} for q in self.quantities
-            ],
+            "quantities": [_quantity(one) for one in self.quantities],
             "curve": None if self.curve is None else {"name": self.curve_name, "points": self.curve.tolist()},
             "words": self.words,
         }
@@ -174,11 +218,22 @@ class Determined:
             told |= {"elevation_deg": elevation, "elevation_interval_deg": ends}
         told |= {"half_angles_deg": np.degrees(one.half_angles).tolist(), "outline": one.outline.tolist()}
         return told | {
-            "range": one.range[0],
-            "range_interval": list(one.range[1:]),
+            "range": _finite(one.range[0])[0],
+            "range_interval": _finite(*one.range[1:]),
             "least_range": one.least_range,
             "gap": one.gap,
         }
+
+
+def _quantity(one: Quantity) -> dict[str, Any]:
+    """Return a number as `Determined.to_dict` has it."""
+    value, *interval = _finite(one.value, one.low, one.high)
+    return {"name": one.name, "value": value, "interval": interval, "unit": one.unit}
+
+
+def _finite(*values: float) -> list[float | None]:
+    """Return numbers as JSON has them: None for what is infinite."""
+    return [value if np.isfinite(value) else None for value in values]
 
 
 def bearing_of(azimuth: tuple[float, float, float]) -> tuple[float, float, float]:

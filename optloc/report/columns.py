@@ -315,6 +315,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
         "unchecked": bool(fix.unchecked),
         "gap_to_infinity": None if fix.infinity is None else fix.infinity,
         "chart": _chart_json(fix),
+        "determined": None if fix.source is None or fix.determined is None else fix.determined.to_dict(),
         "alternatives": [
             {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
             for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)

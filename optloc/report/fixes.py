@@ -38,6 +38,7 @@ from optloc.report.columns import (
     plain,
     records,
 )
+from optloc.report.knowledge import has_place, known_rows
 
 # What a coordinate that an equality holds may have as its sigma, as a share of it: rounding.
 _HELD = 1e-12
@@ -114,7 +115,8 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Shee
             spread = np.sqrt(np.nanmean(values**2))
             told.append((name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip()))
     told += [("constraint", _held(active)) for active in active_of(fix)]
-    told += _extents(fix)
+    known = known_rows(fix)
+    told += known if known and not has_place(fix) else _extents(fix) + known
     told.append(("chi-square", _chi_square(fix)))
     if hasattr(fix.certificate, "proof"):
         told.append(("certificate", f"{fix.certificate.proof}: {fix.certificate.reason}"))
