@@ -90,13 +90,17 @@ def _of_one(flat: Problem) -> Determined:
     """Return the `Determined` of a flat batch of one problem."""
     view, north = View.of(flat), flat.frame.geodetic
     level = _level(flat, view.centre)
-    line = _about_line(flat)
+    axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
-        return Determined(view.centre, level, north, (), _along_line(line, plane_of_stations(flat)[1][0, :, -1]))
+        return Determined(view.centre, level, north, (), _along_line(line), axis=axes[:, -1])
     found = directions_of(view, level)
     name, curve, numbers = _curve(flat)
-    quantities = (*numbers, *_in_plane(flat, view)) if is_coplanar(flat)[0] else numbers
-    return Determined(view.centre, level, north, found, quantities, curve, name)
+    if curve is not None:
+        return Determined(view.centre, level, north, found, numbers, curve, name)
+    # without an end of the range there is none of the distance from a plane
+    closed = all(one.mixed for one in found)
+    across = _in_plane(flat, view) if closed and is_coplanar(flat)[0] else ()
+    return Determined(view.centre, level, north, found, across, axis=axes[:, 0] if across else None)
 
 
 # Stations on a line in space: the target may turn about it.
@@ -116,16 +120,8 @@ def _about_line(flat: Problem) -> Problem | None:
     return reduced if is_coplanar(reduced)[0] else None
 
 
-def _along_line(problem: Problem, axis: Array) -> tuple[Quantity, ...]:
-    """Return angle to a line of stations, place along it and distance from it: of a problem in the half-plane.
-
-    Parameters
-    ----------
-    problem : Problem
-        In the plane, stations along the first axis.
-    axis : array (3,)
-        Direction of the line in space.
-    """
+def _along_line(problem: Problem) -> tuple[Quantity, ...]:
+    """Return angle to a line of stations, place along it and distance from it, of a problem with the line as x axis."""
     view, rise = View.of(problem), quantile(LEVEL, 1)
     minima = minima_of(view, rise)
     if not np.isfinite(minima.cost[0]):
@@ -137,7 +133,6 @@ def _along_line(problem: Problem, axis: Array) -> tuple[Quantity, ...]:
     ]
     points = np.concatenate(found)
     crosses = any((edge[:, 1] > 0.0).any() and (edge[:, 1] < 0.0).any() for edge in found)
-    way = "(" + ", ".join(f"{value:.2f}" for value in axis) + ")"
     angle = np.abs(np.arctan2(points[:, 1], points[:, 0]))
     turn = abs(float(np.arctan2(minima.u[0, 1], minima.u[0, 0])))
     low, high = float(angle.min()), float(angle.max())
@@ -146,14 +141,14 @@ def _along_line(problem: Problem, axis: Array) -> tuple[Quantity, ...]:
     along, away = _endless(points[:, 0], limit), _endless(np.abs(points[:, 1]), limit)
     return (
         Quantity(
-            f"angle to the line of the stations along {way}",
+            "angle to line",
             turn,
             0.0 if ahead[0] else low,
             np.pi if ahead[1] else high,
             "rad",
         ),
-        Quantity("place along the line from the middle", float(best[0]), along[0], along[1], "m"),
-        Quantity("distance from the line", abs(float(best[1])), 0.0 if crosses else away[0], away[1], "m"),
+        Quantity("place along line", float(best[0]), along[0], along[1], "m"),
+        Quantity("distance from line", abs(float(best[1])), 0.0 if crosses else away[0], away[1], "m"),
     )
 
 
@@ -169,21 +164,21 @@ def _endless(values: Array, limit: float) -> tuple[float, float]:
 
 def _in_plane(flat: Problem, view: View) -> tuple[Quantity, ...]:
     """Return the place in the plane of all stations and the distance from it; nothing where either has no end."""
+    if (flat.weight > 0.0).sum() < flat.dimension:
+        return ()
     minima = minima_of(view, 0.0)
     if not np.isfinite(minima.cost[0]) or minima.v[0] <= INFINITY:
         return ()
     across = Across.of(flat)
     x, cost, _ = across.refine(across.to_plane(view.vectors(minima.u[:1], minima.v[:1])), held=False)
     low, high = interval_across(across, x, cost, LEVEL)
-    if not np.isfinite(high[0]):
-        return ()
     spread, ok = linalg.inverse(information_in_square(across, x)[0])
+    if not ok[0] or not np.isfinite(high[0]):
+        return ()
     part, d = across.part, flat.dimension
     place, inner = x[0, part], spread[0, part, part][:-1, :-1]
-    name = "distance from the plane of the stations" if d == 3 else "distance from the line of the stations"
+    name = "distance from plane" if d == 3 else "distance from line"
     far = Quantity(name, float(place[-1]) if place[-1] > across.least[0] else 0.0, float(low[0]), float(high[0]), "m")
-    if not ok[0]:
-        return (far,)
     return (*_coordinates(across, place[:-1], inner), far)
 
 
@@ -194,7 +189,7 @@ def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quant
     if len(level) == len(place):
         names, turn, start = ["xyz"[i] for i in level], axes[level, :-1], centre[level]
     else:
-        names = [f"place along ({', '.join(f'{a:.2f}' for a in axis)}) from the middle" for axis in axes.T[:-1]]
+        names = [f"along ({', '.join(f'{a:.2f}' for a in axis)})" for axis in axes.T[:-1]]
         turn, start = np.eye(len(place)), np.zeros(len(place))
     values = start + turn @ place
     wide = _WIDE * np.sqrt(np.maximum(np.diagonal(turn @ covariance @ turn.T), 0.0))

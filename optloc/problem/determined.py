@@ -40,7 +40,7 @@ class Quantity:
     Parameters
     ----------
     name : str
-        For instance "distance from the line of the stations".
+        For instance "distance from line"; lines and planes are those that all stations are on.
     value : float
         Of the highest likelihood.
     low, high : float
@@ -152,7 +152,9 @@ class Determined:
     curve_name : str
         For instance "hyperbola of one difference".
     words : str
-        What is left open, in a sentence.
+        The reason of the fix.
+    axis : array (d,), optional
+        Direction of the line, or normal of the plane, that all stations are on and quantities are about.
     """
 
     origin: Array
@@ -163,6 +165,7 @@ class Determined:
     curve: Array | None = None
     curve_name: str = ""
     words: str = ""
+    axis: Array | None = None
 
     def __bool__(self) -> bool:
         """Return whether there are directions, numbers or a curve."""
@@ -204,6 +207,7 @@ class Determined:
             "quantities": [_quantity(one) for one in self.quantities],
             "curve": None if self.curve is None else {"name": self.curve_name, "points": self.curve.tolist()},
             "words": self.words,
+            "axis": None if self.axis is None else self.axis.tolist(),
         }
 
     def _direction(self, one: Direction) -> dict[str, Any]:

@@ -45,9 +45,18 @@ def known_rows(fix: Fix) -> list[tuple[str, str]]:
         rows.append((f"95 % direction{number}", _direction_text(found, one)))
         rows.append((f"95 % range{number}", _range_text(one)))
     rows += [(f"95 % {one.name}", _quantity_text(one)) for one in found.quantities]
+    if found.quantities and found.axis is not None:
+        way = ", ".join(f"{value:.2f}" for value in found.axis)
+        shape = "line along" if any(one.name == "angle to line" for one in found.quantities) else "plane across"
+        rows.append(("stations", f"on a {shape} ({way}) through {_place(found)}"))
     if found.curve is not None:
         rows.append(("curve", f"{found.curve_name}, {len(found.curve)} points in fix.determined.curve"))
     return rows
+
+
+def _place(found: Determined) -> str:
+    """Return the middle of the stations in words."""
+    return "(" + ", ".join(f"{value:.6g}" for value in found.origin) + ") m, their middle"
 
 
 def _direction_text(found: Determined, one: Direction) -> str:

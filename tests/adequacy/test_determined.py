@@ -193,14 +193,15 @@ def test_stations_on_a_line_leave_a_circle():
     a = np.arange(1, 6)
     rows = optloc.measured("tdoa", measured[1:] - measured[0], a=a, b=0 * a, arrival_sigma=sigma)
     problem = optloc.assemble(s[:, None] * axis, rows)
-    angle, along, away = optloc.determined(problem, optloc.solve(problem)).quantities
+    found = optloc.determined(problem, optloc.solve(problem))
+    angle, along, away = found.quantities
     # the same from a grid over place and distance
     white = np.linalg.inv(np.linalg.cholesky(sigma**2 * (np.eye(5) + 1.0)))
     x, y = np.meshgrid(np.linspace(10.0, 45.0, 701), np.linspace(30.0, 120.0, 1201), indexing="ij")
     ranges = np.hypot(x[..., None] - s, y[..., None])
     cost = ((((measured[1:] - measured[0]) - (ranges[..., 1:] - ranges[..., :1])) @ white.T) ** 2).sum(-1)
     allowed = cost <= cost.min() + chi2.ppf(0.95, 1)
-    sign = np.sign(axis @ np.linalg.eigh(np.cov((s[:, None] * axis).T))[1][:, -1])
+    sign = np.sign(axis @ found.axis)
     assert sorted([sign * along.low, sign * along.high]) == pytest.approx(
         [x[allowed].min(), x[allowed].max()], abs=0.15
     )
@@ -217,11 +218,11 @@ def test_stations_in_a_plane_leave_a_place_and_a_distance():
     fix = optloc.solve(problem)
     assert fix.status is Status.AMBIGUOUS
     numbers = {one.name: one for one in fix.determined.quantities}
-    far = numbers["distance from the plane of the stations"]
+    far = numbers["distance from plane"]
     np.testing.assert_allclose([far.low, far.high], optloc.distance_from_plane(problem, fix), rtol=1e-2)
     assert numbers["x"].low < 4.0 < numbers["x"].high
     np.testing.assert_allclose([numbers["x"].value, numbers["y"].value], fix.position[:2], atol=1e-4)
-    assert "95 % distance from the plane of the stations" in str(fix)
+    assert "95 % distance from plane" in str(fix)
 
 
 @pytest.mark.parametrize("kind", ["enu", "ecef"])
