@@ -22,6 +22,8 @@ from optloc.problem.problem import Problem
 
 # Standard deviations of a 95 % interval.
 _WIDE = float(np.sqrt(quantile(LEVEL, 1)))
+# Least redundancy of a direction: the range may be open, and nothing else.
+_LEAST = -1
 # Reach of a curve without an end, baselines; and its points, an odd number.
 _REACH, _POINTS = 10.0, 201
 # Cosine of an axis with the normal of a plane below which it is in the plane: rounding.
@@ -72,7 +74,7 @@ def determined(problem: Problem, fix: Fix) -> Determined:
         centre = problem.stations.places.reshape(-1, problem.dimension).mean(0)
         return Determined(centre, _level(problem, centre), problem.frame.geodetic, words=words)
     with np.errstate(all="ignore"):
-        return replace(_of_one(flat), words=words)
+        return replace(_of_one(flat, bool(fix.dof >= _LEAST)), words=words)
 
 
 def _level(problem: Problem, centre: Array) -> Array:
@@ -86,18 +88,18 @@ def _is_complete(problem: Problem) -> bool:
     return bool(present.any() and np.isfinite(np.where(present, problem.z, 0.0)).all())
 
 
-def _of_one(flat: Problem) -> Determined:
-    """Return the `Determined` of a flat batch of one problem."""
+def _of_one(flat: Problem, enough: bool) -> Determined:
+    """Return the `Determined` of a flat batch of one problem, with directions if it has enough rows for them."""
     view, north = View.of(flat), flat.frame.geodetic
     level = _level(flat, view.centre)
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
         return Determined(view.centre, level, north, (), _along_line(line), axis=axes[:, -1])
-    found = directions_of(view, level)
+    found = directions_of(view, level) if enough else ()
     name, curve, numbers = _curve(flat)
     if curve is not None:
         return Determined(view.centre, level, north, found, numbers, curve, name)
-    # without an end of the range there is none of the distance from a plane
+    # where the range has no end, the distance from a plane has no end either
     closed = all(one.mixed for one in found)
     across = _in_plane(flat, view) if closed and is_coplanar(flat)[0] else ()
     return Determined(view.centre, level, north, found, across, axis=axes[:, 0] if across else None)

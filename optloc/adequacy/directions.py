@@ -334,36 +334,29 @@ def ends_of_range(view: View, minima: Minima, least: float, rise: float) -> tupl
 
     All directions may follow: the profile of the cost over the inverse range.
     """
-    low, high = np.inf, 0.0
-    for u, v in zip(minima.u, minima.v, strict=True):
-        low, high = min(low, _end(view, u, v, least, rise, -1.0)), max(high, _end(view, u, v, least, rise, 1.0))
-    return low, high
-
-
-def _end(view: View, u: Array, v: float, least: float, rise: float, side: float) -> float:
-    """Return the inverse range beyond which the profile of the cost exceeds a rise, on one side."""
-    wanted, state = np.sqrt(rise), u[None]
+    wanted, count = np.sqrt(rise), len(minima.v)
+    # all ends at once, the near ones with the sign changed: each is a search upwards
+    side, state = np.repeat([-1.0, 1.0], count), np.tile(minima.u, (2, 1))
+    low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, _NEAR, -INFINITY)
 
     def at(inverse: Array, _: Array) -> tuple[Array, Array]:
         nonlocal state
-        there, _, cost = view.descend(state, inverse, True, False, _FEW)
-        state = there if cost[0] <= least + rise else state
+        there, _, cost = view.descend(state, side * inverse, True, False, _FEW)
+        state = np.where((cost <= least + rise)[:, None], there, state)
         return _root(cost, least) - wanted, inverse
 
-    _, information, _ = view.look(u[None], np.atleast_1d(v))
-    step = wanted / np.sqrt(max(information[0, -1, -1], 1e-300))
-    start, before, limit = np.atleast_1d(v), np.array([-wanted]), _NEAR if side > 0.0 else INFINITY
+    _, information, _ = view.look(state, side * low)
+    step = np.clip(wanted / np.sqrt(np.maximum(information[:, -1, -1], 1e-300)), INFINITY, _NEAR)
+    before, high = np.full(2 * count, -wanted), np.minimum(low + step, limit)
     while True:
-        trial = np.clip(start + side * min(step, _NEAR), INFINITY, _NEAR)
-        value, _ = at(trial, trial)
-        if value[0] >= 0.0 or trial[0] == limit:
+        above, _ = at(high, high)
+        inside = (above < 0.0) & (high < limit)
+        if not inside.any():
             break
-        start, before, step = trial, value, 2.0 * step
-    if value[0] < 0.0:
-        return limit
-    ends = ((start, before), (trial, value)) if side > 0.0 else ((-start, before), (-trial, value))
-    flipped = at if side > 0.0 else lambda y, g: at(-y, g)
-    return float(np.abs(_false_position(flipped, *ends, trial)[0]))
+        low, before, step = np.where(inside, high, low), np.where(inside, above, before), 2.0 * step
+        high = np.where(inside, np.minimum(high + step, limit), high)
+    ends = np.abs(np.where(above < 0.0, limit, _false_position(at, (low, before), (high, above), high)))
+    return float(ends[:count].min()), float(ends[count:].max())
 
 
 # Cones.

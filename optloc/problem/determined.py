@@ -277,7 +277,7 @@ def with_sources(problem: Problem, fix: Fix) -> Fix:
     fix : Fix
         Single, or a batch.
     """
-    if fix.shape == () and fix.code == Status.OK:
+    if not fix.shape and int(fix.code) == Status.OK:
         return fix
     items = np.flatnonzero(fix.code.ravel() != Status.OK)
     if not 0 < len(items) <= _KEPT:
