@@ -95,10 +95,10 @@ def _of_one(flat: Problem, enough: bool) -> Determined:
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
         return Determined(view.centre, level, north, (), _along_line(line), axis=axes[:, -1])
-    found = directions_of(view, level) if enough else ()
     name, curve, numbers = _curve(flat)
     if curve is not None:
-        return Determined(view.centre, level, north, found, numbers, curve, name)
+        return Determined(view.centre, level, north, (), numbers, curve, name)
+    found = directions_of(view, level) if enough else ()
     # where the range has no end, the distance from a plane has no end either
     closed = all(one.mixed for one in found)
     across = _in_plane(flat, view) if closed and is_coplanar(flat)[0] else ()
@@ -201,12 +201,8 @@ def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quant
 
 # One measurement in the plane: a curve.
 
-_NAMES = {
-    "tdoa": "hyperbola of one difference",
-    "range": "circle of one range",
-    "range_sum": "ellipse of one range sum",
-}
-_LENGTHS = {"tdoa": "difference of ranges", "range": "range", "range_sum": "sum of ranges"}
+_NAMES = {"tdoa": "hyperbola", "range": "circle", "range_sum": "ellipse"}
+_LENGTHS = {"tdoa": "difference", "range": "range", "range_sum": "sum"}
 
 
 def _curve(flat: Problem) -> tuple[str, Array | None, tuple[Quantity, ...]]:
@@ -222,10 +218,10 @@ def _curve(flat: Problem) -> tuple[str, Array | None, tuple[Quantity, ...]]:
     sigma = float(np.sqrt(np.broadcast_to(variances(flat.noise, flat.count), (1, flat.count))[0, numbers[0]]))
     ends = flat.stations.position.reshape(-1, flat.stations.count, 2)[0]
     names = [flat.stations.names[int(k)] for k in (rows.a[i], rows.b[i])[: MODELS[rows.kind].stations]]
-    length = Quantity(f"{_LENGTHS[rows.kind]} {' - '.join(names)}", z, z - _WIDE * sigma, z + _WIDE * sigma, "m")
+    length = Quantity(_LENGTHS[rows.kind], z, z - _WIDE * sigma, z + _WIDE * sigma, "m")
     a, b = ends[int(rows.a[i])], ends[int(rows.b[i])] if len(names) > 1 else ends[int(rows.a[i])]
     points = _hyperbola(a, b, z) if rows.kind == "tdoa" else _ellipse(a, b, z if len(names) > 1 else 2.0 * z)
-    return _NAMES[rows.kind], points, (length,)
+    return f"{_NAMES[rows.kind]} about {' and '.join(names)}", points, (length,)
 
 
 def _hyperbola(a: Array, b: Array, z: float) -> Array:

@@ -150,7 +150,7 @@ class Determined:
     curve : array (k, d), optional
         Line on which one measurement puts the target, metres.
     curve_name : str
-        For instance "hyperbola of one difference".
+        For instance "hyperbola about A and B".
     words : str
         The reason of the fix.
     axis : array (d,), optional

@@ -50,7 +50,7 @@ def known_rows(fix: Fix) -> list[tuple[str, str]]:
         shape = "line along" if any(one.name == "angle to line" for one in found.quantities) else "plane across"
         rows.append(("stations", f"on a {shape} ({way}) through {_place(found)}"))
     if found.curve is not None:
-        rows.append(("curve", f"{found.curve_name}, {len(found.curve)} points in fix.determined.curve"))
+        rows.append(("curve", f"{found.curve_name}: fix.determined.curve"))
     return rows
 
 
