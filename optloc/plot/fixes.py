@@ -163,18 +163,19 @@ def _lines(panel: Axes, scene: Scene, view: View, size: float) -> None:
 
 def _cones(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> None:
     """Draw the directions of a single fix that has no place as wedges and rays, cut off by the limits of the plan."""
-    if len(fixes) != 1 or fixes[0].code.size != 1 or (fix := fixes[0].flat()[0]).source is None:
+    if len(fixes) != 1 or fixes[0].code.size != 1 or int(fixes[0].code.ravel()[0]) not in WITHOUT_PLACE:
         return
     from matplotlib.collections import Collection, LineCollection, PolyCollection
 
-    found = fix.determined
+    found = fixes[0].flat()[0].determined
+    if found is None:
+        return
     reach = size * _BEYOND * float(np.ptp((panel.get_xlim(), panel.get_ylim()), axis=1).max())
-    shown = found.directions if int(fix.code) in WITHOUT_PLACE else ()
-    wedges = [_plan(problem, found.wedge(one, reach, whole=True)) / size for one in shown]
-    rays = [_plan(problem, found.ray(one, reach)) / size for one in shown]
+    wedges = [_plan(problem, found.wedge(one, reach, whole=True)) / size for one in found.directions]
+    rays = [_plan(problem, found.ray(one, reach)) / size for one in found.directions]
     curves = [] if found.curve is None else [_plan(problem, found.curve) / size]
     drawn: list[Collection] = []
-    if shown:
+    if wedges:
         drawn.append(PolyCollection(wedges, color=SKY, alpha=0.35, label="95 % direction", zorder=0))
         drawn.append(LineCollection(rays, colors=BLUE, linestyles="--", label="likeliest direction", zorder=1))
     if curves:

@@ -20,7 +20,8 @@ _LEAST, _SIZES, _MOST = 3.0, 10.0, 1e6
 
 def is_shown(fix: Fix) -> bool:
     """Return whether a single fix has directions, ranges or curves to show in place of a position, or with it."""
-    return fix.source is not None and Status(int(fix.code)) in (*WITHOUT_PLACE, *_WITH_REGION)
+    kept = fix.source is not None and fix.source[()] is not None
+    return kept and Status(int(fix.code)) in (*WITHOUT_PLACE, *_WITH_REGION)
 
 
 def has_place(fix: Fix) -> bool:

@@ -63,7 +63,7 @@ def far_target(rng, places):
 
 
 def test_far_sources_are_in_the_cones_and_beyond_the_least_range():
-    rng, inside, beyond, count = np.random.default_rng(5), 0, 0, 60
+    rng, inside, beyond, count = np.random.default_rng(5), 0, 0, 36
     for k in range(count):
         places = (SQUARE, SIX, TRIANGLE)[k % 3]
         u, distance, sigma = far_target(rng, places)
@@ -73,9 +73,9 @@ def test_far_sources_are_in_the_cones_and_beyond_the_least_range():
         own = [one for one in found.directions if one.covers(u)]
         inside += bool(own)
         beyond += min(one.least_range for one in own or found.directions) <= distance
-    # 95 % of 60: fewer than 52 happen once in 300 seeds
-    assert inside >= 52
-    assert beyond >= 54
+    # 95 % of 36: fewer than 30 happen once in 500 seeds
+    assert inside >= 30
+    assert beyond >= 32
 
 
 def blank(problem):
