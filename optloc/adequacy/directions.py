@@ -51,10 +51,16 @@ _GROWTH, _TRIALS = 1.6, 14
 _CLOSE = 1e-2
 # Cones at most. More minima are points of a valley, which no cone describes.
 _CONES = 4
+# Inverse range next to the stations, where the cost may have another minimum.
+_BESIDE = 0.5
 # Largest angle to the edge of a cone, radians: farther away it has no edge. Lunes of two mirror images are as long.
-_WIDEST = 0.95 * np.pi
+_WIDEST = 0.999 * np.pi
 # Angle and relative range within which two minima are one.
 _SAME = 1e-3
+# Angle within which a direction is the image of another, radians, and share of a cone that must be in one of another.
+_ALIKE, _WITHIN = 1e-2, 0.97
+# Share of rays without an edge from which on a cone has none. A lune between opposite images has some.
+_OPEN = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,10 +154,10 @@ class View:
         return there, np.clip(v + move[:, -1], INFINITY, _NEAR)
 
     def best_range(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Return the best inverse ranges (q,) of directions (q, d) and their costs, from a guess and from infinity."""
-        starts = np.concatenate([v, np.full(len(v), INFINITY)])
-        _, found, cost = self.descend(np.concatenate([u, u]), starts, False, True, _FEW)
-        found, cost = found.reshape(2, -1), cost.reshape(2, -1)
+        """Return the best inverse ranges (q,) of directions (q, d) and their costs: the best of three starts."""
+        starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _BESIDE)])
+        _, found, cost = self.descend(np.tile(u, (3, 1)), starts, False, True, _FEW)
+        found, cost = found.reshape(3, -1), cost.reshape(3, -1)
         best = cost.argmin(0)[None]
         return np.take_along_axis(found, best, 0)[0], np.take_along_axis(cost, best, 0)[0]
 
@@ -381,16 +387,28 @@ def directions_of(view: View, level: Array) -> tuple[Direction, ...]:
     if not np.isfinite(minima.cost[0]):
         return ()
     least, found = float(minima.cost[0]), list[tuple[Direction, list[int]]]()
-    for i in range(len(minima.cost)):
-        own = next((items for cone, items in found if cone.covers(minima.u[i])), None)
-        if own is not None:
+    for i, u in enumerate(minima.u):
+        around, own = next(((cone, items) for cone, items in found if cone.covers(u)), (None, [i]))
+        if around is not None:
             own.append(i)
-            continue
+            if not _is_image(view, around.vector, u):
+                continue
         cone = _cone(view, minima, i, np.array([rise, single]), level)
+        if around is not None and (cone is None or around.covers(u + _WITHIN * (cone.outline - u)).all()):
+            continue
         if cone is None or len(found) == _CONES:
             return ()
-        found.append((cone, [i]))
+        found.append((cone, own))
     return tuple(_ranged(view, cone, minima[np.array(items)], least, single) for cone, items in found)
+
+
+def _is_image(view: View, one: Array, other: Array) -> bool:
+    """Return whether a direction is the mirror image of another in the plane of the stations.
+
+    Cones of images that touch have a waist, and rays from one of them miss much of the other.
+    """
+    image = mirror(view.problem, (view.centre + one)[None])[0] - view.centre
+    return bool(np.abs(image - other).max() < _ALIKE and np.abs(image - one).max() > _ALIKE)
 
 
 def _cone(view: View, minima: Minima, i: int, rises: Array, level: Array) -> Direction | None:
@@ -399,17 +417,20 @@ def _cone(view: View, minima: Minima, i: int, rises: Array, level: Array) -> Dir
     usable, across = rises > minima.cost[i] - least, _principal(view, minima.u[i], minima.v[i])
     sides = np.concatenate([across.T, -across.T])
     reach, _ = edge(view, (u, v), sides, least, np.full(len(sides), rises[0]))
-    if np.isnan(reach).any():
+    if np.isnan(reach).mean() > _OPEN:
         return None
-    half = reach.reshape(2, -1).mean(0)
+    half = np.where(np.isnan(reach), _WIDEST, reach).reshape(2, -1).mean(0)
     # rays are spread evenly in the metric of the ellipse, so that its tips are not cut off
     ways = sides if len(u) == 2 else _normalised(_around() * half @ across.T)
     k = len(ways)
     angle, edges = np.zeros((2, k)), np.tile(u, (2, k, 1))
     found = edge(view, (u, v), np.tile(ways, (usable.sum(), 1)), least, np.repeat(rises[usable], k))
     angle[usable], edges[usable] = found[0].reshape(-1, k), found[1].reshape(-1, k, len(u))
-    if np.isnan(angle[0]).any():
+    if np.isnan(angle[0]).mean() > _OPEN:
         return None
+    opposite = np.isnan(angle)
+    angle = np.where(opposite, _WIDEST, angle)
+    edges = np.where(opposite[..., None], np.cos(_WIDEST) * u + np.sin(_WIDEST) * ways, edges)
     half, axes = _ellipse(u, ways, angle[0])
     azimuth, elevation = _angles(u, edges[1], level)
     return Direction(u, azimuth, elevation, half, axes, edges[0], (np.inf, 0.0, np.inf), float(minima.cost[i]) - least)
