@@ -95,14 +95,19 @@ def _of_one(flat: Problem, enough: bool) -> Determined:
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
         return Determined(view.centre, level, north, (), _along_line(line), axis=axes[:, -1])
-    name, curve, numbers = _curve(flat)
+    outside, (name, curve, numbers) = False, _curve(flat)
     if curve is not None:
         return Determined(view.centre, level, north, (), numbers, curve, name)
     found = directions_of(view, level) if enough else ()
+    if enough and not found:
+        # between the stations any direction is possible: look at targets outside their sphere alone
+        found = directions_of(replace(view, most=1.0), level)
+        outside = bool(found)
     # where the range has no end, the distance from a plane has no end either
-    closed = all(one.mixed for one in found)
+    closed = not outside and all(one.mixed for one in found)
     across = _in_plane(flat, view) if closed and is_coplanar(flat)[0] else ()
-    return Determined(view.centre, level, north, found, across, axis=axes[:, 0] if across else None)
+    axis = axes[:, 0] if across else None
+    return Determined(view.centre, level, north, found, across, axis=axis, outside=outside)
 
 
 # Stations on a line in space: the target may turn about it.

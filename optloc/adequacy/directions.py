@@ -79,6 +79,8 @@ class View:
         Their greatest distance from it, metres; 1 for one station.
     weighed : array (1, size), optional
         Where station errors are weighed; at each place itself if absent.
+    most : float
+        Greatest inverse range that is looked at.
     """
 
     problem: Problem
@@ -86,6 +88,7 @@ class View:
     centre: Array
     spread: float
     weighed: Array | None = None
+    most: float = _NEAR
 
     @classmethod
     def of(cls, problem: Problem) -> View:
@@ -133,7 +136,7 @@ class View:
         cost, information, vector = self.look(u, v)
         damping, growth = np.full(len(u), _DAMPING), np.full(len(u), FIRST_GROWTH)
         for _ in range(steps):
-            move, gain, ok = _step(information, vector, damping, _free(free, v, vector))
+            move, gain, ok = _step(information, vector, damping, self._free(free, v, vector))
             if not (gain > _STILL * (1.0 + cost)).any():
                 break
             there, v_there = self._moved(u, v, move)
@@ -151,7 +154,13 @@ class View:
         turn = turn * np.minimum(1.0, _TURN / np.maximum(length, 1e-300))
         there = u + (basis(u) @ turn[..., None])[..., 0]
         there /= np.sqrt((there**2).sum(-1, keepdims=True))
-        return there, np.clip(v + move[:, -1], INFINITY, _NEAR)
+        return there, np.clip(v + move[:, -1], INFINITY, self.most)
+
+    def _free(self, free: Array, v: Array, vector: Array) -> Array:
+        """Return the mask (q, d) of coordinates that move: an inverse range at its bound does so only away from it."""
+        out = np.broadcast_to(free, vector.shape).copy()
+        out[:, -1] &= ~(((v <= INFINITY) & (vector[:, -1] <= 0.0)) | ((v >= self.most) & (vector[:, -1] >= 0.0)))
+        return out
 
     def best_range(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the best inverse ranges (q,) of directions (q, d) and their costs: the best of three starts."""
@@ -160,13 +169,6 @@ class View:
         found, cost = found.reshape(3, -1), cost.reshape(3, -1)
         best = cost.argmin(0)[None]
         return np.take_along_axis(found, best, 0)[0], np.take_along_axis(cost, best, 0)[0]
-
-
-def _free(free: Array, v: Array, vector: Array) -> Array:
-    """Return the mask (q, d) of coordinates that move: an inverse range at its bound does so only away from it."""
-    out = np.broadcast_to(free, vector.shape).copy()
-    out[:, -1] &= ~(((v <= INFINITY) & (vector[:, -1] <= 0.0)) | ((v >= _NEAR) & (vector[:, -1] >= 0.0)))
-    return out
 
 
 def _step(information: Array, vector: Array, damping: Array, free: Array) -> tuple[Array, Array, Array]:
@@ -202,10 +204,10 @@ def minima_of(view: View, rise: float) -> Minima:
     """Return the minima that cost no more than a rise above the least."""
     d = len(view.centre)
     spot = _spiral(d)
-    u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(_INVERSE, len(spot))
+    u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(np.minimum(_INVERSE, view.most), len(spot))
     cost = view.look(u, v)[0].reshape(len(spot), -1)
     order = np.argsort(cost.min(1), kind="stable")[:_REFINED]
-    found = view.descend(spot[order], _INVERSE[cost[order].argmin(1)], True, True, _STEPS)
+    found = view.descend(spot[order], np.minimum(_INVERSE, view.most)[cost[order].argmin(1)], True, True, _STEPS)
     found = _lowest(view, *found)
     # mirror images in the plane of the stations, and points on it, where an own minimum has no width
     image = _normalised(mirror(view.problem, view.centre + found[0][None])[0] - view.centre)
@@ -343,7 +345,7 @@ def ends_of_range(view: View, minima: Minima, least: float, rise: float) -> tupl
     wanted, count = np.sqrt(rise), len(minima.v)
     # all ends at once, the near ones with the sign changed: each is a search upwards
     side, state = np.repeat([-1.0, 1.0], count), np.tile(minima.u, (2, 1))
-    low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, _NEAR, -INFINITY)
+    low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, view.most, -INFINITY)
 
     def at(inverse: Array, _: Array) -> tuple[Array, Array]:
         nonlocal state
@@ -352,7 +354,7 @@ def ends_of_range(view: View, minima: Minima, least: float, rise: float) -> tupl
         return _root(cost, least) - wanted, inverse
 
     _, information, _ = view.look(state, side * low)
-    step = np.clip(wanted / np.sqrt(np.maximum(information[:, -1, -1], 1e-300)), INFINITY, _NEAR)
+    step = np.clip(wanted / np.sqrt(np.maximum(information[:, -1, -1], 1e-300)), INFINITY, view.most)
     before, high = np.full(2 * count, -wanted), np.minimum(low + step, limit)
     while True:
         above, _ = at(high, high)

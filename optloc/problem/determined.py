@@ -155,6 +155,8 @@ class Determined:
         The reason of the fix.
     axis : array (d,), optional
         Direction of the line, or normal of the plane, that all stations are on and quantities are about.
+    outside : bool
+        Whether the directions assume a target farther from the middle than all stations: without that any is possible.
     """
 
     origin: Array
@@ -166,6 +168,7 @@ class Determined:
     curve_name: str = ""
     words: str = ""
     axis: Array | None = None
+    outside: bool = False
 
     def __bool__(self) -> bool:
         """Return whether there are directions, numbers or a curve."""
@@ -207,6 +210,7 @@ class Determined:
             "quantities": [_quantity(one) for one in self.quantities],
             "curve": None if self.curve is None else {"name": self.curve_name, "points": self.curve.tolist()},
             "words": self.words,
+            "outside": self.outside,
             "axis": None if self.axis is None else self.axis.tolist(),
         }
 

@@ -41,6 +41,8 @@ def known_rows(fix: Fix) -> list[tuple[str, str]]:
     found: Determined = fix.determined
     rows = []
     directions = shown_directions(fix, found)
+    if directions and found.outside:
+        rows.append(("assumed", "the target is farther away from their middle than the stations"))
     for i, one in enumerate(directions, 1):
         number = f" {i}" if len(directions) > 1 else ""
         rows.append((f"95 % direction{number}", _direction_text(found, one)))
