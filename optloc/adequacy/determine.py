@@ -74,7 +74,7 @@ def determined(problem: Problem, fix: Fix) -> Determined:
         centre = problem.stations.places.reshape(-1, problem.dimension).mean(0)
         return Determined(centre, _level(problem, centre), problem.frame.geodetic, words=words)
     with np.errstate(all="ignore"):
-        return replace(_of_one(flat, bool(fix.dof >= _LEAST)), words=words)
+        return replace(_of_one(flat, int(fix.dof)), words=words)
 
 
 def _level(problem: Problem, centre: Array) -> Array:
@@ -88,7 +88,7 @@ def _is_complete(problem: Problem) -> bool:
     return bool(present.any() and np.isfinite(np.where(present, problem.z, 0.0)).all())
 
 
-def _of_one(flat: Problem, enough: bool) -> Determined:
+def _of_one(flat: Problem, dof: int) -> Determined:
     """Return the `Determined` of a flat batch of one problem, with directions if it has enough rows for them."""
     view, north = View.of(flat), flat.frame.geodetic
     level = _level(flat, view.centre)
@@ -98,8 +98,8 @@ def _of_one(flat: Problem, enough: bool) -> Determined:
     outside, (name, curve, numbers) = False, _curve(flat)
     if curve is not None:
         return Determined(view.centre, level, north, (), numbers, curve, name)
-    found = directions_of(view, level) if enough else ()
-    if enough and not found:
+    found = directions_of(view, level, dof < 0) if dof >= _LEAST else ()
+    if dof >= 0 and not found:
         # between the stations any direction is possible: look at targets outside their sphere alone
         found = directions_of(replace(view, most=1.0), level)
         outside = bool(found)

@@ -59,6 +59,8 @@ _WIDEST = 0.999 * np.pi
 _SAME = 1e-3
 # Angle within which a direction is the image of another, radians, and share of a cone that must be in one of another.
 _ALIKE, _WITHIN = 1e-2, 0.97
+# Angle between points of a valley, radians: cones that are useful are as narrow.
+_APART = 0.1
 # Share of rays without an edge from which on a cone has none. A lune between opposite images has some.
 _OPEN = 0.5
 
@@ -370,7 +372,7 @@ def ends_of_range(view: View, minima: Minima, least: float, rise: float) -> tupl
 # Cones.
 
 
-def directions_of(view: View, level: Array) -> tuple[Direction, ...]:
+def directions_of(view: View, level: Array, few: bool = False) -> tuple[Direction, ...]:
     """Return the directions that the data allow with their cones; none where no few cones hold them.
 
     Parameters
@@ -379,6 +381,8 @@ def directions_of(view: View, level: Array) -> tuple[Direction, ...]:
         The cost.
     level : array (d, d)
         Rows: two level axes and, in space, the upward one.
+    few : bool
+        Whether there are fewer rows than unknowns: separate minima are then points of a valley, and no cone is traced.
     """
     d = len(view.centre)
     rise, single = quantile(LEVEL, d - 1), quantile(LEVEL, 1)
@@ -386,7 +390,7 @@ def directions_of(view: View, level: Array) -> tuple[Direction, ...]:
     if depends_on_place(view.problem):
         view = replace(view, weighed=view.vectors(minima.u[:1], minima.v[:1]))
         minima = minima_of(view, rise)
-    if not np.isfinite(minima.cost[0]):
+    if not np.isfinite(minima.cost[0]) or (few and _is_valley(minima.u)):
         return ()
     least, found = float(minima.cost[0]), list[tuple[Direction, list[int]]]()
     for i, u in enumerate(minima.u):
@@ -402,6 +406,15 @@ def directions_of(view: View, level: Array) -> tuple[Direction, ...]:
             return ()
         found.append((cone, own))
     return tuple(_ranged(view, cone, minima[np.array(items)], least, single) for cone, items in found)
+
+
+def _is_valley(u: Array) -> bool:
+    """Return whether directions (k, d) are more than cones may be, all well apart."""
+    kept = u[:1]
+    for one in u[1:]:
+        if (kept @ one).max() < np.cos(_APART):
+            kept = np.concatenate([kept, one[None]])
+    return len(kept) > _CONES
 
 
 def _is_image(view: View, one: Array, other: Array) -> bool:
