@@ -59,7 +59,7 @@ def determined(problem: Problem, fix: Fix) -> Determined:
     distance from the stations' middle, and f_min the least cost, infinity included; q is the quantile of chi-square
     with d - 1 degrees of freedom. Azimuth, elevation, range and all other intervals follow from profiles of the cost
     with one degree of freedom. With small arrays and far targets,
-    94 to 96 % of simulated directions are in the cones.
+    94.6 % of 2 200 simulated directions are in the cones.
 
     References
     ----------
