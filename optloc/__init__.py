@@ -23,6 +23,7 @@ from optloc.problem.problem import Problem
 if TYPE_CHECKING:
     from optloc.adequacy.advice import advise, explained
     from optloc.adequacy.coplanar import distance_from_plane
+    from optloc.adequacy.determine import determined
     from optloc.adequacy.evidence import Reliability, reliability
     from optloc.adequacy.geometry import Advice
     from optloc.adequacy.noise_level import CommonLevel, LateSignals
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from optloc.problem.build import assemble, measured, station_array
     from optloc.problem.chart import Chart
     from optloc.problem.clocks import clock_densities
+    from optloc.problem.determined import Determined, Direction, Quantity
     from optloc.problem.epochs import by_epoch
     from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
     from optloc.problem.layout import Layout
@@ -105,6 +107,8 @@ __all__ = [
     "Chart",
     "CommonLevel",
     "Course",
+    "Determined",
+    "Direction",
     "Emitters",
     "Explanation",
     "Fix",
@@ -131,6 +135,7 @@ __all__ = [
     "Prepared",
     "Prior",
     "Problem",
+    "Quantity",
     "Region",
     "Reliability",
     "Rows",
@@ -154,6 +159,7 @@ __all__ = [
     "constraints",
     "crlb",
     "crlb_course",
+    "determined",
     "distance_from_plane",
     "epochs",
     "explained",
@@ -227,6 +233,7 @@ _HOMES = {
     "problem.build": "assemble measured station_array",
     "problem.chart": "Chart",
     "problem.clocks": "clock_densities",
+    "problem.determined": "Determined Direction Quantity",
     "problem.epochs": "by_epoch",
     "problem.fix": "Alternatives Explanation Fix Stage Suspect",
     "problem.layout": "Layout",
@@ -246,6 +253,7 @@ _HOMES = {
     "linear.least_squares_ranges": "reduce",
     "solvers.suspects.stage": "suspects",
     "adequacy.coplanar": "distance_from_plane",
+    "adequacy.determine": "determined",
     "uncertainty.arc": "Arc trace_arc",
     "uncertainty.posterior": "Mixture Samples mixture samples",
     "uncertainty.radii": "Accuracy accuracy",

@@ -153,3 +153,25 @@ def status_named(label: str) -> Status:
         if status.label == wanted:
             return status
     raise InvalidProblem(f"there is no status {label!r}", "status", nearest(label, [one.label for one in Status]))
+
+
+# The redundancy that a fix must have.
+
+
+def whole(redundancy: Any) -> int:
+    """Return a redundancy that is asked for; raise InvalidProblem where it is no whole number."""
+    if isinstance(redundancy, bool) or not isinstance(redundancy, int | np.integer) or redundancy < 0:
+        raise InvalidProblem(f"{redundancy!r} is no redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")
+    return int(redundancy)
+
+
+def too_weak(fix: Any, weak: Any, wanted: int) -> str:
+    """Return the sentence on fixes of a batch, by their numbers, that have too little redundancy."""
+    found = int(np.ravel(fix.dof)[weak[0]])
+    which = "The fix" if fix.shape == () else f"Fix {int(weak[0])} of {fix.code.size}"
+    more = f" ({len(weak)} fixes have less than {wanted})" if len(weak) > 1 else ""
+    means = "a wrong measurement would not be noticed" if found <= 0 else "a wrong measurement could not be named"
+    return (
+        f"{which} has a redundancy of {found}, and {wanted} is required{more}: {means}; "
+        "add a row, a station or what is known, such as a height."
+    )

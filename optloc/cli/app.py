@@ -22,8 +22,10 @@ from optloc.cli.options import (
     Choose,
     Costs,
     Criterion,
+    EmitterCount,
     Explain,
     FailOne,
+    FalseRows,
     Force,
     Geodetic,
     Group,
@@ -44,8 +46,11 @@ from optloc.cli.options import (
     ProblemPath,
     Quiet,
     RescaleNoise,
+    SearchRegion,
+    SeenShare,
     SimulatedFixes,
     StatusShares,
+    TrackGap,
     TruePlace,
     TrueVelocity,
     Verbose,
@@ -207,14 +212,7 @@ def track(
     as_json: Json = False,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw track, sigma and NIS.")] = None,
     html: Html = None,
-    gap: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="A longer silence ends the track, and a new fix begins another; by default when the prediction is "
-            "more uncertain than the stations are spread.",
-        ),
-    ] = None,
+    gap: TrackGap = None,
     gate: Annotated[float, typer.Option(metavar="SIGMAS", help="Rows further from the prediction are left out.")] = 5.0,
     start: Annotated[
         str | None, typer.Option(metavar="X,Y[,Z],VX...", help="Known state at the first scan; needs none.")
@@ -250,19 +248,10 @@ def track(
 )
 def separate(
     file: ProblemPath,
-    detection: Annotated[
-        float, typer.Option(metavar="P", help="Probability that an emitter is seen in a channel.")
-    ] = 0.9,
-    false: Annotated[
-        float, typer.Option("--false", metavar="N", help="Mean number of false rows in a channel and epoch.")
-    ] = 1.0,
-    emitters: Annotated[
-        str, typer.Option(metavar="N|auto", help="How many emitters; the most likely number.")
-    ] = "auto",
-    region: Annotated[
-        str | None,
-        typer.Option("--region", metavar="LOW:HIGH", help="Where they are sought, metres: X,Y[,Z]:X,Y[,Z]."),
-    ] = None,
+    detection: SeenShare = 0.9,
+    false: FalseRows = 1.0,
+    emitters: EmitterCount = "auto",
+    region: SearchRegion = None,
     as_json: Json = False,
     outside: Outside = False,
     budget: Budget = None,
@@ -285,9 +274,7 @@ def simulate(
     out: Annotated[
         Path, typer.Option(metavar="OUT.toml", help="Problem file to write; rows go to CSV files beside it.")
     ],
-    velocity: Annotated[
-        str | None, typer.Option(metavar="X,Y[,Z]", help="True velocity of a moving target, m/s.")
-    ] = None,
+    velocity: TrueVelocity = None,
     geodetic: Geodetic = False,
     seed: Annotated[int, typer.Option(min=0, help="Decides the draw.")] = 0,
     trials: Annotated[int, typer.Option(min=1, help="Independent draws; each becomes an epoch.")] = 1,

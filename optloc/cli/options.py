@@ -431,3 +431,24 @@ MapExtent = Annotated[
 ]
 StatusShares = Annotated[bool, typer.Option("--status", help="Simulate fixes, and give the share of each status.")]
 SimulatedFixes = Annotated[int | None, typer.Option(min=1, help="Fixes at each place; 200, or 50 of a map.")]
+
+
+# Of several emitters, and of gaps of tracks.
+
+SeenShare = Annotated[float, typer.Option(metavar="P", help="Probability that an emitter is seen in a channel.")]
+FalseRows = Annotated[
+    float, typer.Option("--false", metavar="N", help="Mean number of false rows in a channel and epoch.")
+]
+EmitterCount = Annotated[str, typer.Option(metavar="N|auto", help="How many emitters; the most likely number.")]
+SearchRegion = Annotated[
+    str | None,
+    typer.Option("--region", metavar="LOW:HIGH", help="Where they are sought, metres: X,Y[,Z]:X,Y[,Z]."),
+]
+TrackGap = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="A longer silence ends the track, and a new fix begins another; by default when the prediction is "
+        "more uncertain than the stations are spread.",
+    ),
+]

@@ -38,6 +38,7 @@ from optloc.plot.style import (
     unit_of,
     xy,
 )
+from optloc.problem.determined import WITHOUT_PLACE
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
@@ -66,6 +67,8 @@ _SHAPES = {
     "azimuth": "ray of a bearing",
     "isodoppler": "equal Doppler through the fix",
 }
+# Length of a wedge without an end, widths of the plan that it crosses.
+_BEYOND = 3.0
 # Metres from the picture's origin at which the Earth's surface stands almost upright in its plan, and steps to it.
 _STEEP, _STEPS = 5.5e6, 12
 
@@ -108,6 +111,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
         for panel, size, centre in zip((panels[0], panels[-1]), sizes, centres, strict=False):
             if _position_lines(panel, problem, every[0], centre, size) and spatial and panel is panels[0]:
                 panel.set_title("plan, lines at the height of the fix")
+    _cones(panels[0], problem, every, sizes[0])
     finish(figure, title, panels[:1])
     # The limits of a plan are settled once the figure was laid out.
     figure.draw_without_rendering()
@@ -155,6 +159,35 @@ def _lines(panel: Axes, scene: Scene, view: View, size: float) -> None:
     for lines, look in styles:
         for i, part in enumerate(lines):
             panel.plot(*xy(part, view, size), zorder=2, **(look if i == 0 else look | {"label": None}))
+
+
+def _cones(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: float) -> None:
+    """Draw the directions of a single fix that has no place as wedges and rays, cut off by the limits of the plan."""
+    if len(fixes) != 1 or fixes[0].code.size != 1 or int(fixes[0].code.ravel()[0]) not in WITHOUT_PLACE:
+        return
+    from matplotlib.collections import Collection, LineCollection, PolyCollection
+
+    found = fixes[0].flat()[0].determined
+    if found is None:
+        return
+    reach = size * _BEYOND * float(np.ptp((panel.get_xlim(), panel.get_ylim()), axis=1).max())
+    wedges = [_plan(problem, found.wedge(one, reach, whole=True)) / size for one in found.directions]
+    rays = [_plan(problem, found.ray(one, reach)) / size for one in found.directions]
+    curves = [] if found.curve is None else [_plan(problem, found.curve) / size]
+    drawn: list[Collection] = []
+    if wedges:
+        drawn.append(PolyCollection(wedges, color=SKY, alpha=0.35, label="95 % direction", zorder=0))
+        drawn.append(LineCollection(rays, colors=BLUE, linestyles="--", label="likeliest direction", zorder=1))
+    if curves:
+        drawn.append(LineCollection(curves, colors=PURPLE, label=found.curve_name, zorder=1))
+    for each in drawn:
+        panel.add_collection(each, autolim=False)
+
+
+def _plan(problem: Problem, line: Array) -> Array:
+    """Return the plan (n, 2) of a line (n, d) of the problem's frame, metres."""
+    local = local_frame(problem)
+    return np.asarray((line if local is None else local.from_ecef(line))[:, :2])
 
 
 def _nearby(scene: Scene) -> bool:

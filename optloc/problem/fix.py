@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, NoSolution, status_named
+from optloc.base.errors import InvalidProblem, NoSolution, status_named, too_weak, whole
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
 from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Status, statuses_of
@@ -206,6 +206,8 @@ class Fix:
         Least cost of positions infinitely far away less that of the fix; NaN where nobody has looked.
     reach : array (...), optional
         Greatest distance of a station, and of a target without a chart, from the middle of the stations, metres.
+    source : object array (...), optional
+        A `Source` for `determined`; None for fixes that are `ok`, and where many are not.
     """
 
     x: Annotated[Array, Axes(1)]
@@ -227,6 +229,7 @@ class Fix:
     chart: Chart | None = None
     infinity: Annotated[Array, Axes(0)] | None = None
     reach: Annotated[Array, Axes(0)] | None = None
+    source: Annotated[Array, Axes(0, empty=None)] | None = None
     # told once: a program may ask for one after the other
     _certificates: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 
@@ -375,6 +378,15 @@ class Fix:
     def _repr_html_(self) -> str:
         """Return the same as HTML, for notebooks."""
         return str(_TELLER[0]().html_of(self)) if _TELLER else ""
+
+    @property
+    def determined(self) -> Any:
+        """Return the `Determined` of a single fix: directions, ranges and curves that the data know in its status.
+
+        It is computed when it is read. None where the problem is not at hand, as in batches with many refused fixes:
+        `optloc.determined(problem, fix)` returns it then.
+        """
+        return _TELLER[0]().determined_of(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fix as plain numbers, texts and lists, ready for JSON.
@@ -535,14 +547,14 @@ class Fix:
         InvalidProblem
             For an unknown status or a redundancy that is no whole number.
         """
-        wanted = _whole(redundancy)
+        wanted = whole(redundancy)
         passing = [Status.OK, *(one if isinstance(one, Status) else status_named(one) for one in allow)]
         bad = np.flatnonzero(~np.isin(np.ravel(self.code), passing))
         if len(bad):
             raise NoSolution(None, self.flat()[int(bad[0])])
         weak = np.flatnonzero(np.ravel(self.dof) < wanted)
         if len(weak):
-            raise NoSolution(None, self.flat()[int(weak[0])], _too_weak(self, weak, wanted))
+            raise NoSolution(None, self.flat()[int(weak[0])], too_weak(self, weak, wanted))
         if level > TOLD and len(tails := np.flatnonzero(np.ravel(self.has(Status.TAILS)))):
             raise NoSolution(None, self.flat()[int(tails[0])], Status.TAILS.sentence)
         return self
@@ -564,25 +576,6 @@ class Fix:
         return int(self.x.shape[0])
 
 
-def _whole(redundancy: Any) -> int:
-    """Return a redundancy that is asked for; raise InvalidProblem where it is no whole number."""
-    if isinstance(redundancy, bool) or not isinstance(redundancy, int | np.integer) or redundancy < 0:
-        raise InvalidProblem(f"{redundancy!r} is no redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")
-    return int(redundancy)
-
-
-def _too_weak(fix: Fix, weak: Array, wanted: int) -> str:
-    """Return why fixes of a batch, by their numbers, have too little redundancy, in a sentence."""
-    found = int(np.ravel(fix.dof)[weak[0]])
-    which = "The fix" if fix.shape == () else f"Fix {int(weak[0])} of {fix.code.size}"
-    more = f" ({len(weak)} fixes have less than {wanted})" if len(weak) > 1 else ""
-    means = "a wrong measurement would not be noticed" if found <= 0 else "a wrong measurement could not be named"
-    return (
-        f"{which} has a redundancy of {found}, and {wanted} is required{more}: {means}; "
-        "add a row, a station or what is known, such as a height."
-    )
-
-
 # Words, tables and maps are made on a higher floor: `optloc` says by whom, once.
 _TELLER: list[Callable[[], Any]] = []
 
@@ -595,6 +588,6 @@ def told_by(teller: Callable[[], Any]) -> None:
 def _as_array(value: Any) -> Array:
     if isinstance(value, np.ndarray | np.generic):
         return np.asarray(value)
-    out = np.empty(1, dtype=object if value is None or isinstance(value, str | tuple) else None)
+    out = np.empty(1, dtype=object)
     out[0] = value
     return out.reshape(())

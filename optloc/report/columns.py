@@ -15,6 +15,7 @@ from optloc.bounds.observability import Observability
 from optloc.problem.chart import AXES, CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
 from optloc.problem.fix import Active, Explanation, Fix
+from optloc.report.knowledge import is_shown
 
 Columns = dict[str, Array]
 """A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
@@ -315,6 +316,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
         "unchecked": bool(fix.unchecked),
         "gap_to_infinity": None if fix.infinity is None else fix.infinity,
         "chart": _chart_json(fix),
+        "determined": fix.determined.to_dict() if is_shown(fix) else None,
         "alternatives": [
             {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
             for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)

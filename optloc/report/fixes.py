@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optloc.adequacy.determine import determined, of_fix
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import visible
 from optloc.base.types import NOTES, Array, Status
 from optloc.bounds.observability import Observability
 from optloc.problem.bias import estimated_speed
 from optloc.problem.chart import AXES, CARTESIAN, INVERSE_RANGE, NAMES
+from optloc.problem.determined import Determined
 from optloc.problem.fix import Active, Fix, Suspect
 from optloc.problem.problem import Problem
 from optloc.report.columns import (
@@ -36,6 +38,7 @@ from optloc.report.columns import (
     plain,
     records,
 )
+from optloc.report.knowledge import has_place, known_rows
 
 # What a coordinate that an equality holds may have as its sigma, as a share of it: rounding.
 _HELD = 1e-12
@@ -112,7 +115,8 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Shee
             spread = np.sqrt(np.nanmean(values**2))
             told.append((name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip()))
     told += [("constraint", _held(active)) for active in active_of(fix)]
-    told += _extents(fix)
+    known = known_rows(fix)
+    told += known if known and not has_place(fix) else _extents(fix) + known
     told.append(("chi-square", _chi_square(fix)))
     if hasattr(fix.certificate, "proof"):
         told.append(("certificate", f"{fix.certificate.proof}: {fix.certificate.reason}"))
@@ -364,6 +368,20 @@ def html_of(fix: Fix) -> str:
         title = f"<caption>{escape(visible(sheet.title))}</caption>" if sheet.title else ""
         parts.append(f"<table>{title}{f'<tr>{head}</tr>' if head else ''}{body}</table>")
     return "".join(parts)
+
+
+def determined_of(fix: Fix) -> Determined | None:
+    """Return the `Determined` of a single fix, None without its problem; raise InvalidProblem for a batch."""
+    if fix.shape:
+        advice = "take one of them: fix[i].determined"
+        raise InvalidProblem(f"these are fixes of shape {fix.shape}", "determined", advice)
+    source: Any = None if fix.source is None else fix.source[()]
+    if source is None:
+        return of_fix(fix)
+    if source.found is None:
+        source.found = determined(source.problem.flat(), fix)
+    found: Determined = source.found
+    return found
 
 
 def dict_of(fix: Fix) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.linear.vectors import vectors
+from optloc.problem.determined import with_sources
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -51,7 +52,8 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None, refine: 
     """
     run = Method.parse(method)
     fix = at_once(problem, run) if start is None else None
-    return solve_in_stages(problem, run, start, refine=refine) if fix is None else fix
+    fix = solve_in_stages(problem, run, start, refine=refine) if fix is None else fix
+    return with_sources(problem, fix)
 
 
 def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:

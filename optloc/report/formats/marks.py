@@ -17,6 +17,7 @@ from optloc.problem.chart import CARTESIAN, NAMES
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.report.columns import UNCHECKED, Columns, records
+from optloc.report.knowledge import known_features
 
 if TYPE_CHECKING:
     from optloc.uncertainty.outline import Outline
@@ -225,6 +226,14 @@ class Results:
             outlines = self._outlines(self.problem)
         return [self._area(row, outlines.get(i)) for i, row in enumerate(records(self.columns))]
 
+    def known(self) -> list[list[tuple[dict[str, Any], dict[str, Any]]]]:
+        """Return geometries and their properties of what each row determines without a place; see `known_features`."""
+        flat = [fix if len(fix.shape) == 1 else fix.flat() for fix in self.fixes]
+        # fixes of one position each: a row is a fix
+        if not self.frame.geodetic or sum(map(len, flat)) != self._count:
+            return [[] for _ in range(self._count)]
+        return [known_features(fix[i], self.frame) for fix in flat for i in range(len(fix))]
+
     def _mark(self, row: dict[str, Any], others: tuple[Other, ...]) -> Mark:
         axes = self.axes
         number = {name: np.nan if row.get(name) is None else row[name] for name in row}
@@ -335,7 +344,7 @@ def geojson(results: Results) -> dict[str, Any]:
     features = [feature(point_geometry(place), {"role": "station", "name": name}) for name, place in results.stations()]
     skipped = {"x", "y", "z", "lat_deg", "lon_deg", "height"}
     rows = records(results.columns)
-    for row, mark, area in zip(rows, results.marks(), results.areas(), strict=True):
+    for row, mark, area, known in zip(rows, results.marks(), results.areas(), results.known(), strict=True):
         about: dict[str, Any] = {name: row[name] for name in ("number", "epoch", "target") if name in row}
         told = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
         if mark.known:
@@ -345,4 +354,5 @@ def geojson(results: Results) -> dict[str, Any]:
         for other in mark.others:
             doubt = {"gap": other.gap, "probability": other.probability}
             features.append(feature(point_geometry(other.place), {"role": "alternative", **about, **doubt}))
+        features += [feature(geometry, {**own, **about}) for geometry, own in known]
     return {"type": "FeatureCollection", "features": features}

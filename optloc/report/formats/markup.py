@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring  # it writes and reads nothing
 
 import numpy as np
@@ -74,8 +75,10 @@ def kml(results: Results) -> str:
     for name, place in results.stations():
         _point(_placemark(document, name, "station", "station"), place, len(results.axes))
     marks = results.marks()
-    for mark, area in zip(marks, results.areas(), strict=True):
+    for mark, area, known in zip(marks, results.areas(), results.known(), strict=True):
         _kml_mark(document, mark, area)
+        for geometry, about in known:
+            _kml_known(document, mark, geometry, about)
     for target, parts in _courses(marks) if results.course else ():
         line = _add(_placemark(document, f"{target}: track", "ok scans, in order", "ok"), "MultiGeometry")
         for run in (run for run in parts if len(run) > 1):
@@ -98,6 +101,22 @@ def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
     for number, other in enumerate(mark.others, 1):
         place = _placemark(document, _named(mark, number), _doubt(mark, other), "alternative")
         _point(place, other.place, flat)
+
+
+def _kml_known(document: Element, mark: Mark, geometry: dict[str, Any], about: dict[str, Any]) -> None:
+    """Add a wedge, ray or curve in the place of a position."""
+    words = {"direction95": "direction, 95 %" + (", cut off" if about.get("cut") else ""), "ray": "likeliest direction"}
+    name = words.get(about["role"], about.get("name", ""))
+    placemark = _placemark(document, f"{mark.name}: {name}", mark.words, "doubtful")
+    if geometry["type"] != "MultiLineString":
+        _polygons(placemark, Area(about["role"], geometry))
+        return
+    parent = _add(placemark, "MultiGeometry")
+    for part in geometry["coordinates"]:
+        line = _add(parent, "LineString")
+        _add(line, "tessellate", "1")
+        _add(line, "altitudeMode", "clampToGround")
+        _add(line, "coordinates", _line(np.array(part)))
 
 
 def _named(mark: Mark, number: int) -> str:

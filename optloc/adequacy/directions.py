@@ -1,0 +1,577 @@
+"""Which directions and ranges the data allow: the likelihood set over the direction and the inverse of the range.
+
+The target is at ``x = c + (s / v) u``: c is the middle of the stations, s their spread, u a unit vector, and v >= 0 the
+inverse of the range in spreads. Infinity is v = 0, a point like others, so a plane wave needs no special case. A cone
+holds the directions whose cost, at the v that suits them best, is near enough to the least. The inverse range is not
+Gaussian at its bound, so all ends follow from the cost itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.adequacy.scaled_rows import has_scales, profile_by_rows
+from optloc.adequacy.shape import profile
+from optloc.base import linalg
+from optloc.base.types import Array
+from optloc.compute.damping import FIRST_GROWTH, judge
+from optloc.linear.mirror import mirror, one_position, plane_of_stations
+from optloc.linear.normal import depends_on_place
+from optloc.linear.vectors import vectors
+from optloc.problem.chart import basis, jacobian, quantile
+from optloc.problem.determined import LEVEL, Direction, holds
+from optloc.problem.problem import Problem
+
+INFINITY = 1e-6
+"""Inverse range that counts as zero: fronts bend by 5e-7 of the spread, and derivatives by it keep four digits."""
+
+# Greatest inverse range: a point so near the middle has no direction.
+_NEAR = 1e3
+# Directions that are tried, some 28 degrees apart in space and 15 in the plane, each at these inverse ranges.
+_TRIED = {2: 24, 3: 50}
+_INVERSE = np.array([INFINITY, 0.1, 0.3, 1.0, 3.0])
+# Starts that are refined, and steps of each: a damped step squares a small error.
+_REFINED, _STEPS = 16, 40
+# Steps at one point of an edge: it begins next to its end.
+_FEW = 12
+# Share of a cost that steps must promise to go on: it is compared with a quantile of several.
+_STILL = 1e-6
+# Damping of the first step, relative to the diagonal.
+_DAMPING = 1e-3
+# Largest turn of a step, radians: beyond it the model is of another place.
+_TURN = 0.5
+# Rays to the edge of a cone in space: the polygon lacks 0.6 % of an ellipse.
+_RAYS = 32
+# Growth of a step that looks for the far side of an edge, and false positions at most.
+_GROWTH, _TRIALS = 1.6, 14
+# Departure of the root of a rise from its goal that is left: a hundredth of a standard deviation.
+_CLOSE = 1e-2
+# Cones at most. More minima are points of a valley, which no cone describes.
+_CONES = 4
+# Inverse range next to the stations, where the cost may have another minimum.
+_BESIDE = 0.5
+# Largest angle to the edge of a cone, radians: farther away it has no edge. Lunes of two mirror images are as long.
+_WIDEST = 0.999 * np.pi
+# Angle and relative range within which two minima are one.
+_SAME = 1e-3
+# Angle within which a direction is the image of another, radians, and share of a cone that must be in one of another.
+_ALIKE, _WITHIN = 1e-2, 0.97
+# Angle between points of a valley, radians: cones that are useful are as narrow.
+_APART = 0.1
+# Share of rays without an edge from which on a cone has none. A lune between opposite images has some.
+_OPEN = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The cost over direction and inverse range, all other unknowns at their best.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem of one position.
+    x : array (1, size)
+        Where the search for the other unknowns begins.
+    centre : array (d,)
+        Middle of the stations that rows are present of, metres.
+    spread : float
+        Their greatest distance from it, metres; 1 for one station.
+    weighed : array (1, size), optional
+        Where station errors are weighed; at each place itself if absent.
+    most : float
+        Greatest inverse range that is looked at.
+    """
+
+    problem: Problem
+    x: Array
+    centre: Array
+    spread: float
+    weighed: Array | None = None
+    most: float = _NEAR
+
+    @classmethod
+    def of(cls, problem: Problem) -> View:
+        """Return the view of a flat batch of one problem."""
+        centre, _, _, size = plane_of_stations(problem)
+        spread = float(size[0]) if size[0] > 0.0 else 1.0
+        return cls(problem, vectors(problem, np.zeros((1, 1, problem.dimension)))[:, 0], centre[0], spread)
+
+    def positions(self, u: Array, v: Array) -> Array:
+        """Return positions (q, d), metres."""
+        return np.asarray(self.centre + (self.spread / v)[:, None] * u)
+
+    def vectors(self, u: Array, v: Array) -> Array:
+        """Return parameter vectors (q, size)."""
+        slot, _ = self.problem.layout.find("position")
+        x = np.repeat(self.x, len(u), axis=0)
+        x[:, slot.start : slot.start + slot.size] = self.positions(u, v)
+        return x
+
+    def look(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return costs (q,), and the normal equations in a turn of u and in v: (q, d, d) and (q, d)."""
+        x = self.vectors(u, v)[:, None]
+        own = profile_by_rows if has_scales(self.problem) else profile
+        cost, information, vector = own(self.problem, x, x if self.weighed is None else self.weighed, 2)
+        away = self.spread * u
+        gradient = jacobian(np.concatenate([0.0 * u[:, :-1], v[:, None]], axis=1), away, np.zeros(u.shape[1]))
+        turned = np.swapaxes(gradient, -1, -2)
+        cost = np.where(np.isfinite(cost[:, 0]), cost[:, 0], np.inf)
+        return cost, turned @ information[:, 0] @ gradient, (turned @ vector[:, 0, :, None])[..., 0]
+
+    def descend(self, u: Array, v: Array, turns: bool, moves: bool, steps: int) -> tuple[Array, Array, Array]:
+        """Return the ends of damped steps of Gauss and Newton: directions (q, d), inverse ranges and costs (q,).
+
+        Parameters
+        ----------
+        u, v : array (q, d), (q,)
+            Starts.
+        turns, moves : bool
+            Whether the direction changes, and the inverse range.
+        steps : int
+            At most.
+        """
+        d = u.shape[1]
+        free = np.array([turns] * (d - 1) + [moves])
+        cost, information, vector = self.look(u, v)
+        damping, growth = np.full(len(u), _DAMPING), np.full(len(u), FIRST_GROWTH)
+        for _ in range(steps):
+            move, gain, ok = _step(information, vector, damping, self._free(free, v, vector))
+            if not (gain > _STILL * (1.0 + cost)).any():
+                break
+            there, v_there = self._moved(u, v, move)
+            new, more, other = self.look(there, v_there)
+            better, _, _, damping, growth = judge(cost, new, gain, ok, 0.0 * cost, damping, growth, 0.0, True)
+            u, v = np.where(better[:, None], there, u), np.where(better, v_there, v)
+            information = np.where(better[:, None, None], more, information)
+            vector, cost = np.where(better[:, None], other, vector), np.where(better, new, cost)
+        return u, v, cost
+
+    def _moved(self, u: Array, v: Array, move: Array) -> tuple[Array, Array]:
+        """Return directions and inverse ranges after a step (q, d)."""
+        turn = move[:, :-1]
+        length = np.sqrt((turn**2).sum(-1, keepdims=True))
+        turn = turn * np.minimum(1.0, _TURN / np.maximum(length, 1e-300))
+        there = u + (basis(u) @ turn[..., None])[..., 0]
+        there /= np.sqrt((there**2).sum(-1, keepdims=True))
+        return there, np.clip(v + move[:, -1], INFINITY, self.most)
+
+    def _free(self, free: Array, v: Array, vector: Array) -> Array:
+        """Return the mask (q, d) of coordinates that move: an inverse range at its bound does so only away from it."""
+        out = np.broadcast_to(free, vector.shape).copy()
+        out[:, -1] &= ~(((v <= INFINITY) & (vector[:, -1] <= 0.0)) | ((v >= self.most) & (vector[:, -1] >= 0.0)))
+        return out
+
+    def best_range(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Return the best inverse ranges (q,) of directions (q, d) and their costs: the best of three starts."""
+        starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _BESIDE)])
+        _, found, cost = self.descend(np.tile(u, (3, 1)), starts, False, True, _FEW)
+        found, cost = found.reshape(3, -1), cost.reshape(3, -1)
+        best = cost.argmin(0)[None]
+        return np.take_along_axis(found, best, 0)[0], np.take_along_axis(cost, best, 0)[0]
+
+
+def _step(information: Array, vector: Array, damping: Array, free: Array) -> tuple[Array, Array, Array]:
+    """Return damped steps (q, d) of the coordinates that move, the gain that they promise, and where they exist."""
+    inner = np.where(free[:, :, None] & free[:, None, :], information, 0.0)
+    right = np.where(free, vector, 0.0)
+    size = np.diagonal(inner, axis1=-2, axis2=-1).copy()
+    # turns share a scale: across the plane of the stations the derivative vanishes on it
+    size[:, :-1] = size[:, :-1].max(-1, keepdims=True)
+    size = np.where(free & (size > 0.0), size, np.maximum(size.max(-1, keepdims=True), 1e-300))
+    grown = inner + (damping[:, None] * size + np.where(free, 0.0, size))[..., None] * np.eye(size.shape[-1])
+    move, ok = linalg.solve(grown, right[..., None])
+    move = np.where(free & ok[:, None], move[..., 0], 0.0)
+    return move, (move * right).sum(-1), ok
+
+
+# All minima, whatever a fix has found.
+
+
+@dataclass(frozen=True, slots=True)
+class Minima:
+    """Minima of the cost over direction and inverse range, the cheapest first: (k, d), (k,), (k,)."""
+
+    u: Array
+    v: Array
+    cost: Array
+
+    def __getitem__(self, items: Array) -> Minima:
+        return Minima(self.u[items], self.v[items], self.cost[items])
+
+
+def minima_of(view: View, rise: float) -> Minima:
+    """Return the minima that cost no more than a rise above the least."""
+    d = len(view.centre)
+    spot = _spiral(d)
+    u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(np.minimum(_INVERSE, view.most), len(spot))
+    cost = view.look(u, v)[0].reshape(len(spot), -1)
+    order = np.argsort(cost.min(1), kind="stable")[:_REFINED]
+    found = view.descend(spot[order], np.minimum(_INVERSE, view.most)[cost[order].argmin(1)], True, True, _STEPS)
+    found = _lowest(view, *found)
+    # mirror images in the plane of the stations, and points on it, where an own minimum has no width
+    image = _normalised(mirror(view.problem, view.centre + found[0][None])[0] - view.centre)
+    on = _normalised(found[0] + image)
+    more = view.descend(np.concatenate([image, on]), np.tile(found[1], 2), True, True, _STEPS)
+    u, v, cost = (np.concatenate(pair) for pair in zip(found, more, strict=True))
+    return _distinct(u, v, cost, rise)
+
+
+def _lowest(view: View, u: Array, v: Array, cost: Array) -> tuple[Array, Array, Array]:
+    """Return minima with the better of their inverse range and of infinity."""
+    there, other, flat = view.descend(u, np.full(len(v), INFINITY), True, True, _STEPS)
+    better = flat < cost
+    return np.where(better[:, None], there, u), np.where(better, other, v), np.where(better, flat, cost)
+
+
+def _distinct(u: Array, v: Array, cost: Array, rise: float) -> Minima:
+    """Return the minima within a rise of the least, each once."""
+    order = [int(i) for i in np.argsort(cost, kind="stable") if cost[i] <= cost.min() + rise]
+    kept: list[int] = []
+    for i in order:
+        alike = [abs(v[i] - v[j]) <= _SAME * (1.0 + v[j]) and u[i] @ u[j] > 1.0 - 0.5 * _SAME**2 for j in kept]
+        if not any(alike):
+            kept.append(i)
+    return Minima(u[kept], v[kept], cost[kept])
+
+
+def _normalised(vector: Array) -> Array:
+    length = np.sqrt((vector**2).sum(-1, keepdims=True))
+    first = np.eye(vector.shape[-1])[0]
+    return np.where(length > 0.0, vector / np.where(length > 0.0, length, 1.0), first)
+
+
+def _spiral(d: int) -> Array:
+    """Return unit vectors (q, d) spread evenly."""
+    count = _TRIED[d]
+    number = np.arange(count) + 0.5
+    if d == 2:
+        turn = 2.0 * np.pi * number / count
+        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
+    across = np.sqrt(1.0 - height**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=-1)
+
+
+# Edges: where the root of the rise of the cost reaches a goal.
+
+# Excess of the root at arguments (k,), with guesses of what is profiled out, and these at their best.
+Profile = Callable[[Array, Array], tuple[Array, Array]]
+
+
+def edge(view: View, start: tuple[Array, Array], ways: Array, least: float, rise: Array) -> tuple[Array, Array]:
+    """Return the angles (k,) at which cones end along rays, and the directions (k, d) there; NaN beyond the widest.
+
+    Parameters
+    ----------
+    view : View
+        The cost.
+    start : tuple of array (d,), ()
+        Direction and inverse range of a minimum.
+    ways : array (k, d)
+        Unit vectors across the direction.
+    least : float
+        Cost of the best minimum of all.
+    rise : array (k,)
+        By how much the cost exceeds it on the edge.
+    """
+    u0, v0 = start
+    wanted, v = np.sqrt(rise), np.full(len(ways), v0)
+    low, high, above = np.zeros(len(ways)), _first(view, u0, v0, ways, wanted), np.zeros(len(ways))
+    below = _root(view.look(u0[None], np.atleast_1d(v0))[0], least)[0] - wanted
+
+    def at(angle: Array, guess: Array) -> tuple[Array, Array]:
+        turned = np.cos(angle)[:, None] * u0 + np.sin(angle)[:, None] * ways
+        found, cost = view.best_range(turned, guess)
+        return _root(cost, least) - wanted, found
+
+    inside = np.ones(len(ways), dtype=bool)
+    while inside.any():
+        above, found = at(high, v)
+        inside = (above < 0.0) & (high < _WIDEST)
+        low, below = np.where(inside, high, low), np.where(inside, above, below)
+        v = np.where(inside, found, v)
+        high = np.where(inside, np.minimum(_GROWTH * high, _WIDEST), high)
+    open_ = above < 0.0
+    low = _false_position(at, (low, below), (high, above), v)
+    turned = np.cos(low)[:, None] * u0 + np.sin(low)[:, None] * ways
+    return np.where(open_, np.nan, low), np.where(open_[:, None], np.nan, turned)
+
+
+def _root(cost: Array, least: float) -> Array:
+    return np.sqrt(np.maximum(cost - least, 0.0))
+
+
+def _first(view: View, u: Array, v: Array, ways: Array, wanted: Array) -> Array:
+    """Return angles (k,) at which a Gaussian cone would end."""
+    _, information, _ = view.look(u[None], np.atleast_1d(v))
+    across = ways @ basis(u)
+    form = ((across @ _of_turns(information[0], float(v))) * across).sum(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        guess = wanted / np.sqrt(form)
+    return np.clip(np.where(np.isfinite(guess), guess, _TURN), 1e-9, _TURN)
+
+
+def _false_position(at: Profile, low: tuple[Array, Array], high: tuple[Array, Array], v: Array) -> Array:
+    """Return the zeros (k,) of functions between two ends, by the modified false position.
+
+    References
+    ----------
+    M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11 (1971).
+    """
+    (a, f_a), (b, f_b) = low, high
+    side, middle = np.zeros(len(a)), a
+    for _ in range(_TRIALS):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            middle = (a * f_b - b * f_a) / (f_b - f_a)
+        middle = np.where(np.isfinite(middle) & (middle > a) & (middle < b), middle, 0.5 * (a + b))
+        now, found = at(middle, v)
+        if (np.abs(now) <= _CLOSE).all():
+            break
+        over = now > 0.0
+        v = np.where(over, v, found)
+        f_a, f_b = np.where(over & (side > 0.0), 0.5 * f_a, f_a), np.where(~over & (side < 0.0), 0.5 * f_b, f_b)
+        a, f_a = np.where(over, a, middle), np.where(over, f_a, now)
+        b, f_b = np.where(over, middle, b), np.where(over, now, f_b)
+        side = np.where(over, 1.0, -1.0)
+    return np.asarray(middle)
+
+
+def ends_of_range(view: View, minima: Minima, least: float, rise: float) -> tuple[float, float]:
+    """Return the least and the greatest inverse range, in spreads, at which a direction near minima costs little.
+
+    All directions may follow: the profile of the cost over the inverse range.
+    """
+    wanted, count = np.sqrt(rise), len(minima.v)
+    # all ends at once, the near ones with the sign changed: each is a search upwards
+    side, state = np.repeat([-1.0, 1.0], count), np.tile(minima.u, (2, 1))
+    low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, view.most, -INFINITY)
+
+    def at(inverse: Array, _: Array) -> tuple[Array, Array]:
+        nonlocal state
+        there, _, cost = view.descend(state, side * inverse, True, False, _FEW)
+        state = np.where((cost <= least + rise)[:, None], there, state)
+        return _root(cost, least) - wanted, inverse
+
+    _, information, _ = view.look(state, side * low)
+    step = np.clip(wanted / np.sqrt(np.maximum(information[:, -1, -1], 1e-300)), INFINITY, view.most)
+    before, high = np.full(2 * count, -wanted), np.minimum(low + step, limit)
+    while True:
+        above, _ = at(high, high)
+        inside = (above < 0.0) & (high < limit)
+        if not inside.any():
+            break
+        low, before, step = np.where(inside, high, low), np.where(inside, above, before), 2.0 * step
+        high = np.where(inside, np.minimum(high + step, limit), high)
+    ends = np.abs(np.where(above < 0.0, limit, _false_position(at, (low, before), (high, above), high)))
+    return float(ends[:count].min()), float(ends[count:].max())
+
+
+# Cones.
+
+
+def directions_of(view: View, level: Array, few: bool = False) -> tuple[Direction, ...]:
+    """Return the directions that the data allow with their cones; none where no few cones hold them.
+
+    Parameters
+    ----------
+    view : View
+        The cost.
+    level : array (d, d)
+        Rows: two level axes and, in space, the upward one.
+    few : bool
+        Whether there are fewer rows than unknowns: separate minima are then points of a valley, and no cone is traced.
+    """
+    d = len(view.centre)
+    rise, single = quantile(LEVEL, d - 1), quantile(LEVEL, 1)
+    minima = minima_of(view, rise)
+    if depends_on_place(view.problem):
+        view = replace(view, weighed=view.vectors(minima.u[:1], minima.v[:1]))
+        minima = minima_of(view, rise)
+    if not np.isfinite(minima.cost[0]) or (few and _is_valley(minima.u)):
+        return ()
+    least, found = float(minima.cost[0]), list[tuple[Direction, list[int]]]()
+    for i, u in enumerate(minima.u):
+        around, own = next(((cone, items) for cone, items in found if cone.covers(u)), (None, [i]))
+        if around is not None:
+            own.append(i)
+            if not _is_image(view, around.vector, u):
+                continue
+        cone = _cone(view, minima, i, np.array([rise, single]), level)
+        if around is not None and (cone is None or around.covers(u + _WITHIN * (cone.outline - u)).all()):
+            continue
+        if cone is None or len(found) == _CONES:
+            return ()
+        found.append((cone, own))
+    return tuple(_ranged(view, cone, minima[np.array(items)], least, single) for cone, items in found)
+
+
+def _is_valley(u: Array) -> bool:
+    """Return whether directions (k, d) are more than cones may be, all well apart."""
+    kept = u[:1]
+    for one in u[1:]:
+        if (kept @ one).max() < np.cos(_APART):
+            kept = np.concatenate([kept, one[None]])
+    return len(kept) > _CONES
+
+
+def _is_image(view: View, one: Array, other: Array) -> bool:
+    """Return whether a direction is the mirror image of another in the plane of the stations.
+
+    Cones of images that touch have a waist, and rays from one of them miss much of the other.
+    """
+    image = mirror(view.problem, (view.centre + one)[None])[0] - view.centre
+    return bool(np.abs(image - other).max() < _ALIKE and np.abs(image - one).max() > _ALIKE)
+
+
+def _cone(view: View, minima: Minima, i: int, rises: Array, level: Array) -> Direction | None:
+    """Return the cone about a minimum without a range, or None where it is no cone."""
+    u, v, least = minima.u[i], minima.v[i], float(minima.cost[0])
+    usable, across = rises > minima.cost[i] - least, _principal(view, minima.u[i], minima.v[i])
+    sides = np.concatenate([across.T, -across.T])
+    reach, _ = edge(view, (u, v), sides, least, np.full(len(sides), rises[0]))
+    if np.isnan(reach).mean() > _OPEN:
+        return None
+    half = np.where(np.isnan(reach), _WIDEST, reach).reshape(2, -1).mean(0)
+    # rays are spread evenly in the metric of the ellipse, so that its tips are not cut off
+    ways = sides if len(u) == 2 else _normalised(_around() * half @ across.T)
+    k = len(ways)
+    angle, edges = np.zeros((2, k)), np.tile(u, (2, k, 1))
+    found = edge(view, (u, v), np.tile(ways, (usable.sum(), 1)), least, np.repeat(rises[usable], k))
+    angle[usable], edges[usable] = found[0].reshape(-1, k), found[1].reshape(-1, k, len(u))
+    if np.isnan(angle[0]).mean() > _OPEN:
+        return None
+    opposite = np.isnan(angle)
+    angle = np.where(opposite, _WIDEST, angle)
+    edges = np.where(opposite[..., None], np.cos(_WIDEST) * u + np.sin(_WIDEST) * ways, edges)
+    half, axes = _ellipse(u, ways, angle[0])
+    azimuth, elevation = _angles(u, edges[1], level)
+    return Direction(u, azimuth, elevation, half, axes, edges[0], (np.inf, 0.0, np.inf), float(minima.cost[i]) - least)
+
+
+def _principal(view: View, u: Array, v: float) -> Array:
+    """Return unit vectors (d, d - 1) across a direction along which the information on it is least and greatest."""
+    _, information, _ = view.look(u[None], np.atleast_1d(v))
+    return np.asarray(basis(u) @ np.linalg.eigh(_of_turns(information[0], v))[1])
+
+
+def _around() -> Array:
+    """Return unit vectors (k, 2) all around counter-clockwise."""
+    turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
+    return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+
+
+def _of_turns(information: Array, v: float) -> Array:
+    """Return the information (d - 1, d - 1) on turns of a direction, the inverse range at its best."""
+    turns = information[:-1, :-1]
+    if v <= INFINITY or information[-1, -1] <= 0.0:
+        return turns
+    return np.asarray(turns - np.outer(information[:-1, -1], information[-1, :-1]) / information[-1, -1])
+
+
+def _ellipse(u: Array, ways: Array, angle: Array) -> tuple[Array, Array]:
+    """Return semi-axes (d - 1,) and their unit vectors (d, d - 1) of the ellipse with the moments of an outline."""
+    across = basis(u)
+    if len(u) == 2:
+        return np.array([0.5 * angle.sum()]), across
+    rim = angle[:, None] * (ways @ across)
+    rim = rim[np.argsort(np.arctan2(rim[:, 1], rim[:, 0]))]
+    following = np.roll(rim, -1, axis=0)
+    # triangles from the direction: twice their areas, and their second moments
+    double = rim[:, 0] * following[:, 1] - rim[:, 1] * following[:, 0]
+    both = rim + following
+    moment = (double[:, None, None] * sum(e[:, :, None] * e[:, None, :] for e in (rim, following, both))).sum(0) / 24.0
+    values, turned = np.linalg.eigh(moment / (0.5 * double.sum()))
+    return 2.0 * np.sqrt(np.maximum(values[::-1], 0.0)), across @ turned[:, ::-1]
+
+
+def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, float], tuple[float, ...]]:
+    """Return azimuth and elevation of a direction with their ends, from the edge (k, d) of a cone."""
+    own, rim = level @ u, edges @ level.T
+    middle = float(np.arctan2(own[1], own[0]))
+    turn = np.arctan2(rim[:, 1] * own[0] - rim[:, 0] * own[1], rim[:, :2] @ own[:2])
+    ends = (middle + float(turn.min()), middle + float(turn.max()))
+    if len(u) == 2:
+        return (middle, *ends), ()
+    height = np.arcsin(np.clip(rim[:, 2], -1.0, 1.0))
+    up, down = (bool(holds(u, edges, side * level[2])) for side in (1.0, -1.0))
+    low, high = -0.5 * np.pi if down else float(height.min()), 0.5 * np.pi if up else float(height.max())
+    # about a cone that holds the vertical every azimuth is possible
+    ends = (middle - np.pi, middle + np.pi) if up or down else ends
+    return (middle, *ends), (float(np.arcsin(np.clip(own[2], -1.0, 1.0))), low, high)
+
+
+def _ranged(view: View, cone: Direction, minima: Minima, least: float, rise: float) -> Direction:
+    """Return a cone with its range: the inverse ranges of all minima in it."""
+    near = minima[minima.cost <= least + rise]
+    if not len(near.cost):
+        near = minima[minima.cost == minima.cost.min()]
+    with np.errstate(divide="ignore"):
+        low, high = ends_of_range(view, near, least, max(rise, float(near.cost.min()) - least))
+        best = near.v[near.cost.argmin()]
+
+    def distance(v: float) -> float:
+        return np.inf if v <= INFINITY else 0.0 if v >= _NEAR else view.spread / v
+
+    return replace(cone, range=(distance(float(best)), distance(high), distance(low)))
+
+
+def has_directions(problem: Problem) -> bool:
+    """Return whether problems are of one position at rest, without constraints: what has a view from the stations."""
+    still = one_position(problem) and problem.motions[0].order == 0 and problem.layout.shares("position")
+    return still and not problem.constraints and problem.medium is None
+
+
+# Regions in the plane.
+
+# Rays about a minimum: the extent along an axis lacks 0.1 % of an ellipse.
+_AROUND = 64
+
+
+def extent_of(view: View, u: Array, v: float, least: float, rise: float) -> Array:
+    """Return positions (k, 2) on the edge of the region in the plane whose cost is less than a rise above the least.
+
+    Parameters
+    ----------
+    view : View
+        A problem in the plane.
+    u, v : array (2,), float
+        A minimum within it.
+    least, rise : float
+        Cost of the best minimum of all, and how much more the edge costs. The edge at infinity is at 1e6 spreads of the
+        stations.
+    """
+    _, information, _ = view.look(u[None], np.atleast_1d(v))
+    values, axes = np.linalg.eigh(information[0])
+    steps = axes * np.sqrt(rise / np.maximum(values, _DAMPING * max(float(values.max()), 1e-300)))
+    turn = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
+    ways, side = np.stack([np.cos(turn), np.sin(turn)], axis=-1) @ steps.T, basis(u)[:, 0]
+
+    def places(share: Array) -> tuple[Array, Array]:
+        angle = np.clip(share * ways[:, 0], -np.pi, np.pi)
+        inverse = np.clip(v + share * ways[:, 1], INFINITY, _NEAR)
+        return np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * side, inverse
+
+    def at(share: Array, _: Array) -> tuple[Array, Array]:
+        return _root(view.look(*places(share))[0], least) - np.sqrt(rise), share
+
+    # a ray that arrives at infinity ends there
+    falls = ways[:, 1] < 0.0
+    most = np.where(falls, (v - INFINITY) / np.maximum(-ways[:, 1], 1e-300), _FARTHEST)
+    low, high = np.zeros(_AROUND), np.minimum(1.0, most)
+    below = np.full(_AROUND, float(at(low, low)[0][0]))
+    while True:
+        above, _ = at(high, high)
+        inside = (above < 0.0) & (high < most)
+        if not inside.any():
+            break
+        low, below = np.where(inside, high, low), np.where(inside, above, below)
+        high = np.where(inside, np.minimum(_GROWTH * high, most), high)
+    ends = np.where(above < 0.0, high, _false_position(at, (low, below), (high, above), high))
+    return view.positions(*places(ends))
+
+
+# Longest ray, in lengths of a Gaussian one.
+_FARTHEST = 1e4
