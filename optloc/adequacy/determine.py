@@ -14,7 +14,7 @@ from optloc.base.frames import CARTESIAN
 from optloc.base.types import Array, Status
 from optloc.linear.mirror import plane_of_stations
 from optloc.models import MODELS
-from optloc.problem.chart import quantile
+from optloc.problem.chart import AXES, Extent, quantile
 from optloc.problem.determined import LEVEL, Determined, Quantity
 from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
@@ -266,11 +266,18 @@ def of_fix(fix: Fix) -> Determined | None:
     """Return the coordinates of a single fix that is `ok` with their intervals, None for others."""
     if Status(int(fix.code)) is not Status.OK or fix.chart is None:
         return None
-    wide = _WIDE * fix.sigma()
-    ends = zip(
-        "xyz", fix.position.tolist(), (fix.position - wide).tolist(), (fix.position + wide).tolist(), strict=False
+    numbers = tuple(
+        Quantity(name, value, *_ends(fix, name), "m") for name, value in zip(AXES, fix.position.tolist(), strict=False)
     )
-    numbers = tuple(Quantity(name, value, low, high, "m") for name, value, low, high in ends)
     centre, north = np.asarray(fix.chart.centre), fix.frame.geodetic
     level = fix.frame.enu_axes(centre) if north else np.eye(len(centre))
     return Determined(centre, level, north, (), numbers)
+
+
+def _ends(fix: Fix, axis: Extent) -> tuple[float, float]:
+    """Return the 95 % interval of a coordinate: shortest where bounds cut its law off."""
+    if fix.chart is not None and fix.chart.cut_off:
+        low, high = fix.interval(axis)
+        return float(low), float(high)
+    value, wide = (float(each[AXES.index(axis)]) for each in (fix.position, _WIDE * fix.sigma()))
+    return value - wide, value + wide

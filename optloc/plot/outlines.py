@@ -46,14 +46,14 @@ def outlines_of(problem: Problem, fix: Fix, planes: Sequence[Array], level: floa
     flat = fix if len(fix.shape) == 1 else fix.flat()
     if flat.chart is None:
         return [[] for _ in range(len(flat))]
-    kinds = np.where(np.isfinite(flat.cov).all((-1, -2)), flat.chart.kind, CARTESIAN)
+    shaped = ((flat.chart.kind != CARTESIAN) | flat.chart.cut_off) & np.isfinite(flat.cov).all((-1, -2))
     own = _one_each(problem, len(flat))
-    if own is None or (kinds != CARTESIAN).sum() > _MOST:
+    if own is None or shaped.sum() > _MOST:
         return [[] for _ in range(len(flat))]
     found: list[list[Outline]] = []
-    for i, kind in enumerate(kinds):
+    for i in range(len(flat)):
         made = []
-        if kind != CARTESIAN:
+        if shaped[i]:
             one, fixed = own.take(np.array([i])), flat[i]
             made = [outline_of(one, fixed, plane if plane.ndim == 2 else plane[i], level) for plane in planes]
         found.append([] if any(one is None for one in made) else [one for one in made if one is not None])

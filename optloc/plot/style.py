@@ -79,6 +79,10 @@ def panels_for(count: int, most: int, width: float, height: float) -> tuple[Figu
     return figure, panels[:count]
 
 
+# Width of a letter of a legend, inches, and letters that its handle takes.
+_LETTER, _HANDLE = 0.085, 6
+
+
 def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int = 5, **style: Any) -> Figure:
     """Give a figure its title, and below it the legend of some of its panels, each label once."""
     shown: dict[str, Any] = {}
@@ -87,6 +91,8 @@ def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int =
         for label, handle in zip(labels, handles, strict=True):
             shown.setdefault(label, handle)
     if shown:
+        fit = int(figure.get_figwidth() / (_LETTER * (max(map(len, shown)) + _HANDLE)))
+        ncols = max(1, min(ncols, fit))
         figure.legend(shown.values(), shown, loc="outside lower center", ncols=ncols, frameon=False, **style)
     if title:
         figure.suptitle(literal(title), wrap=True)
