@@ -80,7 +80,7 @@ def panels_for(count: int, most: int, width: float, height: float) -> tuple[Figu
 
 
 # Width of a letter of a legend, inches, and letters that its handle takes.
-_LETTER, _HANDLE = 0.085, 6
+_LETTER, _HANDLE = 0.07, 6
 
 
 def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int = 5, **style: Any) -> Figure:
