@@ -32,6 +32,22 @@ def has_law(problem: Problem) -> bool:
     return limited and one_position(problem) and problem.motions[0].order == 0
 
 
+def are_near(limits: Array, value: Array, gradient: Array, covariance: Array) -> bool:
+    """Return whether a bound may cut off the law of one of a few fixes: it is within three standard deviations.
+
+    Parameters
+    ----------
+    limits : array (k, 2)
+        Least and greatest values of quantities; infinite for none.
+    value, gradient : array (n, k), (n, k, d)
+        The quantities at the fixes.
+    covariance : array (n, d, d)
+        Of the positions.
+    """
+    reach = _NEAR * np.sqrt(np.maximum(((gradient @ covariance) * gradient).sum(-1), 0.0))
+    return bool(((value - reach <= limits[:, 0]) | (value + reach >= limits[:, 1])).any())
+
+
 @dataclass(frozen=True, slots=True)
 class Law:
     """The normal laws of N fixes, cut off.

@@ -18,12 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.adequacy.coplanar import normal_of
-from optloc.adequacy.truncation import has_law, law_of
+from optloc.adequacy.truncation import are_near, has_law
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band, Certificate, Status, first_status
 from optloc.compute.jit import usable
+from optloc.engine.admission import levels_of
 from optloc.engine.memory import Answer, Found
 from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
@@ -171,8 +172,8 @@ class Single:
         Whether it is worth loading machine code for.
     repeatable : bool
         Whether the measurement of a curved fix can be repeated.
-    limited : bool
-        Whether bounds may cut its law off.
+    limits : array (k, 2), optional
+        Bounds that may cut its law off; None without any.
     own : threading.local
         What each thread writes into.
     """
@@ -194,7 +195,7 @@ class Single:
     region: float
     often: bool
     repeatable: bool
-    limited: bool
+    limits: Array | None
     own: local = field(default_factory=local)
 
     def __call__(self, z: Array) -> Fix | None:
@@ -219,7 +220,7 @@ class Single:
             tied = self.plan.frame.geodetic and one.rival_cost - one.cost <= equal_cost(one.cost)
             if not one.settled or tied or not one.cost <= self.doubt:
                 return None
-        if self.limited and self._is_near_bound(answer):
+        if self.limits is not None and self._is_near_bound(self.limits, answer):
             return None
         if self.normal is not None and self._is_near_plane(self.normal, answer):
             return None
@@ -236,11 +237,12 @@ class Single:
             return fix if room.checked else None
         return fix
 
-    def _is_near_bound(self, answer: Answer) -> bool:
-        """Return whether a bound cuts the law of a fix off."""
-        many = self.problem.flat().take(np.zeros(len(answer.x), dtype=int))
-        free = np.zeros((len(answer.x), self.plan.shared))
-        return law_of(many, answer.x, answer.covariance, free) is not None
+    def _is_near_bound(self, limits: Array, answer: Answer) -> bool:
+        """Return whether a bound may cut the law of a fix off."""
+        d = self.load.place.shape[-1]
+        # equalities come first
+        own = slice(answer.quantity.shape[1] - len(limits), None)
+        return are_near(limits, answer.quantity[:, own], answer.normal[:, own], answer.covariance[:, :d, :d])
 
     def _is_near_plane(self, normal: Array, answer: Answer) -> bool:
         """Return whether a fix may be so near to the plane of the stations that both sides of it are one region."""
@@ -513,7 +515,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         quantile(COVERED, d),
         often,
         is_repeatable(bare.flat()),
-        has_law(bare),
+        levels_of(bare)[0][len(held) :] if has_law(bare) else None,
     )
 
 
