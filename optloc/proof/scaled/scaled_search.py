@@ -22,7 +22,7 @@ from optloc.proof.box import (
     widest,
 )
 from optloc.proof.convex_boxes import is_known, set_axes, set_hull
-from optloc.proof.curvature import curve_nodes, most_curved_side, sum_up
+from optloc.proof.curvature import most_curved_side, sum_up
 from optloc.proof.descents import newton_step
 from optloc.proof.level_search import bound_row, cost_set, descend_near, search_levels, set_rival, side_of_rest
 from optloc.proof.nodes.dispatch import bound_pieces
@@ -44,7 +44,7 @@ from optloc.proof.scaled.reduction import (
     reduce_rows,
     sheet_of,
 )
-from optloc.proof.search_space import Box, Chart, Cost, empty_box, place, widen
+from optloc.proof.search_space import Box, Chart, Cost, curve_at, empty_box, place, widen
 from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, set_nodes, set_place
 
 
@@ -78,18 +78,7 @@ def cost_near(scaled: Scaled, chart: Chart, tables: Tables) -> float:
     bound_nodes(cost.kinds, cost.data, near.centre, chart.sense, chart.gram, near.half, near.line, near.nodes)
     reduce_rows(scaled, chart.floor, near, tables.sheet)
     look_at(scaled, tables.sheet, near, tables.look)
-    curve_nodes(
-        cost.kinds,
-        cost.data,
-        near.centre,
-        chart.sense,
-        chart.gram,
-        near.half,
-        near.line,
-        near.solve,
-        near.nodes,
-        near.curves,
-    )
+    curve_at(cost, chart, near)
     sum_up(tables.look.K, tables.look.w, cost.weight, 0.0, near.nodes, near.curves, near.sums)
     return float(tables.sheet.span[HERE])
 
