@@ -35,7 +35,7 @@ from optloc.proof.box import (
     steepest_side,
     uncut,
 )
-from optloc.proof.convex_boxes import accuracy_floor_far, known_minima, set_minimum
+from optloc.proof.convex_boxes import known_minima, set_minimum
 from optloc.proof.curvature import clip_to_minima
 from optloc.proof.descents import descend
 from optloc.proof.everywhere import leaves
@@ -52,7 +52,7 @@ from optloc.proof.search_space import (
     empty_box,
     turned,
 )
-from optloc.proof.space import Space, bound_or_halve, place_of
+from optloc.proof.space import Space, bound_or_halve, floor_of, place_of
 from optloc.proof.surface import SIDES, reach_of_piece
 
 # Standard deviations within which two minima are one: descents end a thousandth of one from their minimum.
@@ -205,50 +205,11 @@ def _search(
     count: int,
 ) -> tuple[int, int]:
     """Look for minima in the boxes of a stack; return the number of minima that are known, and the number of boxes."""
-    at, boxes, lows, cheapest, floor = np.empty(aim.points.shape[1]), zero(), zero(), inf, _floor_of(cost, space)
+    at, boxes, lows, cheapest, floor = np.empty(aim.points.shape[1]), zero(), zero(), inf, floor_of(space, cost)
     queue = [(0.0, i) for i in range(size)]
-    while True:
-        found = _search_known(
-            cost, space, box, near, aim, at, stack, queue, floor, budget, size, count, boxes, lows, cheapest
-        )
-        size, more, boxes, lows, cheapest, low, side, piece = found
-        if more == count:
-            return count, boxes
-        count = more
-        if space.far:
-            space, more = _push_minimum(cost, space, near, at, stack, size)
-            _queue_up(queue, 0.0, size, more)
-            size = more
-        else:
-            space = _with_known(cost, space, near, aim, corners, count)
-        size = _split(space, box, stack, queue, size, side, low, piece)
-
-
-@compiled
-def _search_known(
-    cost: Cost,
-    space: Space,
-    box: Box,
-    near: Box,
-    aim: Aim,
-    at: Array,
-    stack: Array,
-    queue: list[tuple[float, int]],
-    floor: float,
-    budget: int,
-    size: int,
-    count: int,
-    boxes: int,
-    lows: int,
-    cheapest: float,
-) -> tuple[int, int, int, int, float, float, int, int]:
-    """Search until a minimum is new; return the numbers of the search, and bound, side and piece of a box to halve.
-
-    A loop that renews its space would count references to all arrays of the space at each box.
-    """
     while len(queue) > 0 and boxes < budget:
         before, i = heappop(queue)
-        level, piece = _least(aim, count) + aim.gap, int(stack[i, PIECE])
+        level, piece, known = _least(aim, count) + aim.gap, int(stack[i, PIECE]), count
         if before >= level:
             break
         boxes += 1
@@ -265,11 +226,15 @@ def _search_known(
         lows, promising = lows + int(here < level), here < _HALF * cheapest
         cheapest = min(cheapest, here)
         if promising or _is_due(lows, here < level, boxes):
-            more = _add(cost, near, aim, at, count, level)
-            if more > count:
-                return size, more, boxes, lows, cheapest, low, side, piece
+            count = _add(cost, near, aim, at, count, level)
+        if count > known and space.far:
+            space, more = _push_minimum(cost, space, near, at, stack, size)
+            _queue_up(queue, 0.0, size, more)
+            size = more
+        elif count > known:
+            space = _with_known(cost, space, near, aim, corners, count)
         size = _split(space, box, stack, queue, size, side, low, piece)
-    return size, count, boxes, lows, cheapest, 0.0, -1, 0
+    return count, boxes
 
 
 @inlined
@@ -289,12 +254,6 @@ def _split(
     exact = space.far and piece <= 2 * space.atlas.dimension
     _queue_up(queue, low, size, size + 2)
     return push_halves(stack, size, side, box.at, box.half, low, piece, exact)
-
-
-@compiled
-def _floor_of(cost: Cost, space: Space) -> float:
-    """Return the sizes that `optloc.proof.box.rounding` counts beside the nodes."""
-    return accuracy_floor_far(cost, space.atlas) if space.far else space.chart.floor
 
 
 @compiled

@@ -7,7 +7,7 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, zero
+from optloc.compute.jit import compiled, inlined
 from optloc.compute.systems import inverse
 from optloc.proof.nodes.dispatch import bound_others, infinity_of, points_of
 from optloc.proof.nodes.node import (
@@ -397,6 +397,14 @@ def steepest_side(half: Array, rows: Array, dimension: int) -> int:
     return k
 
 
+@inlined
+def widest(half: Array) -> int:
+    """Return the widest side of a box."""
+    if half[0] >= half[1] and half[0] >= half[2]:
+        return 0
+    return 1 if half[1] >= half[2] else 2
+
+
 @compiled
 def _steepness(rows: Array, m: int) -> float:
     total = 0.0
@@ -443,11 +451,11 @@ def pop(stack: Array, row: int, at: Array, half: Array) -> None:
 
 
 @compiled
-def push(stack: Array, size: int, at: Array, half: Array, low: float) -> int:
-    """Push a box of the near chart; return the size of the stack."""
+def push(stack: Array, size: int, at: Array, half: Array, low: float, piece: int) -> int:
+    """Push a box; return the size of the stack."""
     for k in range(3):
         stack[size, CENTRE + k], stack[size, HALF + k] = at[k], half[k]
-    stack[size, LEAST], stack[size, PIECE] = low, 0.0
+    stack[size, LEAST], stack[size, PIECE] = low, piece
     return size + 1
 
 
@@ -558,37 +566,3 @@ def cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
             middle[k] += _ASIDE[k] * reach
         reach *= 1.0 + _ASIDE[0]
     return middle, _REACHES * reach if reach > 0.0 else 1.0
-
-
-# Levels that costs are held against, and boxes that wait for a lower one.
-
-
-@compiled
-def last_above_zero(levels: Array) -> int:
-    """Return the last level above zero, -1 where none is."""
-    last: int = levels.shape[0] - 1
-    while last >= 0 and levels[last] <= 0.0:
-        last -= 1
-    return last
-
-
-@compiled
-def first_below(levels: Array, first: int, ends: float) -> int:
-    """Return the first level from one on that a cost reaches, or how many there are where it reaches none."""
-    while first < levels.shape[0] and ends < levels[first]:
-        first += 1
-    return first
-
-
-@compiled
-def take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[int, int]:
-    """Move the boxes whose bound is below a level from aside to the stack; return how many there are on each."""
-    size, left = zero(), zero()
-    for i in range(waiting):
-        if aside[i, LEAST] * aside[i, LEAST] < level:
-            stack[size] = aside[i]
-            size += 1
-        else:
-            aside[left] = aside[i]
-            left += 1
-    return size, left

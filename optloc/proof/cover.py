@@ -20,7 +20,6 @@ from optloc.proof.box import (
     J0,
     J1,
     J2,
-    LEAST,
     MIDDLE,
     PIECE,
     bound_nodes,
@@ -31,6 +30,7 @@ from optloc.proof.box import (
     least_residual,
     linearise_rows,
     pop,
+    push,
     push_halves,
     reaches_infinity,
     rounding,
@@ -41,12 +41,10 @@ from optloc.proof.convex_boxes import set_minimum
 from optloc.proof.enclosure import enclose
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW
-from optloc.proof.pieces import push_faces
+from optloc.proof.pieces import SHRUNK, push_faces
 from optloc.proof.search_space import Box, Chart, Cost, chart_at, place
 from optloc.proof.space import Space, floor_of, set_box, set_place
 
-# Share of a box below which what is left of it is looked at again before it is cut, as in `optloc.proof.near`.
-_SHRUNK = 0.5
 # Share of its bend that halving a side must leave a box at most, to be preferred to what its slopes say: nodes that are
 # only enclosed bend as much in half the box.
 _STRAIGHTER = 0.8
@@ -163,9 +161,9 @@ def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: A
         for i in range(size):
             fate, piece = _look(cost, space, box, lists[0], i, level, floor), int(lists[0, i, PIECE])
             if fate == _IN or (last and fate != _OUT):
-                count = _keep(lists[2], count, box, piece)
+                count = push(lists[2], count, box.at, box.half, 0.0, piece)
             elif fate == _SMALLER:
-                following = _keep(lists[1], following, box, piece)
+                following = push(lists[1], following, box.at, box.half, 0.0, piece)
             elif fate == _ACROSS:
                 side = _side(cost, space, box, piece)
                 following = push_halves(lists[1], following, side, box.at, box.half, 0.0, piece, False)
@@ -230,7 +228,7 @@ def _clip(cost: Cost, box: Box, longest: float) -> int:
         if reach < inf:  # nor where a node is not bounded, which may leave no number at all
             clip(box.cut, k, -middle / own, (longest * sqrt(own) + reach) / own)
     share = cut_out(box.cut, box.at, half)
-    return _OUT if not share > 0.0 else _SMALLER if share < _SHRUNK else _ACROSS
+    return _OUT if not share > 0.0 else _SMALLER if share < SHRUNK else _ACROSS
 
 
 @inlined
@@ -262,15 +260,6 @@ def _most_residual(cost: Cost, box: Box) -> float:
         j2 += box.rows[i, J2] ** 2
     reach = sqrt(middle) + sqrt(j0) * box.half[0] + sqrt(j1) * box.half[1] + sqrt(j2) * box.half[2]
     return float(reach + _bends(cost, box))
-
-
-@compiled
-def _keep(boxes: Array, count: int, box: Box, piece: int) -> int:
-    """Write a box into a list; return how many it holds."""
-    for k in range(3):
-        boxes[count, CENTRE + k], boxes[count, HALF + k] = box.at[k], box.half[k]
-    boxes[count, LEAST], boxes[count, PIECE] = 0.0, piece
-    return count + 1
 
 
 @compiled

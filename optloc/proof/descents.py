@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import inf, sqrt
 
-from optloc.compute.jit import compiled, put
+from optloc.compute.jit import compiled, inlined, put
 from optloc.compute.systems import inverse, positive_along
 from optloc.proof.curvature import G0, G1, G2
 from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22
@@ -37,7 +37,7 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
     noise = blur_at(cost, chart, box)
     curve_box(cost, chart, box)
     for _ in range(_STEPS):
-        length = newton_step(cost, box, damping)
+        length = newton_step(box, damping)
         if not length >= 0.0:
             return float("inf")
         put(box.at, start)
@@ -61,12 +61,12 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
 
 
 @compiled
-def newton_step(cost: Cost, box: Box, damping: float) -> float:
+def newton_step(box: Box, damping: float) -> float:
     """Write the damped step into the first row of box.solve; return its squared length in standard deviations.
 
     NaN where there is none.
     """
-    sums, solve = box.sums, box.solve
+    sums = box.sums
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
     second, third = h3 != 0.0, h5 != 0.0
     if not positive_along(h0, h1, h2, h3, h4, h5, second, third):
@@ -79,8 +79,14 @@ def newton_step(cost: Cost, box: Box, damping: float) -> float:
             h3 -= force * box.curves[j, H11]
             h4 -= force * box.curves[j, H12]
             h5 -= force * box.curves[j, H22]
-    more = 1.0 + damping
     h3, h5 = h3 if second else 1.0, h5 if third else 1.0
+    return abs(damped_step(box, h0, h1, h2, h3, h4, h5, damping))
+
+
+@inlined
+def damped_step(box: Box, h0: float, h1: float, h2: float, h3: float, h4: float, h5: float, damping: float) -> float:
+    """Write the step of a Hessian (00, 01, 02, 11, 12, 22) as `newton_step` does; return its squared length, or NaN."""
+    sums, solve, more = box.sums, box.solve, 1.0 + damping
     if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
         return float("nan")
     g0, g1, g2 = sums[G0], sums[G1], sums[G2]
@@ -88,4 +94,4 @@ def newton_step(cost: Cost, box: Box, damping: float) -> float:
     s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
     s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
     solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
-    return float(abs(s0 * g0 + s1 * g1 + s2 * g2))
+    return float(s0 * g0 + s1 * g1 + s2 * g2)

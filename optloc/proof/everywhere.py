@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from math import inf, isnan, nan, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put, zero
+from optloc.compute.jit import compiled, inlined, put, with_constants, zero
 from optloc.proof.atlas import (
     Atlas,
     atlas_of,
     clip_to_corners,
     first_minima,
     infinity,
-    one_more,
-    position,
     set_centre,
     widen_around,
     with_minima,
@@ -27,10 +26,7 @@ from optloc.proof.box import (
     cube,
     cut_out,
     digits,
-    first_below,
     is_empty,
-    last_above_zero,
-    least_left,
     least_residual,
     linearise_rows,
     pop,
@@ -40,26 +36,43 @@ from optloc.proof.box import (
     share_left,
     shrink,
     steepest_side,
-    take_back,
     uncut,
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
 from optloc.proof.curvature import has_no_infimum, most_curved_side, spread_of, sum_up
 from optloc.proof.descents import descend
-from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove, region_of
+from optloc.proof.level_search import (
+    bound_row,
+    cost_set,
+    descend_near,
+    search_levels,
+    set_rival,
+    side_of_rest,
+)
+from optloc.proof.near import (
+    ANOTHER,
+    BETTER,
+    BUDGET,
+    CHEAPER,
+    CLEAR,
+    COARSE,
+    INFINITE,
+    OPEN,
+    OTHER,
+    SINGULAR,
+    STATIONARY,
+    UNIQUE,
+    VALUE,
+    prove,
+    region_of,
+)
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.pieces import (
     CAPACITY,
     SHRUNK,
-    SPARE,
     end_at_infinity,
     is_left,
-    is_listed,
-    is_tiny,
-    keep_rest,
-    push_core,
     push_pieces,
-    touches_infinity,
 )
 from optloc.proof.search_space import (
     COARSEST,
@@ -72,18 +85,11 @@ from optloc.proof.search_space import (
     empty_box,
     equal_within,
 )
+from optloc.proof.space import Space, in_atlas
 from optloc.proof.squares import Squares, bend_of, clip_to_squares, squares_of
 
 # Branch and bound over all positions, for costs that nothing encloses.
 
-# What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
-# infinity below the level.
-CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
-# The test for stationary points is made where the cost at the centre is within so many levels: elsewhere the box is too
-# large, or its bound will do when it is halved. Over 8 fixes by range differences one level took four times as many
-# boxes; a test everywhere took a quarter more time for the same. Over 500 fixes of five stations ten and a hundred
-# levels took the same time.
-_NEAR = 10.0
 # How often in turn a box is clipped to its squared rows, while that takes off half: from all of a face three times do.
 _LOOKS = 8
 # What ranges bend over a box, squared and over the level, from which on its squared rows are looked at. Over 100 fixes
@@ -91,134 +97,41 @@ _LOOKS = 8
 _BENT = 9.0
 
 
-@compiled
-def search_everywhere(
-    cost: Cost,
-    atlas: Atlas,
-    chart: Chart,
-    corners: Array,
-    squares: Squares,
-    levels: Array,
-    eps: float,
-    whole: bool,
-    budget: int,
-    rivals: Array,
-    found: Array,
-) -> tuple[int, int, float, int, int]:
-    """Search all positions but some boxes for minima that cost less than a level, the lowest level first.
-
-    A box is done where the cost is at least the first level, or where it has no minimum, its gradient or its curvature
-    being of one sign: the least cost over all positions, if it is attained, is attained elsewhere. What of a box can be
-    neither is all that is looked at again. Around known minima boxes lie along their principal axes, and around those
-    that are met as well. Boxes that cost more than a lower level wait until that is shown: so one tree tells how far
-    the budget goes.
+class Work(NamedTuple):
+    """A cost that stays finite at infinity (`optloc.proof.box.reaches_infinity`), and working memory for its search.
 
     Parameters
     ----------
     cost : Cost
-        The cost; `optloc.proof.box.reaches_infinity` holds.
-    atlas : Atlas
-        The pieces, known minima among them.
-    chart : Chart
-        Search coordinates around the fix, in which low points descend.
+        The cost.
     corners : array (2, 3)
-        Corners in these coordinates beyond which the cost is at least the first level; NaN where none are known.
+        Corners in search coordinates around the fix beyond which the cost is at least the first level; NaN where none
+        are known.
     squares : Squares
         Squared rows, of which boxes are clipped.
-    levels : array (G,)
-        Costs to exceed, falling; a point that costs less than the last refutes the fix.
-    eps : float
-        How far the last is below the cost of the fix.
-    whole : bool
-        Whether a box is done as well where it has no minimum; otherwise only if it costs at least the last level.
-    budget : int
-        How many boxes may be looked at.
-    rivals : array (F, D)
-        Written: minima that cost less than the first level and were met.
-    found : array (D,)
-        Written: the point of the outcomes CHEAPER and ANOTHER.
-
-    Returns
-    -------
-    outcome : int
-        CLEAR: no minimum beside those known and met costs less than a level. CHEAPER: `found` costs less than the
-        last. ANOTHER: `found` is a minimum that costs less than the first, and was not searched around. SPENT: boxes
-        are left. INFINITE: the cost at infinity is below the level.
-    boxes : int
-        How many boxes were looked at.
-    bound : float
-        A lower bound of f: the last level, unless boxes are left.
-    shown : int
-        Which of the levels is exceeded.
-    met : int
-        How many rivals there are.
+    floor : float
+        The sizes that `optloc.proof.box.rounding` counts beside the nodes.
+    box, near : Box
+        Tables for a box of the atlas, and for one around a position.
     """
-    box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
-    stack, aside, d = np.empty((CAPACITY, DEPTH)), np.empty((CAPACITY, DEPTH)), atlas.dimension
-    size, waiting, boxes, lows, met = push_pieces(stack, atlas), zero(), 0, 0, zero()
-    floor, first, now, value = accuracy_floor_far(cost, atlas), zero(), last_above_zero(levels), levels[-1]
-    if now < first:  # no cost is below zero
-        return CLEAR, 0, value, first, met
-    while True:
-        if size == 0:  # nothing below this level is left
-            if now <= first:
-                return CLEAR, boxes, value, now, met
-            now -= 1
-            size, waiting = take_back(stack, aside, waiting, levels[now])
-            continue
-        shown, level = now + 1, levels[first]
-        if boxes >= budget or size + SPARE > CAPACITY:
-            spent = shown == levels.shape[0]
-            return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
-        size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
-        low = _bound_of_row(cost, atlas, chart, corners, squares, level, floor, box, stack, size)
-        if low == inf:
-            continue
-        here, noise = cost_at(cost.K, cost.w, box.nodes), rounding(cost.K, cost.weight, floor, box.nodes)
-        if here < value:
-            position(atlas, found)
-            return CHEAPER, boxes, 0.0, shown, met
-        touching = touches_infinity(box, d - 1, infinity(atlas, piece))
-        # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
-        sound = (whole or reaches(low, value)) and here < _NEAR * (level + 1.0)
-        side = _side_of_rest(cost, atlas, box, touching, sqrt(max(level, 0.0)), noise, sound)
-        if side < 0:
-            continue
-        lows += int(here < level)
-        # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
-        if here < level and lows & (lows - 1) == 0:
-            met, size, atlas = _meet(cost, atlas, chart, near, levels, first, eps, stack, size, rivals, met, found)
-            if met < 0:
-                return ANOTHER, boxes, 0.0, shown, 0
-            set_centre(atlas, piece, box.at)
-        if touching and is_tiny(box, piece, d):
-            first = first_below(levels, first, _at_infinity(cost, atlas, box, piece))
-            if first > now:
-                return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
-        size, waiting = keep_rest(stack, size, aside, waiting, box, side, low, piece, levels[now])
+
+    cost: Cost
+    corners: Array
+    squares: Squares
+    floor: float
+    box: Box
+    near: Box
 
 
 @compiled
-def _bound_of_row(
-    cost: Cost,
-    atlas: Atlas,
-    chart: Chart,
-    corners: Array,
-    squares: Squares,
-    level: float,
-    floor: float,
-    box: Box,
-    stack: Array,
-    row: int,
-) -> float:
-    """Return a lower bound of the residual in a box of the stack, infinite where all costs exceed a level."""
-    piece = int(stack[row, PIECE])
-    if not _take(stack, row, atlas, chart, corners, box, piece):
-        return inf
-    if not _squeeze(cost, atlas, squares, level, box, piece):
-        return inf
-    low = _bound(cost, atlas, box, floor)
-    return inf if reaches(low, level) else low
+def _bound_row(work: Work, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+    atlas, box, cost, piece = space.atlas, work.box, work.cost, int(stack[row, PIECE])
+    if not _take(stack, row, atlas, space.chart, work.corners, box, piece):
+        return inf, inf
+    if not _squeeze(cost, atlas, work.squares, level, box, piece):
+        return inf, inf
+    low = _bound(cost, atlas, box, work.floor)
+    return (inf, inf) if reaches(low, level) else (low, cost_at(cost.K, cost.w, box.nodes))
 
 
 @inlined
@@ -230,11 +143,9 @@ def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
 
 
 @inlined
-def _side_of_rest(cost: Cost, atlas: Atlas, box: Box, touching: bool, rho: float, noise: float, sound: bool) -> int:
-    """Return the side across which to halve what of a box may hold a residual shorter than rho; -1 for nothing of it.
-
-    Nor may it be without a minimum, where that is `sound`. What is left are the ends of ``box.cut``.
-    """
+def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: bool) -> int:
+    cost, atlas, box = work.cost, space.atlas, work.box
+    noise = rounding(cost.K, cost.weight, work.floor, box.nodes)
     uncut(box.half, box.cut)
     flat = box.half[2] == 0.0
     shrink(cost.K, cost.weight, rho + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
@@ -247,40 +158,6 @@ def _side_of_rest(cost: Cost, atlas: Atlas, box: Box, touching: bool, rho: float
         return -1
     curved = most_curved_side(box.half, box.sums, atlas.dimension)
     return int(curved if curved >= 0 else steepest_side(box.half, box.rows, atlas.dimension))
-
-
-@compiled
-def _meet(
-    cost: Cost,
-    atlas: Atlas,
-    chart: Chart,
-    near: Box,
-    levels: Array,
-    first: int,
-    eps: float,
-    stack: Array,
-    size: int,
-    rivals: Array,
-    met: int,
-    found: Array,
-) -> tuple[int, int, Atlas]:
-    """Descend from the centre set; where that ends in another minimum, write it and push boxes around it.
-
-    Returns how many rivals there are, -1 where that one cannot be searched around; the size of the stack; the atlas.
-    """
-    if not _another(cost, atlas, chart, near, levels[first], found):
-        return met, size, atlas
-    known, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
-    # As of those that are known all its convex box must cost at least what nothing may fall short of.
-    slack = max(0.5 * (cost_at(cost.K, cost.w, near.nodes) - value), 0.5 * eps)
-    if met == rivals.shape[0] or not set_minimum(
-        cost, near, wider, known, found, value + 0.5 * slack, 0.5 * slack, inf
-    ):
-        return -1, size, atlas
-    widen_core(wider, known, inf)
-    for k in range(atlas.dimension):
-        rivals[met, k] = found[k]
-    return met + 1, push_core(stack, size, wider, known), wider
 
 
 @inlined
@@ -328,24 +205,6 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
 
 
 @compiled
-def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
-    d = atlas.dimension
-    position(atlas, found)
-    for k in range(3):
-        near.at[k] = 0.0
-        for m in range(d):
-            near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
-    if not descend(cost, chart, near) < level:
-        return False
-    if is_listed(atlas, near.centre):
-        return False
-    for m in range(d):
-        found[m] = near.centre[m]
-    return True
-
-
-@compiled
 def leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
     """Return whether no infimum of the cost can lie in a box whose nodes are bounded; `touching`: infinity is there."""
     uncut(box.half, box.cut)
@@ -362,14 +221,34 @@ def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float
 
 
 @compiled
-def _at_infinity(cost: Cost, atlas: Atlas, box: Box, piece: int) -> float:
-    """Return the cost at infinity next to the centre of a box that reaches there; its table of nodes is lost."""
-    at = box.at.copy()
-    at[atlas.dimension - 1] = infinity(atlas, piece)
-    set_centre(atlas, piece, at)
-    atlas.scale[0] = 0.0
-    bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
-    return cost_at(cost.K, cost.w, box.nodes)
+def _descend_near(work: Work, chart: Chart) -> float:
+    return descend(work.cost, chart, work.near)
+
+
+@compiled
+def _set_rival(
+    work: Work, atlas: Atlas, _chart: Chart, i: int, x: Array, value: float, eps: float, _rho: float
+) -> bool:
+    return set_minimum(work.cost, work.near, atlas, i, x, value, eps, inf)
+
+
+@compiled
+def _cost_set(work: Work, atlas: Atlas) -> float:
+    bound_pieces(atlas, work.cost.kinds, work.cost.data, work.box.half, work.box.nodes)
+    return cost_at(work.cost.K, work.cost.w, work.box.nodes)
+
+
+search_everywhere = with_constants(
+    search_levels,
+    "everywhere",
+    {
+        bound_row: _bound_row,
+        side_of_rest: _side_of_rest,
+        descend_near: _descend_near,
+        set_rival: _set_rival,
+        cost_set: _cost_set,
+    },
+)
 
 
 # A verdict beside those of `optloc.proof.near`: the cost at infinity is within the gap.
@@ -467,9 +346,11 @@ def prove_atlas(
     levels = np.empty(gaps.shape[0])
     for k in range(gaps.shape[0]):
         levels[k] = least + gaps[k] if gaps[k] > 0.0 else least - eps
-    whole = beside.hidden == 0
+    q, J = cost.K.shape
+    work = Work(cost, corners, squares, accuracy_floor_far(cost, atlas), empty_box(q, J), empty_box(q, J))
+    space, stack, whole = in_atlas(atlas, chart), np.empty((CAPACITY, DEPTH)), beside.hidden == 0
     outcome, boxes, bound, shown, met = search_everywhere(
-        cost, atlas, chart, corners, squares, levels, eps, whole, budget, rivals, found
+        work, space, stack, push_pieces(stack, atlas), levels, eps, whole, budget, rivals, found
     )
     return verdict_of(outcome, boxes, bound, shown, met, gaps, least - eps)
 

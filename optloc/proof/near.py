@@ -14,19 +14,18 @@ from optloc.proof.box import (
     DIRECTION,
     bound_nodes,
     cost_at,
-    cut_out,
     is_empty,
     least_left,
     least_residual,
     linearise_rows,
     pop,
-    push,
     push_around,
     push_halves,
     reaches,
     rounding,
     shrink,
     uncut,
+    widest,
 )
 from optloc.proof.convex_boxes import is_known, known_minima
 from optloc.proof.curvature import G0, G1, G2, clip_to_minima, convex, curve_nodes, sum_up
@@ -41,6 +40,7 @@ from optloc.proof.nodes.node import (
     SLOPE1,
     SLOPE2,
 )
+from optloc.proof.pieces import push_rest
 from optloc.proof.search_space import (
     COARSEST,
     Box,
@@ -63,11 +63,9 @@ from optloc.proof.surface import DATA, LEVEL, MIDDLE, SIDES, is_beyond, is_one_s
 
 # Branch and bound over boxes of the near chart.
 
-# What a search finds: nothing, a cheaper point, another minimum below the level, or no end within the budget.
-CLEAR, CHEAPER, ANOTHER, SPENT = range(4)
-# Share of a box below which what is left is looked at again before it is cut. Over 16 fixes by range differences a half
-# took 2 % fewer boxes than a quarter or four fifths, and 5 % fewer than no second look.
-_SHRUNK = 0.5
+# What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
+# infinity below the level.
+CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 # Boxes on the stack: a stack that goes deep first holds one box a halving, and 512 halvings no box survives.
 _CAPACITY = 512
 
@@ -186,16 +184,8 @@ def branch(
                     if outcome != CLEAR:
                         return outcome, boxes, 0.0
         side = cut_side(kinds, K, gram, half, nodes, rows, here < aim.level)
-        size = _push_rest(stack, size, cut_out(cut, at, half), side, at, half, low)
+        size = push_rest(stack, size, cut, at, half, side, low, 0)
     return CLEAR, boxes, inf
-
-
-@inlined
-def _push_rest(stack: Array, size: int, share: float, side: int, at: Array, half: Array, low: float) -> int:
-    """Push what is left of a box, a share of it, whole or cut across a side; return the size of the stack."""
-    if 0.0 < share < _SHRUNK:
-        return push(stack, size, at, half, low)
-    return push_halves(stack, size, side, at, half, low, 0, False) if share > 0.0 else size
 
 
 @inlined
@@ -237,7 +227,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
     because the centre lies below the level (`inside`), the widest side is cut.
     """
     if inside:
-        return _widest(half)
+        return widest(half)
     t0, t1, t2, h0, h1, h2 = 0.0, 0.0, 0.0, half[0], half[1], half[2]
     for j in range(kinds.shape[0]):
         wide = nodes[j, HIGH] - nodes[j, LOW]
@@ -256,7 +246,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
             t2 += pull * z
     most = max(t0, t1, t2)
     if not most > 0.0:
-        return _widest(half)
+        return widest(half)
     return 0 if t0 == most else (1 if t1 == most else 2)
 
 
@@ -274,13 +264,6 @@ def lay_or_halve(cost: Cost, chart: Chart, box: Box, stack: Array, size: int) ->
     first = (sense[0, 0] * sense[0, 0] + sense[1, 0] * sense[1, 0] + sense[2, 0] * sense[2, 0]) * half[0] * half[0]
     second = (sense[0, 1] * sense[0, 1] + sense[1, 1] * sense[1, 1] + sense[2, 1] * sense[2, 1]) * half[1] * half[1]
     return push_halves(stack, size, 0 if first >= second else 1, box.at, half, 0.0, 0, False)
-
-
-@inlined
-def _widest(half: Array) -> int:
-    if half[0] >= half[1] and half[0] >= half[2]:
-        return 0
-    return 1 if half[1] >= half[2] else 2
 
 
 # The proof.

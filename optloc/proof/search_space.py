@@ -437,15 +437,21 @@ def curve_along(cost: Cost, chart: Chart, box: Box) -> None:
 
 
 @inlined
+def curve_at(cost: Cost, chart: Chart, box: Box) -> None:
+    """Bound second derivatives of the nodes over a box whose nodes are bounded."""
+    if chart.surface.shape[0] > 0:
+        curve_along(cost, chart, box)
+        return
+    half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
+    curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
+
+
+@inlined
 def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
-    half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
-    if chart.surface.shape[0] == 0:
-        curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
-    else:
-        curve_along(cost, chart, box)
-    noise = rounding(cost.K, cost.weight, chart.floor, nodes)
-    sum_up(cost.K, cost.w, cost.weight, noise, nodes, curves, box.sums)
+    curve_at(cost, chart, box)
+    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+    sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
 
 
 @compiled

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
 from optloc.proof.atlas import Atlas, position, set_centre, widen_around
 from optloc.proof.box import bound_nodes
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known
-from optloc.proof.curvature import curve_nodes
 from optloc.proof.near import lay_or_halve
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.pieces import is_left
-from optloc.proof.search_space import LINES, Box, Chart, Cost, accuracy_floor, curve_along, is_bounded, place, widen
+from optloc.proof.search_space import LINES, Box, Chart, Cost, accuracy_floor, curve_at, is_bounded, place, widen
 
 
 class Space(NamedTuple):
@@ -36,6 +37,13 @@ class Space(NamedTuple):
     chart: Chart
     minima: Array
     sides: Array
+
+
+@compiled
+def in_atlas(atlas: Atlas, chart: Chart) -> Space:
+    """Return an atlas as the space of a search."""
+    none = np.empty((0, 3))
+    return Space(True, atlas, chart, none, none)
 
 
 @compiled
@@ -101,14 +109,10 @@ def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array,
 @compiled
 def set_curves(space: Space, cost: Cost, box: Box) -> None:
     """Bound second derivatives of the nodes over a box whose nodes are bounded."""
-    chart = space.chart
     if space.far:
         curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
-    elif chart.surface.shape[0] > 0:
-        curve_along(cost, chart, box)
     else:
-        half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
-        curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
+        curve_at(cost, space.chart, box)
 
 
 @compiled

@@ -20,8 +20,24 @@ from optloc.proof.box import (
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, draw_in, is_elsewhere, set_axes, set_hull
 from optloc.proof.curvature import G0, LENGTH0, entry
-from optloc.proof.everywhere import CHEAPER, CLEAR, INFINITE, SPENT, UNBOUNDED
-from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, Aim, region_of
+from optloc.proof.everywhere import UNBOUNDED
+from optloc.proof.near import (
+    BETTER,
+    BUDGET,
+    CHEAPER,
+    CLEAR,
+    COARSE,
+    INFINITE,
+    OPEN,
+    OTHER,
+    SINGULAR,
+    SPENT,
+    STATIONARY,
+    UNIQUE,
+    VALUE,
+    Aim,
+    region_of,
+)
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
 from optloc.proof.pieces import push_pieces

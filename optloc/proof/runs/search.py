@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, put
-from optloc.compute.systems import inverse, positive_along
+from optloc.compute.systems import positive_along
 from optloc.proof.atlas import set_centre
 from optloc.proof.box import (
     PIECE,
@@ -28,9 +28,9 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.convex_boxes import is_known
-from optloc.proof.curvature import G0, G1, G2, has_no_infimum
-from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
-from optloc.proof.near import Aim
+from optloc.proof.curvature import has_no_infimum
+from optloc.proof.descents import damped_step
+from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, Aim
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
 from optloc.proof.pieces import is_listed
@@ -282,16 +282,9 @@ def blur_beside(run: Run, space: Space, tables: Tables, floor: float) -> float:
 @compiled
 def _step(box: Box, damping: float) -> float:
     """Write a damped Newton step into box.solve[0]; return its squared length, NaN where there is none."""
-    sums, solve, more = box.sums, box.solve, 1.0 + damping
-    h3, h5 = sums[H11], sums[H22]
-    if not positive_along(sums[H00], sums[H01], sums[H02], h3, sums[H12], h5, h3 != 0.0, h5 != 0.0):
+    sums = box.sums
+    h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
+    if not positive_along(h0, h1, h2, h3, h4, h5, h3 != 0.0, h5 != 0.0):
         return nan
     h3, h5 = h3 if h3 != 0.0 else 1.0, h5 if h5 != 0.0 else 1.0
-    if not inverse(sums[H00] * more, sums[H01], sums[H02], h3 * more, sums[H12], h5 * more, solve):
-        return nan
-    g0, g1, g2 = sums[G0], sums[G1], sums[G2]
-    s0 = solve[0, 0] * g0 + solve[0, 1] * g1 + solve[0, 2] * g2
-    s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
-    s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
-    solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
-    return float(s0 * g0 + s1 * g1 + s2 * g2)
+    return damped_step(box, h0, h1, h2, h3, h4, h5, damping)

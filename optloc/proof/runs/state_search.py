@@ -11,8 +11,20 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled, zero
 from optloc.compute.systems import invert
 from optloc.proof.box import reaches
-from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, SPENT
-from optloc.proof.near import BETTER, BUDGET, COARSE, OTHER, STATIONARY, UNIQUE, VALUE, Aim
+from optloc.proof.near import (
+    ANOTHER,
+    BETTER,
+    BUDGET,
+    CHEAPER,
+    CLEAR,
+    COARSE,
+    OTHER,
+    SPENT,
+    STATIONARY,
+    UNIQUE,
+    VALUE,
+    Aim,
+)
 from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.runs.state_bounds import has_no_minimum, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import (

@@ -25,8 +25,8 @@ from optloc.proof.scaled.enclosures import first_enclosed, stays_finite
 from optloc.proof.scaled.reduction import HERE, Scaled, blur_of, look_at, reduce_rows
 from optloc.proof.scaled.scaled_search import (
     Tables,
+    Work,
     cost_near,
-    in_atlas,
     search_scaled,
     set_near_minimum,
     set_scaled_minimum,
@@ -41,7 +41,7 @@ from optloc.proof.search_space import (
     cost_of,
     equal_within,
 )
-from optloc.proof.space import Space
+from optloc.proof.space import Space, floor_of, in_atlas
 
 
 class ScaledCosts(NamedTuple):
@@ -158,8 +158,9 @@ def prove_scaled(
         space, size = _in_box(scaled, tables, atlas, chart, x, others, levels, least, eps, low, high, stack)
     if size == 0:
         return STATIONARY, 0, -inf, gaps[0], 0
+    work = Work(scaled, tables, floor_of(space, cost), tables.box, tables.near)
     outcome, boxes, bound, shown, met = search_scaled(
-        scaled, tables, space, stack, size, levels, eps, budget, rivals, found
+        work, space, stack, size, levels, eps, True, budget, rivals, found
     )
     return verdict_of(outcome, boxes, bound, shown, met, gaps, least - eps)
 

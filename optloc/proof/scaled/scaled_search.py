@@ -8,38 +8,28 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, zero
-from optloc.proof.atlas import Atlas, home_of, infinity, one_more, set_centre
+from optloc.compute.jit import compiled, inlined, with_constants
+from optloc.proof.atlas import Atlas, home_of, infinity
 from optloc.proof.box import (
-    DEPTH,
     PIECE,
     bound_nodes,
-    first_below,
     is_empty,
-    last_above_zero,
-    least_left,
     pop,
     reaches,
     share_left,
     steepest_side,
-    take_back,
+    uncut,
+    widest,
 )
-from optloc.proof.convex_boxes import is_known, set_axes, set_hull, widen_core
-from optloc.proof.curvature import curve_nodes, most_curved_side, sum_up
+from optloc.proof.convex_boxes import is_known, set_axes, set_hull
+from optloc.proof.curvature import most_curved_side, sum_up
 from optloc.proof.descents import newton_step
-from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
+from optloc.proof.level_search import bound_row, cost_set, descend_near, search_levels, set_rival, side_of_rest
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.pieces import (
-    CAPACITY,
     SHRUNK,
-    SPARE,
     end_at_infinity,
     is_left,
-    is_listed,
-    is_tiny,
-    keep_rest,
-    push_core,
-    touches_infinity,
 )
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled, slope_of
 from optloc.proof.scaled.reduction import (
@@ -54,11 +44,8 @@ from optloc.proof.scaled.reduction import (
     reduce_rows,
     sheet_of,
 )
-from optloc.proof.search_space import Box, Chart, Cost, empty_box, place, widen
-from optloc.proof.space import Space, floor_of, place_of, set_box, set_curves, set_nodes, set_place
-
-# The test for stationary points is made where the cost at the centre is within this number of levels.
-_NEAR = 10.0
+from optloc.proof.search_space import Box, Chart, Cost, curve_at, empty_box, place, widen
+from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, set_nodes, set_place
 
 
 class Tables(NamedTuple):
@@ -79,13 +66,6 @@ def tables_of(scaled: Scaled) -> Tables:
     return Tables(empty_box(q, J), sheet_of(scaled), empty_box(q, J), look)
 
 
-@compiled
-def in_atlas(atlas: Atlas, chart: Chart) -> Space:
-    """Return an atlas as the space of a search."""
-    none = np.empty((0, 3))
-    return Space(True, atlas, chart, none, none)
-
-
 # The cost at a position, and descents.
 
 
@@ -98,18 +78,7 @@ def cost_near(scaled: Scaled, chart: Chart, tables: Tables) -> float:
     bound_nodes(cost.kinds, cost.data, near.centre, chart.sense, chart.gram, near.half, near.line, near.nodes)
     reduce_rows(scaled, chart.floor, near, tables.sheet)
     look_at(scaled, tables.sheet, near, tables.look)
-    curve_nodes(
-        cost.kinds,
-        cost.data,
-        near.centre,
-        chart.sense,
-        chart.gram,
-        near.half,
-        near.line,
-        near.solve,
-        near.nodes,
-        near.curves,
-    )
+    curve_at(cost, chart, near)
     sum_up(tables.look.K, tables.look.w, cost.weight, 0.0, near.nodes, near.curves, near.sums)
     return float(tables.sheet.span[HERE])
 
@@ -125,7 +94,7 @@ def descend_scaled(scaled: Scaled, chart: Chart, tables: Tables) -> float:
     near = tables.near
     now, damping, start = cost_near(scaled, chart, tables), _DAMPING, near.at.copy()
     for _ in range(_STEPS):
-        length = newton_step(tables.look, near, damping)
+        length = newton_step(near, damping)
         if not length >= 0.0:
             return inf
         for k in range(3):
@@ -278,110 +247,38 @@ def _grow(
 # The search.
 
 
-@compiled
-def search_scaled(
-    scaled: Scaled,
-    tables: Tables,
-    space: Space,
-    stack: Array,
-    size: int,
-    levels: Array,
-    eps: float,
-    budget: int,
-    rivals: Array,
-    found: Array,
-) -> tuple[int, int, float, int, int]:
-    """Search the boxes of a stack for minima that cost less than a level, the lowest level first.
+class Work(NamedTuple):
+    """A cost and working memory for its search; the tables hold `box` and `near` as well."""
 
-    Parameters
-    ----------
-    scaled, tables : Scaled, Tables
-        The cost, and working memory.
-    space : Space
-        Where the boxes are: an atlas of all positions, or search coordinates around the fix.
-    stack, size : array (CAPACITY, DEPTH), int
-        The boxes.
-    levels, eps, budget, rivals, found
-        As of `optloc.proof.everywhere.search_everywhere`.
-
-    Returns
-    -------
-    outcome, boxes, bound, shown, met
-        As of `optloc.proof.everywhere.search_everywhere`.
-    """
-    box, sheet, d, value = tables.box, tables.sheet, space.atlas.dimension, levels[-1]
-    aside, waiting, boxes, lows, met = np.empty((CAPACITY, DEPTH)), zero(), 0, 0, zero()
-    floor, first, now, end = floor_of(space, scaled.cost), zero(), last_above_zero(levels), -inf
-    if now < first:  # no cost is below zero
-        return CLEAR, 0, value, first, met
-    while True:
-        if size == 0:  # nothing below this level is left
-            if now <= first:
-                return CLEAR, boxes, value, now, met
-            now -= 1
-            size, waiting = take_back(stack, aside, waiting, levels[now])
-            continue
-        shown, level = now + 1, levels[first]
-        if boxes >= budget or size + SPARE > CAPACITY:
-            spent = shown == levels.shape[0]
-            return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
-        size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
-        end = infinity(space.atlas, piece) if space.far else -inf
-        low = _bound_of_row(scaled, tables, space, level, floor, end, stack, size)
-        if low == inf:
-            continue
-        here = sheet.span[HERE]
-        if here < value:
-            place_of(space, box, found)
-            return CHEAPER, boxes, 0.0, shown, met
-        touching = touches_infinity(box, d - 1, end)
-        side = _side_of_rest(scaled, tables, space, touching, sqrt(max(level, 0.0)), here < _NEAR * (level + 1.0))
-        if side < 0:
-            continue
-        lows += int(here < level)
-        # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
-        if here < level and lows & (lows - 1) == 0:
-            cut, at, half = box.cut.copy(), box.at.copy(), box.half.copy()
-            met, size, space = _meet(scaled, tables, space, levels, first, eps, stack, size, rivals, met, found)
-            if met < 0:
-                return ANOTHER, boxes, 0.0, shown, 0
-            for k in range(3):
-                box.at[k], box.half[k], box.cut[k], box.cut[3 + k] = at[k], half[k], cut[k], cut[3 + k]
-            set_place(space, box, piece)
-        if touching and is_tiny(box, piece, d):
-            first = first_below(levels, first, _at_infinity(scaled, tables, space.atlas, piece, floor))
-            if first > now:
-                return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
-        size, waiting = keep_rest(stack, size, aside, waiting, box, side, low, piece, levels[now])
+    scaled: Scaled
+    tables: Tables
+    floor: float
+    box: Box
+    near: Box
 
 
 @compiled
-def _bound_of_row(
-    scaled: Scaled, tables: Tables, space: Space, level: float, floor: float, end: float, stack: Array, row: int
-) -> float:
-    """Return a lower bound of the residual in a box of the stack, infinite where all costs exceed a level."""
-    box, piece = tables.box, int(stack[row, PIECE])
+def _bound_row(work: Work, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+    scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
-    end_at_infinity(box, space.atlas.dimension - 1, end)
+    end_at_infinity(box, space.atlas.dimension - 1, infinity(space.atlas, piece) if space.far else -inf)
     set_box(space, box, piece)
     if is_left(space.atlas, box, piece) if space.far else is_known(box.at, box.half, space.minima, space.sides):
-        return inf
+        return inf, inf
     set_nodes(space, scaled.cost, box)
-    reduce_rows(scaled, floor, box, tables.sheet)
-    if not bound_factors(scaled, sqrt(max(level, 0.0)), box, tables.sheet):
-        return inf
-    low = bound_rows(scaled, box, tables.sheet)
-    return inf if reaches(low, level) else low
+    reduce_rows(scaled, work.floor, box, sheet)
+    if not bound_factors(scaled, sqrt(max(level, 0.0)), box, sheet):
+        return inf, inf
+    low = bound_rows(scaled, box, sheet)
+    return (inf, inf) if reaches(low, level) else (low, sheet.span[HERE])
 
 
 @compiled
-def _side_of_rest(scaled: Scaled, tables: Tables, space: Space, touching: bool, rho: float, sound: bool) -> int:
-    """Return the side across which to halve what of a box may hold a minimum; -1 for nothing of it."""
-    box, sheet, d = tables.box, tables.sheet, space.atlas.dimension
+def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: bool) -> int:
+    scaled, box, sheet, d = work.scaled, work.box, work.tables.sheet, space.atlas.dimension
     if not is_bounded(sheet):
-        for k in range(3):
-            box.cut[k], box.cut[3 + k] = -box.half[k], box.half[k]
-        return _widest(box.half)
+        uncut(box.half, box.cut)
+        return int(widest(box.half))
     clip_rows(scaled, rho, box, sheet)
     if is_empty(box.cut):
         return -1
@@ -401,63 +298,31 @@ def _side_of_rest(scaled: Scaled, tables: Tables, space: Space, touching: bool, 
     return int(curved if curved >= 0 else side)
 
 
-@inlined
-def _widest(half: Array) -> int:
-    """Return the widest side of a box."""
-    if half[0] >= half[1] and half[0] >= half[2]:
-        return 0
-    return 1 if half[1] >= half[2] else 2
+@compiled
+def _descend_near(work: Work, chart: Chart) -> float:
+    return descend_scaled(work.scaled, chart, work.tables)
 
 
 @compiled
-def _meet(
-    scaled: Scaled,
-    tables: Tables,
-    space: Space,
-    levels: Array,
-    first: int,
-    eps: float,
-    stack: Array,
-    size: int,
-    rivals: Array,
-    met: int,
-    found: Array,
-) -> tuple[int, int, Space]:
-    """Descend from the centre set; where that ends in another minimum, write it and push boxes around it.
-
-    Returns the number of rivals, -1 where one cannot be searched around; the size of the stack; the space.
-    """
-    atlas, chart, near, d = space.atlas, space.chart, tables.near, space.atlas.dimension
-    place_of(space, tables.box, found)
-    for k in range(3):
-        near.at[k] = 0.0
-        for m in range(d):
-            near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
-    least = descend_scaled(scaled, chart, tables)
-    known = is_listed(atlas, near.centre) if space.far else is_known(near.at, near.half, space.minima, space.sides)
-    if not least < levels[first] or known:
-        return met, size, space
-    for m in range(d):
-        found[m] = near.centre[m]
-    if not space.far or met == rivals.shape[0]:
-        return -1, size, space
-    count, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
-    slack, rho = max(0.5 * (least - value), 0.5 * eps), sqrt(max(levels[0], 0.0))
-    if not set_scaled_minimum(scaled, tables, wider, chart, count, found, value + 0.5 * slack, 0.5 * slack, rho):
-        return -1, size, space
-    widen_core(wider, count, inf)
-    for k in range(d):
-        rivals[met, k] = found[k]
-    return met + 1, push_core(stack, size, wider, count), in_atlas(wider, chart)
+def _set_rival(work: Work, atlas: Atlas, chart: Chart, i: int, x: Array, value: float, eps: float, rho: float) -> bool:
+    return set_scaled_minimum(work.scaled, work.tables, atlas, chart, i, x, value, eps, rho)
 
 
 @compiled
-def _at_infinity(scaled: Scaled, tables: Tables, atlas: Atlas, piece: int, floor: float) -> float:
-    """Return the cost at infinity next to the centre of a box that reaches there; its tables are lost."""
-    at = tables.box.at.copy()
-    at[atlas.dimension - 1] = infinity(atlas, piece)
-    set_centre(atlas, piece, at)
-    atlas.scale[0] = 0.0
-    bound_pieces(atlas, scaled.cost.kinds, scaled.cost.data, tables.box.half, tables.box.nodes)
-    reduce_rows(scaled, floor, tables.box, tables.sheet)
-    return float(tables.sheet.span[HERE])
+def _cost_set(work: Work, atlas: Atlas) -> float:
+    bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
+    reduce_rows(work.scaled, work.floor, work.box, work.tables.sheet)
+    return float(work.tables.sheet.span[HERE])
+
+
+search_scaled = with_constants(
+    search_levels,
+    "scaled",
+    {
+        bound_row: _bound_row,
+        side_of_rest: _side_of_rest,
+        descend_near: _descend_near,
+        set_rival: _set_rival,
+        cost_set: _cost_set,
+    },
+)

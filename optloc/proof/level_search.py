@@ -1,0 +1,253 @@
+"""The search of boxes for minima that cost less than some levels: one loop for costs with unknown scales and without.
+
+A box is done where the cost is at least the first level, or where it has no minimum, its gradient or its curvature
+being of one sign: the least cost over all positions, if it is attained, is attained elsewhere. What of a box can be
+neither is all that is looked at again. Around known minima boxes lie along their principal axes, and around those that
+are met as well. Boxes that cost more than a lower level wait until that is shown: so one tree tells how far the budget
+goes.
+"""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, zero
+from optloc.proof.atlas import Atlas, infinity, one_more, set_centre
+from optloc.proof.box import DEPTH, LEAST, PIECE, least_left, reaches
+from optloc.proof.convex_boxes import is_known, widen_core
+from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
+from optloc.proof.pieces import CAPACITY, SPARE, is_listed, is_tiny, keep_rest, push_core, touches_infinity
+from optloc.proof.search_space import Chart
+from optloc.proof.space import Space, in_atlas, place_of, set_place
+
+# The test for stationary points is made where the cost at the centre is within so many levels: elsewhere the box is too
+# large, or its bound will do when it is halved. Over 8 fixes by range differences one level took four times as many
+# boxes; a test everywhere took a quarter more time for the same. Over 500 fixes of five stations ten and a hundred
+# levels took the same time.
+_NEAR = 10.0
+
+# What differs between costs: kernels of these names take the places of these (`optloc.compute.jit.with_constants`).
+
+
+@compiled
+def bound_row(work: Any, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+    """Return a bound of the residual in a box of the stack, infinite where all costs exceed a level, and the cost."""
+    raise NotImplementedError
+
+
+@compiled
+def side_of_rest(work: Any, space: Space, touching: bool, rho: float, sound: bool) -> int:
+    """Return the side across which to halve what of a box may hold a residual shorter than rho; -1 for nothing of it.
+
+    Nor may it be without a minimum, where that is `sound`. What is left are the ends of ``box.cut``.
+    """
+    raise NotImplementedError
+
+
+@compiled
+def descend_near(work: Any, chart: Chart) -> float:
+    """Move the box around a position to a minimum; return its cost, or infinity where none is reached."""
+    raise NotImplementedError
+
+
+@compiled
+def set_rival(work: Any, atlas: Atlas, chart: Chart, i: int, x: Array, value: float, eps: float, rho: float) -> bool:
+    """Write a minimum and its surroundings into an atlas, see `optloc.proof.convex_boxes.set_minimum`."""
+    raise NotImplementedError
+
+
+@compiled
+def cost_set(work: Any, atlas: Atlas) -> float:
+    """Return the cost at the centre set, with tables of the box."""
+    raise NotImplementedError
+
+
+# The search.
+
+
+@compiled
+def search_levels(
+    work: Any,
+    space: Space,
+    stack: Array,
+    size: int,
+    levels: Array,
+    eps: float,
+    whole: bool,
+    budget: int,
+    rivals: Array,
+    found: Array,
+) -> tuple[int, int, float, int, int]:
+    """Search the boxes of a stack for minima that cost less than a level, the lowest level first.
+
+    Parameters
+    ----------
+    work : NamedTuple
+        The cost, and working memory: `box`, and `near` for boxes around a position.
+    space : Space
+        Where the boxes are: an atlas of all positions, or search coordinates around the fix.
+    stack, size : array (CAPACITY, DEPTH), int
+        The boxes.
+    levels : array (G,)
+        Costs to exceed, falling; a point that costs less than the last refutes the fix.
+    eps : float
+        How far the last is below the cost of the fix.
+    whole : bool
+        Whether a box is done as well where it has no minimum; otherwise only if it costs at least the last level.
+    budget : int
+        How many boxes may be looked at.
+    rivals : array (F, D)
+        Written: minima that cost less than the first level and were met.
+    found : array (D,)
+        Written: the point of the outcomes CHEAPER and ANOTHER.
+
+    Returns
+    -------
+    outcome : int
+        CLEAR: no minimum beside those known and met costs less than a level. CHEAPER: `found` costs less than the
+        last. ANOTHER: `found` is a minimum that costs less than the first, and was not searched around. SPENT: boxes
+        are left. INFINITE: the cost at infinity is below the level.
+    boxes : int
+        How many boxes were looked at.
+    bound : float
+        A lower bound of f: the last level, unless boxes are left.
+    shown : int
+        Which of the levels is exceeded.
+    met : int
+        How many rivals there are.
+    """
+    box, d, value = work.box, space.atlas.dimension, levels[-1]
+    aside, waiting, boxes, lows, met = np.empty((CAPACITY, DEPTH)), zero(), 0, 0, zero()
+    first, now = zero(), _last_above_zero(levels)
+    if now < first:  # no cost is below zero
+        return CLEAR, 0, value, first, met
+    while True:
+        if size == 0:  # nothing below this level is left
+            if now <= first:
+                return CLEAR, boxes, value, now, met
+            now -= 1
+            size, waiting = _take_back(stack, aside, waiting, levels[now])
+            continue
+        shown, level = now + 1, levels[first]
+        if boxes >= budget or size + SPARE > CAPACITY:
+            spent = shown == levels.shape[0]
+            return SPENT if spent else CLEAR, boxes, least_left(stack, size) if spent else value, shown, met
+        size, boxes, piece = size - 1, boxes + 1, int(stack[size - 1, PIECE])
+        low, here = bound_row(work, space, stack, size, level)
+        if low == inf:
+            continue
+        if here < value:
+            place_of(space, box, found)
+            return CHEAPER, boxes, 0.0, shown, met
+        touching = touches_infinity(box, d - 1, infinity(space.atlas, piece) if space.far else -inf)
+        # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
+        sound = (whole or reaches(low, value)) and here < _NEAR * (level + 1.0)
+        side = side_of_rest(work, space, touching, sqrt(max(level, 0.0)), sound)
+        if side < 0:
+            continue
+        lows += int(here < level)
+        # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
+        if here < level and lows & (lows - 1) == 0:
+            at, half, cut = box.at.copy(), box.half.copy(), box.cut.copy()
+            met, size, space = _meet(work, space, levels, first, eps, stack, size, rivals, met, found)
+            if met < 0:
+                return ANOTHER, boxes, 0.0, shown, 0
+            for k in range(3):
+                box.at[k], box.half[k], box.cut[k], box.cut[3 + k] = at[k], half[k], cut[k], cut[3 + k]
+            set_place(space, box, piece)
+        if touching and is_tiny(box, piece, d):
+            first = _first_below(levels, first, _at_infinity(work, space.atlas, piece))
+            if first > now:
+                return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
+        size, waiting = keep_rest(stack, size, aside, waiting, box, side, low, piece, levels[now])
+
+
+@compiled
+def _meet(
+    work: Any,
+    space: Space,
+    levels: Array,
+    first: int,
+    eps: float,
+    stack: Array,
+    size: int,
+    rivals: Array,
+    met: int,
+    found: Array,
+) -> tuple[int, int, Space]:
+    """Descend from the centre set; where that ends in another minimum, write it and push boxes around it.
+
+    Returns the number of rivals, -1 where one cannot be searched around; the size of the stack; the space.
+    """
+    atlas, chart, near, d = space.atlas, space.chart, work.near, space.atlas.dimension
+    place_of(space, work.box, found)
+    for k in range(3):
+        near.at[k] = 0.0
+        for m in range(d):
+            near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
+    least = descend_near(work, chart)
+    if not least < levels[first]:
+        return met, size, space
+    if is_listed(atlas, near.centre) if space.far else is_known(near.at, near.half, space.minima, space.sides):
+        return met, size, space
+    for m in range(d):
+        found[m] = near.centre[m]
+    if not space.far or met == rivals.shape[0]:
+        return -1, size, space
+    known, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
+    # As of those that are known all its convex box must cost at least what nothing may fall short of.
+    slack, rho = max(0.5 * (least - value), 0.5 * eps), sqrt(max(levels[0], 0.0))
+    if not set_rival(work, wider, chart, known, found, value + 0.5 * slack, 0.5 * slack, rho):
+        return -1, size, space
+    widen_core(wider, known, inf)
+    for k in range(d):
+        rivals[met, k] = found[k]
+    return met + 1, push_core(stack, size, wider, known), in_atlas(wider, chart)
+
+
+@compiled
+def _at_infinity(work: Any, atlas: Atlas, piece: int) -> float:
+    """Return the cost at infinity next to the centre of a box that reaches there; its tables are lost."""
+    at = work.box.at.copy()
+    at[atlas.dimension - 1] = infinity(atlas, piece)
+    set_centre(atlas, piece, at)
+    atlas.scale[0] = 0.0
+    return cost_set(work, atlas)
+
+
+# Levels that costs are held against, and boxes that wait for a lower one.
+
+
+@compiled
+def _last_above_zero(levels: Array) -> int:
+    """Return the last level above zero, -1 where none is."""
+    last: int = levels.shape[0] - 1
+    while last >= 0 and levels[last] <= 0.0:
+        last -= 1
+    return last
+
+
+@compiled
+def _first_below(levels: Array, first: int, ends: float) -> int:
+    """Return the first level from one on that a cost reaches, or how many there are where it reaches none."""
+    while first < levels.shape[0] and ends < levels[first]:
+        first += 1
+    return first
+
+
+@compiled
+def _take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[int, int]:
+    """Move the boxes whose bound is below a level from aside to the stack; return how many there are on each."""
+    size, left = zero(), zero()
+    for i in range(waiting):
+        if aside[i, LEAST] * aside[i, LEAST] < level:
+            stack[size] = aside[i]
+            size += 1
+        else:
+            aside[left] = aside[i]
+            left += 1
+    return size, left
