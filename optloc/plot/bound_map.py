@@ -28,11 +28,6 @@ _STEPS = (1.0, 2.0, 5.0)
 _BETWEEN = {1.0: (1.2, 1.5), 2.0: (3.0,), 5.0: (7.0,)}
 # Levels at most: lines of more run into each other.
 _LEVELS = 9
-_NOT_ON_EARTH = (
-    "GeoJSON needs positions on Earth, but the frame is cartesian",
-    "map",
-    'give a [frame] of kind "geodetic", "ecef" or "enu"',
-)
 # Stations that are named.
 _NAMED = 12
 # Decimals of a degree of isolines: a tenth of a metre.
@@ -191,14 +186,19 @@ def map_geojson(found: BoundMap) -> dict[str, Any]:
     InvalidProblem
         Where the frame is not on Earth, or matplotlib is missing.
     """
-    if not found.geodetic:
-        raise InvalidProblem(*_NOT_ON_EARTH)
+    _demand_earth(found)
     features = _station_features(found)
     for level, lines in isolines(found):
         if lines:
             about = {"role": "bound", "sigma_m": level, "height": found.height}
             features.append(feature(line_geometry(lines, _DIGITS), about))
     return {"type": "FeatureCollection", "features": features}
+
+
+def _demand_earth(grid: BoundMap | Grid) -> None:
+    if not grid.geodetic:
+        advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
+        raise InvalidProblem("GeoJSON needs positions on Earth, but the frame is cartesian", "map", advice)
 
 
 def _station_features(grid: BoundMap | Grid) -> list[dict[str, Any]]:
@@ -217,8 +217,7 @@ def status_geojson(found: StatusMap) -> dict[str, Any]:
         Where the frame is not on Earth.
     """
     grid, shares = found.grid, found.shares
-    if not grid.geodetic:
-        raise InvalidProblem(*_NOT_ON_EARTH)
+    _demand_earth(grid)
     features = _station_features(grid)
     for j, lat in enumerate(grid.y):
         for i, lon in enumerate(grid.x):
