@@ -69,7 +69,9 @@ def determined(problem: Problem, fix: Fix) -> Determined:
     if fix.shape != () or int(np.prod(problem.batch_shape)) != 1:
         advice = "take one fix of a batch: `problem.flat().take([i])` and `fix.flat()[i]`"
         raise InvalidProblem("this describes one fix, and these are several", "fix", advice)
-    flat, words = problem.flat().with_rows(weight=fix.weights[None]), str(fix.reason[()] or "")
+    # weights of a fix among fixes with more rows are padded
+    flat = problem.flat().with_rows(weight=fix.weights[None, : problem.count])
+    words = str(fix.reason[()] or "")
     if not has_directions(flat) or not _is_complete(flat):
         centre = problem.stations.places.reshape(-1, problem.dimension).mean(0)
         return Determined(centre, _level(problem, centre), problem.frame.geodetic, words=words)

@@ -302,3 +302,13 @@ def test_other_problems_have_words_alone():
     found = fix.determined
     assert not found
     assert found.words == str(fix.reason)
+
+
+def test_a_fix_among_fixes_with_more_rows_has_its_own_rows():
+    """Batches of fixes pad the weights of those with fewer rows."""
+    problem = differences(SIX, 90.0 * np.array([1.0, 0.4, 0.2]), 1e-3, np.random.default_rng(3))
+    fix = optloc.solve(problem)
+    padded = dataclasses.replace(fix, weights=np.concatenate([fix.weights, np.zeros(2)]))
+    one, other = (optloc.determined(problem, each).directions for each in (fix, padded))
+    assert len(one) == len(other) > 0
+    np.testing.assert_array_equal(one[0].vector, other[0].vector)
