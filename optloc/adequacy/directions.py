@@ -16,6 +16,7 @@ import numpy as np
 from optloc.adequacy.scaled_rows import has_scales, profile_by_rows
 from optloc.adequacy.shape import profile
 from optloc.base import linalg
+from optloc.base.linalg import normalised, spread_directions
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_GROWTH, judge
 from optloc.linear.mirror import mirror, one_position, plane_of_stations
@@ -205,15 +206,15 @@ class Minima:
 def minima_of(view: View, rise: float) -> Minima:
     """Return the minima that cost no more than a rise above the least."""
     d = len(view.centre)
-    spot = _spiral(d)
+    spot = spread_directions(_TRIED[d], d)
     u, v = np.repeat(spot, len(_INVERSE), axis=0), np.tile(np.minimum(_INVERSE, view.most), len(spot))
     cost = view.look(u, v)[0].reshape(len(spot), -1)
     order = np.argsort(cost.min(1), kind="stable")[:_REFINED]
     found = view.descend(spot[order], np.minimum(_INVERSE, view.most)[cost[order].argmin(1)], True, True, _STEPS)
     found = _lowest(view, *found)
     # mirror images in the plane of the stations, and points on it, where an own minimum has no width
-    image = _normalised(mirror(view.problem, view.centre + found[0][None])[0] - view.centre)
-    on = _normalised(found[0] + image)
+    image = normalised(mirror(view.problem, view.centre + found[0][None])[0] - view.centre)
+    on = normalised(found[0] + image)
     more = view.descend(np.concatenate([image, on]), np.tile(found[1], 2), True, True, _STEPS)
     u, v, cost = (np.concatenate(pair) for pair in zip(found, more, strict=True))
     return _distinct(u, v, cost, rise)
@@ -235,24 +236,6 @@ def _distinct(u: Array, v: Array, cost: Array, rise: float) -> Minima:
         if not any(alike):
             kept.append(i)
     return Minima(u[kept], v[kept], cost[kept])
-
-
-def _normalised(vector: Array) -> Array:
-    length = np.sqrt((vector**2).sum(-1, keepdims=True))
-    first = np.eye(vector.shape[-1])[0]
-    return np.where(length > 0.0, vector / np.where(length > 0.0, length, 1.0), first)
-
-
-def _spiral(d: int) -> Array:
-    """Return unit vectors (q, d) spread evenly."""
-    count = _TRIED[d]
-    number = np.arange(count) + 0.5
-    if d == 2:
-        turn = 2.0 * np.pi * number / count
-        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
-    across = np.sqrt(1.0 - height**2)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=-1)
 
 
 # Edges: where the root of the rise of the cost reaches a goal.
@@ -436,7 +419,7 @@ def _cone(view: View, minima: Minima, i: int, rises: Array, level: Array) -> Dir
         return None
     half = np.where(np.isnan(reach), _WIDEST, reach).reshape(2, -1).mean(0)
     # rays are spread evenly in the metric of the ellipse, so that its tips are not cut off
-    ways = sides if len(u) == 2 else _normalised(_around() * half @ across.T)
+    ways = sides if len(u) == 2 else normalised(_around() * half @ across.T)
     k = len(ways)
     angle, edges = np.zeros((2, k)), np.tile(u, (2, k, 1))
     found = edge(view, (u, v), np.tile(ways, (usable.sum(), 1)), least, np.repeat(rises[usable], k))

@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.adequacy.scaled_rows import cost_beyond_speed, has_scales, profile_by_rows
 from optloc.base import linalg
-from optloc.base.linalg import centre_and_spread
+from optloc.base.linalg import centre_and_spread, normalised, spread_directions
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_GROWTH, judge
 from optloc.compute.sums import equations_at
@@ -271,7 +271,8 @@ def cost_at_infinity(problem: Problem, x: Array) -> Array:
     sphere = _Sphere(problem, x, part, centre, _INFINITE * np.broadcast_to(spread, (len(x),)), along)
     with np.errstate(all="ignore"):
         own = sphere.direction(x[:, part] - centre)
-        tried = sphere.direction(np.broadcast_to(_spiral(slot.size)[:, None], (_DIRECTIONS[slot.size], *own.shape)))
+        spread_out = spread_directions(_DIRECTIONS[slot.size], slot.size)[:, None]
+        tried = sphere.direction(np.broadcast_to(spread_out, (len(spread_out), *own.shape)))
         cost = sphere.look(tried)[0]
         best = np.argsort(cost, axis=0)[:_REFINED]
         starts = np.concatenate([own[None], np.take_along_axis(tried, best[..., None], axis=0)])
@@ -294,7 +295,7 @@ class _Sphere:
         """Return unit vectors (..., N, d), along the equalities where there are some."""
         if self.along is not None:
             vector = (self.along @ (np.swapaxes(self.along, -1, -2) @ vector[..., None]))[..., 0]
-        return _normalised(vector)
+        return normalised(vector)
 
     def look(self, direction: Array) -> tuple[Array, Array, Array]:
         """Return costs (q, N) in directions (q, N, d), and information and vector of the position."""
@@ -331,23 +332,3 @@ class _Sphere:
             vector = np.where(better[..., None], other, vector)
             cost = np.where(better, new, cost)
         return np.asarray(cost)
-
-
-def _normalised(vector: Array) -> Array:
-    """Return unit vectors (..., d); the first axis for those of no length."""
-    length = np.sqrt((vector**2).sum(-1, keepdims=True))
-    first = np.zeros(vector.shape[-1])
-    first[0] = 1.0
-    return np.where(length > 0.0, vector / np.where(length > 0.0, length, 1.0), first)
-
-
-def _spiral(d: int) -> Array:
-    """Return directions (q, d) spread evenly: the circle, or a spiral of the golden angle on the sphere."""
-    count = _DIRECTIONS[d]
-    number = np.arange(count) + 0.5
-    if d == 2:
-        turn = 2.0 * np.pi * number / count
-        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
-    across = np.sqrt(1.0 - height**2)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=-1)

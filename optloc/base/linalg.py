@@ -394,3 +394,21 @@ def span_of(unknowns: Array) -> Array:
     u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
     # The rounding of a column that is a sum of others is some thousandth of that; what is dependent changes nothing.
     return np.asarray(u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :])
+
+
+def normalised(vector: Array) -> Array:
+    """Return unit vectors (..., d); the first axis for vectors without length."""
+    length = np.sqrt((vector**2).sum(-1, keepdims=True))
+    first = np.eye(vector.shape[-1])[0]
+    return np.where(length > 0.0, vector / np.where(length > 0.0, length, 1.0), first)
+
+
+def spread_directions(count: int, d: int) -> Array:
+    """Return unit vectors (count, d) spread evenly: on the circle, or on a spiral of the golden angle on the sphere."""
+    number = np.arange(count) + 0.5
+    if d == 2:
+        turn = 2.0 * np.pi * number / count
+        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
+    across = np.sqrt(1.0 - height**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=-1)

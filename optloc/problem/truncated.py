@@ -14,7 +14,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from optloc.base.linalg import factor_semidefinite
+from optloc.base.linalg import factor_semidefinite, spread_directions
 from optloc.base.records import Axes, take
 from optloc.base.types import Array
 
@@ -325,13 +325,4 @@ def _gauss() -> tuple[Array, Array]:
 @lru_cache(maxsize=4)
 def _directions(rank: int) -> Array:
     """Return unit vectors (k, rank) that are spread evenly."""
-    if rank <= 1:
-        return np.array([[-1.0], [1.0]])[:, :rank]
-    k = np.arange(_RAYS[rank]) + 0.5
-    if rank == 2:
-        angle = 2.0 * np.pi * k / len(k)
-        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    # a spiral with steps of the golden angle
-    height, angle = 1.0 - 2.0 * k / len(k), np.pi * (3.0 - np.sqrt(5.0)) * k
-    level = np.sqrt(1.0 - height**2)
-    return np.stack([level * np.cos(angle), level * np.sin(angle), height], axis=-1)
+    return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(_RAYS[rank], rank)
