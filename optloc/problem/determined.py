@@ -258,7 +258,7 @@ class Source:
     Parameters
     ----------
     problem : Problem
-        Flat batch of one.
+        Single, or a flat batch of one.
     found : Determined, optional
         None until it is asked for.
     """
@@ -283,6 +283,10 @@ def with_sources(problem: Problem, fix: Fix) -> Fix:
     """
     if not fix.shape and int(fix.code) == Status.OK:
         return fix
+    if not fix.shape and not problem.batch_shape:  # a copy of the problem would take as long as the fix
+        own = np.empty((), dtype=object)
+        own[()] = Source(problem)
+        return replace(fix, source=own)
     items = np.flatnonzero(fix.code.ravel() != Status.OK)
     if not 0 < len(items) <= _KEPT:
         return fix
