@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -62,39 +62,23 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True)
-class BoundMap:
-    """The bound of the position over a grid of places, at one height.
+class BoundMap(Grid):
+    """The bound of the position over a grid of places.
 
     Parameters
     ----------
-    x, y : array (nx,), (ny,)
-        The grid: longitude and latitude in degrees on Earth, else metres of the frame.
-    height : float
-        Above the ellipsoid on Earth, else the third coordinate; 0 in the plane; metres.
     sigma : array (ny, nx)
         Root of the trace of the bound of the position, metres; NaN where the geometry is singular.
     horizontal, vertical : array (ny, nx)
         The same of its plan, and of its height (NaN in the plane).
     row : float
         Root mean square standard deviation of a row, metres; NaN where not all rows are lengths.
-    stations : array (s, 2)
-        As x and y.
-    names : tuple of s str
-        Of the stations.
-    geodetic : bool
-        Whether x and y are degrees.
     """
 
-    x: Array
-    y: Array
-    height: float
     sigma: Array
     horizontal: Array
     vertical: Array
     row: float
-    stations: Array
-    names: tuple[str, ...]
-    geodetic: bool
 
     @property
     def dilution(self) -> Array:
@@ -142,16 +126,11 @@ def bound_map(
     plan = np.sqrt(variance[:, :2].sum(-1))
     up = np.sqrt(variance[:, 2]) if problem.dimension == 3 else np.full(len(vectors), np.nan)
     return BoundMap(
-        grid.x,
-        grid.y,
-        grid.height,
-        np.sqrt(variance.sum(-1)).reshape(grid.shape),
-        plan.reshape(grid.shape),
-        up.reshape(grid.shape),
-        _deviation(problem),
-        grid.stations,
-        grid.names,
-        grid.geodetic,
+        **{one.name: getattr(grid, one.name) for one in fields(grid)},
+        sigma=np.sqrt(variance.sum(-1)).reshape(grid.shape),
+        horizontal=plan.reshape(grid.shape),
+        vertical=up.reshape(grid.shape),
+        row=_deviation(problem),
     )
 
 

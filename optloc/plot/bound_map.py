@@ -89,7 +89,7 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
     return _draw(found.grid, values, list(_SHARES), Normalize(0.0, 100.0), "fixes with status ok (%)", title)
 
 
-def _draw(grid: BoundMap | Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
+def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
     """Return a map of values (ny, nx) with isolines at steps."""
     scale = 1.0 if grid.geodetic or max(np.ptp(grid.x), np.ptp(grid.y)) < _FAR else 1e-3
     x, y = grid.x * scale, grid.y * scale
@@ -195,13 +195,13 @@ def map_geojson(found: BoundMap) -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": features}
 
 
-def _demand_earth(grid: BoundMap | Grid) -> None:
+def _demand_earth(grid: Grid) -> None:
     if not grid.geodetic:
         advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
         raise InvalidProblem("GeoJSON needs positions on Earth, but the frame is cartesian", "map", advice)
 
 
-def _station_features(grid: BoundMap | Grid) -> list[dict[str, Any]]:
+def _station_features(grid: Grid) -> list[dict[str, Any]]:
     return [
         feature(point_geometry(place, _DIGITS), {"role": "station", "name": name})
         for name, place in zip(grid.names, grid.stations, strict=True)
