@@ -155,9 +155,10 @@ class Truncated:
         return float(low[best]), float(high[best])
 
     def draw(self, n: int, seed: int) -> tuple[Array, Array]:
-        """Return n points (n, d) of one law, metres from the fix, and squared deviations (n,) less the fix's.
+        """Return n points (n, d) of one law, metres from the fix, and excesses (n,).
 
-        Systematic resampling of nodes along the rays: `seed` decides where it begins.
+        The excess of a point is its squared deviation minus the squared deviation of the fix. The draw is a systematic
+        resampling of nodes along the rays; `seed` decides its start.
         """
         rays = self._rays()
         place, weight = rays.spread()
