@@ -69,9 +69,9 @@ if TYPE_CHECKING:
         common_level,
         late_signals,
         noise_levels,
-        with_estimated_noise,
         with_noise_levels,
     )
+    from optloc.quality.structure import NoiseStructure, noise_structure, with_estimated_noise
     from optloc.several import Emitters, separate
     from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
     from optloc.solvers.certify.admitted import certify
@@ -128,6 +128,7 @@ __all__ = [
     "NoSolution",
     "Noise",
     "NoiseLevels",
+    "NoiseStructure",
     "Normal",
     "Observability",
     "OptlocError",
@@ -177,6 +178,7 @@ __all__ = [
     "network_of",
     "noise",
     "noise_levels",
+    "noise_structure",
     "normal",
     "observability",
     "place",
@@ -242,7 +244,8 @@ _HOMES = {
     "problem.problem": "Problem",
     "problem.signal": "Signal",
     "quality.health": "Health health",
-    "quality.levels": "NoiseLevels common_level late_signals noise_levels with_estimated_noise with_noise_levels",
+    "quality.levels": "NoiseLevels common_level late_signals noise_levels with_noise_levels",
+    "quality.structure": "NoiseStructure noise_structure with_estimated_noise",
     "several": "Emitters separate",
     "solvers": "FORMULATIONS METHODS SOLVERS Formulation solve",
     "solvers.certify.admitted": "certify",

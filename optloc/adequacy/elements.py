@@ -97,7 +97,7 @@ def batch_of(problem: Problem) -> Problem:
     return flat
 
 
-def elements(problem: Problem, x: Array, by: By, common: bool = False) -> Elements:
+def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> Elements:
     """Return the elements of a flat batch of problems at parameter vectors.
 
     Parameters
@@ -108,28 +108,29 @@ def elements(problem: Problem, x: Array, by: By, common: bool = False) -> Elemen
         Their fixes, finite.
     by : "station", "pair" or "kind"
         What makes a group.
-    common : bool
-        Whether the rows of a group have an error in common in every epoch besides: a group of its own, named as
-        `common_name` says, of which the noise states nothing; its sigma is that of `typical_sigma`.
+    common : "station", "pair" or "kind", optional
+        Whose rows have an error in common in every epoch besides: a group of its own, named as `common_name` says, of
+        which the noise states nothing; its sigma is that of `typical_sigma`.
     """
     ends = ends_of(problem, by)
     names = sorted({*ends.name.ravel().tolist()} - {""})
-    size = typical_sigma(problem, by) if common else {}
+    size = typical_sigma(problem, common) if common else {}
     parts = []
     for first in range(0, len(x), _PART):
         items = np.arange(first, min(first + _PART, len(x)))
-        parts.append(_part(problem.take(items), x[items], by, size))
+        parts.append(_part(problem.take(items), x[items], by, (common, size)))
     more = sorted({name for part in parts for name in part.names} - set(names))
     return _join((*names, *more), parts)
 
 
-def _part(problem: Problem, x: Array, by: By, common: dict[str, float]) -> Elements:
+def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str, float]]) -> Elements:
     count, rows = len(x), problem.count
     present = np.broadcast_to(problem.weight > 0.0, (count, rows))
     residual, jacobian = _linearise(problem, x)
     effect, error_names, sigma = _effects(problem, by, present)
-    if common:
-        more, more_names, size = common_effects(problem, by, common)
+    shared_by, sizes = common
+    if shared_by:
+        more, more_names, size = common_effects(problem, shared_by, sizes)
         effect = np.concatenate([effect, np.broadcast_to(more, (count, *more.shape))], axis=-1)
         sigma = np.concatenate([sigma, np.broadcast_to(size, (count, len(size)))], axis=-1)
         error_names = np.concatenate([error_names, more_names])

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.adequacy.elements import Elements
+from optloc.adequacy.groups import ROW_PRICE
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
@@ -29,6 +30,9 @@ the tails of airliners' messages (7.7 % beyond 3 sigma) count as noise of single
 _WIDE = 10.0
 """The same of an error that rows have in common: a fix follows it as it follows another place, so that no test tells it
 there, and what is left out of the level is in no covariance. One in fifteen headings of robots is beyond 3.5."""
+
+# Margin of the squared test of a gross row over the test of an error in common: a likelihood ratio of ninety.
+_MARGIN = 9.0
 
 LOOSE = 0.5
 """Relative standard error of a standard deviation from which the data are said not to tell it."""
@@ -152,6 +156,8 @@ def fit(made: Elements, left: Array, single: Array) -> Fitted:
     level = np.where(alone, 0.0, begin[: len(kinds)])
     information, _ = _score(alike.tests, own, np.exp(begin[: len(kinds)]), alone)
     penalty = np.minimum(_PENALTY, _SHARE * np.diagonal(information))
+    # An error in common is kept only where the data show it. Where fixes follow it, the weight alone would size it.
+    penalty[made.common[used[kinds]]] = 0.0
     found = _maximise(made, own, level, alone, penalty)
     low, high = (np.where(alone, np.nan, end)[place] for end in _interval(found, own, alone))
 
@@ -427,13 +433,47 @@ def without(tests: Tested, gross: Array) -> Tested:
     return tests
 
 
+def deviance(made: Elements, found: Fitted) -> float:
+    """Return twice the negative logarithm of the restricted likelihood, each gross error a free unknown at a price.
+
+    It is the likelihood of K' v, K an orthonormal basis of the complement of J. The basis does not depend on the
+    variances, so that sets of groups can be compared (Harville 1977, section 3).
+    """
+    variance = np.append(np.nan_to_num(found.variance), 0.0)[made.of_effect]
+    scaled = made.effect * np.sqrt(variance)[:, None]
+    covariance = scaled @ np.swapaxes(scaled, 1, 2) + made.fixed
+    absent = np.diagonal(covariance, axis1=1, axis2=2) == 0.0
+    covariance += absent[:, :, None] * np.eye(covariance.shape[1])
+    basis, sizes, _ = np.linalg.svd(made.jacobian)
+    seen = np.zeros((len(basis), basis.shape[-1]), dtype=bool)
+    seen[:, : sizes.shape[1]] = sizes > _NOTHING * sizes[:, :1]
+    # Directions of the Jacobian become unit variances without residual.
+    free = np.swapaxes(basis, 1, 2) * ~seen[:, :, None]
+    inside = free @ covariance @ np.swapaxes(free, 1, 2) + seen[:, :, None] * np.eye(basis.shape[-1])
+    doubled = float(np.linalg.slogdet(inside)[1].sum())
+    tests = tested(made, variance)
+    items = np.arange(len(variance))
+    order = np.argsort(~found.gross, axis=1, kind="stable")[:, : int(found.gross.sum(1).max(initial=0))]
+    for column in order.T:
+        out = found.gross[items, column] & (tests.size[items, column] > 0.0)
+        doubled += float(np.log(tests.size[items, column][out]).sum()) + ROW_PRICE * int(out.sum())
+        tests = tests.without(np.where(out, column, -1))
+    return doubled + float(tests.cost.sum())
+
+
 # Data snooping.
 
 
 def cleaned(made: Elements, variance: Array) -> tuple[Array, Tested]:
-    """Return which errors are gross (N, q), and the tests without them."""
+    """Return which errors are gross (N, q), and the tests without them.
+
+    A row is gross only where its error explains much more than an error in common. Without this rule epochs with a
+    large common error would be left out, and its variance would be too small.
+    """
     tests = tested(made, variance)
-    found = snooped(tests, slice(0, tests.errors), np.where(made.common[made.of_effect], _WIDE, CUT))
+    shared = made.common[made.of_effect] & (np.broadcast_to(variance, made.of_effect.shape) > 0.0)
+    cut = np.where(made.common[made.of_effect], _WIDE, CUT)
+    found = snooped(tests, slice(0, tests.errors), cut, shared if shared.any() else None)
     return found.gross, found.tests
 
 
@@ -457,8 +497,10 @@ class Snooped:
     tests: Tested
 
 
-def snooped(tests: Tested, columns: slice, cut: float | Array) -> Snooped:
+def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | None = None) -> Snooped:
     """Return the gross errors along some columns of tests, each with its cut or all with one.
+
+    Its squared test must exceed the tests of all `shared` columns (N, p) of its problem by a margin.
 
     Of each problem the column with the largest test beyond the cut is left out, and the rest are tested anew, until
     none is beyond it: data snooping (Baarda 1968, section 4).
@@ -467,7 +509,11 @@ def snooped(tests: Tested, columns: slice, cut: float | Array) -> Snooped:
     shift, sigma = shown(tests, columns)
     gross = np.zeros(shift.shape, dtype=bool)
     while True:
-        beyond = np.abs(tests.sigmas[:, columns]) / cut
+        size = np.abs(tests.sigmas[:, columns])
+        beyond = size / cut
+        if shared is not None:
+            most = np.where(shared, size, 0.0).max(1, keepdims=True)
+            beyond = np.where(shared | (size**2 > most**2 + _MARGIN), beyond, 0.0)
         worst = beyond.argmax(1)
         hit = np.flatnonzero(beyond[np.arange(n), worst] > 1.0)
         now = shown(tests, columns)

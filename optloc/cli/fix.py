@@ -45,8 +45,8 @@ from optloc.quality.levels import (
     NoiseLevels,
     common_level,
     late_signals,
-    with_estimated_noise,
 )
+from optloc.quality.structure import with_estimated_noise
 from optloc.report.columns import Columns, records
 from optloc.report.fixes import (
     SHOWN,
@@ -226,16 +226,24 @@ def _show_many(found: FileFixes, console: Console) -> None:
 
 # Noise from data.
 
+# The grouping that means the structure with the best explanation of the data.
+_AUTO = "auto"
+
 
 def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
     """Return a file's problem with its noise estimated for each station, pair or kind; unchanged where not asked."""
     if by is None:
         return loaded
+    if by == _AUTO:
+        return _with_levels(loaded, *with_estimated_noise(loaded.problem))
     grouping, plus, more = by.partition("+")
     if plus and more != "epoch":
         raise InvalidProblem(f"unknown component {more!r}", "--noise-from-data", "write +epoch or nothing behind it")
     group = grouping_of(grouping, "--noise-from-data")
-    problem, levels = with_estimated_noise(loaded.problem, group, common=bool(plus))
+    return _with_levels(loaded, *with_estimated_noise(loaded.problem, group, common=bool(plus)))
+
+
+def _with_levels(loaded: Loaded, problem: Problem, levels: NoiseLevels) -> Loaded:
     return replace(loaded, problem=problem, levels=levels)
 
 
@@ -290,7 +298,7 @@ def tell_level(
     if level is not None and level.suspect and (used or not said):
         said.append(f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}")
     elif level is not None and level.alone:
-        said.append(f"{level.sentence}: see `optloc check`, or --noise-from-data station")
+        said.append(f"{level.sentence}: see `optloc check`, or --noise-from-data auto")
     elif used:
         said.append("the noise is used as stated: no common factor explains more")
     return tuple(said)
@@ -309,7 +317,7 @@ def level_json(level: CommonLevel, used: bool = False) -> dict[str, Any]:
 def grouping_of(by: str, where: str) -> By:
     """Return what makes a group of errors; raise InvalidProblem for an unknown word."""
     if by not in GROUPINGS:
-        raise InvalidProblem(f"unknown grouping {by!r}", where, nearest(by, GROUPINGS))
+        raise InvalidProblem(f"unknown grouping {by!r}", where, nearest(by, (*GROUPINGS, _AUTO)))
     return cast("By", by)
 
 
@@ -317,9 +325,16 @@ def _levels_json(levels: NoiseLevels) -> dict[str, Any]:
     """Return noise levels as one JSON value, SI units."""
     columns: Columns = {"name": np.array(levels.names), "sigma": levels.sigma, "sigma_error": levels.sigma_error}
     columns |= {"low": levels.low * levels.stated, "high": levels.high * levels.stated}
-    columns |= {"stated": levels.stated, "redundancy": levels.redundancy, "count": levels.count, "gross": levels.gross}
+    columns |= {
+        "tails": levels.tails,
+        "stated": levels.stated,
+        "redundancy": levels.redundancy,
+        "count": levels.count,
+        "gross": levels.gross,
+    }
     return {
         "by": levels.by,
+        "common": levels.common,
         "levels": records(columns),
         "fixes": levels.fixes,
         "chi_square_stated": levels.before,
@@ -330,14 +345,15 @@ def _levels_json(levels: NoiseLevels) -> dict[str, Any]:
 
 def _show_levels(levels: NoiseLevels, console: Console) -> None:
     """Print noise levels as a table."""
-    table = Table(title=f"Noise from data, by {levels.by}", title_justify="left")
+    besides = f", and what rows of each {levels.common} have in common in an epoch" if levels.common else ""
+    table = Table(title=f"Noise from data, by {levels.by}{besides}", title_justify="left")
     table.add_column(levels.by)
     for name in ("sigma, SI", "95 %", "stated", "redundancy", "errors", "gross"):
         table.add_column(name, justify="right")
     low, high = levels.low * levels.stated, levels.high * levels.stated
     for i, name in enumerate(levels.names):
         # What is not told alone is used all the same: as stated, by a common factor, or none.
-        sigma = f"{levels.factor[i] * levels.stated[i]:.3g}" + ("" if np.isfinite(levels.error[i]) else ", not told")
+        sigma = f"{levels.used[i] * levels.stated[i]:.3g}" + ("" if np.isfinite(levels.error[i]) else ", not told")
         within = f"{low[i]:.3g} to {high[i]:.3g}" if np.isfinite(high[i]) else "-"
         cells = (f"{levels.stated[i]:.3g}", f"{levels.redundancy[i]:.0%}", str(levels.count[i]), str(levels.gross[i]))
         table.add_row(name, sigma, within, *cells)

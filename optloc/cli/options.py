@@ -311,8 +311,9 @@ NoiseFromData = Annotated[
     str | None,
     typer.Option(
         "--noise-from-data",
-        metavar="station|pair|kind",
-        help="Estimate the noise of each of these; with +epoch behind it also what their rows of an epoch share.",
+        metavar="auto|kind|station|pair",
+        help="Estimate the noise of each of these; with +epoch behind it also what their rows of an epoch share. "
+        "auto: whatever explains the data best.",
     ),
 ]
 RescaleNoise = Annotated[

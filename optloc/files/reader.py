@@ -53,7 +53,8 @@ from optloc.problem.noise import Block, Noise, arrivals, group, together
 from optloc.problem.problem import Problem
 from optloc.problem.signal import Signal
 from optloc.problem.validation import checked
-from optloc.quality.levels import NoiseLevels, with_estimated_noise
+from optloc.quality.levels import NoiseLevels
+from optloc.quality.structure import with_estimated_noise
 
 LOG = logging.getLogger("optloc.read")
 

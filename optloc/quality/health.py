@@ -208,7 +208,7 @@ def _settle(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
     # Offsets first, with the noise as stated: a bias in the residuals would be taken for noise.
     offsets = offsets_of(made, tested(made, np.ones(())))
     for _ in range(_ROUNDS):
-        levels = levels_of(_take_out(made, offsets), by)
+        levels = levels_of(_take_out(made, offsets), by, tails=False)
         offsets = offsets_of(made, tested(made, _variance(made, levels)))
     return levels, offsets
 

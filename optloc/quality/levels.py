@@ -17,6 +17,7 @@ from optloc.adequacy.elements import (
     split,
 )
 from optloc.adequacy.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.adequacy.overbound import tail_factors
 from optloc.adequacy.variance_components import Fitted, Tested, fit, tested, total, visible, without
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
@@ -26,9 +27,6 @@ from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise, gathered, group, together
 from optloc.problem.problem import Problem
 
-# Turns of fixes and levels, and the change of all levels that ends them: 2 % is below the standard error that a
-# thousand errors leave (1 / sqrt(2 n)), and each turn fixes every epoch again.
-_ROUNDS, _CLOSE = 4, 0.02
 # Groups that a sentence names; the others are counted.
 _NAMED = 8
 
@@ -66,6 +64,10 @@ class NoiseLevels:
         Number of fixes that were used.
     sentences : tuple of str
         What the data do not tell.
+    tails : array (G,)
+        Further factor, at least 1, with which a Gaussian bounds the tails of the errors.
+    common : "station", "pair" or "kind", optional
+        Whose rows have an error in common in an epoch.
     """
 
     by: By
@@ -82,20 +84,32 @@ class NoiseLevels:
     after: float
     fixes: int
     sentences: tuple[str, ...]
+    tails: Array
+    common: By | None = None
+
+    @property
+    def used(self) -> Array:
+        """Return the factors (G,) of the stated standard deviations, tails included."""
+        return np.asarray(self.factor * self.tails)
 
     @property
     def sigma(self) -> Array:
         """Return the standard deviations (G,) that were found, SI units; NaN where the data do not tell."""
-        return np.where(np.isnan(self.error), np.nan, self.factor * self.stated)
+        return np.where(np.isnan(self.error), np.nan, self.used * self.stated)
 
     @property
     def sigma_error(self) -> Array:
         """Return the standard errors (G,) of `sigma`, SI units."""
-        return np.asarray(self.error * self.stated)
+        return np.asarray(self.error * self.tails * self.stated)
 
 
 def noise_levels(
-    problem: Problem, by: By = "station", *, common: bool = False, method: str = "auto", fix: Fix | None = None
+    problem: Problem,
+    by: By = "station",
+    *,
+    common: By | bool | None = None,
+    method: str = "auto",
+    fix: Fix | None = None,
 ) -> NoiseLevels:
     """Return how large the errors of groups of rows are, from the residuals of many fixes.
 
@@ -113,9 +127,9 @@ def noise_levels(
         Its noise may be wrong; its ratios within a group are kept.
     by : "station", "pair" or "kind"
         Whether each station has a level (the error of an arrival where rows combine arrivals), each pair or each kind.
-    common : bool
-        Whether the rows of a group have an error in common in every epoch besides: of an attitude, a place that is
-        taken as known, or refraction. It is told where a group has several rows in an epoch.
+    common : "station", "pair" or "kind", optional
+        Whose rows have an error in common in every epoch besides: of an attitude, a place that is taken as known, or
+        refraction; True: as `by`. It is told where a group has several rows in an epoch.
     method : str
         How to fix; see `solve`.
     fix : Fix, optional
@@ -145,44 +159,13 @@ def noise_levels(
     if fix is None and batch.layout.size:
         fix = solve(batch, method)
     kept, x = usable(batch, fix)
-    return levels_of(elements(batch.take(kept), x, by, common), by)
+    shared_by = shared_grouping(by, common)
+    return levels_of(elements(batch.take(kept), x, by, shared_by), by, shared_by)
 
 
-def with_estimated_noise(
-    problem: Problem, by: By = "kind", *, common: bool = False, method: str = "auto"
-) -> tuple[Problem, NoiseLevels]:
-    """Return the problem with its noise from the data, and the levels: fixes and levels are made until they agree.
-
-    Parameters
-    ----------
-    problem : Problem
-        Ratios of its noise within a group are kept; what it states else is only where to begin, but for groups that the
-        data do not tell: they stay as stated.
-    by, common, method
-        As in `noise_levels`.
-
-    Raises
-    ------
-    InvalidProblem
-        As `noise_levels`, and where the data do not tell any level.
-    """
-    from optloc.solvers import solve
-
-    batch, now = batch_of(problem), problem
-    # Better weights move the fixes, and these the residuals: turns until nothing moves.
-    factor = np.ones(1)
-    for _ in range(1 + _ROUNDS):
-        kept, x = usable(batch, solve(batch_of(now), method) if batch.layout.size else None)
-        # Fixes with the noise as found, factors of the noise as stated: what is not told stays as stated, in any turn.
-        levels = levels_of(elements(batch.take(kept), x, by, common), by)
-        if np.isnan(levels.low).all():  # not even one factor for all; more turns would be this one again
-            advice = "state a sigma, or add rows, stations or epochs"
-            raise InvalidProblem("the data do not tell the noise", "noise", advice)
-        now = with_noise_levels(problem, levels)
-        if factor.shape == levels.factor.shape and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max():
-            break
-        factor = levels.factor
-    return now, levels
+def shared_grouping(by: By, common: By | bool | None) -> By | None:
+    """Return the grouping of errors in common: `by` itself for True."""
+    return by if common is True else common or None
 
 
 def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
@@ -200,13 +183,15 @@ def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
     InvalidProblem
         Where rows have an error in common in an epoch and others that last longer.
     """
-    factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
+    factor = dict(zip(levels.names, levels.used.tolist(), strict=True))
     present = problem.weight > 0.0
     noise = Noise(tuple(_scale(problem, block, levels.by, factor, present) for block in problem.noise.blocks))
-    sigma = dict(zip(levels.names, (levels.factor * levels.stated).tolist(), strict=True))
-    names = {*ends_of(problem, levels.by).name.ravel().tolist()} - {""}
+    if levels.common is None:
+        return replace(problem, noise=noise)
+    sigma = dict(zip(levels.names, (levels.used * levels.stated).tolist(), strict=True))
+    names = {*ends_of(problem, levels.common).name.ravel().tolist()} - {""}
     common = {name: sigma[common_name(name)] for name in sorted(names) if sigma.get(common_name(name), 0.0) > 0.0}
-    return replace(problem, noise=_with_common(problem, noise, levels.by, common) if common else noise)
+    return replace(problem, noise=_with_common(problem, noise, levels.common, common) if common else noise)
 
 
 def _scale(problem: Problem, block: Block, by: By, factor: dict[str, float], present: Array) -> Block:
@@ -281,28 +266,30 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
     return kept, flat.x[kept]
 
 
-def levels_of(made: Elements, by: By) -> NoiseLevels:
-    """Return the noise levels of linearised fixes; see `noise_levels`."""
+def levels_of(made: Elements, by: By, common: By | None = None, *, tails: bool = True) -> NoiseLevels:
+    """Return the noise levels of linearised fixes, with or without a bound of their tails; see `noise_levels`."""
+    found, absent = fitted(made, common)
+    return report_levels(made, by, common, (found, absent), tails=tails)
+
+
+def fitted(made: Elements, shared_by: By | None) -> tuple[Fitted, Array]:
+    """Return the variance factors of groups, and the errors in common (g,) without evidence."""
     from threadpoolctl import threadpool_limits
 
+    common = made.common[:-1]
     # Products of small matrices gain nothing from threads, and wait for them on a busy machine: ten times as long.
     with threadpool_limits(1):
-        return _levels(made, by)
-
-
-def _levels(made: Elements, by: By) -> NoiseLevels:
-    common = made.common[:-1]
-    plain = fit(made, common, common)
-    # What rows have in common is stated nowhere: where the data do not show it, it is none.
-    seen = _with_their_like(visible(made, plain, common), common, by)
-    found = fit(made, common & ~seen, common) if seen.any() else plain
-    while (fewer := _with_their_like(seen & (found.low > 0.0), common, by)).sum() < seen.sum():
-        seen = fewer
+        plain = fit(made, common, common)
+        # No noise is stated for errors in common: without evidence they are zero.
+        seen = _with_their_like(visible(made, plain, common), common, shared_by)
         found = fit(made, common & ~seen, common) if seen.any() else plain
-    return _report(made, by, found, common & ~seen)
+        while (fewer := _with_their_like(seen & (found.low > 0.0), common, shared_by)).sum() < seen.sum():
+            seen = fewer
+            found = fit(made, common & ~seen, common) if seen.any() else plain
+    return found, common & ~seen
 
 
-def _with_their_like(shown: Array, common: Array, by: By) -> Array:
+def _with_their_like(shown: Array, common: Array, by: By | None) -> Array:
     """Return which errors in common (G,) are kept: those of one station or pair show that the others have them too.
 
     A fix follows as many of these as it has unknowns. Levels of a few that explain the rest say that the others are
@@ -311,8 +298,11 @@ def _with_their_like(shown: Array, common: Array, by: By) -> Array:
     return shown if by == "kind" else common & shown.any()
 
 
-def _report(made: Elements, by: By, found: Fitted, none: Array) -> NoiseLevels:
-    """Return the levels of all groups that have errors; `none` (G,) are those that the data do not show."""
+def report_levels(
+    made: Elements, by: By, common: By | None, fitted: tuple[Fitted, Array], *, tails: bool
+) -> NoiseLevels:
+    """Return the levels of all groups with errors, from a fit and the groups (g,) without evidence."""
+    found, none = fitted
     size = len(made.names)
     count, gross = total(made.of_effect, size), total(made.of_effect, size, found.gross)
     used = np.flatnonzero(count)
@@ -323,6 +313,8 @@ def _report(made: Elements, by: By, found: Fitted, none: Array) -> NoiseLevels:
     own = np.append(none, False)[made.of_effect]
     stated = without(tested(made, np.where(own, 0.0, 1.0)), found.gross)
     low, high = (np.where(none, np.nan, np.sqrt(end)) for end in (found.low, found.high))
+    names = np.array(made.names, dtype=object)
+    wider = np.where(np.isnan(found.low), 1.0, tail_factors(made, found) if tails else 1.0)
     return NoiseLevels(
         by,
         tuple(made.names[i] for i in used),
@@ -337,8 +329,23 @@ def _report(made: Elements, by: By, found: Fitted, none: Array) -> NoiseLevels:
         _ratio(stated),
         _ratio(found.tests),
         int((stated.dof > 0).sum()),
-        _sentences(np.array(made.names, dtype=object), found, redundancy, none),
+        (*_sentences(names, found, redundancy, none), *_tails_in_words(names, wider)),
+        wider[used],
+        common,
     )
+
+
+# Factor of a sigma for its tails that is worth a sentence.
+_LONG = 1.1
+
+
+def _tails_in_words(names: Array, wider: Array) -> list[str]:
+    """Return a sentence for each group with longer tails than normal errors."""
+    return [
+        f"errors of {name} have long tails: the sigma used is {size:.2g} times the most likely one"
+        for name, size in zip(names.tolist(), wider.tolist(), strict=True)
+        if size > _LONG
+    ]
 
 
 def _ratio(tests: Tested) -> float:
@@ -372,8 +379,9 @@ def _list(names: Array) -> str:
 
 # Late rows.
 
-# Change of the share of late rows that ends turns, well below its error from a thousand rows.
-_SAME = 0.02
+# Turns of fixes and shares, and the change of the share of late rows that ends them, well below its error from a
+# thousand rows.
+_ROUNDS, _SAME = 4, 0.02
 
 
 def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = None) -> LateSignals:

@@ -17,7 +17,8 @@ from optloc.adequacy.score import descend
 from optloc.compute.sums import equations_at
 from optloc.problem.epochs import by_epoch
 from optloc.problem.noise import Block, Noise, variances
-from optloc.quality.levels import levels_of, with_estimated_noise
+from optloc.quality.levels import levels_of
+from optloc.quality.structure import with_estimated_noise
 
 
 def differences(rng, epochs, sigma):

@@ -1,0 +1,76 @@
+"""Standard deviations that bound the tails of errors: real noise is seldom normal at five sigma."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.adequacy.elements import Elements
+from optloc.adequacy.variance_components import Fitted, Tested, tested, without
+from optloc.base.types import Array
+
+# Sizes of a test, standard deviations, at which tails are compared: beyond them are 5 %, 1 % and 0.1 % of normal
+# errors.
+_SIZES = np.array([1.960, 2.576, 3.291])
+# Standard deviations by which a count may exceed its expectation: with three, few clean groups are enlarged.
+_CHANCE = 3.0
+# Share of an error that the residuals must show for its test to count.
+_SHOWN = 1e-3
+# Factors of a variance that are tried: in steps of 5 %, up to sixteen times the standard deviation.
+_FACTORS = np.exp(0.05 * np.arange(112))
+# Turns, and the factor of a variance that counts as none.
+_TURNS, _NONE = 8, 1.05
+
+
+def tail_factors(made: Elements, found: Fitted) -> Array:
+    """Return the factor of the standard deviation of each group (g,) with which a Gaussian bounds its tails.
+
+    With k times the variance theta of an error, its test t / sqrt(T) has the variance 1 + (k - 1) theta T. The factor
+    is the least k that explains the numbers of tests beyond 2, 2.6 and 3.3 sigma: an overbound, as in the
+    integrity of satellite navigation. Each variance grows by the root of its factor, and the tests are repeated until
+    all factors are one: errors that the residuals cannot separate share the excess.
+
+    Parameters
+    ----------
+    made : Elements
+        N linearised problems.
+    found : Fitted
+        Their variances; gross errors are not part of the tails.
+
+    References
+    ----------
+    B. DeCleene, "Defining pseudorange integrity - overbounding", Proc. ION GPS (2000).
+    """
+    variance = np.append(np.nan_to_num(found.variance), 0.0)
+    grown = np.ones(len(variance))
+    for _ in range(_TURNS):
+        tests = without(tested(made, (grown * variance)[made.of_effect]), found.gross)
+        needed = np.array([_needed(tests, made.of_effect == g, v) for g, v in enumerate((grown * variance)[:-1])])
+        if (needed <= _NONE).all():
+            break
+        grown[:-1] *= np.sqrt(needed)
+    return np.sqrt(grown[:-1])
+
+
+def _needed(tests: Tested, own: Array, variance: float) -> float:
+    """Return the least factor of the variance of some errors (N, q) with which normal tails bound theirs."""
+    size = tests.size[:, : tests.errors]
+    own = own & (size * variance > _SHOWN)
+    count = int(own.sum())
+    if not count:
+        return 1.0
+    share, squared = size[own] * variance, tests.vector[:, : tests.errors][own] ** 2 / size[own]
+    expected = count * _beyond()
+    allowed = expected + _CHANCE * np.sqrt(expected) + 1.0
+    for factor in _FACTORS:
+        # Errors of one fix depend on each other; most pairs of errors are of different fixes.
+        beyond = squared[:, None] > _SIZES**2 * (1.0 + (factor - 1.0) * share)[:, None]
+        if (beyond.sum(0) <= allowed).all():
+            return float(factor)
+    return float(_FACTORS[-1])
+
+
+def _beyond() -> Array:
+    """Return the shares of normal errors beyond the sizes (3,)."""
+    from scipy.special import ndtr
+
+    return np.asarray(2.0 * ndtr(-_SIZES))

@@ -1,0 +1,389 @@
+"""Structure of the noise: errors of rows, stations, kinds and epochs, and errors that last."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.adequacy.elements import By, Elements, batch_of, elements, ends_of, kinds_of
+from optloc.adequacy.score import descend
+from optloc.adequacy.variance_components import Fitted, Tested, cleaned, deviance, tested
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.linear.constraints import is_exact
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.quality.levels import (
+    NoiseLevels,
+    fitted,
+    report_levels,
+    shared_grouping,
+    usable,
+    with_noise_levels,
+)
+
+# Standard errors of a correlation from which errors last, and the least correlation that counts: 0.2 widens the
+# interval of a level by 4 %.
+_SURE, _WORTH = 4.0, 0.2
+# Visible share of an error in common below which fixes follow most of it.
+_FOLLOWED = 0.5
+# Fewest pairs of successive epochs for a correlation, and the pairs in one part: its matrices take a few megabytes.
+_PAIRS, _PART = 30, 500
+# Largest correlation: with 1 the interval of a level would be infinite.
+_LASTS = 0.99
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """One structure of the noise, and its likelihood.
+
+    Parameters
+    ----------
+    by : "station", "pair" or "kind"
+        Groups that have a level each.
+    common : "station", "pair" or "kind", optional
+        Whose rows have an error in common in an epoch.
+    levels : int
+        Number of levels that the residuals determine.
+    deviance : float
+        Twice the negative logarithm of the restricted likelihood.
+    price : float
+        Price of the levels: the logarithm of the redundancy for each (Schwarz 1978).
+    """
+
+    by: By
+    common: By | None
+    levels: int
+    deviance: float
+    price: float
+
+    @property
+    def total(self) -> float:
+        """Return deviance and price."""
+        return self.deviance + self.price
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseStructure:
+    """The structure of the noise with the best explanation of the residuals of many fixes.
+
+    Parameters
+    ----------
+    tried : tuple of Tried
+        All structures, the best first.
+    lasting : dict
+        Correlation of the errors of each kind from one epoch to the next, where it is significant.
+    sentences : tuple of str
+        Findings, and errors that residuals cannot show.
+    """
+
+    tried: tuple[Tried, ...]
+    lasting: dict[str, float]
+    sentences: tuple[str, ...]
+
+    @property
+    def by(self) -> By:
+        """Return the groups that have a level each."""
+        return self.tried[0].by
+
+    @property
+    def common(self) -> By | None:
+        """Return the grouping of the errors in common in an epoch; None without them."""
+        return self.tried[0].common
+
+    @property
+    def option(self) -> str:
+        """Return the structure as `--noise-from-data` takes it."""
+        return self.by + ("+epoch" if self.common else "")
+
+
+def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None = None) -> NoiseStructure:
+    """Return the structure of the noise with the least deviance and price, from the residuals of many fixes.
+
+    The structures are levels by kind with and without an error in common of each epoch, and levels by station and by
+    pair. Levels by station and by pair assume independent errors. Where errors last, or an epoch has an error in
+    common, such levels are too small for some stations, and fixes with them are wrong: levels are then by kind.
+
+    Parameters
+    ----------
+    problem : Problem
+        As in `noise_levels`.
+    method : str
+        How to fix; see `solve`.
+    fix : Fix, optional
+        Fixes of `batch_of(problem)` made before.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no fix has redundancy.
+
+    References
+    ----------
+    D. A. Harville, "Maximum likelihood approaches to variance component estimation" (1977), section 3.
+    G. Schwarz, "Estimating the dimension of a model", Annals of Statistics 6 (1978).
+    """
+    from optloc.solvers import solve
+
+    batch = batch_of(problem)
+    if fix is None and batch.layout.size:
+        fix = solve(batch, method)
+    kept, x = usable(batch, fix)
+    return structure_at(batch.take(kept), x, kept, _try(batch.take(kept), x, "kind", None))
+
+
+def structure_at(batch: Problem, x: Array, number: Array, plain: _Candidate) -> NoiseStructure:
+    """Return the structure of the noise at fixes (N, size) of a flat batch, their epochs in `number` (N,)."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1):
+        common = _try(batch, x, "kind", "kind")
+        best = common if common.seen and common.tried.total < plain.tried.total else plain
+        lasting = _lasting(batch, x, number, best)
+        found = [plain, common] if common.seen else [plain]
+        if best is plain and not lasting:
+            found += [_try(batch, x, by, None) for by in _groupings(batch)]
+    tried = tuple(sorted((candidate.tried for candidate in found), key=lambda structure: structure.total))
+    return NoiseStructure(tried, lasting, tuple(_sentences(tried, lasting, common if best is common else None)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A structure with its elements, its fit, and the groups (g,) without evidence."""
+
+    tried: Tried
+    made: Elements
+    fit: Fitted
+    absent: Array
+
+    @property
+    def seen(self) -> bool:
+        """Return whether there is evidence of an error in common."""
+        return bool((self.made.common[:-1] & ~self.absent).any())
+
+
+def _try(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
+    made = elements(batch, x, by, common)
+    return _candidate(made, by, common, *fitted(made, common))
+
+
+def _candidate(made: Elements, by: By, common: By | None, fit: Fitted, absent: Array) -> _Candidate:
+    """Return a structure that was fitted to the residuals."""
+    known = np.isfinite(fit.low) & ~absent
+    levels = int((known & ~fit.shared).sum()) + int((known & fit.shared).any())
+    redundancy = max(int(tested(made, np.ones(())).dof.sum()), 1)
+    price = levels * float(np.log(redundancy))
+    return _Candidate(Tried(by, common, levels, deviance(made, fit), price), made, fit, absent)
+
+
+def _groupings(batch: Problem) -> Iterator[By]:
+    """Yield the groupings of rows that are finer than kinds."""
+    kinds = len(set(kinds_of(batch).tolist()))
+    stations, pairs = (
+        {*ends.name.ravel().tolist()} - {""} for ends in (ends_of(batch, "station"), ends_of(batch, "pair"))
+    )
+    if len(stations) > kinds:
+        yield "station"
+    if pairs != stations and len(pairs) > kinds:
+        yield "pair"
+
+
+def _lasting(batch: Problem, x: Array, number: Array, best: _Candidate) -> dict[str, float]:
+    """Return the correlation of errors of each kind from one epoch to the next, where it is significant."""
+    made = elements(batch, x, "station", "kind" if best.tried.common else None)
+    level = dict(zip(best.made.names, np.nan_to_num(best.fit.variance, nan=1.0).tolist(), strict=True))
+    kinds = _kind_of(batch)
+    kind_of = np.array([kinds.get(name, name) for name in made.names], dtype=object)
+    own_level = [level.get(name, level.get(str(kind), 1.0)) for name, kind in zip(made.names, kind_of, strict=True)]
+    variance = np.array([*own_level, 0.0])
+    _, tests = cleaned(made, variance[made.of_effect])
+    follows = np.flatnonzero(np.diff(number) == 1)
+    parts = [follows[i : i + _PART] for i in range(0, len(follows), _PART)]
+    found = {}
+    for kind in sorted(set(kind_of.tolist())):
+        own = np.flatnonzero(kind_of == kind)
+        sums = [_products(tests, made.of_effect, own, variance, part) for part in parts]
+        product, share = (np.concatenate([one[i] for one in sums] or [np.zeros(0)]) for i in range(2))
+        if np.count_nonzero(share) < _PAIRS:
+            continue
+        size, error = (float(v / share.sum()) for v in (product.sum(), np.sqrt((product**2).sum())))
+        if size > max(_SURE * error, _WORTH):
+            found[kind] = min(size, _LASTS)
+    return found
+
+
+def _kind_of(batch: Problem) -> dict[str, str]:
+    """Return the kind of the rows of each group of stations."""
+    ends, kinds = ends_of(batch, "station").name, kinds_of(batch)
+    return {name: str(kind) for row, kind in zip(ends.tolist(), kinds.tolist(), strict=True) for name in row if name}
+
+
+def _products(tests: Tested, of: Array, own: Array, variance: Array, first: Array) -> tuple[Array, Array]:
+    """Return products of the errors of some groups in successive epochs, and their means at a correlation of one.
+
+    An epoch has the tests t = T e of its errors e, and the next epoch t' = T' e'. The sum of t_g t'_g over groups g is
+    on average the correlation times the sum of T_gh T'_gh theta_h.
+    """
+    here = of[:, :, None] == own
+    vector = np.einsum("nqg,nq->ng", here[first], tests.vector[first, : tests.errors])
+    after = np.einsum("nqg,nq->ng", here[first + 1], tests.vector[first + 1, : tests.errors])
+    matrix, next_matrix = (
+        np.swapaxes(here[i], 1, 2) @ tests.matrix[i][:, : tests.errors, : tests.errors] @ here[i]
+        for i in (first, first + 1)
+    )
+    scale = variance[own]
+    return (vector * after * scale).sum(1), (matrix * next_matrix * scale * scale[:, None]).sum((1, 2))
+
+
+def _sentences(tried: tuple[Tried, ...], lasting: dict[str, float], common: _Candidate | None) -> Iterator[str]:
+    """Yield the findings, and the errors that residuals cannot show."""
+    best = tried[0]
+    if len(tried) > 1:
+        gain = tried[1].total - best.total
+        yield f"{_words(best)} explain the residuals best: deviance {gain:.3g} lower than with {_words(tried[1])}"
+    for kind, size in lasting.items():
+        yield (
+            f"errors of {kind} last: their correlation from one epoch to the next is {size:.2g}, and means of epochs "
+            "are less certain than with independent errors"
+        )
+    if best.common and common is not None:
+        followed = _followed(common)
+        if followed:
+            what = ", ".join(f"{100.0 * share:.0f} % of {name}" for name, share in followed.items())
+            yield f"fixes follow {what}: known places or more stations would show the rest"
+    yield "residuals cannot show an error that shifts all fixes alike: measure at a known place to find it"
+
+
+def _words(one: Tried) -> str:
+    besides = f" and an error in common of each {one.common} in an epoch" if one.common else ""
+    return f"levels of each {one.by}{besides}"
+
+
+def _followed(one: _Candidate) -> dict[str, float]:
+    """Return the share of each error in common that fixes follow, where that is most of it."""
+    q = one.made.of_effect.shape[1]
+    found = {}
+    for g in np.flatnonzero(one.made.common[:-1] & (np.nan_to_num(one.fit.low) > 0.0)):
+        own = one.made.of_effect == g
+        share = float((one.fit.tests.size[:, :q][own] * one.fit.variance[g]).mean())
+        if share < _FOLLOWED:
+            found[one.made.names[g]] = 1.0 - share
+    return found
+
+
+# Fixes and levels that agree.
+
+# Turns of fixes and levels, and the change of all levels that ends them: 2 % is below the standard error that a
+# thousand errors leave (1 / sqrt(2 n)), and each turn fixes every epoch again.
+_ROUNDS, _CLOSE = 4, 0.02
+# Fixes from which turns use only some.
+_SOME = 300
+
+
+def with_estimated_noise(
+    problem: Problem, by: By | None = None, *, common: By | bool | None = None, method: str = "auto"
+) -> tuple[Problem, NoiseLevels]:
+    """Return the problem with its noise from the data, and the levels: fixes and levels are made until they agree.
+
+    Parameters
+    ----------
+    problem : Problem
+        Ratios of its noise within a group are kept; what it states else is only where to begin, but for groups that the
+        data do not tell: they stay as stated.
+    by : "station", "pair" or "kind", optional
+        As in `noise_levels`; None: the result of `noise_structure` at fixes with levels by kind.
+    common, method
+        As in `noise_levels`; `common` counts where `by` is given.
+
+    Raises
+    ------
+    InvalidProblem
+        As `noise_levels`, and where the data do not tell any level.
+    """
+    batch = batch_of(problem)
+    learnt = _agree(problem, batch, by or "kind", shared_grouping(by, common) if by else None, method)
+    if by is not None:
+        return _finished(problem, learnt)
+    plain = _candidate(learnt.made, "kind", None, *learnt.fit)
+    found = structure_at(batch.take(learnt.kept), learnt.x, learnt.kept, plain)
+    if (found.by, found.common) != ("kind", None):
+        learnt = _agree(problem, batch, found.by, found.common, method, learnt)
+    _, levels = _finished(problem, learnt)
+    levels = replace(_widened(levels, found.lasting), sentences=(*found.sentences, *levels.sentences))
+    return with_noise_levels(problem, levels), levels
+
+
+@dataclass(frozen=True, slots=True)
+class _Learnt:
+    """Fixes (n,) of a batch with the noise that their residuals show, linearised there."""
+
+    by: By
+    common: By | None
+    kept: Array
+    x: Array
+    made: Elements
+    fit: tuple[Fitted, Array]
+
+
+def _finished(problem: Problem, learnt: _Learnt) -> tuple[Problem, NoiseLevels]:
+    levels = report_levels(learnt.made, learnt.by, learnt.common, learnt.fit, tails=True)
+    return with_noise_levels(problem, levels), levels
+
+
+def _agree(
+    problem: Problem, batch: Problem, by: By, common: By | None, method: str, before: _Learnt | None = None
+) -> _Learnt:
+    """Return fixes whose noise agrees with their residuals, from earlier fixes or from none."""
+    from optloc.solvers import solve
+
+    if before is None:
+        before_kept, x = usable(batch, solve(batch, method) if batch.layout.size else None)
+    else:
+        before_kept, x = before.kept, before.x
+    # Turns use some of the fixes, spread over all: their levels are good enough to weigh the next fixes.
+    kept, some, factor = before_kept, slice(None, None, max(len(before_kept) // _SOME, 1)), np.ones(1)
+    # Better weights move the fixes, and these the residuals: turns until nothing moves.
+    for turn in range(1 + _ROUNDS):
+        made = elements(batch.take(kept[some]), x[some], by, common)
+        found = fitted(made, common)
+        # Factors are of the stated noise: a level that the data do not determine stays as stated.
+        levels = report_levels(made, by, common, found, tails=False)
+        if np.isnan(levels.low).all():
+            advice = "state a sigma, or add rows, stations or epochs"
+            raise InvalidProblem("the data do not tell the noise", "noise", advice)
+        same = factor.shape == levels.factor.shape
+        if turn == _ROUNDS or (same and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max()):
+            break
+        factor = levels.factor
+        kept, x = _fix_again(batch_of(with_noise_levels(problem, levels)), method, kept, x)
+    if some.step > 1:
+        made = elements(batch.take(kept), x, by, common)
+        found = fitted(made, common)
+    return _Learnt(by, common, kept, x, made, found)
+
+
+def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array, Array]:
+    """Return fixes with other noise: by descent from the earlier fixes, for least squares without bounds."""
+    from optloc.solvers import solve
+
+    if not now.layout.size:
+        return kept, x
+    if method != "auto" or any(not is_exact(constraint) for constraint in now.constraints):
+        return usable(now, solve(now, method))
+    found, cost = descend(now.take(kept), x)
+    finite = np.isfinite(cost) & np.isfinite(found).all(-1)
+    return kept[finite], found[finite]
+
+
+def _widened(levels: NoiseLevels, lasting: dict[str, float]) -> NoiseLevels:
+    """Return levels with the intervals of errors that last: squares of neighbours are correlated by r^2.
+
+    Their mean has (1 + r^2) / (1 - r^2) times the variance of independent squares (Bartlett 1946).
+    """
+    r = np.array([lasting.get(name, 0.0) for name in levels.names])
+    wider = np.sqrt((1.0 + r**2) / (1.0 - r**2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = (levels.factor * (end / levels.factor) ** wider for end in (levels.low, levels.high))
+    return replace(levels, error=levels.error * wider, low=low, high=high)
