@@ -434,7 +434,7 @@ def without(tests: Tested, gross: Array) -> Tested:
 
 
 def deviance(made: Elements, found: Fitted) -> float:
-    """Return twice the negative logarithm of the restricted likelihood, each gross error a free unknown at a price.
+    """Return twice the negative logarithm of the restricted likelihood; a gross row is a free unknown at a price.
 
     It is the likelihood of K' v, K an orthonormal basis of the complement of J. The basis does not depend on the
     variances, so that sets of groups can be compared (Harville 1977, section 3).
@@ -452,10 +452,13 @@ def deviance(made: Elements, found: Fitted) -> float:
     inside = free @ covariance @ np.swapaxes(free, 1, 2) + seen[:, :, None] * np.eye(basis.shape[-1])
     doubled = float(np.linalg.slogdet(inside)[1].sum())
     tests = tested(made, variance)
+    # Each structure may leave out the rows that it explains worst, at one price: a row is no reason for a structure.
+    cut = np.where(made.common[made.of_effect], np.inf, np.sqrt(ROW_PRICE))
+    gross = snooped(tests, slice(0, tests.errors), cut).gross
     items = np.arange(len(variance))
-    order = np.argsort(~found.gross, axis=1, kind="stable")[:, : int(found.gross.sum(1).max(initial=0))]
+    order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
     for column in order.T:
-        out = found.gross[items, column] & (tests.size[items, column] > 0.0)
+        out = gross[items, column] & (tests.size[items, column] > 0.0)
         doubled += float(np.log(tests.size[items, column][out]).sum()) + ROW_PRICE * int(out.sum())
         tests = tests.without(np.where(out, column, -1))
     return doubled + float(tests.cost.sum())

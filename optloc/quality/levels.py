@@ -268,8 +268,7 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
 
 def levels_of(made: Elements, by: By, common: By | None = None, *, tails: bool = True) -> NoiseLevels:
     """Return the noise levels of linearised fixes, with or without a bound of their tails; see `noise_levels`."""
-    found, absent = fitted(made, common)
-    return report_levels(made, by, common, (found, absent), tails=tails)
+    return replace(_report(made, by, *fitted(made, common), tails=tails), common=common)
 
 
 def fitted(made: Elements, shared_by: By | None) -> tuple[Fitted, Array]:
@@ -298,11 +297,8 @@ def _with_their_like(shown: Array, common: Array, by: By | None) -> Array:
     return shown if by == "kind" else common & shown.any()
 
 
-def report_levels(
-    made: Elements, by: By, common: By | None, fitted: tuple[Fitted, Array], *, tails: bool
-) -> NoiseLevels:
+def _report(made: Elements, by: By, found: Fitted, none: Array, *, tails: bool) -> NoiseLevels:
     """Return the levels of all groups with errors, from a fit and the groups (g,) without evidence."""
-    found, none = fitted
     size = len(made.names)
     count, gross = total(made.of_effect, size), total(made.of_effect, size, found.gross)
     used = np.flatnonzero(count)
@@ -331,7 +327,6 @@ def report_levels(
         int((stated.dof > 0).sum()),
         (*_sentences(names, found, redundancy, none), *_tails_in_words(names, wider)),
         wider[used],
-        common,
     )
 
 

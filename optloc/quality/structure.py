@@ -18,7 +18,7 @@ from optloc.problem.problem import Problem
 from optloc.quality.levels import (
     NoiseLevels,
     fitted,
-    report_levels,
+    levels_of,
     shared_grouping,
     usable,
     with_noise_levels,
@@ -131,15 +131,15 @@ def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None =
     if fix is None and batch.layout.size:
         fix = solve(batch, method)
     kept, x = usable(batch, fix)
-    return structure_at(batch.take(kept), x, kept, _try(batch.take(kept), x, "kind", None))
+    return structure_at(batch.take(kept), x, kept)
 
 
-def structure_at(batch: Problem, x: Array, number: Array, plain: _Candidate) -> NoiseStructure:
+def structure_at(batch: Problem, x: Array, number: Array) -> NoiseStructure:
     """Return the structure of the noise at fixes (N, size) of a flat batch, their epochs in `number` (N,)."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
-        common = _try(batch, x, "kind", "kind")
+        plain, common = (_try(batch, x, "kind", shared) for shared in (None, "kind"))
         best = common if common.seen and common.tried.total < plain.tried.total else plain
         lasting = _lasting(batch, x, number, best)
         found = [plain, common] if common.seen else [plain]
@@ -165,12 +165,9 @@ class _Candidate:
 
 
 def _try(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
+    """Return a structure fitted to the residuals."""
     made = elements(batch, x, by, common)
-    return _candidate(made, by, common, *fitted(made, common))
-
-
-def _candidate(made: Elements, by: By, common: By | None, fit: Fitted, absent: Array) -> _Candidate:
-    """Return a structure that was fitted to the residuals."""
+    fit, absent = fitted(made, common)
     known = np.isfinite(fit.low) & ~absent
     levels = int((known & ~fit.shared).sum()) + int((known & fit.shared).any())
     redundancy = max(int(tested(made, np.ones(())).dof.sum()), 1)
@@ -278,8 +275,9 @@ def _followed(one: _Candidate) -> dict[str, float]:
 # Turns of fixes and levels, and the change of all levels that ends them: 2 % is below the standard error that a
 # thousand errors leave (1 / sqrt(2 n)), and each turn fixes every epoch again.
 _ROUNDS, _CLOSE = 4, 0.02
-# Fixes from which turns use only some.
-_SOME = 300
+# Fixes from which turns use only some: 300 fixes give a level to 4 %. Fixes that show the structure, and the length of
+# their stretches: a thousand give a level to 2 %.
+_SOME, _MANY, _STRETCH = 300, 1000, 50
 
 
 def with_estimated_noise(
@@ -305,31 +303,37 @@ def with_estimated_noise(
     batch = batch_of(problem)
     learnt = _agree(problem, batch, by or "kind", shared_grouping(by, common) if by else None, method)
     if by is not None:
-        return _finished(problem, learnt)
-    plain = _candidate(learnt.made, "kind", None, *learnt.fit)
-    found = structure_at(batch.take(learnt.kept), learnt.x, learnt.kept, plain)
+        levels = learnt.levels(batch)
+        return with_noise_levels(problem, levels), levels
+    part = _stretches(len(learnt.kept))
+    found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part])
     if (found.by, found.common) != ("kind", None):
         learnt = _agree(problem, batch, found.by, found.common, method, learnt)
-    _, levels = _finished(problem, learnt)
-    levels = replace(_widened(levels, found.lasting), sentences=(*found.sentences, *levels.sentences))
+    levels = _widened(learnt.levels(batch), found.lasting)
+    levels = replace(levels, sentences=(*found.sentences, *levels.sentences))
     return with_noise_levels(problem, levels), levels
 
 
 @dataclass(frozen=True, slots=True)
 class _Learnt:
-    """Fixes (n,) of a batch with the noise that their residuals show, linearised there."""
+    """Fixes (n,) of a batch with the noise that their residuals show."""
 
     by: By
     common: By | None
     kept: Array
     x: Array
-    made: Elements
-    fit: tuple[Fitted, Array]
+
+    def levels(self, batch: Problem) -> NoiseLevels:
+        """Return the levels from all fixes."""
+        return levels_of(elements(batch.take(self.kept), self.x, self.by, self.common), self.by, self.common)
 
 
-def _finished(problem: Problem, learnt: _Learnt) -> tuple[Problem, NoiseLevels]:
-    levels = report_levels(learnt.made, learnt.by, learnt.common, learnt.fit, tails=True)
-    return with_noise_levels(problem, levels), levels
+def _stretches(count: int) -> Array:
+    """Return the numbers of fixes that show the structure: all, or stretches of successive ones spread over all."""
+    if count <= _MANY:
+        return np.arange(count)
+    first = np.linspace(0, count - _STRETCH, _MANY // _STRETCH).astype(int)
+    return np.unique(first[:, None] + np.arange(_STRETCH))
 
 
 def _agree(
@@ -347,9 +351,8 @@ def _agree(
     # Better weights move the fixes, and these the residuals: turns until nothing moves.
     for turn in range(1 + _ROUNDS):
         made = elements(batch.take(kept[some]), x[some], by, common)
-        found = fitted(made, common)
         # Factors are of the stated noise: a level that the data do not determine stays as stated.
-        levels = report_levels(made, by, common, found, tails=False)
+        levels = levels_of(made, by, common, tails=False)
         if np.isnan(levels.low).all():
             advice = "state a sigma, or add rows, stations or epochs"
             raise InvalidProblem("the data do not tell the noise", "noise", advice)
@@ -358,10 +361,7 @@ def _agree(
             break
         factor = levels.factor
         kept, x = _fix_again(batch_of(with_noise_levels(problem, levels)), method, kept, x)
-    if some.step > 1:
-        made = elements(batch.take(kept), x, by, common)
-        found = fitted(made, common)
-    return _Learnt(by, common, kept, x, made, found)
+    return _Learnt(by, common, kept, x)
 
 
 def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array, Array]:

@@ -1,0 +1,115 @@
+"""All shipped data sets in one table: fixes and tracks with stated and learnt noise. Writes docs/measured/real.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from data.windows import report
+from monte_carlo.tables import ledger
+
+from optloc import InvalidProblem, Problem, Status, datasets, solve
+from optloc.adequacy.elements import batch_of
+from optloc.quality.structure import with_estimated_noise
+
+pytestmark = [pytest.mark.data, pytest.mark.full]
+
+# Standard deviations beyond which an error is far, and the probability from which a fix is likely.
+FAR, LIKELY = 5.0, 0.01
+# A share may fall, and the far ones may rise, by this much before a guard fails: one or two fixes of a small set.
+SLACK = 0.01
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Fixes of a set: their number, the number that is `ok`, that is likely, that is far, and errors in metres."""
+
+    fixes: int
+    ok: int
+    likely: int
+    far: int
+    median: float
+    from_truth: float
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        share = f"{100.0 * self.ok / self.fixes:.1f} %"
+        far = f"{self.far} of {self.likely}"
+        return (str(self.fixes), share, far, f"{self.median:.3g}", f"{self.from_truth:.3g}")
+
+
+def count(problem: Problem, truth: np.ndarray) -> Counts:
+    """Return the counts of the fixes of a problem by `auto`, and the median error of descents from the truth."""
+    batch = batch_of(problem)
+    d, fix = batch.dimension, solve(batch).flat()
+    place = np.broadcast_to(np.asarray(truth).reshape(-1, truth.shape[-1])[:, :d], fix.position.shape)
+    error = fix.position - place
+    cov = fix.gaussian()[1][:, :d, :d]
+    good = (fix.code == Status.OK) & (fix.p_value > LIKELY)
+    squared = np.einsum("ni,nij,nj->n", error[good], np.linalg.pinv(cov[good]), error[good])
+    return Counts(
+        len(error),
+        int((fix.code == Status.OK).sum()),
+        int(good.sum()),
+        int((squared > FAR**2).sum()),
+        float(np.nanmedian(np.linalg.norm(error, axis=1))),
+        float(np.nanmedian(np.linalg.norm(_from_truth(batch, fix.x, place) - place, axis=1))),
+    )
+
+
+def _from_truth(batch: Problem, x: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return the positions of descents that start at the truth; other unknowns start where the fix has them."""
+    start = np.where(np.isfinite(x), x, 0.0)
+    start[:, : place.shape[1]] = place
+    return solve(batch, "lsr", start=start).flat().position
+
+
+def learnt(problem: Problem) -> tuple[Problem, str]:
+    """Return a problem with noise from its data, and the structure of the noise."""
+    try:
+        now, levels = with_estimated_noise(problem)
+    except InvalidProblem:
+        return problem, "not determined"
+    return now, f"learnt: {levels.by}{'+epoch' if levels.common else ''}"
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Options of a set, and guards for stated and for learnt noise: least share `ok`, largest share of far fixes."""
+
+    name: str
+    options: dict[str, object]
+    stated: tuple[float, float]
+    learnt: tuple[float, float]
+
+
+def _mrclam(number: int, kinds: tuple[str, ...]) -> dict[str, object]:
+    return {"number": number, "kinds": kinds}
+
+
+SETS: dict[str, Guard] = {}
+
+
+@pytest.fixture(scope="module")
+def book():
+    header = ("set", "noise", "fixes", "`ok`", "beyond 5 sigma", "median error, m", "from the truth, m")
+    names = [f"{name}, {noise}" for name in SETS for noise in ("stated", "learnt")]
+    with ledger("real", header, names, "every fix by `auto` alone (`test_real.py`)") as made:
+        yield made
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_fixes_of_real_data_keep_their_promise(book, name):
+    guard = SETS[name]
+    data = datasets.load(guard.name, **guard.options)
+    now, structure = learnt(data.problem)
+    for key, noise, problem, limits in (
+        ("stated", "stated", data.problem, guard.stated),
+        ("learnt", structure, now, guard.learnt),
+    ):
+        found = count(problem, data.truth)
+        report(f"{name}, {noise}: {found}")
+        book.add(f"{name}, {key}", noise, *found.cells)
+        assert found.ok >= (limits[0] - SLACK) * found.fixes
+        assert found.far <= (limits[1] + SLACK) * found.likely
