@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.adequacy.elements import Elements
-from optloc.adequacy.variance_components import Fitted, Tested, tested, without
+from optloc.adequacy.variance_components import Fitted, Tested, snooped, tested, without
 from optloc.base.types import Array
 
 # Sizes of a test, standard deviations, at which tails are compared: beyond them are 5 %, 1 % and 0.1 % of normal
@@ -13,6 +13,8 @@ from optloc.base.types import Array
 _SIZES = np.array([1.960, 2.576, 3.291])
 # Standard deviations by which a count may exceed its expectation: with three, few clean groups are enlarged.
 _CHANCE = 3.0
+# Size of a test beyond which an error is gross here.
+_GROSS = 10.0
 # Share of an error that the residuals must show for its test to count.
 _SHOWN = 1e-3
 # Factors of a variance that are tried: in steps of 5 %, up to sixteen times the standard deviation.
@@ -34,16 +36,18 @@ def tail_factors(made: Elements, found: Fitted) -> Array:
     made : Elements
         N linearised problems.
     found : Fitted
-        Their variances; gross errors are not part of the tails.
+        Their variances.
 
     References
     ----------
     B. DeCleene, "Defining pseudorange integrity - overbounding", Proc. ION GPS (2000).
     """
     variance = np.append(np.nan_to_num(found.variance), 0.0)
+    # Errors of five sigma are tails, errors of ten are gross.
+    gross = snooped(tested(made, variance[made.of_effect]), slice(0, made.effect.shape[-1]), _GROSS).gross
     grown = np.ones(len(variance))
     for _ in range(_TURNS):
-        tests = without(tested(made, (grown * variance)[made.of_effect]), found.gross)
+        tests = without(tested(made, (grown * variance)[made.of_effect]), gross)
         needed = np.array([_needed(tests, made.of_effect == g, v) for g, v in enumerate((grown * variance)[:-1])])
         if (needed <= _NONE).all():
             break
