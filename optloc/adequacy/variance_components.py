@@ -212,8 +212,22 @@ def visible(made: Elements, found: Fitted, left: Array) -> Array:
     coupling = information[:, rest]
     own = np.diagonal(information) - ((coupling @ _inverse(information[np.ix_(rest, rest)])) * coupling).sum(1)
     # What the other factors can stand for altogether leaves rounding.
-    told = left & (own > (1.0 - _OWN) ** 2 * np.diagonal(information))
+    told = left & (own > (1.0 - _OWN) ** 2 * np.diagonal(information)) & _determinable(tests, made, found, left)
     return np.asarray(told & (per_fix.sum(0) > _SEEN * np.sqrt(np.where(told, own, 1.0))))
+
+
+# An error in common of three times the rows' sigma must have a level with at most this relative error. Fixes by ranges
+# from one side follow it almost entirely, and residuals would give it any size: thirty times the rows' sigma occurred.
+_TIMES, _RELATIVE = 3.0, 0.25
+
+
+def _determinable(tests: Tested, made: Elements, found: Fitted, left: Array) -> Array:
+    """Return the groups (g,) whose level the data would show if it were a few times the level of the rows."""
+    level = _TIMES**2 * float(np.nanmedian(found.variance[~left]))
+    share = tests.size[:, : tests.errors] * level
+    # The standard error of a log-variance is the root of the inverse information, twice the error of a log-sigma.
+    information = 0.5 * total(made.of_effect, len(left), (share / (1.0 + share)) ** 2)
+    return np.asarray(information * (2.0 * _RELATIVE) ** 2 > 1.0)
 
 
 def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Array) -> _Found:
