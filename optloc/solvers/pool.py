@@ -161,8 +161,6 @@ class Pool:
         Why there is no candidate, where there is none; it counts only there.
     asked : bool
         Whether contradictions were looked into.
-    refuted : str
-        Why the noise of all of them cannot be as stated, or "".
     conclusion : object array (N,), optional
         What explains the data where they contradict each other, an `optloc.solvers.verdict.conclusion.Conclusion`; or
         a `Fix` from outside that stands as it is.
@@ -189,7 +187,6 @@ class Pool:
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
     missing: NoStart | None = None
     asked: bool = False
-    refuted: str = ""
     conclusion: Annotated[Array, Axes(0, empty=None)] | None = None
 
     def __len__(self) -> int:

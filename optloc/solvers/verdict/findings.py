@@ -154,7 +154,7 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
         blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, NOTICED))
     with np.errstate(invalid="ignore"):
         marks: Array = marks_of(
-            improbable | bool(pool.refuted),
+            improbable,
             np.nan if pool.infinity is None else pool.infinity - cost,
             quantile(COVERED, problem.dimension),
             _apart(pool, gap).min(1, initial=np.inf),
@@ -442,7 +442,7 @@ def _name_residuals(finished: Finished, items: Array) -> Any:
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], DOUBT)
     told = tail_probability(pool.cost[items, 0], pool.dof[items])
     said = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in told]
-    return pool.refuted or np.where(improbable, np.array(said, dtype=object), "")
+    return np.where(improbable, np.array(said, dtype=object), "")
 
 
 def _name_infinity(finished: Finished, items: Array) -> Any:
