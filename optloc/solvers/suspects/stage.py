@@ -135,9 +135,7 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
     before = pool.stages
     asked = partial(_explain, present=present, doubted=doubted, by=by)
-    found, louder = asked(problem, judge(problem, pool)), None
-    if together:
-        louder, found = _weigh(problem, pool, asked, found)
+    louder, found = _weigh(problem, pool, asked, together)
     count = sum(len(items) for items, _, _ in found)
     if louder is None:
         pool = _with_conclusions(problem, pool, found)
@@ -183,20 +181,23 @@ class _Louder:
 
 
 def _weigh(
-    problem: Problem, pool: Pool, asked: Callable[[Problem, Fix], _Explained], found: _Explained
+    problem: Problem, pool: Pool, asked: Callable[[Problem, Fix], _Explained], together: bool
 ) -> tuple[_Louder | None, _Explained]:
     """Return the larger noise that is likelier for all problems together, if any, and the explanations with it."""
     fix = judge(problem, pool)
-    louder = _louder(problem, pool, fix)
+    louder = _louder(problem, pool, fix) if together else None
     if louder is None:
-        return None, found
+        return None, asked(problem, fix)
     # with the larger noise a suspect is a row that stands out from it
     other = judge(louder.problem, louder.pool)
     again, present = asked(louder.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
     more = 2.0 * (present @ np.log(louder.sizes)) / np.maximum(present.sum(1), 1.0)
-    if _score(again, other, more) + ROW_PRICE < _score(found, fix, np.zeros(len(more))):
+    score = _score(again, other, more) + ROW_PRICE
+    # with the noise as stated each fix costs what it does, or the price of a row at least
+    if score < np.fmin(fix.cost, ROW_PRICE)[np.isfinite(fix.cost) & (fix.dof > 0)].sum():
         return louder, again
-    return None, found
+    found = asked(problem, fix)
+    return (louder, again) if score < _score(found, fix, np.zeros(len(more))) else (None, found)
 
 
 def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
