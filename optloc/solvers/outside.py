@@ -100,6 +100,7 @@ def accept(problem: Problem, fix: Fix) -> Pool:
         curvature=Curvature(fix.cov, information, known & regular, None, fix.active, fix.local),
         infinity=None if fix.infinity is None else fix.cost + fix.infinity,
         loss="" if np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) else "given",
+        robust=np.asarray(marks & Status.ROBUST.mark != 0),
         searched=searched,
         remark=np.where(fix.code == Status.SEARCHED, fix.reason, ""),
         proven=_claims(fix.claims),

@@ -147,6 +147,8 @@ class Pool:
         otherwise.
     loss : str
         Name of the loss that doubts rows, or "" where all are believed.
+    robust : bool array (N,), optional
+        Where the minima of a loss were searched, the rows that count prove the place, and ellipses of repeats hold.
     searched : bool array (N,), optional
         Where the candidates are the best of a search, not of starts that are known to be safe.
     remark : object array (N,), optional
@@ -180,6 +182,7 @@ class Pool:
     free: Annotated[Array, Axes(0)] | None = None
     pair: Annotated[Array, Axes(2)] | None = None
     loss: str = ""
+    robust: Annotated[Array, Axes(0, empty=False)] | None = None
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None
     proven: Claims | None = None

@@ -1,0 +1,160 @@
+"""What a robust fix may promise: the rows that count prove the place, no single row decides, and ellipses cover."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.adequacy.groups import ROW_PRICE
+from optloc.base import linalg
+from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
+from optloc.linear.evaluate import predict
+from optloc.linear.normal import marginal
+from optloc.linear.redundancy import degrees_of_freedom
+from optloc.problem.chart import quantile
+from optloc.problem.fix import Fix
+from optloc.problem.loss import Loss
+from optloc.problem.problem import Problem
+from optloc.solvers.certify.admitted import certified
+from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, REJECTED
+from optloc.solvers.pool import Pool, begin
+from optloc.solvers.robust.reweighting import Doubt, reweight, robust_equations
+from optloc.solvers.stages import lsr
+from optloc.solvers.verdict.judge import fill, judge, verdict
+from optloc.solvers.verdict.repeats import Repeats, holds, is_repeatable, repeated
+
+# Squared distance in standard deviations up to which the minimum of the loss and that of the rows that count are one
+# answer: with clean data nine in ten are nearer than half of it.
+_NEAR = 1.0
+# Fall of the cost from which leaving a row out is another explanation, and rise up to which taking one back is: as for
+# suspects, of which all within the gap of the best score are listed.
+_OUT, _BACK = ROW_PRICE - AMBIGUOUS_GAP, ROW_PRICE + AMBIGUOUS_GAP
+# Rows of a problem up to which each is left out by itself: of more, one hardly decides, and time grows with the square.
+_ROWS = 64
+# Weighings of a repeated measurement, which begins at its true place.
+_WEIGHINGS = 30
+
+SEARCHED = "the minima of the loss come from a search: that there is no other is not proven"
+NEEDS = "only one resting position without constraints is checked against its rows"
+
+
+def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
+    """Return settled pools of a loss with what their best minima may promise, and why others may not.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    loss : Loss
+        Whose minima they are.
+    pool : Pool
+        Settled, by a search of all starts.
+    """
+    curvature, count = pool.curvature, len(pool)
+    assert curvature is not None
+    kept, remark = np.zeros(count, dtype=bool), fill(count, SEARCHED)
+    pool = replace(pool, robust=kept, remark=remark)
+    if problem.constraints or problem.count > _ROWS or not is_repeatable(problem):
+        return replace(pool, remark=fill(count, NEEDS))
+    fix = judge(problem, pool)
+    present = np.broadcast_to(problem.weight, pool.weights.shape) > 0.0
+    doubted = present & (pool.weights < REJECTED * problem.weight)
+    spent = doubted.sum(1)
+    left = degrees_of_freedom(problem.with_rows(weight=np.where(doubted, 0.0, problem.weight)))
+    sole = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.CONTRADICTORY)
+    # the rows that count name the doubted ones, and one more would show another choice
+    checked = left > spent
+    for i in np.flatnonzero(sole & ~checked):
+        remark[i] = f"redundancy {left[i]} without {spent[i]} doubted rows: another choice of them would not be noticed"
+    items = np.flatnonzero(sole & checked)
+    if not len(items):
+        return pool
+    part, out = problem.take(items), doubted[items]
+    good, told, repeats = _examine(part, loss, fix.x[items], out)
+    kept[items], remark[items] = good, told
+    found = np.full((count, 3), np.nan)
+    found[items] = repeats
+    return replace(pool, curvature=replace(curvature, repeats=found))
+
+
+def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Array, Array, Array]:
+    """Return which fixes (N,) keep the promise, reasons (N,) why others do not, and shares of repeats (N, 3)."""
+    rest = problem.with_rows(weight=np.where(doubted, 0.0, problem.weight))
+    fix = verdict(rest, certified(rest, lsr(rest, begin(rest, x))))
+    reason, repeats = fill(len(x), ""), np.full((len(x), 3), np.nan)
+    good = fix.code == Status.OK
+    for i in np.flatnonzero(~good):
+        reason[i] = f"the rows that count do not prove the place: {fix[int(i)].status.label}"
+    apart = _squared(fix, x - fix.x)
+    far = good & ~(apart <= _NEAR)
+    reason[far] = "the minimum of the loss is not that of the rows that count: the doubted rows pull at it"
+    good &= ~far
+    items = np.flatnonzero(good)
+    single = items[_decides(problem.take(items), fix[items], doubted[items])]
+    reason[single] = "a single measurement decides: with it the place is another than without it"
+    good[single] = False
+    items = np.flatnonzero(good)
+    if len(items):
+        repeats[items] = _repeat(problem.take(items), loss, fix[items], doubted[items])
+        held = holds(repeats)
+        reason[good & ~held] = "the ellipses of repeated measurements do not hold their places"
+        good &= held
+    return good, reason, repeats
+
+
+def _squared(fix: Fix, step: Array) -> Array:
+    """Return squared lengths (N,) of steps of vectors (N, size) in the covariances of fixes, shared unknowns alone."""
+    n = fix.cov.shape[-1]
+    with np.errstate(all="ignore"):
+        return np.asarray((step[:, :n] * linalg.solve(fix.cov, step[:, :n, None])[0][..., 0]).sum(-1))
+
+
+def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
+    """Return where leaving out one row, or taking one back, is another explanation with another place, (N,).
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems with all rows.
+    fix : Fix
+        Of the rows that count.
+    doubted : bool array (N, m)
+        The other rows.
+    """
+    item, row = np.nonzero(np.broadcast_to(problem.weight, doubted.shape) > 0.0)
+    out = np.zeros(len(doubted), dtype=bool)
+    if not len(item):
+        return out
+    changed = np.array(doubted[item])
+    changed[np.arange(len(item)), row] ^= True
+    part = problem.take(item)
+    part = part.with_rows(weight=np.where(changed, 0.0, part.weight))
+    with np.errstate(all="ignore"):
+        done = refine(part, fix.x[item])
+        more, back = done.cost - fix.cost[item], doubted[item, row]
+        open_ = np.where(back, more < _BACK, more < -_OUT)
+        slot, _ = problem.layout.find("position")
+        where = slice(slot.start, slot.start + slot.size)
+        step = (done.x - fix.x[item])[:, where]
+        spread = fix.cov[item][:, where, where]
+        moved = (step * linalg.solve(spread, step[..., None])[0][..., 0]).sum(-1)
+    elsewhere = ~(moved <= quantile(COVERED, problem.dimension)) & (done.status == Status.OK)
+    out[item[open_ & elsewhere]] = True
+    return out
+
+
+def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:
+    """Return shares of repeats of the loss whose ellipses hold their places, and an inflation, (N, 3)."""
+    z = np.where(doubted, problem.observed - predict(problem, fix.x), 0.0)
+    return repeated(problem, fix.x, fix.cov, lambda many, truth: _refit(many, loss, truth), z)
+
+
+def _refit(problem: Problem, loss: Loss, truth: Array) -> Repeats:
+    """Return the minima of a loss next to true places, and covariances."""
+    doubt = Doubt.of(problem, truth)
+    done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS)
+    information, _, ok = marginal(robust_equations(loss, problem, doubt, done.x, done.weight))
+    spread, regular = linalg.inverse(information)
+    return Repeats(done.x, spread, ok & regular & (done.status == Status.OK))
