@@ -376,8 +376,8 @@ _SENTENCES: dict[Status, str] = {
     Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
     Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
     Status.TAILS: "The 95 % figures hold, as repeats of the measurement show; the 99.9 % region does not.",
-    Status.ROBUST: "The rows that count prove the position; that no other choice of doubted rows explains the data "
-    "comes from a search, not from a proof.",
+    Status.ROBUST: "The rows that keep their weight prove the position; a search, not a proof, found no other rows to "
+    "reject that explain the data.",
     Status.RESCALED: "The fixes of the batch show that the noise is larger than stated; cost and covariance use the "
     "larger noise.",
 }

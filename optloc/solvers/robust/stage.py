@@ -102,7 +102,7 @@ class Robust:
     loss : Loss
         For instance ``LOSSES["cauchy"]``.
     states : bool
-        Whether to look into what its minima may promise, where it has searched for them.
+        Whether to test the minima that it has searched for, so that fixes may be `ok`.
     """
 
     loss: Loss

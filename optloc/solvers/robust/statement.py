@@ -1,4 +1,4 @@
-"""What a robust fix may promise: the rows that count prove the place, no single row decides, and ellipses cover."""
+"""Tests of a robust fix before it is `ok`: a proof by the rows that count, single rows, and repeats."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import fill, judge, verdict
 from optloc.solvers.verdict.repeats import Repeats, holds, is_repeatable, repeated
 
-# Squared distance in standard deviations up to which the minimum of the loss and that of the rows that count are one
+# Squared distance in standard deviations up to which the minima of the loss and of the rows that count are one
 # answer: with clean data nine in ten are nearer than half of it.
 _NEAR = 1.0
 # Fall of the cost from which leaving a row out is another explanation, and rise up to which taking one back is: as for
@@ -36,12 +36,12 @@ _ROWS = 64
 # Weighings of a repeated measurement, which begins at its true place.
 _WEIGHINGS = 30
 
-SEARCHED = "the minima of the loss come from a search: that there is no other is not proven"
+SEARCHED = "the minima of the loss come from a search, without a proof"
 NEEDS = "only one resting position without constraints is checked against its rows"
 
 
 def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
-    """Return settled pools of a loss with what their best minima may promise, and why others may not.
+    """Return settled pools of a loss with marks of the minima that pass all tests, and reasons for the others.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
 
 
 def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Array, Array, Array]:
-    """Return which fixes (N,) keep the promise, reasons (N,) why others do not, and shares of repeats (N, 3)."""
+    """Return flags (N,) of fixes that pass, reasons (N,) of the others, and shares of repeats (N, 3)."""
     rest = problem.with_rows(weight=np.where(doubted, 0.0, problem.weight))
     fix = verdict(rest, certified(rest, lsr(rest, begin(rest, x))))
     reason, repeats = fill(len(x), ""), np.full((len(x), 3), np.nan)
@@ -89,7 +89,7 @@ def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Ar
         reason[i] = f"the rows that count do not prove the place: {fix[int(i)].status.label}"
     apart = _squared(fix, x - fix.x)
     far = good & ~(apart <= _NEAR)
-    reason[far] = "the minimum of the loss is not that of the rows that count: the doubted rows pull at it"
+    reason[far] = "the rows that count have another minimum: the rejected rows still pull at this one"
     good &= ~far
     items = np.flatnonzero(good)
     single = items[_decides(problem.take(items), fix[items], doubted[items])]
@@ -112,7 +112,7 @@ def _squared(fix: Fix, step: Array) -> Array:
 
 
 def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
-    """Return where leaving out one row, or taking one back, is another explanation with another place, (N,).
+    """Return flags (N,) of problems where one row more or less is another explanation with another place.
 
     Parameters
     ----------

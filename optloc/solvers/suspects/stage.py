@@ -188,7 +188,7 @@ def _weigh(
     louder = _louder(problem, pool, fix) if together else None
     if louder is None:
         return None, asked(problem, fix)
-    # with the larger noise a suspect is a row that stands out from it
+    # with the larger noise fewer rows are suspects
     other = judge(louder.problem, louder.pool)
     again, present = asked(louder.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
     more = 2.0 * (present @ np.log(louder.sizes)) / np.maximum(present.sum(1), 1.0)

@@ -147,7 +147,7 @@ class _Request:
 
 
 def explain(alike: Sequence[Alike]) -> list[list[Outcome]]:
-    """Return what explains each problem: all sets of groups within the gap of the best.
+    """Return the explanations of each problem: all sets of groups within the gap of the best.
 
     Sets of one, of two and so on are tried, as long as their prices alone do not exceed what has been found, the rest
     has redundancy, and they are few enough. Rests of all problems of a batch are fixed together.
@@ -168,7 +168,7 @@ def explain(alike: Sequence[Alike]) -> list[list[Outcome]]:
 
 
 def _search(alike: Alike) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
-    """Yield the sets to be tried, size by size, and return what explains each problem."""
+    """Yield the sets to be tried, size by size, and return the outcomes (N,)."""
     groups, whole, count = alike.groups, alike.whole, alike.batch.count
     prices = np.cumsum(np.sort([group.price for group in groups]))
     rests = [[rest_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes(whole))]
@@ -266,7 +266,7 @@ def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], 
 
 
 def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Tried]]]:
-    """Return what the sets of each request say about each of its problems."""
+    """Return the results of the sets of each request for each of its problems."""
     out = {number: [[_Tried([], {}) for _ in one.items] for one in requests] for number, requests in asked.items()}
     pairs: dict[Any, list[_Pair]] = {}
     # problems of a batch have the same priors and unknowns: sets that change the same ones are fixed together
@@ -297,7 +297,7 @@ class _Pair(NamedTuple):
 
 
 def _try_pairs(pairs: Sequence[_Pair]) -> None:
-    """Note what the rests of some problems say: those that pass near the best, probabilities, cheapest and least."""
+    """Store the rests that pass near the best, the probabilities, the cheapest rests and the least scores."""
     alike, others = pairs[0].alike, sorted(pairs[0].left[2])
     items = np.array([pair.alike.items[pair.item] for pair in pairs])
     rows, changed = np.stack([pair.left[1] for pair in pairs]), [alike.groups[i] for i in others]
@@ -358,7 +358,7 @@ def fix_rest(problem: Problem) -> Fix:
 
 
 def _is_proven(problem: Problem, pool: Pool) -> Array:
-    """Return where a short proof shows that all minima within the listed gap are known, (N,)."""
+    """Return flags (N,) of rests of which a short proof shows that all minima within the listed gap are known."""
     if not enabled() or problem.constraints or is_run(problem) or is_scaled(problem):
         return np.zeros(len(pool), dtype=bool)
     told = certified(problem, pool, effort=_SHORT).proven

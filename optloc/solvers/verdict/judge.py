@@ -351,7 +351,7 @@ def judge(problem: Problem, pool: Pool) -> Fix:
 
 
 def _concluded(problem: Problem, item: int, told: Conclusion | Fix) -> Fix:
-    """Return the fix, a flat batch of one, that stands in the place of that of an item."""
+    """Return the fix of an item with a conclusion, a flat batch of one."""
     return told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([item])), told)
 
 

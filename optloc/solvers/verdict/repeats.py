@@ -81,7 +81,7 @@ def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
 
 
 class Repeats(NamedTuple):
-    """What M repeated measurements give: vectors (M, size), covariances (M, n, n), and which of them end, (M,)."""
+    """Fixes of M repeated measurements: vectors (M, size), covariances (M, n, n), and flags (M,) of finished ones."""
 
     x: Array
     spread: Array
