@@ -18,10 +18,11 @@ from optloc.problem.fix import Fix
 from optloc.problem.loss import Loss
 from optloc.problem.problem import Problem
 from optloc.solvers.certify.admitted import certified
-from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, REJECTED
+from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, NOTICED, REJECTED
 from optloc.solvers.pool import Pool, begin
 from optloc.solvers.robust.reweighting import Doubt, reweight, robust_equations
 from optloc.solvers.stages import lsr
+from optloc.solvers.verdict.findings import is_improbable
 from optloc.solvers.verdict.judge import fill, judge, verdict
 from optloc.solvers.verdict.repeats import Repeats, holds, is_repeatable, repeated
 
@@ -33,6 +34,8 @@ _NEAR = 1.0
 _OUT, _BACK = ROW_PRICE - AMBIGUOUS_GAP, ROW_PRICE + AMBIGUOUS_GAP
 # Rows of a problem up to which each is left out by itself: of more, one hardly decides, and time grows with the square.
 _ROWS = 64
+# Rows of changed problems that are refined at a time: 10 MB.
+_TOGETHER = 2**12
 # Weighings of a repeated measurement, which begins at its true place.
 _WEIGHINGS = 30
 
@@ -87,6 +90,10 @@ def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Ar
     good = fix.code == Status.OK
     for i in np.flatnonzero(~good):
         reason[i] = f"the rows that count do not prove the place: {fix[int(i)].status.label}"
+    # rejected rows may be too few of the wrong ones: then the rest hardly fits
+    poor = good & doubted.any(1) & is_improbable(fix.cost, fix.dof, NOTICED)
+    reason[poor] = "the rows that count hardly agree: p is below 0.01"
+    good &= ~poor
     apart = _squared(fix, x - fix.x)
     far = good & ~(apart <= _NEAR)
     reason[far] = "the rows that count have another minimum: the rejected rows still pull at this one"
@@ -114,6 +121,8 @@ def _squared(fix: Fix, step: Array) -> Array:
 def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
     """Return flags (N,) of problems where one row more or less is another explanation with another place.
 
+    Each row is left out or taken back by itself, and each rejected row is exchanged for each of the others.
+
     Parameters
     ----------
     problem : Problem
@@ -123,26 +132,42 @@ def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
     doubted : bool array (N, m)
         The other rows.
     """
-    item, row = np.nonzero(np.broadcast_to(problem.weight, doubted.shape) > 0.0)
+    item, change, limit = _changes(np.broadcast_to(problem.weight, doubted.shape) > 0.0, doubted)
     out = np.zeros(len(doubted), dtype=bool)
-    if not len(item):
-        return out
-    changed = np.array(doubted[item])
-    changed[np.arange(len(item)), row] ^= True
-    part = problem.take(item)
-    part = part.with_rows(weight=np.where(changed, 0.0, part.weight))
-    with np.errstate(all="ignore"):
-        done = refine(part, fix.x[item])
-        more, back = done.cost - fix.cost[item], doubted[item, row]
-        open_ = np.where(back, more < _BACK, more < -_OUT)
-        slot, _ = problem.layout.find("position")
-        where = slice(slot.start, slot.start + slot.size)
-        step = (done.x - fix.x[item])[:, where]
-        spread = fix.cov[item][:, where, where]
-        moved = (step * linalg.solve(spread, step[..., None])[0][..., 0]).sum(-1)
-    elsewhere = ~(moved <= quantile(COVERED, problem.dimension)) & (done.status == Status.OK)
-    out[item[open_ & elsewhere]] = True
+    step = max(1, _TOGETHER // problem.count)
+    for first in range(0, len(item), step):
+        own, some = item[first : first + step], slice(first, first + step)
+        part = problem.take(own)
+        part = part.with_rows(weight=np.where(doubted[own] ^ change[some], 0.0, part.weight))
+        with np.errstate(all="ignore"):
+            done = refine(part, fix.x[own])
+            as_good = (done.cost - fix.cost[own] < limit[some]) & (done.status == Status.OK)
+        moved = _squared_position(problem, fix[own], done.x - fix.x[own])
+        out[own[as_good & ~(moved <= quantile(COVERED, problem.dimension))]] = True
     return out
+
+
+def _changes(present: Array, doubted: Array) -> tuple[Array, Array, Array]:
+    """Return the problems (M,) of changes, the rows (M, m) that these move, and how far the cost (M,) may rise."""
+    item, row = np.nonzero(present)
+    change = np.zeros((len(item), present.shape[1]), dtype=bool)
+    change[np.arange(len(item)), row] = True
+    limit = np.where(doubted[item, row], _BACK, -_OUT)
+    swapped, back, out = np.nonzero(doubted[:, :, None] & (present & ~doubted)[:, None, :])
+    more = np.zeros((len(swapped), present.shape[1]), dtype=bool)
+    more[np.arange(len(swapped)), back] = more[np.arange(len(swapped)), out] = True
+    # both leave out the same number of rows: the costs alone decide
+    limits = np.concatenate([limit, np.full(len(swapped), AMBIGUOUS_GAP)])
+    return np.concatenate([item, swapped]), np.concatenate([change, more]), limits
+
+
+def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
+    """Return squared lengths (N,) of steps (N, size) of positions in the covariances of fixes."""
+    slot, _ = problem.layout.find("position")
+    where = slice(slot.start, slot.start + slot.size)
+    with np.errstate(all="ignore"):
+        solved = linalg.solve(fix.cov[:, where, where], step[:, where, None])[0][..., 0]
+        return np.asarray((step[:, where] * solved).sum(-1))
 
 
 def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:

@@ -52,6 +52,9 @@ from optloc.solvers.verdict.judge import failed, fill, judge, standing, verdict
 _HALF = 0.5
 # Minima of a loss from which who is wrong is sought: an image in the plane of the stations has another beside it.
 _MINIMA = 4
+# Median costs per degree of freedom beyond which a fix is left out where the noise level is sought: noise of any size
+# exceeds it in 3 % of fixes with redundancy one, and hardly ever with more.
+_GROSS = 10.0
 # No other choice of rows helps these.
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
 
@@ -208,8 +211,14 @@ def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
     """
     if problem.epochs > 1 or len(fix.x) < SEVERAL:
         return None
-    batch = batch_of(problem)
-    level = common_level_at(batch, restore_order(batch.layout, problem.layout, fix.x))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        each = fix.cost / fix.dof
+        # a liar has a large cost relative to the other fixes, for noise of any size
+        kept = np.flatnonzero((fix.dof > 0) & (each <= _GROSS * np.median(each[np.isfinite(each) & (fix.dof > 0)])))
+    if len(kept) < SEVERAL:
+        return None
+    batch = batch_of(problem.take(kept))
+    level = common_level_at(batch, restore_order(batch.layout, problem.layout, fix.x[kept]))
     grown = level.factor > 1.0
     if not level.refutes or not np.isfinite(level.high[grown]).all():
         return None
