@@ -20,7 +20,9 @@ from optloc.cli import app
 from optloc.problem.loss import LOSSES
 from optloc.problem.noise import Block, Noise
 from optloc.solvers import pool
+from optloc.solvers.outside import accept
 from optloc.solvers.robust.reweighting import Doubt, reweight
+from optloc.solvers.verdict.judge import judge
 
 REDESCENDING = ("cauchy", "truncated")
 
@@ -140,6 +142,16 @@ def test_a_loss_next_to_a_start_promises_nothing():
     for fix in (solve(case.problem, "cauchy", start=own.x), solve(case.problem, "gtrs+cauchy")):
         assert (fix.code == Status.UNPROVEN).all()
         assert not fix.has(Status.ROBUST).any()
+
+
+@pytest.mark.parametrize("name", REDESCENDING)
+def test_an_accepted_fix_keeps_its_findings(name):
+    case = spoilt("toa", 40, 8, bad=1, size=30.0, seed=21)
+    fix = solve(case.problem, name)
+    again = judge(case.problem, accept(case.problem, fix))
+    assert (again.code == fix.code).all()
+    assert (again.has(Status.ROBUST) == fix.has(Status.ROBUST)).all()
+    assert all(again.reason[again.code == Status.UNPROVEN])
 
 
 def test_the_sheet_names_the_search():

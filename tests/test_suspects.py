@@ -20,8 +20,10 @@ from optloc.adequacy.groups import groups_of
 from optloc.cli import app
 from optloc.compute.least_squares import refine
 from optloc.problem.arrivals import as_arrivals, restore_order
+from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.suspects import subsets
+from optloc.solvers.verdict.judge import judge
 
 RNG = np.random.default_rng(20251121)
 STATIONS = RNG.uniform(-0.5, 0.5, (8, 3)) * [10e3, 10e3, 6e3]
@@ -266,6 +268,16 @@ def test_understated_noise_is_rescaled_and_no_station_is_named(kind, noise, batc
     assert good > 0.7 * trials * batches
     assert inside >= binom.ppf(1e-3, good, 0.95)
     assert accused <= binom.isf(1e-3, trials * batches, 0.03)
+
+
+def test_an_accepted_fix_with_larger_noise_stays_as_it_is():
+    case = spoilt("range", 20, 8, seed=5, noise=3.0)
+    fix = solve(case.problem, "robust")
+    again = judge(case.problem, accept(case.problem, fix))
+    assert fix.has(Status.RESCALED).all()
+    assert again.has(Status.RESCALED).all()
+    np.testing.assert_array_equal(again.code, fix.code)
+    np.testing.assert_allclose(again.cov, fix.cov)
 
 
 def test_a_refuted_fix_stays_refuted_with_the_larger_noise():

@@ -468,8 +468,9 @@ def _name_search(finished: Finished, items: Array) -> Any:
 
 
 def _name_proof(finished: Finished, items: Array) -> Any:
-    if finished.pool.robust is not None and finished.pool.remark is not None:
-        return finished.pool.remark[items]
+    pool = finished.pool
+    if pool.loss and pool.robust is not None and pool.remark is not None:
+        return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
     told = finished.proven.reason[items]
     return NOT_TRIED if finished.pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
 
