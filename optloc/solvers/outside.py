@@ -90,7 +90,7 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     robust = marks & Status.ROBUST.mark != 0
     whole = np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) and not robust.any()
     verbatim = ~fix.answered if fix.explanations is None else ~fix.answered | (_lengths(fix.explanations) > 0)
-    # its noise is not that of the problem
+    # it has another noise than the problem
     verbatim = verbatim | (marks & Status.RESCALED.mark != 0)
     return Pool(
         x,
