@@ -96,7 +96,7 @@ def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Ar
     good &= ~poor
     apart = _squared(fix, x - fix.x)
     far = good & ~(apart <= _NEAR)
-    reason[far] = "the rows that count have another minimum: the rejected rows still pull at this one"
+    reason[far] = "the rows that count have another minimum: doubted rows still pull at this one"
     good &= ~far
     items = np.flatnonzero(good)
     single = items[_decides(problem.take(items), fix[items], doubted[items])]
