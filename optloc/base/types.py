@@ -316,6 +316,8 @@ class Status(IntEnum):
     UNREFINED = 17
     UNCHECKED = 18
     TAILS = 19
+    ROBUST = 20
+    RESCALED = 21
 
     def __str__(self) -> str:
         """Return the label: what `print` shows."""
@@ -374,6 +376,10 @@ _SENTENCES: dict[Status, str] = {
     Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
     Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
     Status.TAILS: "The 95 % figures hold, as repeats of the measurement show; the 99.9 % region does not.",
+    Status.ROBUST: "The rows that keep their weight prove the position; a search, not a proof, found no other rows to "
+    "reject that explain the data.",
+    Status.RESCALED: "The fixes of the batch show that the noise is larger than stated; cost and covariance use the "
+    "larger noise.",
 }
 
 PRECEDENCE = (
@@ -400,7 +406,7 @@ PRECEDENCE = (
 )
 """Which of all that applies to a fix is its status: the first of these."""
 
-NOTES = (Status.UNCHECKED, Status.TAILS)
+NOTES = (Status.UNCHECKED, Status.TAILS, Status.ROBUST, Status.RESCALED)
 """Findings that are never a status: they stand beside one, `ok` included."""
 
 ANSWERED = (

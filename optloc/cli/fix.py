@@ -109,12 +109,13 @@ def run_fix(
         return 0 if found.passes(allow) else 1
     # many statuses are told by their own sentence; causes take a search, which only readers need
     level = rescaled or _level_of(found)
+    used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
     signals = signals or _late_of(found)
     told = advice_for_fixes(found)
     other = _explain(found, method) if explain else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
-        noise_found |= {} if level is None else {"noise_level": level_json(level, rescaled is not None)}
+        noise_found |= {} if level is None else {"noise_level": level_json(level, used)}
         noise_found |= {"explained": explained_json(found, other)} if explain else {}
         noise_found |= {} if signals is None else {"late_signals": late_json(signals, late)}
         write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
@@ -125,7 +126,7 @@ def run_fix(
         if explain:
             _show_explained(found, other, console)
         if level is not None or signals is not None:
-            say_all(console, tell_level(level, rescaled is not None, signals, late))
+            say_all(console, tell_level(level, used, signals, late))
         if levels is not None:
             _show_levels(levels, console)
     return 0 if found.passes(allow) else 1

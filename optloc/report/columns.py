@@ -22,6 +22,8 @@ Columns = dict[str, Array]
 
 UNCHECKED = "no redundancy: a wrong measurement would not be noticed"
 TAILS = "the 95 % figures hold, the 99.9 % region does not"
+ROBUST = "the minima of the loss were found by a search"
+RESCALED = "the noise is larger than stated"
 """The sentence beside the status of a fix that nothing checks."""
 
 _RATES = {"velocity": "v", "acceleration": "a"}

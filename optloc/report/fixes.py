@@ -25,6 +25,8 @@ from optloc.problem.determined import Determined
 from optloc.problem.fix import Active, Fix, Suspect
 from optloc.problem.problem import Problem
 from optloc.report.columns import (
+    RESCALED,
+    ROBUST,
     TAILS,
     UNCHECKED,
     Columns,
@@ -97,7 +99,8 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Shee
     """
     columns = fix_columns(fix) if columns is None else columns
     verdict, reason = Status(int(fix.code)), str(fix.reason[()] or "")
-    notes = [UNCHECKED] * fix.unchecked + [TAILS] * bool(fix.has(Status.TAILS))
+    noted = {Status.TAILS: TAILS, Status.ROBUST: ROBUST, Status.RESCALED: RESCALED}
+    notes = [UNCHECKED] * fix.unchecked + [words for note, words in noted.items() if fix.has(note)]
     told = [("status", "; ".join([verdict.label, *notes])), ("", verdict.sentence)]
     told += [("reason", reason)] if reason else []
     others = [one.label for one in fix.findings if one is not verdict and one not in NOTES]

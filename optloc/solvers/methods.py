@@ -167,12 +167,12 @@ class _Derived(dict[str, Entry]):
 
     def __missing__(self, name: str) -> Entry:
         loss = LOSSES[name]
-        return _start(Robust(loss), loss.summary)
+        return _start(Robust(loss, states=True), loss.summary)
 
 
 def _derive() -> Mapping[str, Entry]:
     """Return the stages that follow from other tables: of each loss, and of each start of a formulation."""
-    out = _Derived({name: _start(Robust(loss), loss.summary) for name, loss in LOSSES.items()})
+    out = _Derived({name: _start(Robust(loss, states=True), loss.summary) for name, loss in LOSSES.items()})
     for formulation in FORMULATIONS.values():
         for word in formulation.starts:
             out.setdefault(word, _start(stages.start_with(word), formulation.summary))

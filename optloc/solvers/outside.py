@@ -87,7 +87,11 @@ def accept(problem: Problem, fix: Fix) -> Pool:
         information[held], regular[held] = np.linalg.pinv(covariance[held], _HELD, hermitian=True), True
     marks = np.zeros(len(fix.code), dtype=int) if fix.marks is None else fix.marks
     searched = (fix.code == Status.SEARCHED) | (marks & Status.SEARCHED.mark != 0)
+    robust = marks & Status.ROBUST.mark != 0
+    whole = np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) and not robust.any()
     verbatim = ~fix.answered if fix.explanations is None else ~fix.answered | (_lengths(fix.explanations) > 0)
+    # it has another noise than the problem
+    verbatim = verbatim | (marks & Status.RESCALED.mark != 0)
     return Pool(
         x,
         np.where(np.isfinite(cost), cost, np.inf),
@@ -99,7 +103,8 @@ def accept(problem: Problem, fix: Fix) -> Pool:
         refined=True,
         curvature=Curvature(fix.cov, information, known & regular, None, fix.active, fix.local),
         infinity=None if fix.infinity is None else fix.cost + fix.infinity,
-        loss="" if np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) else "given",
+        loss="" if whole else "given",
+        robust=robust if robust.any() else None,
         searched=searched,
         remark=np.where(fix.code == Status.SEARCHED, fix.reason, ""),
         proven=_claims(fix.claims),

@@ -147,6 +147,8 @@ class Pool:
         otherwise.
     loss : str
         Name of the loss that doubts rows, or "" where all are believed.
+    robust : bool array (N,), optional
+        Where the minima of a loss were searched, the rows that count prove the place, and ellipses of repeats hold.
     searched : bool array (N,), optional
         Where the candidates are the best of a search, not of starts that are known to be safe.
     remark : object array (N,), optional
@@ -161,8 +163,6 @@ class Pool:
         Why there is no candidate, where there is none; it counts only there.
     asked : bool
         Whether contradictions were looked into.
-    refuted : str
-        Why the noise of all of them cannot be as stated, or "".
     conclusion : object array (N,), optional
         What explains the data where they contradict each other, an `optloc.solvers.verdict.conclusion.Conclusion`; or
         a `Fix` from outside that stands as it is.
@@ -182,6 +182,7 @@ class Pool:
     free: Annotated[Array, Axes(0)] | None = None
     pair: Annotated[Array, Axes(2)] | None = None
     loss: str = ""
+    robust: Annotated[Array, Axes(0, empty=False)] | None = None
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None
     proven: Claims | None = None
@@ -189,7 +190,6 @@ class Pool:
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
     missing: NoStart | None = None
     asked: bool = False
-    refuted: str = ""
     conclusion: Annotated[Array, Axes(0, empty=None)] | None = None
 
     def __len__(self) -> int:

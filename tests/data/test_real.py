@@ -84,11 +84,19 @@ class Guard:
     learnt: tuple[float, float]
 
 
-def _mrclam(number: int, kinds: tuple[str, ...]) -> dict[str, object]:
-    return {"number": number, "kinds": kinds}
-
-
-SETS: dict[str, Guard] = {}
+BEARINGS, BOTH, RANGES = ("azimuth",), ("azimuth", "range"), ("range",)
+SETS = {
+    "MRCLAM 1, bearings": Guard("mrclam", {"number": 1, "kinds": BEARINGS}, (0.82, 0.0), (0.99, 0.0)),
+    "MRCLAM 2, bearings": Guard("mrclam", {"number": 2, "kinds": BEARINGS}, (0.87, 0.0), (0.93, 0.0)),
+    "MRCLAM 5, bearings": Guard("mrclam", {"number": 5, "kinds": BEARINGS}, (0.70, 0.0), (0.95, 0.005)),
+    "MRCLAM 1, bearings and ranges": Guard("mrclam", {"number": 1, "kinds": BOTH}, (1.0, 0.002), (1.0, 0.0)),
+    "MRCLAM 2, bearings and ranges": Guard("mrclam", {"number": 2, "kinds": BOTH}, (0.97, 0.003), (0.97, 0.004)),
+    "MRCLAM 5, bearings and ranges": Guard("mrclam", {"number": 5, "kinds": BOTH}, (0.99, 0.005), (0.99, 0.002)),
+    "MRCLAM 1, ranges": Guard("mrclam", {"number": 1, "kinds": RANGES}, (0.65, 0.0), (0.68, 0.0)),
+    "MRCLAM 2, ranges": Guard("mrclam", {"number": 2, "kinds": RANGES}, (0.52, 0.001), (0.54, 0.001)),
+    "MRCLAM 5, ranges": Guard("mrclam", {"number": 5, "kinds": RANGES}, (0.20, 0.004), (0.26, 0.028)),
+    "UWB F01": Guard("uwb", {"flight": "F01"}, (0.77, 0.0), (1.0, 0.0)),
+}
 
 
 @pytest.fixture(scope="module")

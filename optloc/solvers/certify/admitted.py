@@ -79,7 +79,7 @@ LEFT = "no minimum was found along the edge {}"
 
 
 def certified(
-    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
+    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: float = 1
 ) -> Pool:
     """Return the pools of a flat batch with certificates: the stage "certify"; region (2, d) as of `certify`.
 
@@ -117,7 +117,9 @@ def certified(
     return replace(pool, proven=proven, stages=(*stages, certify_stage(detail, began)))
 
 
-def _prove_freely(problem: Problem, pool: Pool, items: Array, margin: float, effort: int) -> tuple[Pool, Claims, Array]:
+def _prove_freely(
+    problem: Problem, pool: Pool, items: Array, margin: float, effort: float
+) -> tuple[Pool, Claims, Array]:
     """Return pools after proofs of some of them as if nothing were bounded, their claims, and which claims hold (n,).
 
     They hold where the bounds are out of reach: then only the fix is a minimum, with them and without them.
@@ -199,7 +201,7 @@ def _beside(problem: Problem, pool: Pool, minima: Minima) -> Pool:
     return keep_evidence(settle(problem, both, stage), pool)
 
 
-def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: int) -> tuple[Claims, Minima]:
+def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: float) -> tuple[Claims, Minima]:
     """Return claims (n,) about fixes, and all minima that are admitted."""
     sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), eliminate_nuisance(problem)
     sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
@@ -238,7 +240,7 @@ def _least_around(known: dict[Face, Along], face: Face, size: int) -> Array:
 
 
 def _know_along(
-    problem: Problem, costs: Costs, fix: Fix, face: Face, seeds: Array, margin: float, effort: int
+    problem: Problem, costs: Costs, fix: Fix, face: Face, seeds: Array, margin: float, effort: float
 ) -> Along:
     """Return what is known of n problems along a face: its minima, unless all of it costs too much for any.
 
@@ -259,7 +261,9 @@ def _know_along(
     return overwrite(out, rest, replace(some, boxes=some.boxes + boxes[rest]))
 
 
-def _is_dear(on: Problem, limits: Array, costs: Costs, seeds: Array, level: Array, effort: int) -> tuple[Array, Array]:
+def _is_dear(
+    on: Problem, limits: Array, costs: Costs, seeds: Array, level: Array, effort: float
+) -> tuple[Array, Array]:
     """Return whether all of a face, of equalities alone, costs at least a level (n,), and the boxes looked at (n,).
 
     Beyond the limits (2, d) of the coordinates nothing is admitted.
@@ -309,7 +313,7 @@ def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: int) -> Asked:
+def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> Asked:
     """Return the question whether nothing along a face costs less than vectors x (n, size) by more than `less` (n,)."""
     place = x[:, state_columns(on)]
     (n, d), value = place.shape, np.zeros(len(x))
@@ -330,7 +334,7 @@ def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, e
     )
 
 
-def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: int) -> Along:
+def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> Along:
     """Return what is known of n problems along a face, looked for from seeds (n, q, size)."""
     began, on, limits = perf_counter(), on_face(problem, face), admitted(problem, problem.dimension)
     names = " and ".join(face_names(problem, face)) or "inside"
@@ -402,7 +406,7 @@ def _is_sure(claims: Claims, limits: Array) -> Array:
     return out
 
 
-def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, effort: int) -> Pool:
+def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, effort: float) -> Pool:
     """Return pools of which claims that cannot be made of all positions are about those that a box admits."""
     assert pool.proven is not None
     open_ones = np.flatnonzero(~_is_sure(pool.proven, limits))

@@ -173,7 +173,7 @@ class Work:
         Which of the margins is tried.
     pending : bool array (N,)
         What is not settled.
-    effort : int
+    effort : float
         By how much budgets and rounds are multiplied.
     limited : bool
         Whether the claims are limited to a region that somebody asked for.
@@ -195,7 +195,7 @@ class Work:
     margins: Array
     level: Array
     pending: Array
-    effort: int
+    effort: float
     limited: bool
     spent: Array
     replaced: int = 0
@@ -204,7 +204,7 @@ class Work:
 
     @classmethod
     def begin(
-        cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: int
+        cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: float
     ) -> Work:
         """Return the work before the first round."""
         size, state = len(fix.x), fix.x[:, state_columns(problem)]
@@ -249,7 +249,7 @@ def gaps_below(margin: float, dimension: int) -> list[float]:
 def settle(work: Work) -> Work:
     """Return the work with a certificate for every fix that was to be proven."""
     asked = np.flatnonzero(work.pending)
-    for _ in range(_ROUNDS * work.effort):
+    for _ in range(int(_ROUNDS * max(work.effort, 1))):
         items = np.flatnonzero(work.pending)
         if not len(items):
             break
@@ -335,7 +335,7 @@ def _asked(work: Work, items: Array) -> Asked:
     )
 
 
-def budgets(n: int, nodes: float, effort: int) -> Array:
+def budgets(n: int, nodes: float, effort: float) -> Array:
     """Return the boxes (n,) that proofs may take: one takes time with the square of the nodes of dense rows."""
     if not enabled():
         return np.full(n, max(_AT_LEAST, _SLOW_BUDGET // max(n, 1)))
@@ -475,7 +475,7 @@ def keep_evidence(pool: Pool, before: Pool) -> Pool:
 
 
 def certified_freely(
-    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
+    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: float = 1
 ) -> Pool:
     """Return the pools of a flat batch with certificates of claims about all positions, admitted or not.
 
@@ -489,7 +489,7 @@ def certified_freely(
         As of `optloc.solvers.certify.admitted.certify`.
     margin : float
         Gap to prove.
-    effort : int
+    effort : float
         Multiplies the boxes that a proof may take.
     """
     if pool is None:
@@ -498,7 +498,7 @@ def certified_freely(
     fix = judge(problem, pool)
     answered, proven_before = to_prove(pool, fix)
     why = unsupported(problem)
-    if not why and region is None and effort == 1:  # who calls `certify` wants what can be had
+    if not why and region is None and effort <= 1:  # who calls `certify` wants what can be had
         why = unlimited(problem)
     if why or not answered.any():
         proven = claims_before(pool)

@@ -22,6 +22,7 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
 from optloc.solvers.pool import Pool, crowd_of, in_parts, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
 from optloc.solvers.robust.starts import flip_rows, robust_starts
+from optloc.solvers.robust.statement import stated
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
 
@@ -100,9 +101,12 @@ class Robust:
     ----------
     loss : Loss
         For instance ``LOSSES["cauchy"]``.
+    states : bool
+        Whether to test the minima that it has searched for, so that fixes may be `ok`.
     """
 
     loss: Loss
+    states: bool = False
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled minima for a flat batch of problems; their weights are those of the loss."""
@@ -111,9 +115,14 @@ class Robust:
 
         def work(some: Problem, part: slice) -> Pool:
             own = None if start is None else start[part]
-            return by_arrivals(some, own, lambda one, x: _minimise(one, self.loss, x, stages))
+            return by_arrivals(some, own, lambda one, x: self._minima(one, x, stages))
 
         return in_parts(problem, work, crowd_of(problem))
+
+    def _minima(self, problem: Problem, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
+        found = _minimise(problem, self.loss, start, stages)
+        # from given starts the minima are those next to them
+        return stated(problem, self.loss, found) if self.states and start is None else found
 
 
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:

@@ -18,6 +18,7 @@ from optloc.linear.vectors import vectors
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import independent, variances
 from optloc.problem.problem import Problem
+from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.pool import Pool, pack
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
@@ -55,7 +56,7 @@ _GROWTH, _GRADES, _SHARP = 1.4, 40, 1e3
 # Which rows to start from: all but those of some stations, or all but one, of the rows that each problem has.
 
 
-def subsets(problem: Problem) -> tuple[Array, Array]:
+def subsets(problem: Problem, clean: Array) -> tuple[Array, Array]:
     """Return the subsets of all problems of a flat batch: problem of each (S,), and its rows (S, m).
 
     One station is left out, or one row where a problem has few, or two stations, or three of few.
@@ -64,14 +65,17 @@ def subsets(problem: Problem) -> tuple[Array, Array]:
     ----------
     problem : Problem
         N problems; what is left out of each are its own stations, those that it has rows of.
+    clean : bool array (N,)
+        Problems of which no two stations are left out.
     """
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
     touched, single = rows_of_stations(problem), np.eye(problem.count, dtype=bool)
     heard = np.asarray((present[:, None] & touched).any(-1))
     short = np.flatnonzero(present.sum(1) <= _ROWS)
     stations, rows = _unite(heard, touched, 3), _unite(present[short], single, 1)
-    item = np.concatenate([stations[0], short[rows[0]]])
-    kept = present[item] & ~np.concatenate([stations[1], rows[1]])
+    wanted = ~clean[stations[0]] | (stations[2] == 1)
+    item = np.concatenate([stations[0][wanted], short[rows[0]]])
+    kept = present[item] & ~np.concatenate([stations[1][wanted], rows[1]])
     # several stations, or one row, may leave the same rest: it is started from once
     _, first = np.unique(np.column_stack([item, kept]), axis=0, return_index=True)
     item, kept = item[first], kept[first]
@@ -79,19 +83,21 @@ def subsets(problem: Problem) -> tuple[Array, Array]:
     return item[enough], kept[enough]
 
 
-def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array]:
-    """Return the unions (S, m) of the rows that up to `size` members touch (g, m), for each problem (S,) of its own."""
+def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array, Array]:
+    """Return problems (S,), unions (S, m) of the rows (g, m) of up to `size` of their members, and sizes (S,)."""
     count = own.sum(1)
     most = int(count.max(initial=0))
     # numbers of each problem's own members, first: sets are of places in this list, the same for all problems
     local = np.argsort(~own, axis=1, kind="stable")[:, :most]
     sizes = range(1, 1 + (size if most <= _THREE else min(size, 2)))
     items, unions = [np.zeros(0, dtype=int)], [np.zeros((0, touched.shape[1]), dtype=bool)]
+    lengths = [np.zeros(0, dtype=int)]
     for members in [chosen for q in sizes for chosen in combinations(range(most), q)][:_MOST]:
         item = np.flatnonzero(count > max(members))
         items.append(item)
         unions.append(np.asarray(touched[local[item][:, members]].any(1)))
-    return np.concatenate(items), np.concatenate(unions)
+        lengths.append(np.full(len(item), len(members)))
+    return np.concatenate(items), np.concatenate(unions), np.concatenate(lengths)
 
 
 # Starts from those rows, the best of them, and two ways down to a loss that is not convex.
@@ -111,7 +117,8 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
     pool = standing(plain, judge(problem, plain))[:, :_KEPT]
     parts = [pool, _graduate(problem, pool[:, :1])]
     if one_position(problem):
-        parts.append(_leave_out(problem, loss))
+        # two rows that are left out are no rival of a cost below the price of one: a rival may cost that much more
+        parts.append(_leave_out(problem, loss, plain.cost[:, 0] < AMBIGUOUS_GAP))
     else:
         parts.append(_annealed(problem, pool, loss))
         if registrable(problem):
@@ -133,7 +140,8 @@ def _through_epochs(problem: Problem, loss: Loss) -> Array:
     still = replace(problem.motions[0], order=0, reference=None)
     alone = replace(split_epochs(problem), motions=(still,)).flat()
     alone = alone.take((np.arange(size)[:, None] * problem.epochs + epoch).ravel())
-    place = _leave_out(alone, LOSSES["cauchy"])[:, :_SIDES, :d].reshape(size, len(epoch), -1, d)
+    found = _leave_out(alone, LOSSES["cauchy"], np.zeros(size * len(epoch), dtype=bool))
+    place = found[:, :_SIDES, :d].reshape(size, len(epoch), -1, d)
     if order:
         i, j = np.triu_indices(len(epoch), 1)
         time = elapsed(problem, 0)[epoch][:, None, None]
@@ -151,21 +159,22 @@ def _annealed(problem: Problem, pool: Array, loss: Loss) -> Array:
     return _cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True)
 
 
-def _leave_out(problem: Problem, loss: Loss) -> Array:
+def _leave_out(problem: Problem, loss: Loss, clean: Array) -> Array:
     """Return the best starts (N, q, size) from closed forms of all subsets."""
     # Correlation matters for the answer, hardly for where to look for it, and it costs time.
     noise = weighed(problem).noise if not depends_on_place(problem) else problem.noise
     problem = replace(problem, noise=independent(variances(noise, problem.count)))
     size = problem.batch_shape[0]
-    parts = [_start_subsets(problem.take(np.arange(i, min(i + _EACH, size))), loss) for i in range(0, size, _EACH)]
+    each = [np.arange(i, min(i + _EACH, size)) for i in range(0, size, _EACH)]
+    parts = [_start_subsets(problem.take(own), loss, clean[own]) for own in each]
     out = np.full((size, max(part.shape[1] for part in parts), problem.layout.size), np.nan)
     for i, part in enumerate(parts):
         out[i * _EACH : i * _EACH + len(part), : part.shape[1]] = part
     return out
 
 
-def _start_subsets(problem: Problem, loss: Loss) -> Array:
-    item, kept = subsets(problem)
+def _start_subsets(problem: Problem, loss: Loss, clean: Array) -> Array:
+    item, kept = subsets(problem, clean)
     if not len(item):
         return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)
     part = problem.take(item)

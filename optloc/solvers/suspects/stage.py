@@ -12,7 +12,7 @@ import numpy as np
 from optloc.adequacy.elements import batch_of
 from optloc.adequacy.evidence import Error, errors, influence
 from optloc.adequacy.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
-from optloc.adequacy.noise_level import SEVERAL, CommonLevel, common_level_at
+from optloc.adequacy.noise_level import SEVERAL, common_level_at
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
@@ -24,19 +24,20 @@ from optloc.problem.fix import Alternatives, Explanation, Fix, GroupKind, Stage,
 from optloc.problem.layout import Layout
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
+from optloc.solvers.certify.admitted import certified
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED
 from optloc.solvers.pool import Pool, begin, crowd_of, in_parts, offer
 from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.suspects.subsets import (
+    Alike,
     Outcome,
     Rest,
     begin_without,
     enumerable,
     explain,
     fix_rest,
-    fix_without,
     grow,
     joined,
     leave_out_of,
@@ -44,15 +45,21 @@ from optloc.solvers.suspects.subsets import (
     rest_of,
 )
 from optloc.solvers.verdict.conclusion import Conclusion, list_names
-from optloc.solvers.verdict.judge import failed, fill, judge, standing
+from optloc.solvers.verdict.judge import failed, fill, judge, standing, verdict
 
 # A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
 # that is tested, and who fits is taken back.
 _HALF = 0.5
 # Minima of a loss from which who is wrong is sought: an image in the plane of the stations has another beside it.
 _MINIMA = 4
+# Median costs per degree of freedom beyond which a fix is left out where the noise level is sought: noise of any size
+# exceeds it in 3 % of fixes with redundancy one, and hardly ever with more.
+_GROSS = 10.0
 # No other choice of rows helps these.
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
+
+
+_Explained = list[tuple[Array, tuple[Group, ...], list[Outcome]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,40 +138,113 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
     before = pool.stages
     asked = partial(_explain, present=present, doubted=doubted, by=by)
-    found, refuted = _weigh(problem, judge(problem, pool), asked, together)
-    pool = replace(pool, asked=True, refuted=refuted)
+    louder, found = _weigh(problem, pool, asked, together)
+    count = sum(len(items) for items, _, _ in found)
+    if louder is None:
+        pool = _with_conclusions(problem, pool, found)
+    else:
+        pool = replace(pool, asked=True, conclusion=_fix_by_louder_noise(louder, found))
+    stage = Stage("suspects", f"{count} of {len(pool)} contradict themselves", perf_counter() - began)
+    return replace(pool, stages=(*before, stage))
+
+
+def _with_conclusions(problem: Problem, pool: Pool, found: _Explained) -> Pool:
+    """Return pools with the conclusions that explanations lead to."""
+    pool = replace(pool, asked=True)
     fix, conclusion = judge(problem, pool), fill(len(pool), None)
     step = crowd_of(problem)
     for items, groups, outcomes in found:
         for first in range(0, len(items), step):
             part = slice(first, first + step)
             own = items[part]
-            conclusion[own] = _conclude(problem.take(own), fix[own], groups, outcomes[part], refuted)
-    count = sum(len(items) for items, _, _ in found)
-    stage = Stage("suspects", f"{count} of {len(fix)} contradict themselves", perf_counter() - began)
-    return replace(pool, conclusion=conclusion, stages=(*before, stage))
+            conclusion[own] = _conclude(problem.take(own), fix[own], groups, outcomes[part])
+    return replace(pool, conclusion=conclusion)
 
 
-_Explained = list[tuple[Array, tuple[Group, ...], list[Outcome]]]
+@dataclass(frozen=True, slots=True)
+class _Louder:
+    """Problems with larger noise than stated, and their refined candidates.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems with the larger noise.
+    pool : Pool
+        Refined with it.
+    sizes : array (m,)
+        Factors of the stated standard deviations of the rows, 1 or more.
+    reason : str
+        Which noise is larger, and by how much.
+    """
+
+    problem: Problem
+    pool: Pool
+    sizes: Array
+    reason: str
 
 
 def _weigh(
-    problem: Problem, fix: Fix, asked: Callable[[Problem, Fix], _Explained], together: bool
-) -> tuple[_Explained, str]:
-    """Return what explains problems by the noise as stated or, where that is likelier for all, by a larger one."""
+    problem: Problem, pool: Pool, asked: Callable[[Problem, Fix], _Explained], together: bool
+) -> tuple[_Louder | None, _Explained]:
+    """Return the larger noise that is likelier for all problems together, if any, and the explanations with it."""
+    fix = judge(problem, pool)
+    louder = _louder(problem, pool, fix) if together else None
+    if louder is None:
+        return None, asked(problem, fix)
+    # with the larger noise fewer rows are suspects
+    other = judge(louder.problem, louder.pool)
+    again, present = asked(louder.problem, other), np.broadcast_to(problem.weight, fix.weights.shape)
+    more = 2.0 * (present @ np.log(louder.sizes)) / np.maximum(present.sum(1), 1.0)
+    score = _score(again, other, more) + ROW_PRICE
+    # with the noise as stated each fix costs what it does, or the price of a row at least
+    if score < np.fmin(fix.cost, ROW_PRICE)[np.isfinite(fix.cost) & (fix.dof > 0)].sum():
+        return louder, again
     found = asked(problem, fix)
-    level = _level(problem, fix) if together else None
-    if level is None:
-        return found, ""
-    # whoever is accused then stands out from noise as large as it is
-    loud = level.scale(problem)
-    own = fix_by(loud, lambda one: begin(one, fix.x[:, None]))
-    other = replace(fix, x=own.x, cov=own.cov, cost=own.cost)
-    again, present = asked(loud, other), np.broadcast_to(problem.weight, fix.weights.shape)
-    more = 2.0 * (present @ np.log(level.sizes(problem))) / np.maximum(present.sum(1), 1.0)
-    if _score(again, other, more) + ROW_PRICE < _score(found, fix, np.zeros(len(more))):
-        return again, level.sentence
-    return found, ""
+    return (louder, again) if score < _score(found, fix, np.zeros(len(more))) else (None, found)
+
+
+def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
+    """Return a batch with the noise that its fixes show, where that is larger than stated.
+
+    A kind whose noise is stated too large keeps it: its ellipses then cover more than they promise. The upper ends of
+    the intervals count, so that ellipses cover also where few fixes determine the factors.
+    """
+    if problem.epochs > 1 or len(fix.x) < SEVERAL:
+        return None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        each = fix.cost / fix.dof
+        # a liar has a large cost relative to the other fixes, for noise of any size
+        kept = np.flatnonzero((fix.dof > 0) & (each <= _GROSS * np.median(each[np.isfinite(each) & (fix.dof > 0)])))
+    if len(kept) < SEVERAL:
+        return None
+    batch = batch_of(problem.take(kept))
+    level = common_level_at(batch, restore_order(batch.layout, problem.layout, fix.x[kept]))
+    grown = level.factor > 1.0
+    if not level.refutes or not np.isfinite(level.high[grown]).all():
+        return None
+    used = replace(level, factor=np.where(grown, level.high, 1.0))
+    said = [
+        f"the noise of {kind} rows is {factor:.2g} ({low:.2g} to {high:.2g}) times as large as stated"
+        for kind, factor, low, high, larger in zip(level.kinds, level.factor, level.low, level.high, grown, strict=True)
+        if larger
+    ]
+    loud = used.scale(problem)
+    refined = lsr(loud, offer(loud, standing(pool, fix), pool, "start", perf_counter()))
+    return _Louder(loud, refined, used.sizes(problem), f"{' and '.join(said)}: the upper end of the interval is used")
+
+
+def _fix_by_louder_noise(louder: _Louder, found: _Explained) -> Array:
+    """Return the finished fixes (N,), objects, of problems with larger noise than stated."""
+    problem = louder.problem
+    fix = verdict(problem, certified(problem, _with_conclusions(problem, louder.pool, found)))
+    marks, reason = np.array(fix.marks), np.array(fix.reason)
+    items = np.flatnonzero(fix.answered)
+    marks[items] |= Status.RESCALED.mark
+    reason[items] = [f"{louder.reason}; {own}" if own else louder.reason for own in reason[items]]
+    out, fix = fill(len(reason), None), replace(fix, marks=marks, reason=reason)
+    for i in range(len(out)):
+        out[i] = fix[i]
+    return out
 
 
 def _explain(problem: Problem, fix: Fix, present: Array, doubted: _Doubted, by: Sequence[GroupKind]) -> _Explained:
@@ -174,8 +254,20 @@ def _explain(problem: Problem, fix: Fix, present: Array, doubted: _Doubted, by: 
         noticed = ~fix.answered | (fix.cost > ROW_PRICE - AMBIGUOUS_GAP)
     noticed |= problem.epochs > 1  # a few of many rows go unnoticed by the chi-square of all
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
-    alike = [items[own] for own in _group_alike(present[items] > 0.0)]
-    return [(own, *_explain_pattern(problem.take(own), fix[own], doubted.take(own), by)) for own in alike]
+    patterns = [items[own] for own in _group_alike(present[items] > 0.0)]
+    alike = [_alike(problem, fix, own, by) for own in patterns]
+    # few sets: all are tried, and nothing masks anything; runs and many groups: one at a time
+    many = [problem.epochs > 1 or not enumerable(one.groups, one.batch.count, 1) for one in alike]
+    found = iter(explain([one for one, grown in zip(alike, many, strict=True) if not grown]))
+    out: _Explained = []
+    for own, one, grown in zip(patterns, alike, many, strict=True):
+        part = doubted.take(own)
+        if grown:
+            outcomes = [_grow(one, i, part, None) for i in range(len(own))]
+        else:
+            outcomes = _with_grown(one, part, next(found))
+        out.append((own, one.groups, outcomes))
+    return out
 
 
 def _score(found: _Explained, fix: Fix, more: Array) -> float:
@@ -192,15 +284,6 @@ def _score(found: _Explained, fix: Fix, more: Array) -> float:
     return float((score + dof * more).sum())
 
 
-def _level(problem: Problem, fix: Fix) -> CommonLevel | None:
-    """Return by how much the fixes of a batch say that its noise is stated too small; None where they do not."""
-    if problem.epochs > 1 or len(fix.x) < SEVERAL:
-        return None
-    batch = batch_of(problem)
-    found = common_level_at(batch, restore_order(batch.layout, problem.layout, fix.x))
-    return found if found.refutes else None
-
-
 def _group_alike(present: Array) -> list[Array]:
     """Return the numbers of the problems (N, m) that have the same rows, for each pattern."""
     if not len(present):
@@ -209,29 +292,29 @@ def _group_alike(present: Array) -> list[Array]:
     return [np.flatnonzero(pattern.reshape(-1) == i) for i in range(int(pattern.max()) + 1)]
 
 
-def _explain_pattern(
-    problem: Problem, fix: Fix, doubted: _Doubted, by: Sequence[GroupKind]
-) -> tuple[tuple[Group, ...], list[Outcome]]:
-    """Return what may be wrong in problems (N,) in which the same rows are present, and what explains each."""
-    arrivals = as_arrivals(problem)
-    work = problem if arrivals is None else arrivals.problem
-    present = np.broadcast_to(work.weight, (len(fix.x), work.count))[0] > 0.0
+def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) -> Alike:
+    """Return problems in which the same rows are present, by arrivals where that is the same, and their groups."""
+    part = problem.take(items)
+    arrivals = as_arrivals(part)
+    work = part if arrivals is None else arrivals.problem
+    present = np.broadcast_to(work.weight, (len(items), work.count))[0] > 0.0
     groups = groups_of(work, present, by)
-    # few sets: all are tried, and nothing masks anything; runs and many groups: one at a time
-    if problem.epochs > 1 or not enumerable(groups, work.count, 1):
-        return groups, [_grow(work, groups, fix, i, doubted, None) for i in range(len(fix.x))]
-    outcomes = explain(work, groups, fix)
-    # sets that were too many to be tried: group by group from the best that was found
-    untried = [not own.rests and own.tried < dof - 1 for own, dof in zip(outcomes, fix.dof, strict=True)]
+    if arrivals is None:
+        return Alike(problem, items, groups, fix[items])
+    return Alike(work, np.arange(len(items)), groups, fix[items])
+
+
+def _with_grown(alike: Alike, doubted: _Doubted, outcomes: list[Outcome]) -> list[Outcome]:
+    """Return outcomes where sets that were too many to be tried are sought group by group from the best found."""
+    dof = alike.whole.dof
+    untried = [not own.rests and own.tried < most - 1 for own, most in zip(outcomes, dof, strict=True)]
     for i in np.flatnonzero(untried).tolist():
-        more = _grow(work, groups, fix, i, doubted, outcomes[i].closest)
+        more = _grow(alike, i, doubted, outcomes[i].closest)
         outcomes[i] = replace(more, p_value=outcomes[i].p_value | more.p_value)
-    return groups, outcomes
+    return outcomes
 
 
-def _conclude(
-    problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome], refuted: str
-) -> Array:
+def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome]) -> Array:
     """Return what is concluded of problems (N,) in which the same rows are present, None where nothing is."""
     arrivals, out = as_arrivals(problem), fill(len(outcomes), None)
     cases: list[Case] = []
@@ -239,7 +322,7 @@ def _conclude(
     for i, outcome in enumerate(outcomes):
         item = np.array([i])
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(item))
-        cases.append(Case(problem.take(item), one, groups, fix[i], refuted))
+        cases.append(Case(problem.take(item), one, groups, fix[i]))
         if not outcome.rests:
             out[i] = _unexplained(cases[i], outcome)
         elif (best := _best_rest(cases[i], outcome)) is not None:
@@ -256,16 +339,14 @@ def _conclude(
     return out
 
 
-def _grow(
-    problem: Problem, groups: Sequence[Group], fix: Fix, i: int, doubted: _Doubted, start: Rest | None
-) -> Outcome:
+def _grow(alike: Alike, i: int, doubted: _Doubted, start: Rest | None) -> Outcome:
     """Return what explains the i-th of some problems, found group by group.
 
     The fix of all rows is where wrong ones have drawn it, perhaps to another minimum, from which the right ones look
     wrong. Where it shows something, the minima of a loss that no error draws far are begun from as well.
     """
     # the fix is of the problem as given; with arrivals for differences the layout has emission times besides
-    one, own = problem.take(np.array([i])), fix[i]
+    one, own, groups = alike.batch.take(alike.items[[i]]), alike.whole[i], alike.groups
     if own.layout != one.layout or not np.isfinite(own.x).all():
         n = one.layout.n_shared
         known = np.isfinite(own.x[:n]).all()
@@ -299,15 +380,12 @@ class Case:
         What may be wrong.
     whole : Fix
         The fix with nothing left out, without batch axes.
-    refuted : str
-        Why the noise cannot be as stated, or "".
     """
 
     problem: Problem
     arrivals: Arrivals | None
     groups: tuple[Group, ...]
     whole: Fix
-    refuted: str
 
     @property
     def work(self) -> Problem:
@@ -339,9 +417,6 @@ def _best_rest(case: Case, outcome: Outcome) -> Rest | None:
     best, *others = outcome.rests
     if not best.left and all(_same_place(best.fix, rest.fix) for rest in others):
         return None
-    if case.refuted:  # it was found by other noise than is stated
-        work = case.problem if best.fix.layout == case.problem.layout else case.work
-        return rest_of(case.groups, best.left, fix_without(work, case.groups, best.left, best.fix.x))
     return best
 
 
@@ -351,7 +426,7 @@ def _explained(case: Case, outcome: Outcome, best: Rest) -> Conclusion:
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
     explanations = tuple(_explanation(case, rest, outcome) for rest in (best, *others))
     spent, fix = int(case.whole.dof) - int(best.fix.dof), _in_layout(case, best.fix)
-    return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere), case.refuted)
+    return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere))
 
 
 def _same_place(best: Fix, other: Fix) -> bool:

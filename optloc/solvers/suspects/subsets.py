@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 from time import perf_counter
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,23 +15,29 @@ from optloc.adequacy.evidence import Influence, drops, embed, errors, influence,
 from optloc.adequacy.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.base.records import join, take
 from optloc.base.types import Array
+from optloc.compute.jit import enabled
+from optloc.problem.claims import GLOBAL
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
+from optloc.proof.scope import is_run, is_scaled
 from optloc.solvers.certify.admitted import certified
 from optloc.solvers.outside import accept
-from optloc.solvers.policy import AMBIGUOUS_GAP, NOTICED, REFUTED
-from optloc.solvers.pool import Pool, begin, in_parts, offer, pack
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, NOTICED, REFUTED
+from optloc.solvers.pool import Pool, begin, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
 from optloc.solvers.verdict.judge import judge, standing, verdict
 
 # Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and rows of all
-# subsets that are fixed together, at 2.5 kB a row.
-_MOST, _CHUNK = 100_000, 2**16
+# subsets that are fixed together, at 2.5 kB a row: 40 MB, and larger parts are not faster.
+_MOST, _CHUNK = 100_000, 2**14
 # The same from which sets are looked at to first order before they are tried: fewer take less time than is saved.
 _FEW = 2_000
 # Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them. The cheapest
 # start may end at another minimum, and a wrong rest that costs a hundred times too much hardly has one that passes.
 _NEAR, _CLOSE = 100.0, 4.0
+# Share of the boxes of a proof that a rest may take: good rests need tens of these hundreds, and more boxes take longer
+# than other starts.
+_SHORT = 0.01
 _BLIND = "an error is there, but redundancy 1 does not tell where"
 
 
@@ -107,55 +114,92 @@ def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
     return comb(len(groups), size) * rows <= _MOST
 
 
-def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Outcome]:
-    """Return what explains each problem of a flat batch: all sets of groups within the gap of the best.
-
-    Sets of one, of two and so on are tried, as long as their prices alone do not exceed what has been found, the rest
-    has redundancy, and they are few enough.
+@dataclass(frozen=True, slots=True)
+class Alike:
+    """Problems of a flat batch in which the same rows are present.
 
     Parameters
     ----------
-    problem : Problem
-        N problems in which the same rows are present.
-    groups : sequence of Group
+    batch : Problem
+        The batch.
+    items : int array (N,)
+        Their numbers in it.
+    groups : tuple of Group
         What may be wrong.
     whole : Fix
-        The fixes (N,) with nothing left out.
+        Their fixes (N,) with nothing left out.
     """
+
+    batch: Problem
+    items: Array
+    groups: tuple[Group, ...]
+    whole: Fix
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """Sets of groups (C,) that are left out of some of the problems of an `Alike`, and the least scores so far."""
+
+    alike: Alike
+    items: Array
+    sets: Sequence[_Set]
+    best: Array
+
+
+def explain(alike: Sequence[Alike]) -> list[list[Outcome]]:
+    """Return the explanations of each problem: all sets of groups within the gap of the best.
+
+    Sets of one, of two and so on are tried, as long as their prices alone do not exceed what has been found, the rest
+    has redundancy, and they are few enough. Rests of all problems of a batch are fixed together.
+    """
+    searches = dict(enumerate(_search(one) for one in alike))
+    out: list[list[Outcome]] = [[] for _ in alike]
+    tried: dict[int, list[list[_Tried]]] = {}
+    while searches:
+        asked: dict[int, list[_Request]] = {}
+        for number, running in list(searches.items()):
+            try:
+                asked[number] = running.send(tried[number]) if number in tried else next(running)
+            except StopIteration as done:
+                out[number] = done.value
+                del searches[number]
+        tried = _try_requests(asked)
+    return out
+
+
+def _search(alike: Alike) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
+    """Yield the sets to be tried, size by size, and return the outcomes (N,)."""
+    groups, whole, count = alike.groups, alike.whole, alike.batch.count
     prices = np.cumsum(np.sort([group.price for group in groups]))
     rests = [[rest_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes(whole))]
     probability: list[dict[tuple[int, ...], float]] = [{(): float(p)} for p in whole.p_value]
     closest: list[Rest | None] = [None] * len(rests)
     least = [(float(c), int(r)) for c, r in zip(whole.cost, whole.dof, strict=True)]
     tried = np.zeros(len(rests), dtype=np.int64)
-
-    def collect(items: Array, sets: Sequence[_Set]) -> None:
-        for item, found in zip(items, _try_sets(problem.take(items), groups, sets), strict=True):
-            rests[item] += found.rests
-            probability[item] |= found.p_value
-            closest[item], least[item] = found.closest, min(least[item], found.least)
-
     for size in range(1, len(groups) + 1):
         best = np.array([min((rest.score for rest in own), default=np.inf) for own in rests])
         # no set of this size, and so no larger one, can come near
         done = (prices[size - 1] > best + AMBIGUOUS_GAP) | (whole.dof <= size)
         tried[done] = len(groups)
-        if done.all() or not enumerable(groups, problem.count, size):
+        if done.all() or not enumerable(groups, count, size):
             break
         tried[~done] = size
-        items, sets = np.flatnonzero(~done), list(_subsets(groups, problem.count, size))
-        if len(sets) * problem.count > _FEW:
+        items, sets = np.flatnonzero(~done), list(_subsets(groups, count, size))
+        requests = []
+        if len(sets) * count > _FEW:
             # of many sets few matter where all data agree about as well: what their rest costs is known to first order
             agree = [i for i in items if rests[i] and not rests[i][0].left]
             for i in agree:
-                own = _promising(problem.take(np.array([i])), groups, sets, whole[i], best[i])
-                if own:
-                    collect(np.array([i]), own)
+                own = _promising(alike.batch.take(alike.items[[i]]), groups, sets, whole[i], best[i])
+                requests += [_Request(alike, np.array([i]), own, best[[i]])] if own else []
             items = np.setdiff1d(items, agree)
-        # as many problems at a time as fit the memory with all their sets
-        step = max(1, _CHUNK // (len(sets) * problem.count + 1))
-        for first in range(0, len(items), step):
-            collect(items[first : first + step], sets)
+        requests += [_Request(alike, items, sets, best[items])] if len(items) else []
+        answers = (yield requests) if requests else []
+        for request, found in zip(requests, answers, strict=True):
+            for item, one in zip(request.items.tolist(), found, strict=True):
+                rests[item] += one.rests
+                probability[item] |= one.p_value
+                closest[item], least[item] = one.closest, min(least[item], one.least)
     notes = ["" if dof > 1 else _BLIND for dof in whole.dof]
     parts = zip(rests, probability, notes, closest, tried, least, strict=True)
     return [Outcome(listed(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
@@ -200,6 +244,8 @@ class _Tried:
     p_value: dict[tuple[int, ...], float]
     closest: Rest | None = None
     least: tuple[float, int] = (np.inf, 0)
+    best: float = np.inf
+    cheapest: float = np.inf
 
 
 def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], whole: Fix, best: float) -> list[_Set]:
@@ -219,30 +265,66 @@ def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], 
     return [one for one in sets if one[2]] + [plain[i] for i in np.flatnonzero(2.0 * drop >= wanted)]
 
 
-def _try_sets(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set]) -> list[_Tried]:
-    """Return the rests of each problem that pass, the probabilities of all, the cheapest and the least score of all."""
-    out = [_Tried([], {}) for _ in range(problem.batch_shape[0])]
-    # priors and unknowns are the same for a whole batch: sets that change the same ones are fixed together
-    for others in dict.fromkeys(own for _, _, own in sets):
-        own = [(left, rows) for left, rows, its in sets if its == others]
-        fix = _fix_rests(problem, np.stack([rows for _, rows in own]), [groups[i] for i in sorted(others)])
-        good, p_value = passes(fix), fix.p_value
-        cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf).reshape(len(out), len(own))
-        score = cost + [sum(groups[i].price for i in left) for left, _ in own]
-        for item, found in enumerate(out):
-            first = item * len(own)
-            for j, (left, _) in enumerate(own, start=first):
-                found.p_value[left] = float(p_value[j])
-                if good[j]:
-                    found.rests.append(rest_of(groups, left, fix[j]))
-            j = int(score[item].argmin())
-            found.least = min(found.least, (float(score[item, j]), int(fix.dof[first + j])))
-            j = int(cost[item].argmin())
-            # what begins there leaves out more, and has no offset
-            nearer = found.closest is None or cost[item, j] < float(found.closest.fix.cost)
-            if np.isfinite(cost[item, j]) and nearer and all(groups[i].offset is None for i in others):
-                found.closest = rest_of(groups, own[j][0], fix[first + j])
+def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Tried]]]:
+    """Return the results of the sets of each request for each of its problems."""
+    out = {number: [[_Tried([], {}) for _ in one.items] for one in requests] for number, requests in asked.items()}
+    pairs: dict[Any, list[_Pair]] = {}
+    # problems of a batch have the same priors and unknowns: sets that change the same ones are fixed together
+    for number, requests in asked.items():
+        for request, found in zip(requests, out[number], strict=True):
+            groups = request.alike.groups
+            names = [tuple((groups[i].name, groups[i].prior) for i in sorted(others)) for _, _, others in request.sets]
+            for item, best, tried in zip(request.items.tolist(), request.best.tolist(), found, strict=True):
+                tried.best = best
+                for name, one in zip(names, request.sets, strict=True):
+                    key = (id(request.alike.batch), name)
+                    pairs.setdefault(key, []).append(_Pair(request.alike, item, one, tried))
+    for own in pairs.values():
+        # as many rests at a time as fit the memory
+        step = max(1, _CHUNK // (own[0].alike.batch.count + 1))
+        for first in range(0, len(own), step):
+            _try_pairs(own[first : first + step])
     return out
+
+
+class _Pair(NamedTuple):
+    """One problem of an `Alike`, a set that is left out of it, and where the result goes."""
+
+    alike: Alike
+    item: int
+    left: _Set
+    tried: _Tried
+
+
+def _try_pairs(pairs: Sequence[_Pair]) -> None:
+    """Store the rests that pass near the best, the probabilities, the cheapest rests and the least scores."""
+    alike, others = pairs[0].alike, sorted(pairs[0].left[2])
+    items = np.array([pair.alike.items[pair.item] for pair in pairs])
+    rows, changed = np.stack([pair.left[1] for pair in pairs]), [alike.groups[i] for i in others]
+    fix = fix_rest(leave_out(alike.batch.take(items), rows, changed))
+    cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf)
+    price = np.array([sum(pair.alike.groups[i].price for i in pair.left[0]) for pair in pairs])
+    begins = all(group.offset is None for group in changed)  # what begins at the closest has no offset
+    good, kept, near = passes(fix), list[int](), dict[int, int]()
+    for j, (pair, p, c, score) in enumerate(
+        zip(pairs, fix.p_value.tolist(), cost.tolist(), (cost + price).tolist(), strict=True)
+    ):
+        tried = pair.tried
+        tried.p_value[pair.left[0]] = p
+        tried.least = min(tried.least, (score, int(fix.dof[j])))
+        if good[j] and score <= tried.best + AMBIGUOUS_GAP:  # others are never listed
+            tried.best = min(tried.best, score)
+            kept.append(j)
+        if begins and c < tried.cheapest:
+            tried.cheapest, near[id(tried)] = c, j
+    chosen = sorted({*kept, *near.values()})
+    # copies: a view of one fix would keep all of them in memory
+    own = fix[np.array(chosen, dtype=int)]
+    rests = {j: rest_of(pairs[j].alike.groups, pairs[j].left[0], own[k]) for k, j in enumerate(chosen)}
+    for j in kept:
+        pairs[j].tried.rests.append(rests[j])
+    for j in near.values():
+        pairs[j].tried.closest = rests[j]
 
 
 def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[_Set]:
@@ -259,14 +341,6 @@ def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[_Set]:
             yield left, rows, frozenset(i for i in left if not groups[i].rows)
 
 
-def _fix_rests(problem: Problem, left: Array, others: Sequence[Group]) -> Fix:
-    """Return the fixes (N * C,) of N problems without each of C sets of rows (C, m), set after set of each problem."""
-    count = problem.batch_shape[0]
-    # item-major: the C sets of a problem lie together
-    many = problem.take(np.repeat(np.arange(count), len(left)))
-    return in_parts(leave_out(many, np.tile(left, (count, 1)), others), lambda part, _: fix_rest(part))
-
-
 def fix_rest(problem: Problem) -> Fix:
     """Return the fixes of a flat batch by the cheapest start, and in more ways where that one may have missed.
 
@@ -274,19 +348,30 @@ def fix_rest(problem: Problem) -> Fix:
     that passes, or fails by little, all candidates: its other positions explain the data as well.
     """
     pool = lsr(problem, gtrs(problem, None))
-    pool = _redo(problem, pool, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
-    pool = _redo(problem, pool, _CLOSE, lambda part, own: lsr(part, widen(part, own)))
+    # a proof of a good rest takes a fraction of the time of other starts
+    unproven = ~_is_proven(problem, pool)
+    pool = _redo(problem, pool, unproven, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
+    pool = _redo(problem, pool, unproven, _CLOSE, lambda part, own: lsr(part, widen(part, own)))
     if not np.isfinite(pool.cost[:, 0]).any() and (pool.dof >= 0).any():
         pool = search(problem, pool)  # no closed form starts from these kinds
     return judge(problem, pool)
 
 
-def _redo(problem: Problem, pool: Pool, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
+def _is_proven(problem: Problem, pool: Pool) -> Array:
+    """Return flags (N,) of rests of which a short proof shows that all minima within the listed gap are known."""
+    if not enabled() or problem.constraints or is_run(problem) or is_scaled(problem):
+        return np.zeros(len(pool), dtype=bool)
+    told = certified(problem, pool, effort=_SHORT).proven
+    assert told is not None
+    return np.asarray(told.unique & (told.proof == GLOBAL) & (told.margin >= LISTED_GAP))
+
+
+def _redo(problem: Problem, pool: Pool, unproven: Array, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
     """Return pools of which those whose cost is not that many times too large were made anew."""
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     with np.errstate(invalid="ignore"):
         # not: NaN, where there is no fix yet, is tried again as well
-        items = np.flatnonzero(~(cost > near * _limit(pool.dof)) & (pool.dof >= 0))
+        items = np.flatnonzero(unproven & ~(cost > near * _limit(pool.dof)) & (pool.dof >= 0))
     if not len(items):
         return pool
     other = better(problem.take(items), take(pool, items))

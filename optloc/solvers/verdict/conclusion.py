@@ -32,8 +32,6 @@ class Conclusion:
         Redundancy that the first explanation takes.
     several : bool
         Whether other explanations place the target elsewhere.
-    refuted : str
-        Why the noise cannot be as stated, or "": of so many fixes that it is no culprit of this one.
     tried : str
         Where there is no explanation: what came closest.
     """
@@ -43,7 +41,6 @@ class Conclusion:
     alternatives: Alternatives
     spent: int = 0
     several: bool = False
-    refuted: str = ""
     tried: str = ""
 
 
@@ -64,9 +61,6 @@ def conclude(problem: Problem, conclusion: Conclusion) -> Fix:
     if conclusion.several and rest.answered:
         marks |= Status.AMBIGUOUS.mark
     reason = _name_rivals(explanations) if conclusion.several else _name_suspects(explanations, rest)
-    if conclusion.refuted and rest.answered:
-        marks |= Status.MISFIT.mark
-        reason = f"{conclusion.refuted}; {reason}"
     if rest.answered and int(rest.dof) <= conclusion.spent:
         # 2 q name the culprits of q rows, and one more notices that there is another
         marks |= Status.UNPROVEN.mark

@@ -72,6 +72,8 @@ class Evidence(NamedTuple):
         Whether a search for suspects was asked for, and could not see one or tell which.
     held : bool
         Whether the 95 % ellipses of repeated measurements hold.
+    robust : bool
+        Whether the minima of a loss were searched, and the rows that count prove the place.
     """
 
     improbable: Any
@@ -83,6 +85,7 @@ class Evidence(NamedTuple):
     searched: Any = False
     blind: Any = False
     held: Any = False
+    robust: Any = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +157,7 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
         blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, NOTICED))
     with np.errstate(invalid="ignore"):
         marks: Array = marks_of(
-            improbable | bool(pool.refuted),
+            improbable,
             np.nan if pool.infinity is None else pool.infinity - cost,
             quantile(COVERED, problem.dimension),
             _apart(pool, gap).min(1, initial=np.inf),
@@ -163,6 +166,7 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
             False if pool.searched is None else pool.searched,
             blind,
             repeats_hold(pool.curvature),
+            False if pool.robust is None else pool.robust,
         )
     return marks.astype(np.int32)
 
@@ -201,7 +205,9 @@ def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
 
 def _is_unique(pool: Pool) -> Array:
     """Return where it is proven that no other minimum than those listed costs less than the gap more, (N,)."""
-    if pool.proven is None or pool.loss:  # what is proven of squares is not of a loss
+    if pool.loss:  # what is proven of squares is not of a loss
+        return np.zeros(len(pool), dtype=bool) if pool.robust is None else pool.robust
+    if pool.proven is None:
         return np.zeros(len(pool), dtype=bool)
     between = np.zeros(len(pool)) if pool.infinity is None else pool.infinity - pool.cost[:, 0]
     return is_proof_of_one(pool.proven, between)
@@ -442,7 +448,7 @@ def _name_residuals(finished: Finished, items: Array) -> Any:
     improbable = is_improbable(pool.cost[items, 0], pool.dof[items], DOUBT)
     told = tail_probability(pool.cost[items, 0], pool.dof[items])
     said = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in told]
-    return pool.refuted or np.where(improbable, np.array(said, dtype=object), "")
+    return np.where(improbable, np.array(said, dtype=object), "")
 
 
 def _name_infinity(finished: Finished, items: Array) -> Any:
@@ -462,6 +468,9 @@ def _name_search(finished: Finished, items: Array) -> Any:
 
 
 def _name_proof(finished: Finished, items: Array) -> Any:
+    pool = finished.pool
+    if pool.loss and pool.robust is not None and pool.remark is not None:
+        return np.where(pool.remark[items] == "", NOT_TRIED, pool.remark[items])
     told = finished.proven.reason[items]
     return NOT_TRIED if finished.pool.proven is None else np.where(told == NO_PROOF.reason, NOT_TRIED, told)
 
@@ -489,6 +498,7 @@ FINDINGS = (
     Finding(Status.UNPROVEN, lambda e: (_is_unsafe(e) ^ True) & ((e.unique ^ True) | e.blind), _name_proof),
     Finding(Status.CURVED, lambda e: (e.kappa > BENT) & (e.held ^ True), _name_shape),
     Finding(Status.TAILS, lambda e: (e.kappa > BENT) & e.held, lambda finished, items: ""),
+    Finding(Status.ROBUST, lambda e: e.robust, lambda finished, items: ""),
 )
 """All findings against finished answers; the advice of each is `Status.sentence`."""
 _TESTS = tuple((finding.status.mark, finding.test) for finding in FINDINGS)

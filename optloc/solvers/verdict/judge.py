@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from optloc.adequacy.advice import misfit_of
 from optloc.adequacy.truncation import covariance_of
-from optloc.base.records import overwrite, present, take
+from optloc.base.records import join, overwrite, present, take
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
@@ -24,7 +24,7 @@ from optloc.problem.truncated import Truncated
 from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of, spread_of
-from optloc.solvers.verdict.conclusion import conclude
+from optloc.solvers.verdict.conclusion import Conclusion, conclude
 from optloc.solvers.verdict.findings import (
     NO_ANSWER,
     NO_PROOF,
@@ -343,11 +343,16 @@ def judge(problem: Problem, pool: Pool) -> Fix:
         items = np.flatnonzero(~pool.plain)
         fix = overwrite(fix, items, _apply_rules(problem.take(items), take(pool, items), fix[items]))
     if pool.conclusion is not None:
-        for i in np.flatnonzero(present(pool.conclusion)):
-            told = pool.conclusion[i]
-            own = told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([i])), told)
-            fix = overwrite(fix, np.array([i]), own)
+        items = np.flatnonzero(present(pool.conclusion))
+        own = [_concluded(problem, int(i), pool.conclusion[i]) for i in items]
+        # one copy of all fixes for each would take a time that grows with the square of the batch
+        fix = overwrite(fix, items, join(own, len(own))) if own else fix
     return fix
+
+
+def _concluded(problem: Problem, item: int, told: Conclusion | Fix) -> Fix:
+    """Return the fix of an item with a conclusion, a flat batch of one."""
+    return told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([item])), told)
 
 
 def standing(pool: Pool, fix: Fix) -> Array:

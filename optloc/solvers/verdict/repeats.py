@@ -7,8 +7,9 @@ share of ellipses that hold their place decides.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -76,9 +77,41 @@ def repeat(problem: Problem, x: Array, covariance: Array) -> Array:
     covariance : array (N, n, n)
         Of their shared unknowns.
     """
+    return repeated(problem, x, covariance, _refine)
+
+
+class Repeats(NamedTuple):
+    """Fixes of M repeated measurements: vectors (M, size), covariances (M, n, n), and flags (M,) of finished ones."""
+
+    x: Array
+    spread: Array
+    good: Array
+
+
+def repeated(
+    problem: Problem,
+    x: Array,
+    covariance: Array,
+    refit: Callable[[Problem, Array], Repeats],
+    wrong: Array | None = None,
+) -> Array:
+    """Return the shares and inflations (N, 3) of repeats that are fixed by a function of the problems and places.
+
+    Parameters
+    ----------
+    problem, x, covariance : Problem, array (N, size), array (N, n, n)
+        As of `repeat`.
+    refit : callable
+        Maps repeated measurements and their true vectors to fixes.
+    wrong : array (N, m), optional
+        Errors that rows have in all repeats.
+    """
     out, problem = np.empty((len(x), len(LEVELS) + 1)), replace(problem, constraints=())
     for items in _parts(len(x)):
-        out[items] = _shares(problem.take(items), x[items], covariance[items])
+        many, truth = _measured(
+            problem.take(items), x[items], covariance[items], None if wrong is None else wrong[items]
+        )
+        out[items] = _shares(many, truth, refit(many, truth))
     return out
 
 
@@ -88,29 +121,39 @@ def _parts(count: int) -> Iterator[Array]:
         yield np.arange(first, min(first + size, count))
 
 
-def _shares(problem: Problem, x: Array, covariance: Array) -> Array:
-    """Return the shares and inflations of a part of the batch."""
+def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None) -> tuple[Problem, Array]:
+    """Return repeated measurements (N r) and their true vectors (N r, size)."""
     each = np.repeat(np.arange(len(x)), _REPEATS)
     truth, noise, means = _drawn(problem, x, covariance)
     many = _with_priors(problem.take(each), means)
     z = noise + np.asarray(predict(many, truth.view(arrays.Portable)))
+    z = z if wrong is None else z + wrong[each]
     for rows, start in zip(many.rows, many.starts, strict=True):
         part = slice(start, start + rows.count)
         if MODELS[rows.kind].period is not None:
             z[:, part] = np.asarray(wrap(z[:, part].view(arrays.Portable)))
         z[:, part] += rows.correction
-    many = many.with_rows(z=np.where(many.weight > 0.0, z, 0.0))
+    return many.with_rows(z=np.where(many.weight > 0.0, z, 0.0)), truth
+
+
+def _refine(problem: Problem, truth: Array) -> Repeats:
+    """Return the least-squares fixes next to true places."""
     with np.errstate(all="ignore"):
-        done = refine(many, truth, tolerance=_TOLERANCE, limit=_STEPS)
+        done = refine(problem, truth, tolerance=_TOLERANCE, limit=_STEPS)
         information, _, ok = marginal(done.equations)
         spread, regular = linalg.inverse(information)
-        slot, _ = problem.layout.find("position")
-        part = slice(slot.start, slot.start + slot.size)
-        away = done.x[:, part] - truth[:, part]
-        form = (away * linalg.solve(spread[:, part, part], away[..., None])[0][..., 0]).sum(-1)
+    return Repeats(done.x, spread, ok & regular & (done.status == Status.OK))
+
+
+def _shares(problem: Problem, truth: Array, found: Repeats) -> Array:
+    """Return the shares and inflations of a part of the batch."""
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    away = found.x[:, part] - truth[:, part]
+    with np.errstate(all="ignore"):
+        form = (away * linalg.solve(found.spread[:, part, part], away[..., None])[0][..., 0]).sum(-1)
     # a repeat that ends nowhere holds nothing
-    good = ok & regular & (done.status == Status.OK) & np.isfinite(form)
-    form = np.where(good, form, np.inf).reshape(len(x), _REPEATS)
+    form = np.where(found.good & np.isfinite(form), form, np.inf).reshape(-1, _REPEATS)
     limits = [quantile(level, problem.dimension) for level in LEVELS]
     shares = [(form <= limit).mean(1) for limit in limits]
     # the place among 48 at which 95 % are no larger

@@ -1,0 +1,185 @@
+"""Tests of a robust fix before it is `ok`: a proof by the rows that count, single rows, and repeats."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.adequacy.groups import ROW_PRICE
+from optloc.base import linalg
+from optloc.base.types import Array, Status
+from optloc.compute.least_squares import refine
+from optloc.linear.evaluate import predict
+from optloc.linear.normal import marginal
+from optloc.linear.redundancy import degrees_of_freedom
+from optloc.problem.chart import quantile
+from optloc.problem.fix import Fix
+from optloc.problem.loss import Loss
+from optloc.problem.problem import Problem
+from optloc.solvers.certify.admitted import certified
+from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, NOTICED, REJECTED
+from optloc.solvers.pool import Pool, begin
+from optloc.solvers.robust.reweighting import Doubt, reweight, robust_equations
+from optloc.solvers.stages import lsr
+from optloc.solvers.verdict.findings import is_improbable
+from optloc.solvers.verdict.judge import fill, judge, verdict
+from optloc.solvers.verdict.repeats import Repeats, holds, is_repeatable, repeated
+
+# Squared distance in standard deviations up to which the minima of the loss and of the rows that count are one
+# answer: with clean data nine in ten are nearer than half of it.
+_NEAR = 1.0
+# Fall of the cost from which leaving a row out is another explanation, and rise up to which taking one back is: as for
+# suspects, of which all within the gap of the best score are listed.
+_OUT, _BACK = ROW_PRICE - AMBIGUOUS_GAP, ROW_PRICE + AMBIGUOUS_GAP
+# Rows of a problem up to which each is left out by itself: of more, one hardly decides, and time grows with the square.
+_ROWS = 64
+# Rows of changed problems that are refined at a time: 10 MB.
+_TOGETHER = 2**12
+# Weighings of a repeated measurement, which begins at its true place: ten more change no ellipse that holds.
+_WEIGHINGS = 10
+
+SEARCHED = "the minima of the loss come from a search, without a proof"
+NEEDS = "only one resting position without constraints is checked against its rows"
+
+
+def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
+    """Return settled pools of a loss with marks of the minima that pass all tests, and reasons for the others.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    loss : Loss
+        Whose minima they are.
+    pool : Pool
+        Settled, by a search of all starts.
+    """
+    curvature, count = pool.curvature, len(pool)
+    assert curvature is not None
+    kept, remark = np.zeros(count, dtype=bool), fill(count, SEARCHED)
+    pool = replace(pool, robust=kept, remark=remark)
+    if problem.constraints or problem.count > _ROWS or not is_repeatable(problem):
+        return replace(pool, remark=fill(count, NEEDS))
+    fix = judge(problem, pool)
+    present = np.broadcast_to(problem.weight, pool.weights.shape) > 0.0
+    doubted = present & (pool.weights < REJECTED * problem.weight)
+    spent = doubted.sum(1)
+    left = degrees_of_freedom(problem.with_rows(weight=np.where(doubted, 0.0, problem.weight)))
+    sole = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.CONTRADICTORY)
+    # the rows that count name the doubted ones, and one more would show another choice
+    checked = left > spent
+    for i in np.flatnonzero(sole & ~checked):
+        remark[i] = f"redundancy {left[i]} without {spent[i]} doubted rows: another choice of them would not be noticed"
+    items = np.flatnonzero(sole & checked)
+    if not len(items):
+        return pool
+    part, out = problem.take(items), doubted[items]
+    good, told, repeats = _examine(part, loss, fix.x[items], out)
+    kept[items], remark[items] = good, told
+    found = np.full((count, 3), np.nan)
+    found[items] = repeats
+    return replace(pool, curvature=replace(curvature, repeats=found))
+
+
+def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Array, Array, Array]:
+    """Return flags (N,) of fixes that pass, reasons (N,) of the others, and shares of repeats (N, 3)."""
+    rest = problem.with_rows(weight=np.where(doubted, 0.0, problem.weight))
+    fix = verdict(rest, certified(rest, lsr(rest, begin(rest, x))))
+    reason, repeats = fill(len(x), ""), np.full((len(x), 3), np.nan)
+    good = fix.code == Status.OK
+    for i in np.flatnonzero(~good):
+        reason[i] = f"the rows that count do not prove the place: {fix[int(i)].status.label}"
+    # rejected rows may be too few of the wrong ones: then the rest hardly fits
+    poor = good & doubted.any(1) & is_improbable(fix.cost, fix.dof, NOTICED)
+    reason[poor] = "the rows that count hardly agree: p is below 0.01"
+    good &= ~poor
+    apart = _squared(fix, x - fix.x)
+    far = good & ~(apart <= _NEAR)
+    reason[far] = "the rows that count have another minimum: doubted rows still pull at this one"
+    good &= ~far
+    items = np.flatnonzero(good)
+    single = items[_decides(problem.take(items), fix[items], doubted[items])]
+    reason[single] = "a single measurement decides: with it the place is another than without it"
+    good[single] = False
+    items = np.flatnonzero(good)
+    if len(items):
+        repeats[items] = _repeat(problem.take(items), loss, fix[items], doubted[items])
+        held = holds(repeats)
+        reason[good & ~held] = "the ellipses of repeated measurements do not hold their places"
+        good &= held
+    return good, reason, repeats
+
+
+def _squared(fix: Fix, step: Array) -> Array:
+    """Return squared lengths (N,) of steps of vectors (N, size) in the covariances of fixes, shared unknowns alone."""
+    n = fix.cov.shape[-1]
+    with np.errstate(all="ignore"):
+        return np.asarray((step[:, :n] * linalg.solve(fix.cov, step[:, :n, None])[0][..., 0]).sum(-1))
+
+
+def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
+    """Return flags (N,) of problems where one row more or less is another explanation with another place.
+
+    Each row is left out or taken back by itself, and each rejected row is exchanged for each of the others.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems with all rows.
+    fix : Fix
+        Of the rows that count.
+    doubted : bool array (N, m)
+        The other rows.
+    """
+    item, change, limit = _changes(np.broadcast_to(problem.weight, doubted.shape) > 0.0, doubted)
+    out = np.zeros(len(doubted), dtype=bool)
+    step = max(1, _TOGETHER // problem.count)
+    for first in range(0, len(item), step):
+        own, some = item[first : first + step], slice(first, first + step)
+        part = problem.take(own)
+        part = part.with_rows(weight=np.where(doubted[own] ^ change[some], 0.0, part.weight))
+        with np.errstate(all="ignore"):
+            done = refine(part, fix.x[own])
+            as_good = (done.cost - fix.cost[own] < limit[some]) & (done.status == Status.OK)
+        moved = _squared_position(problem, fix[own], done.x - fix.x[own])
+        out[own[as_good & ~(moved <= quantile(COVERED, problem.dimension))]] = True
+    return out
+
+
+def _changes(present: Array, doubted: Array) -> tuple[Array, Array, Array]:
+    """Return the problems (M,) of changes, the rows (M, m) that these move, and how far the cost (M,) may rise."""
+    item, row = np.nonzero(present)
+    change = np.zeros((len(item), present.shape[1]), dtype=bool)
+    change[np.arange(len(item)), row] = True
+    limit = np.where(doubted[item, row], _BACK, -_OUT)
+    swapped, back, out = np.nonzero(doubted[:, :, None] & (present & ~doubted)[:, None, :])
+    more = np.zeros((len(swapped), present.shape[1]), dtype=bool)
+    more[np.arange(len(swapped)), back] = more[np.arange(len(swapped)), out] = True
+    # both leave out the same number of rows: the costs alone decide
+    limits = np.concatenate([limit, np.full(len(swapped), AMBIGUOUS_GAP)])
+    return np.concatenate([item, swapped]), np.concatenate([change, more]), limits
+
+
+def _squared_position(problem: Problem, fix: Fix, step: Array) -> Array:
+    """Return squared lengths (N,) of steps (N, size) of positions in the covariances of fixes."""
+    slot, _ = problem.layout.find("position")
+    where = slice(slot.start, slot.start + slot.size)
+    with np.errstate(all="ignore"):
+        solved = linalg.solve(fix.cov[:, where, where], step[:, where, None])[0][..., 0]
+        return np.asarray((step[:, where] * solved).sum(-1))
+
+
+def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:
+    """Return shares of repeats of the loss whose ellipses hold their places, and an inflation, (N, 3)."""
+    z = np.where(doubted, problem.observed - predict(problem, fix.x), 0.0)
+    return repeated(problem, fix.x, fix.cov, lambda many, truth: _refit(many, loss, truth), z)
+
+
+def _refit(problem: Problem, loss: Loss, truth: Array) -> Repeats:
+    """Return the minima of a loss next to true places, and covariances."""
+    doubt = Doubt.of(problem, truth)
+    done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS)
+    information, _, ok = marginal(robust_equations(loss, problem, doubt, done.x, done.weight))
+    spread, regular = linalg.inverse(information)
+    return Repeats(done.x, spread, ok & regular & np.isin(done.status, (Status.OK, Status.MAX_ITERATIONS)))
