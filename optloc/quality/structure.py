@@ -307,6 +307,7 @@ def with_estimated_noise(
         return with_noise_levels(problem, levels), levels
     part = _stretches(len(learnt.kept))
     found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part])
+    _check_lasting(found.lasting, {*map(str, kinds_of(batch))})
     levels = learnt.levels(batch)
     if (found.by, found.common) != ("kind", None):
         plain, learnt = levels, _agree(problem, batch, found.by, found.common, method, learnt)
@@ -387,6 +388,19 @@ def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array,
     found, cost = descend(now.take(kept), x)
     finite = np.isfinite(cost) & np.isfinite(found).all(-1)
     return kept[finite], found[finite]
+
+
+# Correlation of errors of rows from which their level is not learnt: two hundred epochs are then ten independent ones.
+_TOO_LONG = 0.9
+
+
+def _check_lasting(lasting: dict[str, float], kinds: set[str]) -> None:
+    """Raise InvalidProblem where errors of rows hardly change: fixes follow them, and no residual shows it."""
+    for kind in sorted(kinds):
+        if lasting.get(kind, 0.0) > _TOO_LONG:
+            what = f"errors of {kind} hardly change (correlation {lasting[kind]:.2g} between epochs): residuals do not"
+            advice = "state a sigma, or measure at a known place or for longer"
+            raise InvalidProblem(f"{what} show their size", "noise", advice)
 
 
 def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float]) -> NoiseLevels:

@@ -96,6 +96,27 @@ SETS = {
     "MRCLAM 2, ranges": Guard("mrclam", {"number": 2, "kinds": RANGES}, (0.52, 0.001), (0.54, 0.001)),
     "MRCLAM 5, ranges": Guard("mrclam", {"number": 5, "kinds": RANGES}, (0.20, 0.004), (0.26, 0.028)),
     "UWB F01": Guard("uwb", {"flight": "F01"}, (0.77, 0.0), (1.0, 0.0)),
+    "UWB F02": Guard("uwb", {"flight": "F02"}, (0.17, 0.0), (0.76, 0.0)),
+    "UWB F03": Guard("uwb", {"flight": "F03"}, (0.65, 0.0), (0.97, 0.0)),
+    "UWB F04": Guard("uwb", {"flight": "F04"}, (0.30, 0.0), (0.69, 0.0)),
+    "UWB F05": Guard("uwb", {"flight": "F05"}, (0.10, 0.0), (0.74, 0.0)),
+    "UWB F06": Guard("uwb", {"flight": "F06"}, (0.57, 0.0), (0.89, 0.0)),
+    "Plaza, raw": Guard("plaza", {"form": "raw"}, (0.90, 0.0), (0.98, 0.0)),
+    "Plaza, offsets": Guard("plaza", {"form": "offset"}, (0.99, 0.0), (0.99, 0.0)),
+    "Plaza, affine": Guard("plaza", {"form": "affine"}, (1.0, 0.0), (1.0, 0.0)),
+    "STAR-loc R1, nominal": Guard(
+        "starloc", {"run": "R1", "attitude": "nom", "count": 300}, (0.91, 0.68), (0.96, 0.003)
+    ),
+    "STAR-loc R1, calibrated": Guard(
+        "starloc", {"run": "R1", "attitude": "cal", "count": 300}, (0.92, 0.13), (0.96, 0.007)
+    ),
+    "STAR-loc R2, nominal": Guard("starloc", {"run": "R2", "attitude": "nom", "count": 300}, (0.07, 0.93), (0.05, 0.0)),
+    "STAR-loc R2, calibrated": Guard(
+        "starloc", {"run": "R2", "attitude": "cal", "count": 300}, (0.58, 0.20), (0.50, 0.02)
+    ),
+    "airliners": Guard("adsb", {}, (0.97, 0.16), (0.98, 0.051)),
+    "satellites K078": Guard("gnss", {"session": "K078"}, (1.0, 0.0), (1.0, 0.0)),
+    "satellites N176": Guard("gnss", {"session": "N176"}, (1.0, 0.0), (1.0, 0.0)),
 }
 
 
