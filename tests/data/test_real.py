@@ -104,16 +104,10 @@ SETS = {
     "Plaza, raw": Guard("plaza", {"form": "raw"}, (0.90, 0.0), (0.98, 0.0)),
     "Plaza, offsets": Guard("plaza", {"form": "offset"}, (0.99, 0.0), (0.99, 0.0)),
     "Plaza, affine": Guard("plaza", {"form": "affine"}, (1.0, 0.0), (1.0, 0.0)),
-    "STAR-loc R1, nominal": Guard(
-        "starloc", {"run": "R1", "attitude": "nom", "count": 300}, (0.91, 0.68), (0.96, 0.003)
-    ),
-    "STAR-loc R1, calibrated": Guard(
-        "starloc", {"run": "R1", "attitude": "cal", "count": 300}, (0.92, 0.13), (0.96, 0.007)
-    ),
-    "STAR-loc R2, nominal": Guard("starloc", {"run": "R2", "attitude": "nom", "count": 300}, (0.07, 0.93), (0.05, 0.0)),
-    "STAR-loc R2, calibrated": Guard(
-        "starloc", {"run": "R2", "attitude": "cal", "count": 300}, (0.58, 0.20), (0.50, 0.02)
-    ),
+    "STAR-loc R1, nominal": Guard("starloc", {"run": "R1", "attitude": "nom"}, (0.91, 0.68), (0.96, 0.003)),
+    "STAR-loc R1, calibrated": Guard("starloc", {"run": "R1", "attitude": "cal"}, (0.92, 0.13), (0.96, 0.007)),
+    "STAR-loc R2, nominal": Guard("starloc", {"run": "R2", "attitude": "nom"}, (0.07, 0.93), (0.05, 0.0)),
+    "STAR-loc R2, calibrated": Guard("starloc", {"run": "R2", "attitude": "cal"}, (0.58, 0.20), (0.50, 0.02)),
     "airliners": Guard("adsb", {}, (0.97, 0.16), (0.98, 0.051)),
     "satellites K078": Guard("gnss", {"session": "K078"}, (1.0, 0.0), (1.0, 0.0)),
     "satellites N176": Guard("gnss", {"session": "N176"}, (1.0, 0.0), (1.0, 0.0)),
@@ -129,9 +123,9 @@ def book():
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_fixes_of_real_data_keep_their_promise(book, name):
+def test_fixes_of_real_data_keep_their_promise(book, data_dir, name):
     guard = SETS[name]
-    data = datasets.load(guard.name, **guard.options)
+    data = datasets.load(guard.name, folder=data_dir, **guard.options)
     now, structure = learnt(data.problem)
     for key, noise, problem, limits in (
         ("stated", "stated", data.problem, guard.stated),
