@@ -73,6 +73,7 @@ class Scans:
         how: Filtering,
         move: Move | None = None,
         more: tuple[Array, Array] | None = None,
+        memory: Array | None = None,
     ) -> Filtered | None:
         """Return states (..., n) after a scan, or None where it takes the general form.
 
@@ -88,6 +89,8 @@ class Scans:
             From their time to the time of the scan; None for states that hold then.
         more : tuple of array (..., m), optional
             Measurements less corrections, and weights, that replace the scan's.
+        memory : array, optional
+            Of the track of a single state, see `filter_scan`.
         """
         rows, n = self.rows[k], mean.shape[-1]
         if rows is None or type(mean) is not np.ndarray or rows.tables.shared != n:
@@ -101,7 +104,16 @@ class Scans:
         count, move = math.prod(shape), move or _stay(n)
         ahead = Move(owned(move.F), _each(move.Q, 2, shape), _each(move.drive, 1, shape))
         out = Filtered(np.empty((count, n)), np.empty((count, n, n)), np.empty((count, VALUES)))
-        filter_scan(rows, item, ahead, _each(mean, 1, shape), _each(cov, 2, shape), how, out)
+        filter_scan(
+            rows,
+            item,
+            ahead,
+            _each(mean, 1, shape),
+            _each(cov, 2, shape),
+            how,
+            _NONE if memory is None else memory,
+            out,
+        )
         if not shape:
             return Filtered(out.mean[0], out.cov[0], out.values[0])
         return Filtered(*(part.reshape(*shape, *part.shape[1:]) for part in out))
@@ -131,6 +143,23 @@ def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
         return owned(values)[None]
     inner = values.shape[values.ndim - core :]
     return owned(np.broadcast_to(values, (*shape, *inner)).reshape(-1, *inner))
+
+
+_NONE = np.zeros(0)
+
+
+def touched(problem: Problem) -> tuple[Array, Array]:
+    """Return the stations of rows (m, 2) as numbers of their errors, -1 for none, and the sign of the second (m,).
+
+    A station has one error for each kind of rows, in the order of their names.
+    """
+    names = sorted({rows.kind for rows in problem.rows})
+    count = problem.stations.places.shape[-2]
+    first = np.repeat([names.index(rows.kind) * count for rows in problem.rows], [rows.count for rows in problem.rows])
+    pairs = np.concatenate([np.stack([rows.a, rows.b], axis=1) for rows in problem.rows])
+    # a ratio errs like a difference
+    sign = np.concatenate([np.full(rows.count, 1.0 if rows.kind == "range_sum" else -1.0) for rows in problem.rows])
+    return np.where(pairs >= 0, first[:, None] + pairs, -1).astype(np.int64), sign
 
 
 @cache
@@ -222,7 +251,9 @@ def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows
         matrix = linalg.whitening(covariance.reshape(-1, m, m))
         white, total = np.ascontiguousarray(matrix.reshape(len(matrix), m * m)), size_of(matrix)
     none = np.zeros((1, 1, m))
-    return ScanRows(found.tables, divided.common, divided.own, covariance, white, total, none, none)
+    station, sign = touched(problem)
+    pairs, signs = np.ascontiguousarray(station[index[0]]), sign[index[0]]
+    return ScanRows(found.tables, divided.common, divided.own, covariance, white, total, none, none, pairs, signs)
 
 
 def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:
