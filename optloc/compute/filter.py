@@ -34,7 +34,8 @@ memory.
 VALUES = 10
 
 # Of the memory of a track: sum and variance of the products of the scores of two scans in succession, and of NIS less
-# rows. The score for the error of each station follows.
+# rows. The scores for the errors of the stations follow. The last ``m (n + 2)`` numbers are the rows of the scan:
+# derivatives, residual and weight.
 _PRODUCT, _PRODUCT_VARIANCE, _NIS, _NIS_VARIANCE, COLUMNS = range(5)
 # Weight of earlier scans in a memory: as in `optloc.track.lasting`.
 _KEEP = 0.98
@@ -229,6 +230,8 @@ def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, memo
         return GENERAL
     values[COUNT] = count
     if count == 0.0:
+        for k in range(max(0, len(memory) - len(s.used) * (n + 2)), len(memory)):
+            memory[k] = 0.0
         return _REJECTED if broken else _SILENT
     for i in range(n):
         s.y[i] = 0.0
@@ -463,6 +466,7 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
     memory[_NIS_VARIANCE] += 2.0 * values[COUNT]
     for k in range(COLUMNS, len(memory)):
         memory[k] = 0.0
+    _write_rows(rows.tables, s, memory[len(memory) - m * (n + 2) :])
     for i in range(m):
         size, score = _size(rows, own, i) if s.used[i] > 0.0 else 0.0, 0.0
         for j in range(m):
@@ -472,6 +476,20 @@ def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array
                 memory[COLUMNS + rows.station[i, k]] += size * (rows.sign[i] if k == 1 else 1.0) * score
     values[REPEATS] = memory[_PRODUCT] / sqrt(max(memory[_PRODUCT_VARIANCE], 1e-300))
     values[EXCESS] = memory[_NIS] / sqrt(max(memory[_NIS_VARIANCE], 1e-300))
+
+
+@compiled
+def _write_rows(t: Tables, s: _Space, out: Array) -> None:
+    """Write derivatives, residual and weight of each row at the prediction; zeros for rows that are left out."""
+    n = len(s.x)
+    begin = t.table[t.group, GROUP_COLUMN]
+    columns = t.table[t.group + 1, GROUP_COLUMN] - begin
+    for i in range(len(s.used)):
+        if s.used[i] > 0.0:
+            cell, first = s.room.rows + i * t.width, i * (n + 2)
+            for j in range(columns):
+                out[first + t.table[t.column + begin + j, FIRST]] += s.m[cell + j, 0]
+            out[first + n], out[first + n + 1] = s.m[cell + columns, 0], s.used[i]
 
 
 @compiled

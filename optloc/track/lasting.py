@@ -24,17 +24,18 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from optloc.base.errors import NUMERICAL
 from optloc.base.types import Array
-from optloc.compute.filter import COLUMNS
+from optloc.compute.filter import COLUMNS, ScanRows
 from optloc.linear.normal import linearise, weighed
 from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
-from optloc.track.scan_rows import touched
+from optloc.track.scan_rows import Scans, touched
 from optloc.track.track import State, scan_at
 
 # Correlation times, scans: a decade apart. Measured on real tracks: one of 100 scans alone finds most errors, and finer
@@ -79,14 +80,31 @@ class _Rows:
         R = noises.dense(weighed(part, at).noise, np.arange(part.count))
         spread = np.diagonal(R) + (0.0 if cov is None else ((linear.shared @ cov) * linear.shared).sum(-1))
         used = (part.weight > 0.0) & (np.diagonal(R) > 0.0) & (np.abs(linear.residual) <= _GATE * np.sqrt(spread))
-        columns, sign = touched(part)
-        many = 1 + int(columns.max(initial=0))
-        D, both = np.zeros((part.count, many)), columns[:, 1] >= 0
-        size = np.sqrt(np.diagonal(R) / np.where(both, 2.0, 1.0))
-        for column, times in ((columns[:, 0], size), (columns[:, 1], sign * size)):
-            index = np.flatnonzero(column >= 0)
-            np.add.at(D, (index, column[index]), times[index])
+        D = _errors(R, *touched(part))
         return cls(linear.shared[used], linear.residual[used], part.epoch[used], R[np.ix_(used, used)], D[used])
+
+    @classmethod
+    def written(cls, rows: ScanRows, item: int, memory: Array, n: int) -> _Rows:
+        """Return the rows of a scan as machine code wrote them to a memory, see `optloc.compute.filter`."""
+        m = rows.z.shape[2]
+        line = memory[len(memory) - m * (n + 2) :].reshape(m, n + 2)
+        R = rows.covariance[item if len(rows.covariance) > 1 else 0]
+        R = np.diag(R) if len(R) == m else R.reshape(m, m)
+        used = line[:, n + 1] > 0.0
+        scale = np.sqrt(line[used, n + 1])
+        noise = R[np.ix_(used, used)] / (scale[:, None] * scale)
+        errors = _errors(R, rows.station, rows.sign)[used]
+        return cls(line[used, :n], line[used, n], np.zeros(len(scale), dtype=np.int64), noise, errors)
+
+
+def _errors(R: Array, columns: Array, sign: Array) -> Array:
+    """Return the derivatives D (m, q) of rows by the errors of their stations, which make up the stated variance."""
+    D, two = np.zeros((len(R), 1 + int(columns.max(initial=0)))), columns[:, 1] >= 0
+    size = np.sqrt(np.diagonal(R) / np.where(two, 2.0, 1.0))
+    for column, times in ((columns[:, 0], size), (columns[:, 1], sign * size)):
+        index = np.flatnonzero(column >= 0)
+        np.add.at(D, (index, column[index]), times[index])
+    return D
 
 
 class _Recursion:
@@ -125,8 +143,13 @@ class _Recursion:
     def begin(self, rows: _Rows, cov: Array) -> None:
         """Take the fix of a stretch of scans, with the covariance (n, n) of its state."""
         self.reset(cov)
-        if not 0 < len(rows.residual) <= _MOST:
-            return
+        if 0 < len(rows.residual) <= _MOST:
+            try:
+                self._test_start(rows, cov)
+            except NUMERICAL:
+                self.reset(cov)
+
+    def _test_start(self, rows: _Rows, cov: Array) -> None:
         H, R, D = rows.H, rows.R, rows.D
         gain = _solved(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain
@@ -251,21 +274,10 @@ class _Start:
     score: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Taken:
-    """A scan that a track has taken.
+class Taken(NamedTuple):
+    """A scan that a track has taken: the scans of its run, its number, and the state before its prediction."""
 
-    Parameters
-    ----------
-    problem : Problem
-        The run.
-    k : int
-        Number of the scan.
-    before : State
-        State before the prediction for the scan.
-    """
-
-    problem: Problem
+    scans: Scans
     k: int
     before: State
 
@@ -290,9 +302,8 @@ class LastingErrors:
         self._on = False
         self._memory = np.zeros(COLUMNS)
 
-    def memory(self, problem: Problem) -> Array:
-        """Return the memory of the screen for the scans of a run, see `optloc.compute.filter.filter_scan`."""
-        size = COLUMNS + len(problem.rows) * problem.stations.places.shape[-2]
+    def memory(self, size: int) -> Array:
+        """Return the memory of the screen with at least so large a size, see `optloc.compute.filter.filter_scan`."""
         if len(self._memory) < size:
             self._memory = np.zeros(size)
         return self._memory
@@ -317,10 +328,7 @@ class LastingErrors:
         self._start = _Start(rows, state.cov, found.info, found.score)
         self._recent.clear()
         self._memory[:] = 0.0
-        try:
-            found.begin(rows, state.cov)
-        except NUMERICAL:
-            found.reset(state.cov)
+        found.begin(rows, state.cov)
         self._found, self._on = found, found.active
         return found.covariance(state.cov)
 
@@ -345,11 +353,11 @@ class LastingErrors:
             found = self._found = self._restored(len(cov))
             self._on = True
             for each in self._recent:
-                _go_on(found, each, dynamics)
+                _go_on(found, each, dynamics, None)
         else:
             assert self._found is not None
             found = self._found
-            _go_on(found, taken, dynamics)
+            _go_on(found, taken, dynamics, None if screen is None else self._memory)
             full = found.scans > (self._recent.maxlen or 0)
             self._on = screen is None or found.active or found.sure > _END or not full
         return found.covariance(cov)
@@ -366,21 +374,25 @@ class LastingErrors:
         return found
 
 
-def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics) -> None:
-    """Take a scan."""
-    problem, k, before = taken.problem, taken.k, taken.before
+def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
+    """Take a scan, whose rows are in a memory unless it takes the general form or is taken again."""
+    scans, k, before = taken
+    problem, written = scans.problem, scans.rows[k]
     dt = float(problem.times[k]) - before.time
     F, Q, drive = (
         dynamics.step(dt, before.mean, problem.dimension) if dt > 0.0 else (np.eye(len(before.mean)), 0.0, 0.0)
     )
     mean, cov = F @ before.mean + drive, F @ before.cov @ F.T + Q
     found.step(F)
-    scan = scan_at(problem, k, dynamics.order)
-    rows = _Rows.of(scan, mean, cov) if scan.rows else None
+    if memory is not None and written is not None:
+        rows: _Rows | None = _Rows.written(written, scans.item[k], memory, len(mean))
+    else:
+        scan = scan_at(problem, k, dynamics.order)
+        rows = _Rows.of(scan, mean, cov) if scan.rows else None
     if rows is None or not len(rows.residual):
         found.before = None
         return
     try:
         found.take(rows, F, cov)
-    except NUMERICAL:  # the filter's own status says what is wrong; the recursion starts again
+    except NUMERICAL:  # the status of the filter names the problem; the recursion starts again
         found.reset(np.zeros_like(before.cov))

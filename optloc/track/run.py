@@ -51,6 +51,9 @@ _WINDOW = 4
 # Mean squared innovation over the squared gate: a half where half of the rows are beyond the gate, as every place has
 # some by chance that agree; a quarter (5 sigma: two and a half times as large as stated) where no covariance covers.
 _LOST, _DOUBTFUL = 0.5, 0.25
+# Lasting error of the stations, in standard deviations of their rows, that refutes the noise. On real tracks up to four
+# were found, and the wider covariances covered the errors.
+_LASTING = 5.0
 # Gate, standard deviations: of a good row one in two million is left out.
 _USUAL = 5.0
 Event = Literal["starting", "started", "restarted", ""]
@@ -240,7 +243,7 @@ class _Run:
                 course.heard = times[start_here.last]
                 continue
             before = course.state
-            found = self._update(k, before, times[k] - course.heard, course.lasting.memory(self.problem))
+            found = self._update(k, before, times[k] - course.heard, course.lasting.memory(self.scans.memory))
             if isinstance(found, str):
                 course.why, course.state = found, None
                 continue
@@ -250,11 +253,10 @@ class _Run:
                 _check_agrees(entry)
                 course.fresh = False
             course.take(entry, fit, entry.rejected - self.bad[k])
-            cov = course.lasting.take(Taken(self.problem, k, before), self.dynamics, entry.updated.cov, screen)
+            cov = course.lasting.take(Taken(self.scans, k, before), self.dynamics, entry.updated.cov, screen)
             k += 1
-            vague = ""
-            if screen is None or screen[2] > self.near or cov is not entry.updated.cov:
-                vague = out_of_sight(self.problem, entry.updated.mean, cov)
+            wide = screen is None or screen[2] > self.near or cov is not entry.updated.cov
+            vague = out_of_sight(self.problem, entry.updated.mean, cov) if wide else ""
             yield course.judged(entry, cov, vague)
             course.judge(vague)
 
@@ -377,7 +379,8 @@ class _Recent:
         self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
         self.rules, self.most, self.since = rules, rules.most, 0
         # The mean squared innovation as a share of the squared gate; 0 where the rows are too few to tell.
-        self.share = 0.0
+        # Why the position is too vague, and the lasting error of the stations in standard deviations of their rows.
+        self.share, self.vague, self.lasting = 0.0, "", 0.0
 
     def begin(self, start: Beginning) -> None:
         """Take the rows of a start; what did not fit before is forgotten where they agree, and else still counts."""
@@ -415,7 +418,15 @@ class _Recent:
         return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
 
 
-_RECENTLY = (Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),)
+_RECENTLY = (
+    Finding(Status.UNBOUNDED, lambda recent: recent.vague, lambda recent: [recent.vague]),
+    Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),
+    Finding(
+        Status.MISFIT,
+        lambda recent: recent.lasting > _LASTING,
+        lambda recent: [f"errors that last for many scans are {recent.lasting:.2g} times as large as stated"],
+    ),
+)
 """All findings against a scan by those before it."""
 
 
@@ -466,10 +477,11 @@ class _Course:
 
     def judged(self, entry: Entry, cov: Array, vague: str) -> Entry:
         """Return a scan with its covariance (n, n) and status; `vague` is why its position is not followed."""
+        self.recent.vague, self.recent.lasting = vague, 0.0
         if cov is not entry.updated.cov:
+            self.recent.lasting = self.lasting.size
             entry = replace(entry, updated=replace(entry.updated, cov=cov))
-        done = self.recent.judge(entry)
-        return replace(done, code=Status.UNBOUNDED, reason=vague) if vague and done.code == Status.OK else done
+        return self.recent.judge(entry)
 
     def judge(self, vague: str) -> None:
         """Give the state up where it is lost, or too vague to follow."""

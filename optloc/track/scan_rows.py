@@ -12,7 +12,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.cache import Cache
 from optloc.base.types import Array, Motion
-from optloc.compute.filter import VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
+from optloc.compute.filter import COLUMNS, VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
 from optloc.compute.jit import at_hand
 from optloc.compute.pack import sources
 from optloc.compute.tables import tables
@@ -43,12 +43,15 @@ class Scans:
         Rows of each scan; None for a scan of the general form, or without rows.
     item : list of k int
         Number of each scan among the scans of its structure.
+    memory : int
+        Numbers that the memory of a track has, see `filter_scan`.
     """
 
     problem: Problem
     order: int
     rows: list[ScanRows | None]
     item: list[int]
+    memory: int
 
     @classmethod
     def of(cls, problem: Problem, order: int) -> Scans:
@@ -63,7 +66,9 @@ class Scans:
                     made = kept._replace(z=_by_scan(observed, index), weight=_by_scan(weight, index))
                 for i, k in enumerate(epochs.tolist()):
                     rows[k], item[k] = made, i
-        return cls(problem, order, rows, item)
+        most = max((made.z.shape[2] for made in rows if made is not None), default=0)
+        errors = len(problem.rows) * int(problem.stations.places.shape[-2])
+        return cls(problem, order, rows, item, COLUMNS + errors + most * ((order + 1) * problem.dimension + 2))
 
     def filtered(
         self,
