@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,6 +50,9 @@ _LARGE = 4.0
 # Standard deviations of the screen in machine code that call this test, which costs a hundred times more. And
 # standard deviations of the score below which the test ends.
 _CALL, _END = 3.5, 1.0
+# Standard deviations of the score of a start after which the next scans are tested, and the least number of them: on a
+# UWB flight the first scan after a start was 7 sigma off, and the score of the start was 2.3.
+_DOUBT, _FEW = 2.0, 5
 # Whitened innovations count as no larger than this: wild rows that pass the gate are no lasting errors.
 _WILD = 4.0
 # Least share of the stated variance that is left white, and turns of weights and estimate at a start.
@@ -143,6 +145,7 @@ class _Recursion:
     def begin(self, rows: _Rows, cov: Array) -> None:
         """Take the fix of a stretch of scans, with the covariance (n, n) of its state."""
         self.reset(cov)
+        self.scans = 0
         if 0 < len(rows.residual) <= _MOST:
             try:
                 self._test_start(rows, cov)
@@ -274,12 +277,8 @@ class _Start:
     score: Array
 
 
-class Taken(NamedTuple):
-    """A scan that a track has taken: the scans of its run, its number, and the state before its prediction."""
-
-    scans: Scans
-    k: int
-    before: State
+Taken = tuple[Scans, int, State]
+"""A scan that a track has taken: the scans of its run, its number, and the state before its prediction."""
 
 
 class LastingErrors:
@@ -329,7 +328,7 @@ class LastingErrors:
         self._recent.clear()
         self._memory[:] = 0.0
         found.begin(rows, state.cov)
-        self._found, self._on = found, found.active
+        self._found, self._on = found, found.active or found.sure > _DOUBT
         return found.covariance(state.cov)
 
     def take(self, taken: Taken, dynamics: Dynamics, cov: Array, screen: tuple[float, float, float] | None) -> Array:
@@ -358,8 +357,7 @@ class LastingErrors:
             assert self._found is not None
             found = self._found
             _go_on(found, taken, dynamics, None if screen is None else self._memory)
-            full = found.scans > (self._recent.maxlen or 0)
-            self._on = screen is None or found.active or found.sure > _END or not full
+            self._on = screen is None or found.active or found.sure > _END or found.scans < _FEW
         return found.covariance(cov)
 
     def _restored(self, n: int) -> _Recursion:
@@ -370,7 +368,7 @@ class LastingErrors:
             found.begin(start.rows, start.cov)
         else:
             # what the covariance of an old state comes from is not known: from rows for the most part
-            found.reset(self._recent[0].before.cov)
+            found.reset(self._recent[0][2].cov)
         return found
 
 

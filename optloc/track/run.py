@@ -28,7 +28,7 @@ from optloc.problem.epochs import cut, joined
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.track.dynamics import Dynamics
-from optloc.track.lasting import LastingErrors, Taken
+from optloc.track.lasting import LastingErrors
 from optloc.track.scan_rows import Scans
 from optloc.track.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
 from optloc.track.track import (
@@ -102,11 +102,11 @@ class Entry:
     time : float
         Seconds.
     updated : Updated
-        State after the scan, its NIS and the rows used; NaN before the first start.
+        State after the scan, with errors that last in its covariance; NIS and rows used; NaN before the first start.
     code : Status
         Ok; too few rows where none was valid and the state was only predicted; rejected where most rows did not pass
-        the gate or are not finite; misfit where the innovations of the last scans are much larger than stated;
-        ambiguous where a start has alternatives; numerical where the update failed.
+        the gate or are not finite; misfit where innovations or lasting errors are much larger than stated; unbounded
+        where the position is too vague; ambiguous where a start has alternatives; numerical where the update failed.
     rejected : int
         Rows left out.
     event : "starting", "started", "restarted" or ""
@@ -253,7 +253,7 @@ class _Run:
                 _check_agrees(entry)
                 course.fresh = False
             course.take(entry, fit, entry.rejected - self.bad[k])
-            cov = course.lasting.take(Taken(self.scans, k, before), self.dynamics, entry.updated.cov, screen)
+            cov = course.lasting.take((self.scans, k, before), self.dynamics, entry.updated.cov, screen)
             k += 1
             wide = screen is None or screen[2] > self.near or cov is not entry.updated.cov
             vague = out_of_sight(self.problem, entry.updated.mean, cov) if wide else ""
