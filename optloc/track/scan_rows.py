@@ -151,10 +151,13 @@ def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
 
 
 _NONE = np.zeros(0)
+_SIGNS = {"range_sum": 1.0, "azimuth": 0.0, "elevation": 0.0}
 
 
 def touched(problem: Problem) -> tuple[Array, Array]:
     """Return the stations of rows (m, 2) as numbers of their errors, -1 for none, and the sign of the second (m,).
+
+    The sign is 0 for angles, which have one station.
 
     A station has one error for each kind of rows, in the order of their names.
     """
@@ -163,7 +166,7 @@ def touched(problem: Problem) -> tuple[Array, Array]:
     first = np.repeat([names.index(rows.kind) * count for rows in problem.rows], [rows.count for rows in problem.rows])
     pairs = np.concatenate([np.stack([rows.a, rows.b], axis=1) for rows in problem.rows])
     # a ratio errs like a difference
-    sign = np.concatenate([np.full(rows.count, 1.0 if rows.kind == "range_sum" else -1.0) for rows in problem.rows])
+    sign = np.concatenate([np.full(rows.count, _SIGNS.get(rows.kind, -1.0)) for rows in problem.rows])
     return np.where(pairs >= 0, first[:, None] + pairs, -1).astype(np.int64), sign
 
 

@@ -29,8 +29,11 @@ def course(rng):
     return np.array(out)
 
 
-def run(kind, seed, *, lasts=0.0, scans=10.0):
-    """Return a run and its truth; each station has a Gauss-Markov error of `lasts` sigma over a number of scans."""
+def run(kind, seed, *, lasts=0.0, scans=10.0, common=False):
+    """Return a run and its truth; each station has a Gauss-Markov error of `lasts` sigma over a number of scans.
+
+    A `common` error is the error of the first station for all stations: the heading of a robot that takes bearings.
+    """
     rng = np.random.default_rng(seed)
     truth, s = course(rng), len(STATIONS)
     line = truth[:, None] - STATIONS
@@ -38,6 +41,7 @@ def run(kind, seed, *, lasts=0.0, scans=10.0):
     error, keep = rng.standard_normal((SCANS, s)), np.exp(-1.0 / scans)
     for k in range(1, SCANS):
         error[k] = keep * error[k - 1] + np.sqrt(1.0 - keep**2) * error[k]
+    error = error[:, :1] if common else error
     z = exact + SIGMA[kind] * (rng.standard_normal((SCANS, s)) + lasts * error)
     a, more = np.arange(s), {"sigma": SIGMA[kind]}
     if kind == "tdoa":
@@ -80,6 +84,16 @@ def test_the_covariance_covers_errors_that_last(kind, monkeypatch):
     assert 0.6 < np.mean(square) / 2.0 < 1.7
 
 
+def test_the_covariance_covers_an_error_that_all_stations_share(monkeypatch):
+    square, count = squares_of("azimuth", 6, lasts=1.5, common=True)
+    assert len(square) > 0.95 * count
+    with monkeypatch.context() as context:
+        without(context)
+        before, _ = squares_of("azimuth", 6, lasts=1.5, common=True)
+    assert np.mean(before > 25.0) > 0.2
+    assert np.mean(square > 25.0) < 0.04
+
+
 @pytest.mark.parametrize("runs", few([8, 40], 1))
 @pytest.mark.parametrize("kind", ["range", "azimuth"])
 def test_a_clean_track_stays_as_it_was(kind, runs, monkeypatch):
@@ -114,7 +128,7 @@ def test_the_recursion_is_the_covariance_of_simulated_errors():
     for k in range(scans):
         cov = cov + Q
         found.step(F)
-        rows = lasting._Rows(H, np.zeros(1), np.full(1, k), np.eye(1), np.eye(1))
+        rows = lasting._Rows(H, np.zeros(1), np.full(1, k), np.eye(1), np.ones((len(found.phi), 1, 1)))
         found.take(rows, F, cov)
         error = error + np.sqrt(Q) * rng.standard_normal(n)
         gain = cov[0, 0] / (cov[0, 0] + 1.0)
@@ -144,13 +158,13 @@ def test_the_screen_in_machine_code_is_a_score():
         )
         rows = lasting._Rows.of(scan_at(problem, k, 1), ahead.mean, 1e6 * np.eye(4))
         S = rows.H @ ahead.cov @ rows.H.T + rows.R
-        score = rows.D.T @ np.linalg.solve(S, rows.residual)
+        score = rows.D[0].T @ np.linalg.solve(S, rows.residual)
         total, variance = 0.98 * total, 0.98 * variance
         if before is not None:
-            seen = rows.D @ before
+            seen = rows.D[0] @ before
             total, variance = total + score @ before, variance + seen @ np.linalg.solve(S, seen)
         before, state = score, State(float(k), found.mean, found.cov)
-        written = lasting._Rows.written(scans.rows[k], scans.item[k], memory, 4)
+        written = lasting._Rows.written(scans.rows[k], scans.item[k], memory, 4, len(STATIONS))
         for name in ("H", "residual", "R", "D"):
             np.testing.assert_allclose(getattr(written, name), getattr(rows, name), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(memory[:2], [total, variance], rtol=1e-6, atol=1e-9)
