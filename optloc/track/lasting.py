@@ -123,8 +123,8 @@ def _errors(R: Array, columns: Array, sign: Array, stations: int) -> Array:
 class _Recursion:
     """The parts of a filter's covariance, and the accumulated score of lasting errors.
 
-    The hypotheses j are the correlation times of `_LASTS`. The first three have an error for each station, the others one
-    error for all angles of a kind.
+    The hypotheses j are the correlation times of `_LASTS`. The first half has an error for each station, the other half
+    one error for all angles of a kind.
     """
 
     def __init__(self, n: int) -> None:
