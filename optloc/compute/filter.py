@@ -23,14 +23,22 @@ from optloc.compute.tables import FIRST, GROUP_COLUMN, Tables
 EKF, IEKF, MGEKF, MVEKF = range(4)
 """Forms of an update, see `optloc.track.updates`."""
 
-NIS, LOGLIKELIHOOD, COUNT, CODE, REJECTED_ROWS, INNOVATION, PRESENT, SPREAD = range(8)
+NIS, LOGLIKELIHOOD, COUNT, CODE, REJECTED_ROWS, INNOVATION, PRESENT, SPREAD, REPEATS, EXCESS = range(10)
 """Columns of `Filtered.values`: three of `optloc.track.updates.Updated`, and the status.
 
 REJECTED_ROWS counts the rows that did not pass the gate. INNOVATION is the sum of the squared innovations in their
 standard deviations, each at most `Filtering.most`, and PRESENT the number of their rows. SPREAD is the trace of the
-predicted covariance of the position.
+predicted covariance of the position. REPEATS and EXCESS are the scores of the tests in `_remember`; zero without a
+memory.
 """
-VALUES = 8
+VALUES = 10
+
+# Of the memory of a track: sum and variance of the products of the scores of two scans in succession, and of NIS less
+# rows. The scores for the errors of the stations follow. The last ``m (n + 2)`` numbers are the rows of the scan:
+# derivatives, residual and weight.
+_PRODUCT, _PRODUCT_VARIANCE, _NIS, _NIS_VARIANCE, COLUMNS = range(5)
+# Weight of earlier scans in a memory: as in `optloc.track.lasting`.
+_KEEP = 0.98
 
 GENERAL = -1.0
 """In the place of a status: the scan takes the general form of the filter."""
@@ -61,6 +69,8 @@ class ScanRows(NamedTuple):
     total: Array  # (G or 1, 2): rank of the covariance, logarithm of the determinant of 2 pi R
     z: Array  # (G or 1, N or 1, m): measurements less corrections
     weight: Array  # (G or 1, N or 1, m)
+    station: Array  # (m, 2): places of the errors of each row's stations in a memory, -1 for none
+    sign: Array  # (m,): of the second of them
 
 
 class Move(NamedTuple):
@@ -127,7 +137,9 @@ class _Space(NamedTuple):
 
 
 @compiled
-def filter_scan(rows: ScanRows, item: int, move: Move, mean: Array, cov: Array, how: Filtering, out: Filtered) -> None:
+def filter_scan(
+    rows: ScanRows, item: int, move: Move, mean: Array, cov: Array, how: Filtering, memory: Array, out: Filtered
+) -> None:
     """Predict N states, leave out the rows that do not pass the gate, and update the states by the others.
 
     Parameters
@@ -142,6 +154,8 @@ def filter_scan(rows: ScanRows, item: int, move: Move, mean: Array, cov: Array, 
         States.
     how : Filtering
         The filter and its gate.
+    memory : array
+        Of a single track, changed: what `_remember` keeps of its scans; empty for none.
     out : Filtered
         Written: the prediction where no row is used, or where the update is not finite.
     """
@@ -154,7 +168,7 @@ def filter_scan(rows: ScanRows, item: int, move: Move, mean: Array, cov: Array, 
         _predict(move, one, mean, cov, s)
         for i in range(how.d):
             values[SPREAD] += s.P[i, i]
-        values[CODE] = _update(rows, item, one, how, s, out)
+        values[CODE] = _update(rows, item, one, how, s, memory, out)
         if values[CODE] != GENERAL and values[COUNT] > 0.0:  # else nothing has been written
             for i in range(n):
                 if not isfinite(out.mean[one, i]) or not isfinite(out.cov[one, i, i]):
@@ -203,7 +217,7 @@ def _predict(move: Move, one: int, mean: Array, cov: Array, s: _Space) -> None:
 
 
 @compiled
-def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, out: Filtered) -> float:
+def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, memory: Array, out: Filtered) -> float:
     """Write a state after the scan, and return its status."""
     n, values, mean, cov = len(s.x), out.values[one], out.mean[one], out.cov[one]
     broken = _take(rows, item, one, s)
@@ -216,6 +230,8 @@ def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, out:
         return GENERAL
     values[COUNT] = count
     if count == 0.0:
+        for k in range(max(0, len(memory) - len(s.used) * (n + 2)), len(memory)):
+            memory[k] = 0.0
         return _REJECTED if broken else _SILENT
     for i in range(n):
         s.y[i] = 0.0
@@ -223,6 +239,8 @@ def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, out:
     put(s.slope, s.move)
     solve_factored(s.factor, s.move)
     values[NIS] = _least(s)
+    if len(memory) > 0:
+        _remember(rows, item, s, memory, values)
     values[LOGLIKELIHOOD] = -0.5 * (values[NIS] + logdet)
     for i in range(n):
         values[LOGLIKELIHOOD] -= log(s.factor[i, i])
@@ -408,6 +426,76 @@ def _least(s: _Space) -> float:
             left -= s.white[r, i] * s.move[i]
         total += left * left
     return total
+
+
+@compiled
+def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array) -> None:
+    """Test whether errors of the stations repeat from scan to scan, and whether the innovations are too large.
+
+    Both results are numbers of standard deviations, over the last fifty scans or so. The scores for the errors of the
+    stations are ``a = D' S^-1 nu``. Their product with the scores b of the scan before has the mean zero. For a given b
+    its variance is ``(D b)' S^-1 (D b)``.
+    """
+    n, m, own = len(s.x), len(s.used), _of(len(rows.covariance), item)
+    left, seen, back = np.zeros(m), np.zeros(m), np.zeros(n)
+    for k in range(COLUMNS):
+        memory[k] *= _KEEP
+    for j in range(m):
+        left[j] = s.white[j, n]
+        for i in range(n):
+            left[j] -= s.white[j, i] * s.move[i]
+    for i in range(m):
+        size = _size(rows, own, i) if s.used[i] > 0.0 else 0.0
+        expected = 0.0
+        for k in range(2):
+            if rows.station[i, k] >= 0:
+                expected += size * (rows.sign[i] if k == 1 else 1.0) * memory[COLUMNS + rows.station[i, k]]
+        for j in range(m):
+            seen[j] += s.W[j, i] * expected
+    variance = 0.0
+    for j in range(m):
+        memory[_PRODUCT] += seen[j] * left[j]
+        variance += seen[j] * seen[j]
+        for i in range(n):
+            back[i] += s.white[j, i] * seen[j]
+    substitute(s.factor, back)
+    for i in range(n):
+        variance -= back[i] * back[i]
+    memory[_PRODUCT_VARIANCE] += max(variance, 0.0)
+    memory[_NIS] += values[NIS] - values[COUNT]
+    memory[_NIS_VARIANCE] += 2.0 * values[COUNT]
+    for k in range(COLUMNS, len(memory)):
+        memory[k] = 0.0
+    _write_rows(rows.tables, s, memory[len(memory) - m * (n + 2) :])
+    for i in range(m):
+        size, score = _size(rows, own, i) if s.used[i] > 0.0 else 0.0, 0.0
+        for j in range(m):
+            score += s.W[j, i] * left[j]
+        for k in range(2):
+            if rows.station[i, k] >= 0:
+                memory[COLUMNS + rows.station[i, k]] += size * (rows.sign[i] if k == 1 else 1.0) * score
+    values[REPEATS] = memory[_PRODUCT] / sqrt(max(memory[_PRODUCT_VARIANCE], 1e-300))
+    values[EXCESS] = memory[_NIS] / sqrt(max(memory[_NIS_VARIANCE], 1e-300))
+
+
+@compiled
+def _write_rows(t: Tables, s: _Space, out: Array) -> None:
+    """Write derivatives, residual and weight of each row at the prediction; zeros for rows that are left out."""
+    n = len(s.x)
+    begin = t.table[t.group, GROUP_COLUMN]
+    columns = t.table[t.group + 1, GROUP_COLUMN] - begin
+    for i in range(len(s.used)):
+        if s.used[i] > 0.0:
+            cell, first = s.room.rows + i * t.width, i * (n + 2)
+            for j in range(columns):
+                out[first + t.table[t.column + begin + j, FIRST]] += s.m[cell + j, 0]
+            out[first + n], out[first + n + 1] = s.m[cell + columns, 0], s.used[i]
+
+
+@compiled
+def _size(rows: ScanRows, own: int, i: int) -> float:
+    """Return the standard deviation of the error of each station of a row: all stations err alike."""
+    return sqrt(_entry(rows, own, i, i) / (2.0 if rows.station[i, 1] >= 0 else 1.0))
 
 
 @compiled

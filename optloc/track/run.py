@@ -11,15 +11,26 @@ from typing import Literal
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Status
-from optloc.compute.filter import CODE, GENERAL, INNOVATION, PRESENT, REJECTED_ROWS, SPREAD, Filtering
+from optloc.base.types import Array, Motion, Status
+from optloc.compute.filter import (
+    CODE,
+    EXCESS,
+    GENERAL,
+    INNOVATION,
+    PRESENT,
+    REJECTED_ROWS,
+    REPEATS,
+    SPREAD,
+    Filtering,
+)
 from optloc.problem.chart import tail_probability
-from optloc.problem.epochs import joined
+from optloc.problem.epochs import cut, joined
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.track.dynamics import Dynamics
+from optloc.track.lasting import LastingErrors
 from optloc.track.scan_rows import Scans
-from optloc.track.start import Beginning, Fit, Undecided, begin, reach, with_height_rows
+from optloc.track.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
 from optloc.track.track import (
     State,
     Track,
@@ -40,9 +51,13 @@ _WINDOW = 4
 # Mean squared innovation over the squared gate: a half where half of the rows are beyond the gate, as every place has
 # some by chance that agree; a quarter (5 sigma: two and a half times as large as stated) where no covariance covers.
 _LOST, _DOUBTFUL = 0.5, 0.25
+# Lasting error of the stations, in standard deviations of their rows, that refutes the noise. On real tracks up to four
+# were found, and the wider covariances covered the errors.
+_LASTING = 5.0
 # Gate, standard deviations: of a good row one in two million is left out.
 _USUAL = 5.0
 Event = Literal["starting", "started", "restarted", ""]
+Screen = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +102,11 @@ class Entry:
     time : float
         Seconds.
     updated : Updated
-        State after the scan, its NIS and the rows used; NaN before the first start.
+        State after the scan, with errors that last in its covariance; NIS and rows used; NaN before the first start.
     code : Status
         Ok; too few rows where none was valid and the state was only predicted; rejected where most rows did not pass
-        the gate or are not finite; misfit where the innovations of the last scans are much larger than stated;
-        ambiguous where a start has alternatives; numerical where the update failed.
+        the gate or are not finite; misfit where innovations or lasting errors are much larger than stated; unbounded
+        where the position is too vague; ambiguous where a start has alternatives; numerical where the update failed.
     rejected : int
         Rows left out.
     event : "starting", "started", "restarted" or ""
@@ -153,7 +168,7 @@ def tracked(
     cleaned, broken = _clean(problem)
     # The checks above are made at the call, not at the first scan.
     rules = rules or Rules()
-    course = _Course(start, float(problem.times[0]) if start is None else start.time, _Recent(rules))
+    course = _Course.of(start, float(problem.times[0]) if start is None else start.time, rules)
     course.fresh = start is not None
     return _Run.of(cleaned, broken, dynamics, rule, rules).entries(course)
 
@@ -222,29 +237,34 @@ class _Run:
             if course.state is None:
                 r = self.rules
                 start_here = begin(self.problem, k, self.dynamics, r.speed, r.rate, r.starts, ends=ends)
-                yield from self._starting(start_here, k, course.why)
+                yield from self._starting(start_here, k, course)
                 k, course.state, course.missed = start_here.last + 1, start_here.state, 0
                 course.recent.begin(start_here)
                 course.heard = times[start_here.last]
                 continue
-            found = self._update(k, course.state, times[k] - course.heard)
+            before = course.state
+            found = self._update(k, before, times[k] - course.heard, course.lasting.memory(self.scans.memory))
             if isinstance(found, str):
                 course.why, course.state = found, None
                 continue
             course.why = ""
-            entry, fit = found
+            entry, fit, screen = found
             if course.fresh and entry.updated.count + entry.rejected > 0:
                 _check_agrees(entry)
                 course.fresh = False
             course.take(entry, fit, entry.rejected - self.bad[k])
+            cov = course.lasting.take((self.scans, k, before), self.dynamics, entry.updated.cov, screen)
             k += 1
-            yield course.recent.judge(entry)
-            course.judge()
+            wide = screen is None or screen[2] > self.near or cov is not entry.updated.cov
+            vague = out_of_sight(self.problem, entry.updated.mean, cov) if wide else ""
+            yield course.judged(entry, cov, vague)
+            course.judge(vague)
 
-    def _starting(self, begun: Beginning, k: int, why: str) -> Iterator[Entry]:
+    def _starting(self, begun: Beginning, k: int, course: _Course) -> Iterator[Entry]:
         """Yield the scans of a start, of which the last one has the state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no state of their own: the fix of all of them holds at the last one.
+        why = course.why
         none = Updated(np.full(n, np.nan), np.full((n, n), np.nan), np.array(np.nan), np.array(0.0), np.array(0))
         for i in range(k, begun.last + 1):
             time = float(self.problem.times[i])
@@ -252,19 +272,28 @@ class _Run:
                 yield Entry(time, none, begun.waiting, self.bad[i], "starting", begun.reason)
                 continue
             count = np.array(int((self.problem.weight[self.problem.epoch == i] > 0.0).sum()) - begun.left_out)
-            done = replace(none, mean=begun.state.mean, cov=begun.state.cov, count=count)
+            cov = course.lasting.begin(self._stretch(begun), begun.state)
+            done = replace(none, mean=begun.state.mean, cov=cov, count=count)
             reason = "; ".join(filter(None, (why, begun.reason)))
             out = self.bad[i] + begun.left_out
             yield Entry(time, done, begun.code, out, "restarted" if why else "started", reason)
 
-    def _update(self, k: int, state: State, silence: float) -> tuple[Entry, Fit] | str:
-        """Return what becomes of a state by a scan and how all rows fit the prediction, or why it is not followed."""
+    def _stretch(self, begun: Beginning) -> Problem:
+        """Return the scans of a start."""
+        motion = Motion(self.dynamics.order, reference=float(self.problem.times[begun.last]))
+        return replace(cut(self.problem, begun.first, begun.last + 1), motions=(motion,))
+
+    def _update(self, k: int, state: State, silence: float, memory: Array) -> tuple[Entry, Fit, Screen | None] | str:
+        """Return the entry of a scan, the fit of all rows to the prediction and the screen for lasting errors.
+
+        Where the state is not followed the result is the reason.
+        """
         if self.rules.gap is not None and silence > self.rules.gap:
             return f"no valid row for {silence:.6g} s"
         time = float(self.problem.times[k])
         if self.how is not None and self.scans.rows[k] is not None:
             move = move_of(state, self.dynamics, time, self.problem.dimension)
-            found = self.scans.filtered(k, state.mean, state.cov, self.how, move)
+            found = self.scans.filtered(k, state.mean, state.cov, self.how, move, memory=memory)
             if found is not None and found.values[CODE] != GENERAL:
                 values = found.values.tolist()
                 if values[SPREAD] > self.near and self.rules.gap is None:
@@ -272,7 +301,11 @@ class _Run:
                     if why:
                         return why
                 entry = self._entry(k, read(found), int(values[CODE]), int(values[REJECTED_ROWS]), [])
-                return entry, (values[INNOVATION], int(values[PRESENT]))
+                return (
+                    entry,
+                    (values[INNOVATION], int(values[PRESENT])),
+                    (values[REPEATS], values[EXCESS], values[SPREAD]),
+                )
         ahead = predicted(state, self.dynamics, time, self.problem.dimension)
         return ("" if self.rules.gap is not None else self._unbridged(ahead, silence)) or self._general(k, ahead)
 
@@ -284,7 +317,7 @@ class _Run:
         limit = reach(self.problem, ahead.mean[:d])
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
-    def _general(self, k: int, ahead: State) -> tuple[Entry, Fit]:
+    def _general(self, k: int, ahead: State) -> tuple[Entry, Fit, None]:
         """Return the update of a prediction by any filter with the rows of a scan that pass the gate."""
         scan = scan_at(self.problem, k, self.dynamics.order)
         # Gate first, update then: an iterated update would be drawn by what it should not believe.
@@ -297,7 +330,7 @@ class _Run:
         fit = float(np.nan_to_num(np.minimum(off**2, self.rules.most), nan=self.rules.most).sum()), len(off)
         causes: list[str] = []
         done, code = take_scan(used, ahead, self.rule, causes)
-        return self._entry(k, done, int(code), lost, causes), fit
+        return self._entry(k, done, int(code), lost, causes), fit, None
 
     def _entry(self, k: int, done: Updated, code: int, lost: int, causes: list[str]) -> Entry:
         """Return the entry of an update, of which a number of rows (`lost`) did not pass the gate."""
@@ -346,7 +379,8 @@ class _Recent:
         self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
         self.rules, self.most, self.since = rules, rules.most, 0
         # The mean squared innovation as a share of the squared gate; 0 where the rows are too few to tell.
-        self.share = 0.0
+        # Why the position is too vague, and the lasting error of the stations in standard deviations of their rows.
+        self.share, self.vague, self.lasting = 0.0, "", 0.0
 
     def begin(self, start: Beginning) -> None:
         """Take the rows of a start; what did not fit before is forgotten where they agree, and else still counts."""
@@ -384,7 +418,15 @@ class _Recent:
         return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
 
 
-_RECENTLY = (Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),)
+_RECENTLY = (
+    Finding(Status.UNBOUNDED, lambda recent: recent.vague, lambda recent: [recent.vague]),
+    Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),
+    Finding(
+        Status.MISFIT,
+        lambda recent: recent.lasting > _LASTING,
+        lambda recent: [f"errors that last for many scans are {recent.lasting:.2g} times as large as stated"],
+    ),
+)
 """All findings against a scan by those before it."""
 
 
@@ -400,6 +442,8 @@ class _Course:
         Time of the last valid row.
     recent : _Recent
         How the last scans fit.
+    lasting : LastingErrors
+        Errors that last from scan to scan.
     why : str
         Why the state before was given up.
     missed : int
@@ -411,9 +455,15 @@ class _Course:
     state: State | None
     heard: float
     recent: _Recent
+    lasting: LastingErrors
     why: str = ""
     missed: int = 0
     fresh: bool = False
+
+    @classmethod
+    def of(cls, state: State | None, heard: float, rules: Rules) -> _Course:
+        """Return a track before its first scan."""
+        return cls(state, heard, _Recent(rules), LastingErrors(_WINDOW * rules.patience))
 
     def take(self, entry: Entry, fit: Fit, gated: int) -> None:
         """Go on by a scan of whose rows the gate refused so many."""
@@ -425,9 +475,19 @@ class _Course:
         self.recent.add(fit)
         self.state = State(entry.time, entry.updated.mean, entry.updated.cov)
 
-    def judge(self) -> None:
-        """Give the state up where it is lost."""
-        if self.missed >= self.recent.rules.patience:
+    def judged(self, entry: Entry, cov: Array, vague: str) -> Entry:
+        """Return a scan with its covariance (n, n) and status; `vague` is why its position is not followed."""
+        self.recent.vague, self.recent.lasting = vague, 0.0
+        if cov is not entry.updated.cov:
+            self.recent.lasting = self.lasting.size
+            entry = replace(entry, updated=replace(entry.updated, cov=cov))
+        return self.recent.judge(entry)
+
+    def judge(self, vague: str) -> None:
+        """Give the state up where it is lost, or too vague to follow."""
+        if vague:
+            self.state, self.why = None, vague
+        elif self.missed >= self.recent.rules.patience:
             self.state, self.why = None, f"most rows of {self.missed} scans did not fit the prediction"
         elif self.recent.lost:
             self.state, self.why = None, self.recent.sentence
@@ -493,7 +553,7 @@ class Follower:
             return []
         cleaned, broken = _clean(reduce(joined, run))
         stretch = _Run.of(cleaned, broken, self._dynamics, self._rule, self._rules)
-        course = self._course or _Course(None, float(run[0].times[0]), _Recent(self._rules))
+        course = self._course or _Course.of(None, float(run[0].times[0]), self._rules)
         done: list[Entry] = []
         self._needed = 1
         try:

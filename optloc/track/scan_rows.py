@@ -12,7 +12,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.cache import Cache
 from optloc.base.types import Array, Motion
-from optloc.compute.filter import VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
+from optloc.compute.filter import COLUMNS, VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
 from optloc.compute.jit import at_hand
 from optloc.compute.pack import sources
 from optloc.compute.tables import tables
@@ -43,12 +43,15 @@ class Scans:
         Rows of each scan; None for a scan of the general form, or without rows.
     item : list of k int
         Number of each scan among the scans of its structure.
+    memory : int
+        Numbers that the memory of a track has, see `filter_scan`.
     """
 
     problem: Problem
     order: int
     rows: list[ScanRows | None]
     item: list[int]
+    memory: int
 
     @classmethod
     def of(cls, problem: Problem, order: int) -> Scans:
@@ -63,7 +66,9 @@ class Scans:
                     made = kept._replace(z=_by_scan(observed, index), weight=_by_scan(weight, index))
                 for i, k in enumerate(epochs.tolist()):
                     rows[k], item[k] = made, i
-        return cls(problem, order, rows, item)
+        most = max((made.z.shape[2] for made in rows if made is not None), default=0)
+        errors = len(problem.rows) * int(problem.stations.places.shape[-2])
+        return cls(problem, order, rows, item, COLUMNS + errors + most * ((order + 1) * problem.dimension + 2))
 
     def filtered(
         self,
@@ -73,6 +78,7 @@ class Scans:
         how: Filtering,
         move: Move | None = None,
         more: tuple[Array, Array] | None = None,
+        memory: Array | None = None,
     ) -> Filtered | None:
         """Return states (..., n) after a scan, or None where it takes the general form.
 
@@ -88,6 +94,8 @@ class Scans:
             From their time to the time of the scan; None for states that hold then.
         more : tuple of array (..., m), optional
             Measurements less corrections, and weights, that replace the scan's.
+        memory : array, optional
+            Of the track of a single state, see `filter_scan`.
         """
         rows, n = self.rows[k], mean.shape[-1]
         if rows is None or type(mean) is not np.ndarray or rows.tables.shared != n:
@@ -101,7 +109,16 @@ class Scans:
         count, move = math.prod(shape), move or _stay(n)
         ahead = Move(owned(move.F), _each(move.Q, 2, shape), _each(move.drive, 1, shape))
         out = Filtered(np.empty((count, n)), np.empty((count, n, n)), np.empty((count, VALUES)))
-        filter_scan(rows, item, ahead, _each(mean, 1, shape), _each(cov, 2, shape), how, out)
+        filter_scan(
+            rows,
+            item,
+            ahead,
+            _each(mean, 1, shape),
+            _each(cov, 2, shape),
+            how,
+            _NONE if memory is None else memory,
+            out,
+        )
         if not shape:
             return Filtered(out.mean[0], out.cov[0], out.values[0])
         return Filtered(*(part.reshape(*shape, *part.shape[1:]) for part in out))
@@ -131,6 +148,26 @@ def _each(values: Array, core: int, shape: tuple[int, ...]) -> Array:
         return owned(values)[None]
     inner = values.shape[values.ndim - core :]
     return owned(np.broadcast_to(values, (*shape, *inner)).reshape(-1, *inner))
+
+
+_NONE = np.zeros(0)
+_SIGNS = {"range_sum": 1.0, "azimuth": 0.0, "elevation": 0.0}
+
+
+def touched(problem: Problem) -> tuple[Array, Array]:
+    """Return the stations of rows (m, 2) as numbers of their errors, -1 for none, and the sign of the second (m,).
+
+    The sign is 0 for angles, which have one station.
+
+    A station has one error for each kind of rows, in the order of their names.
+    """
+    names = sorted({rows.kind for rows in problem.rows})
+    count = problem.stations.places.shape[-2]
+    first = np.repeat([names.index(rows.kind) * count for rows in problem.rows], [rows.count for rows in problem.rows])
+    pairs = np.concatenate([np.stack([rows.a, rows.b], axis=1) for rows in problem.rows])
+    # a ratio errs like a difference
+    sign = np.concatenate([np.full(rows.count, _SIGNS.get(rows.kind, -1.0)) for rows in problem.rows])
+    return np.where(pairs >= 0, first[:, None] + pairs, -1).astype(np.int64), sign
 
 
 @cache
@@ -222,7 +259,9 @@ def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows
         matrix = linalg.whitening(covariance.reshape(-1, m, m))
         white, total = np.ascontiguousarray(matrix.reshape(len(matrix), m * m)), size_of(matrix)
     none = np.zeros((1, 1, m))
-    return ScanRows(found.tables, divided.common, divided.own, covariance, white, total, none, none)
+    station, sign = touched(problem)
+    pairs, signs = np.ascontiguousarray(station[index[0]]), sign[index[0]]
+    return ScanRows(found.tables, divided.common, divided.own, covariance, white, total, none, none, pairs, signs)
 
 
 def _first_of(problem: Problem, order: int, epochs: Array) -> Problem:

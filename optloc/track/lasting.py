@@ -1,0 +1,413 @@
+"""Errors that last from scan to scan: found in the innovations of a track, with their share of its covariance.
+
+A filter averages its rows as if their errors were independent. Delays of receivers, multipath and attitude stay for
+many scans, so that the average keeps them. The true covariance of a filter with such errors follows from its gain K,
+as in the consider analysis of Schmidt [1]_. Each station has an error b of s standard deviations of its rows, or all
+angles share one. It is a Gauss-Markov process that keeps the share phi from scan to scan. The rows measure
+h(x) + D b + v, with white noise v. The error e of the state has two steps:
+
+    e <- F e + w,   e <- (I - K H) e - K (D b + v).
+
+Its covariance is the filter's, plus (c^2 - 1) times the part from v, plus s^2 times the part from b. The filter and its
+estimates stay the same. The covariance of the innovations of a scan, and their covariance with the innovations before,
+are linear in s^2 and c^2. Weighted least squares estimates both, and its score tests them [2]_.
+
+References
+----------
+.. [1] S. F. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3 (1966).
+.. [2] R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE Trans. Autom. Control 15
+   (1970): the autocovariances of innovations.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base.errors import NUMERICAL
+from optloc.base.types import Array
+from optloc.compute.filter import COLUMNS, ScanRows
+from optloc.linear.normal import linearise, weighed
+from optloc.problem import noise as noises
+from optloc.problem.problem import Problem
+from optloc.track.dynamics import Dynamics
+from optloc.track.scan_rows import Scans, touched
+from optloc.track.track import State, scan_at
+
+# Correlation times, scans: a decade apart. Measured on real tracks: one of 100 scans alone finds most errors, and finer
+# steps find no more.
+_LASTS = np.array([1.0, 10.0, 100.0])
+# Weight of all earlier scans at each new scan: errors are estimated over some fifty scans. Measured: with 0.95 more
+# simulated scans are 5 sigma off (1.0 % instead of 0.5 %), and 0.99 follows changes of the surroundings later.
+_KEEP = 0.98
+# Standard deviations of the score beyond which errors last: 3 of 120 simulated clean tracks of 60 scans were beyond for
+# some scans, and NEES was between 1.01 and 1.08.
+_SURE = 3.0
+# Standard deviations that are subtracted from the score of one error for all angles: a chi-square with one degree of
+# freedom has a long tail. Measured: without it 7 % of clean tracks have a common error for some scans.
+_SKEWED = 1.5
+# The same for larger errors that do not last: the heavy tails of real rows are no reason.
+_LARGE = 4.0
+# Standard deviations of the screen in machine code that call this test, which costs a hundred times more. And
+# standard deviations of the score below which the test ends.
+_CALL, _END = 3.5, 1.0
+# Standard deviations of the score of a start after which the next scans are tested, and the least number of them: on a
+# UWB flight the first scan after a start was 7 sigma off, and the score of the start was 2.3.
+_DOUBT, _FEW = 2.0, 5
+# Whitened innovations count as no larger than this: wild rows that pass the gate are no lasting errors.
+_WILD = 4.0
+# Least share of the stated variance that is left white, and turns of weights and estimate at a start.
+_LEAST, _TURNS = 0.05, 3
+# Rows of a start that are tested at most: the work grows with their third power, and 400 rows take a tenth of a second.
+_MOST = 400
+# Gate of the rows of a scan, in standard deviations, as of `Rules`.
+_GATE = 5.0
+# Share of the mean variance of the rows that is added to each variance: where pairs close loops the noise is singular.
+_RIDGE = 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Rows that were used, linearised: H (m, n), residuals and scans (m,), R (m, m), lasting errors D (j, m, q)."""
+
+    H: Array
+    residual: Array
+    scan: Array
+    R: Array
+    D: Array
+
+    @classmethod
+    def of(cls, part: Problem, at: Array, cov: Array | None) -> _Rows:
+        """Return the rows of scans at a state that pass the gate; without a covariance, of residuals after a fit."""
+        linear = linearise(part, at, ())
+        R = noises.dense(weighed(part, at).noise, np.arange(part.count))
+        spread = np.diagonal(R) + (0.0 if cov is None else ((linear.shared @ cov) * linear.shared).sum(-1))
+        used = (part.weight > 0.0) & (np.diagonal(R) > 0.0) & (np.abs(linear.residual) <= _GATE * np.sqrt(spread))
+        D = _errors(R, *touched(part), part.stations.places.shape[-2])[:, used]
+        return cls(linear.shared[used], linear.residual[used], part.epoch[used], R[np.ix_(used, used)], D)
+
+    @classmethod
+    def written(cls, rows: ScanRows, item: int, memory: Array, n: int, stations: int) -> _Rows:
+        """Return the rows of a scan as machine code wrote them to a memory, see `optloc.compute.filter`."""
+        m = rows.z.shape[2]
+        line = memory[len(memory) - m * (n + 2) :].reshape(m, n + 2)
+        R = rows.covariance[item if len(rows.covariance) > 1 else 0]
+        R = np.diag(R) if len(R) == m else R.reshape(m, m)
+        used = line[:, n + 1] > 0.0
+        scale = np.sqrt(line[used, n + 1])
+        noise = R[np.ix_(used, used)] / (scale[:, None] * scale)
+        errors = _errors(R, rows.station, rows.sign, stations)[:, used]
+        return cls(line[used, :n], line[used, n], np.zeros(len(scale), dtype=np.int64), noise, errors)
+
+
+def _errors(R: Array, columns: Array, sign: Array, stations: int) -> Array:
+    """Return the derivatives D (j, m, q) of rows by lasting errors, which make up the stated variance of each row.
+
+    `_Recursion` has the hypotheses j. Only angles share an error: an attitude. A common offset of ranges to stations in
+    one direction is the same as an error of the position. With it, real tracks lost a fifth of their `ok` scans.
+    """
+    two = columns[:, 1] >= 0
+    size = np.sqrt(np.diagonal(R) / np.where(two, 2.0, 1.0))
+    # all stations have the first error of the kind
+    shared = np.where(sign == 0.0, columns[:, 0] // stations * stations, columns[:, 0])
+    D = np.zeros((2, len(R), 1 + int(columns.max(initial=0))))
+    for one, first in zip(D, (columns[:, 0], shared), strict=True):
+        for column, times in ((first, size), (columns[:, 1], sign * size)):
+            index = np.flatnonzero(column >= 0)
+            np.add.at(one, (index, column[index]), times[index])
+    return np.repeat(D, len(_LASTS), axis=0)
+
+
+class _Recursion:
+    """The parts of a filter's covariance, and the accumulated score of lasting errors.
+
+    The hypotheses j are the correlation times of `_LASTS`. The first half has an error for each station, the other half
+    one error for all angles of a kind.
+    """
+
+    def __init__(self, n: int) -> None:
+        J = 2 * len(_LASTS)
+        self.phi = np.exp(-1.0 / np.tile(_LASTS, 2))[:, None, None]
+        self.info, self.score = np.zeros((J, 2, 2)), np.zeros((J, 2))
+        self.best, self.sure, self.scans = 0, 0.0, 0
+        self.reset(np.zeros((n, n)))
+        self.size, self.excess = 0.0, 0.0
+        """Squared lasting error, and what the white variance exceeds the stated one by, both in stated variances."""
+
+    @property
+    def active(self) -> bool:
+        """Return whether errors are found."""
+        return self.size > 0.0 or self.excess > 0.0
+
+    def reset(self, white: Array) -> None:
+        """Take a state of whose covariance (n, n) a part comes from white noise, and none from lasting errors."""
+        J, n = len(self.phi), len(white)
+        # Covariance from white noise, from lasting errors, and of the state with these errors.
+        self.white, self.lasting, self.cross = white.copy(), np.zeros((J, n, n)), np.zeros((J, n, 0))
+        # Whitened innovations of the scan before, and what the next ones share with them.
+        self.before: tuple[Array, Array, Array, Array] | None = None
+
+    def covariance(self, cov: Array) -> Array:
+        """Return the covariance (n, n) of a filter with what errors add; it is never less than the filter's."""
+        wide = cov + max(self.excess, 0.0) * self.white + self.size * self.lasting[self.best]
+        return np.asarray(0.5 * (wide + wide.T))
+
+    def begin(self, rows: _Rows, cov: Array) -> None:
+        """Take the fix of a stretch of scans, with the covariance (n, n) of its state."""
+        self.reset(cov)
+        self.scans = 0
+        if 0 < len(rows.residual) <= _MOST:
+            try:
+                self._test_start(rows, cov)
+            except NUMERICAL:
+                self.reset(cov)
+
+    def _test_start(self, rows: _Rows, cov: Array) -> None:
+        H, R, D = rows.H, rows.R, rows.D
+        gain = _solved(R, H @ cov).T
+        left = np.eye(len(R)) - H @ gain
+        apart = np.abs(rows.scan[:, None] - rows.scan)
+        ties = self.phi**apart * (D @ np.swapaxes(D, -1, -2))
+        self.cross = -gain @ (self.phi ** (rows.scan.max() - rows.scan)[:, None] * D)
+        self.lasting = gain @ ties @ gain.T
+        noise, errors = left @ R @ left.T, left @ ties @ left.T
+        info, score = self.info, self.score
+        for turn in range(_TURNS):
+            now = R if turn == 0 else R * (1.0 + max(self.excess, 0.0)) + self.size * ties[self.best]
+            unit = _whitening(now)
+            self.info, self.score = info.copy(), score.copy()
+            self._add(unit, unit @ rows.residual, noise, noise, errors)
+            self._estimate()
+
+    def step(self, F: Array) -> None:
+        """Take a prediction."""
+        self.white = F @ self.white @ F.T
+        self.lasting = F @ self.lasting @ F.T
+        self.cross = self.phi * (F @ self.cross)
+
+    def take(self, rows: _Rows, F: Array, cov: Array) -> None:
+        """Take a scan with the predicted covariance (n, n), after its prediction."""
+        self.scans += 1
+        self._widen(rows.D.shape[-1])
+        H, R, D = rows.H, rows.R, np.pad(rows.D, [(0, 0), (0, 0), (0, self.cross.shape[-1] - rows.D.shape[-1])])
+        back = np.swapaxes(D, -1, -2)
+        S, noise = H @ cov @ H.T + R, H @ self.white @ H.T + R
+        tied = H @ self.cross @ back
+        errors = H @ self.lasting @ H.T + tied + np.swapaxes(tied, -1, -2) + D @ back
+        gain = _solved(S, H @ cov).T
+        unit = _whitening(S + max(self.excess, _LEAST - 1.0) * noise + self.size * errors[self.best], S)
+        w = unit @ rows.residual
+        self.info, self.score = _KEEP * self.info, _KEEP * self.score
+        self._add(unit, w, S, noise, errors)
+        if self.before is not None:
+            last, white, lasting, seen = self.before
+            here = unit @ (H @ F @ lasting + D @ (self.phi * seen))
+            self._repeat(np.clip(w, -_WILD, _WILD), last, unit @ H @ F @ white, here)
+        seen = np.swapaxes(self.cross, -1, -2) @ H.T + back
+        self.before = (
+            np.clip(w, -_WILD, _WILD),
+            (self.white @ H.T - gain @ noise) @ unit.T,
+            (self.lasting @ H.T + self.cross @ back - gain @ errors) @ unit.T,
+            seen @ unit.T,
+        )
+        left, KD = np.eye(len(cov)) - gain @ H, gain @ D
+        self.white = left @ self.white @ left.T + gain @ R @ gain.T
+        part = left @ self.cross
+        both = part @ np.swapaxes(KD, -1, -2)
+        drawn = KD @ np.swapaxes(KD, -1, -2)
+        self.lasting = left @ self.lasting @ left.T + drawn - both - np.swapaxes(both, -1, -2)
+        self.cross = part - KD
+        self._estimate()
+
+    def _widen(self, columns: int) -> None:
+        """Make room for stations that were not there before; they were in no scan, so nothing is lost."""
+        more = columns - self.cross.shape[-1]
+        if more > 0:
+            self.cross = np.pad(self.cross, [(0, 0), (0, 0), (0, more)])
+            if self.before is not None:
+                w, white, lasting, seen = self.before
+                self.before = w, white, lasting, np.pad(seen, [(0, 0), (0, more), (0, 0)])
+
+    def _add(self, unit: Array, w: Array, stated: Array, noise: Array, errors: Array) -> None:
+        """Add what the size of the innovations of a scan says; `unit` whitens them as they are estimated now."""
+        w = np.clip(w, -_WILD, _WILD)
+        stated, noise, errors = (unit @ each @ unit.T for each in (stated, noise, errors))
+        self._sum(0.5, np.outer(w, w) - stated, noise[None], errors)
+
+    def _repeat(self, w: Array, last: Array, noise: Array, errors: Array) -> None:
+        """Add what the innovations of this scan and of the scan before say together."""
+        self._sum(1.0, np.outer(w, last), noise[None], errors)
+
+    def _sum(self, times: float, found: Array, noise: Array, errors: Array) -> None:
+        """Add a matrix that is found and its derivatives (j or 1, ...) by the white and by the lasting variance."""
+        one, mixed, two = ((a * b).sum((-1, -2)) for a, b in ((noise, noise), (noise, errors), (errors, errors)))
+        self.info[:, 0, 0] += times * one
+        self.info[:, 0, 1] += times * mixed
+        self.info[:, 1, 0] += times * mixed
+        self.info[:, 1, 1] += times * two
+        self.score[:, 0] += times * (found * noise).sum((-1, -2))
+        self.score[:, 1] += times * (found * errors).sum((-1, -2))
+
+    def _estimate(self) -> None:
+        """Choose the correlation time whose score is highest; errors count where it is beyond chance."""
+        info = self.info
+        alone = np.maximum(info[:, 1, 1] - info[:, 0, 1] ** 2 / np.maximum(info[:, 0, 0], 1e-12), 1e-12)
+        value = (self.score[:, 1] - info[:, 0, 1] * self.score[:, 0] / np.maximum(info[:, 0, 0], 1e-12)) / alone
+        sure = value * np.sqrt(alone)
+        sure[len(_LASTS) :] -= _SKEWED
+        self.best = int(np.argmax(sure))
+        self.sure = float(sure[self.best])
+        one, mixed = info[self.best, 0]
+        self.size = max(float(value[self.best]), 0.0) if self.sure > _SURE else 0.0
+        excess = float(self.score[self.best, 0] - mixed * self.size) / max(float(one), 1e-12)
+        large = self.size > 0.0 or excess * np.sqrt(float(one)) > _LARGE
+        self.excess = max(excess, _LEAST - 1.0) if large else 0.0
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """Return the inverse of a covariance (m, m), made regular by a small ridge, times a matrix."""
+    ridge = _RIDGE * float(np.trace(matrix)) / len(matrix)
+    return np.asarray(np.linalg.solve(matrix + ridge * np.eye(len(matrix)), right))
+
+
+def _whitening(cov: Array, other: Array | None = None) -> Array:
+    """Return the inverse root of a covariance (m, m), or of another where rounding makes it none."""
+    scale = _RIDGE * float(np.trace(cov)) / len(cov) * np.eye(len(cov))
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov + scale)))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(cov if other is None else other)
+        return np.asarray(vectors.T / np.sqrt(np.maximum(values, 1e-9 * values.max()))[:, None])
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """A start as it was taken: rows, covariance, and the sums of scores before it."""
+
+    rows: _Rows
+    cov: Array
+    info: Array
+    score: Array
+
+
+Taken = tuple[Scans, int, State]
+"""A scan that a track has taken: the scans of its run, its number, and the state before its prediction."""
+
+
+class LastingErrors:
+    """The lasting errors of a track, and its covariance with them.
+
+    Machine code screens each scan, see `REPEATS` and `EXCESS` of `optloc.compute.filter`. Where the screen finds an
+    error, `_Recursion` takes the last scans again. From then on it takes each scan, until no error is left. It always
+    takes scans of the general form.
+
+    Parameters
+    ----------
+    window : int
+        Scans that are taken again.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._recent: deque[Taken] = deque(maxlen=window)
+        self._start: _Start | None = None
+        self._found: _Recursion | None = None
+        self._on = False
+        self._memory = np.zeros(COLUMNS)
+
+    def memory(self, size: int) -> Array:
+        """Return the memory of the screen with at least so large a size, see `optloc.compute.filter.filter_scan`."""
+        if len(self._memory) < size:
+            self._memory = np.zeros(size)
+        return self._memory
+
+    @property
+    def size(self) -> float:
+        """Return the lasting error of each station in standard deviations of its rows; 0 where none is found."""
+        found = self._found
+        alone = self._on and found is not None and found.best < len(_LASTS)
+        return float(np.sqrt(found.size)) if alone and found is not None else 0.0
+
+    def begin(self, stretch: Problem, state: State) -> Array:
+        """Return the covariance (n, n) of a new state, the fix of a stretch of scans.
+
+        Parameters
+        ----------
+        stretch : Problem
+            The scans, with a target that moves by the order of the state.
+        state : State
+            At the last of them.
+        """
+        found = self._found or _Recursion(len(state.mean))
+        rows = _Rows.of(stretch, state.mean, None)
+        self._start = _Start(rows, state.cov, found.info, found.score)
+        self._recent.clear()
+        self._memory[:] = 0.0
+        found.begin(rows, state.cov)
+        self._found, self._on = found, found.active or found.sure > _DOUBT
+        return found.covariance(state.cov)
+
+    def take(self, taken: Taken, dynamics: Dynamics, cov: Array, screen: tuple[float, float, float] | None) -> Array:
+        """Return the covariance (n, n) of the state after a scan.
+
+        Parameters
+        ----------
+        taken : Taken
+            The scan.
+        dynamics : Dynamics
+            Model of motion.
+        cov : array (n, n)
+            Covariance of the filter after the scan.
+        screen : tuple of three float
+            REPEATS, EXCESS and SPREAD of the scan; None for a scan of the general form.
+        """
+        self._recent.append(taken)
+        if not self._on:
+            if screen is not None and screen[0] < _CALL and screen[1] < _CALL:
+                return cov
+            found = self._found = self._restored(len(cov))
+            self._on = True
+            for each in self._recent:
+                _go_on(found, each, dynamics, None)
+        else:
+            assert self._found is not None
+            found = self._found
+            _go_on(found, taken, dynamics, None if screen is None else self._memory)
+            self._on = screen is None or found.active or found.sure > _END or found.scans < _FEW
+        return found.covariance(cov)
+
+    def _restored(self, n: int) -> _Recursion:
+        """Return the recursion as it was before the scans that are taken again."""
+        found, start = _Recursion(n), self._start
+        if start is not None and len(self._recent) < (self._recent.maxlen or 0):
+            found.info, found.score = start.info, start.score
+            found.begin(start.rows, start.cov)
+        else:
+            # what the covariance of an old state comes from is not known: from rows for the most part
+            found.reset(self._recent[0][2].cov)
+        return found
+
+
+def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | None) -> None:
+    """Take a scan, whose rows are in a memory unless it takes the general form or is taken again."""
+    scans, k, before = taken
+    problem, written = scans.problem, scans.rows[k]
+    dt = float(problem.times[k]) - before.time
+    F, Q, drive = (
+        dynamics.step(dt, before.mean, problem.dimension) if dt > 0.0 else (np.eye(len(before.mean)), 0.0, 0.0)
+    )
+    mean, cov = F @ before.mean + drive, F @ before.cov @ F.T + Q
+    found.step(F)
+    if memory is not None and written is not None:
+        rows: _Rows | None = _Rows.written(written, scans.item[k], memory, len(mean), problem.stations.places.shape[-2])
+    else:
+        scan = scan_at(problem, k, dynamics.order)
+        rows = _Rows.of(scan, mean, cov) if scan.rows else None
+    if rows is None or not len(rows.residual):
+        found.before = None
+        return
+    try:
+        found.take(rows, F, cov)
+    except NUMERICAL:  # the status of the filter names the problem; the recursion starts again
+        found.reset(np.zeros_like(before.cov))
