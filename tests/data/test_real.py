@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from monte_carlo.tables import ledger
 
 from optloc import InvalidProblem, Problem, Status, datasets, solve
 from optloc.adequacy.elements import batch_of
+from optloc.datasets import mrclam, plaza, uwb
 from optloc.quality.structure import with_estimated_noise
+from optloc.track import polynomial, tracked
 
 pytestmark = [pytest.mark.data, pytest.mark.full]
 
@@ -114,11 +118,48 @@ SETS = {
 }
 
 
+# Least share of `ok` scans of each flight.
+FLOWN = {"F01": 0.97, "F02": 0.97, "F03": 0.97, "F04": 0.9, "F05": 0.97, "F06": 0.97}
+
+
+@dataclass(frozen=True)
+class TrackGuard:
+    """A run of one target, the least share of `ok` scans, and the largest share of far ones among these."""
+
+    read: Callable[[Path], tuple[Problem, np.ndarray]]
+    ok: float
+    far: float
+
+
+def _course(flight: str) -> Callable[[Path], tuple[Problem, np.ndarray]]:
+    return lambda folder: uwb.course(folder / "util_uwb_tdoa", flight, WINDOW)
+
+
+def _robot(number: int, kinds: tuple[str, ...]) -> Callable[[Path], tuple[Problem, np.ndarray]]:
+    return lambda folder: mrclam.dataset(folder / "mrclam_aoa2d", number=number, kinds=kinds)
+
+
+def _mower(form: str) -> Callable[[Path], tuple[Problem, np.ndarray]]:
+    return lambda folder: plaza.dataset(folder / "plaza_range", form=form)
+
+
+# Seconds of a scan of a flight.
+WINDOW = 0.1
+TRACKS = {
+    **{f"track, UWB {flight}": TrackGuard(_course(flight), ok, 0.0) for flight, ok in FLOWN.items()},
+    **{f"track, Plaza, {form}": TrackGuard(_mower(form), 0.4, 0.0) for form in ("raw", "offset", "affine")},
+    **{f"track, MRCLAM {n}, bearings": TrackGuard(_robot(n, BEARINGS), 0.9, 0.005) for n in (1, 2, 5)},
+    **{f"track, MRCLAM {n}, bearings and ranges": TrackGuard(_robot(n, BOTH), 0.9, 0.015) for n in (1, 2, 5)},
+}
+
+
 @pytest.fixture(scope="module")
 def book():
     header = ("set", "noise", "fixes", "`ok`", "beyond 5 sigma", "median error, m", "from the truth, m")
-    names = [f"{name}, {noise}" for name in SETS for noise in ("stated", "learnt")]
-    with ledger("real", header, names, "every fix by `auto` alone (`test_real.py`)") as made:
+    names = [*(f"{name}, {noise}" for name in SETS for noise in ("stated", "learnt")), *TRACKS]
+    with ledger(
+        "real", header, names, "fixes by `auto`, tracks by `iekf` at constant velocity (`test_real.py`)"
+    ) as made:
         yield made
 
 
@@ -136,3 +177,26 @@ def test_fixes_of_real_data_keep_their_promise(book, data_dir, name):
         book.add(f"{name}, {key}", noise, *found.cells)
         assert found.ok >= (limits[0] - SLACK) * found.fixes
         assert found.far <= (limits[1] + SLACK) * found.likely
+
+
+def counted(problem: Problem, truth: np.ndarray) -> Counts:
+    """Return the counts of the scans of a track at constant velocity; likely are those that are `ok`."""
+    entries = [entry for entry in tracked(problem, polynomial(1, 1.0)) if np.isfinite(entry.updated.mean).all()]
+    at = np.searchsorted(problem.times, [entry.time for entry in entries])
+    d = problem.dimension
+    error = np.array([entry.updated.mean[:d] for entry in entries]) - truth[at, :d]
+    good = np.array([entry.code == Status.OK for entry in entries])
+    cov = np.array([entry.updated.cov[:d, :d] for entry in entries])
+    squared = np.einsum("ni,nij,nj->n", error[good], np.linalg.pinv(cov[good]), error[good])
+    median, far = float(np.median(np.linalg.norm(error, axis=1))), int((squared > FAR**2).sum())
+    return Counts(len(problem.times), int(good.sum()), int(good.sum()), far, median, np.nan)
+
+
+@pytest.mark.parametrize("name", TRACKS)
+def test_tracks_of_real_data_keep_their_promise(book, data_dir, name):
+    guard = TRACKS[name]
+    found = counted(*guard.read(data_dir))
+    report(f"{name}: {found}")
+    book.add(name, "stated", *found.cells[:-1], "-")
+    assert found.ok >= (guard.ok - SLACK) * found.fixes
+    assert found.far <= (guard.far + SLACK) * found.likely
