@@ -131,17 +131,22 @@ def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None =
     if fix is None and batch.layout.size:
         fix = solve(batch, method)
     kept, x = usable(batch, fix)
-    return structure_at(batch.take(kept), x, kept)
+    return structure_at(batch.take(kept), x, kept if _in_order(problem) else None)
 
 
-def structure_at(batch: Problem, x: Array, number: Array) -> NoiseStructure:
-    """Return the structure of the noise at fixes (N, size) of a flat batch, their epochs in `number` (N,)."""
+def _in_order(problem: Problem) -> bool:
+    """Return whether the fixes of a problem are its epochs: problems of a batch have no order in time."""
+    return problem.epochs > 1 and not problem.batch_shape
+
+
+def structure_at(batch: Problem, x: Array, number: Array | None) -> NoiseStructure:
+    """Return the structure of the noise at fixes (N, size) of a flat batch, their epochs in `number` (N,) if known."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
         plain, common = (_try(batch, x, "kind", shared) for shared in (None, "kind"))
         best = common if common.seen and common.tried.total < plain.tried.total else plain
-        lasting = _lasting(batch, x, number, best)
+        lasting = {} if number is None else _lasting(batch, x, number, best)
         found = [plain, common] if common.seen else [plain]
         if best is plain and not lasting:
             found += [_try(batch, x, by, None) for by in _groupings(batch)]
@@ -198,8 +203,8 @@ def _lasting(batch: Problem, x: Array, number: Array, best: _Candidate) -> dict[
     _, tests = cleaned(made, variance[made.of_effect])
     follows = np.flatnonzero(np.diff(number) == 1)
     parts = [follows[i : i + _PART] for i in range(0, len(follows), _PART)]
-    found = {}
-    for kind in sorted(set(kind_of.tolist())):
+    found, known = {}, {name for name, low in zip(best.made.names, best.fit.low, strict=True) if np.isfinite(low)}
+    for kind in sorted(known & {*kind_of.tolist()}):
         own = np.flatnonzero(kind_of == kind)
         sums = [_products(tests, made.of_effect, own, variance, part) for part in parts]
         product, share = (np.concatenate([one[i] for one in sums] or [np.zeros(0)]) for i in range(2))
@@ -306,12 +311,13 @@ def with_estimated_noise(
         levels = learnt.levels(batch)
         return with_noise_levels(problem, levels), levels
     part = _stretches(len(learnt.kept))
-    found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part])
+    ordered = _in_order(problem)
+    found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part] if ordered else None)
     _check_lasting(found.lasting, {*map(str, kinds_of(batch))})
     levels = learnt.levels(batch)
     if (found.by, found.common) != ("kind", None):
         plain, learnt = levels, _agree(problem, batch, found.by, found.common, method, learnt)
-        levels = _at_least(learnt.levels(batch), plain, found.lasting)
+        levels = _at_least(learnt.levels(batch), plain, found.lasting if ordered else None)
     levels = _widened(levels, found.lasting)
     levels = replace(levels, sentences=(*found.sentences, *levels.sentences))
     return with_noise_levels(problem, levels), levels
@@ -403,13 +409,13 @@ def _check_lasting(lasting: dict[str, float], kinds: set[str]) -> None:
             raise InvalidProblem(f"{what} show their size", "noise", advice)
 
 
-def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float]) -> NoiseLevels:
-    """Return levels of rows that are at least those without an error in common, where that error lasts.
+def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float] | None) -> NoiseLevels:
+    """Return levels of rows that are at least those without an error in common, where that error lasts or may last.
 
     An error in common that lasts is few independent errors. Residuals then do not separate it from errors of rows: of
     ranges that are 7 % too long, 14 % of the fixes were beyond five sigma.
     """
-    least = {name: i for i, name in enumerate(plain.names) if common_name(name) in lasting}
+    least = {name: i for i, name in enumerate(plain.names) if lasting is None or common_name(name) in lasting}
     low, factor, high = levels.low.copy(), levels.factor.copy(), levels.high.copy()
     for i, name in enumerate(levels.names):
         if name in least and plain.factor[least[name]] > factor[i]:
