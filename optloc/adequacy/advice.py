@@ -22,6 +22,8 @@ from optloc.problem.problem import Problem
 _SHOWN = 3
 # Rows of a run that are looked at: what lasts shows in them, and tests of all channels take seconds with more.
 _ROWS = 2000
+# Probability of the chi-square test below which the residuals are a misfit.
+_MISFIT = 0.01
 
 
 def advise(problem: Problem, fix: Fix | None = None) -> Any:
@@ -218,7 +220,8 @@ def _tell(problem: Problem, one: Explained) -> Advice:
     kind, what = who.form, _noun(who)
     when = f" from t = {who.since:.6g} s " if np.isfinite(who.since) else ""
     when += {"step": "on", "burst": f"to {who.until:.6g} s"}.get(kind, "")
-    seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain the misfit: p = {one.p_after:.2g}"
+    better = "the misfit" if one.p_before < _MISFIT else "the residuals better"
+    seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain {better}: p = {one.p_after:.2g}"
     seen += f" with it, {one.p_before:.2g} without"
     if kind == "step":
         return Advice("step", seen, "cut the run there, or give the rows from then on another station name")
