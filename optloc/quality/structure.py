@@ -131,7 +131,7 @@ def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None =
     if fix is None and batch.layout.size:
         fix = solve(batch, method)
     kept, x = usable(batch, fix)
-    return structure_at(batch.take(kept), x, kept if _in_order(problem) else None)
+    return structure_at(batch.take(kept), x, kept, ordered=_in_order(problem))
 
 
 def _in_order(problem: Problem) -> bool:
@@ -139,16 +139,19 @@ def _in_order(problem: Problem) -> bool:
     return problem.epochs > 1 and not problem.batch_shape
 
 
-def structure_at(batch: Problem, x: Array, number: Array | None) -> NoiseStructure:
-    """Return the structure of the noise at fixes (N, size) of a flat batch, their epochs in `number` (N,) if known."""
+def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> NoiseStructure:
+    """Return the structure of the noise at fixes (N, size) of a flat batch, the problems `number` (N,).
+
+    Problems that are not ordered in time may have errors that last although neighbours do not show it.
+    """
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
         plain, common = (_try(batch, x, "kind", shared) for shared in (None, "kind"))
         best = common if common.seen and common.tried.total < plain.tried.total else plain
-        lasting = {} if number is None else _lasting(batch, x, number, best)
+        lasting = _lasting(batch, x, number, best)
         found = [plain, common] if common.seen else [plain]
-        if best is plain and not lasting:
+        if best is plain and ordered and not lasting:
             found += [_try(batch, x, by, None) for by in _groupings(batch)]
     tried = tuple(sorted((candidate.tried for candidate in found), key=lambda structure: structure.total))
     return NoiseStructure(tried, lasting, tuple(_sentences(tried, lasting, common if best is common else None)))
@@ -312,7 +315,7 @@ def with_estimated_noise(
         return with_noise_levels(problem, levels), levels
     part = _stretches(len(learnt.kept))
     ordered = _in_order(problem)
-    found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part] if ordered else None)
+    found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part], ordered=ordered)
     _check_lasting(found.lasting, {*map(str, kinds_of(batch))})
     levels = learnt.levels(batch)
     if (found.by, found.common) != ("kind", None):

@@ -148,8 +148,8 @@ WINDOW = 0.1
 TRACKS = {
     **{f"track, UWB {flight}": TrackGuard(_course(flight), ok, 0.0) for flight, ok in FLOWN.items()},
     **{f"track, Plaza, {form}": TrackGuard(_mower(form), 0.4, 0.0) for form in ("raw", "offset", "affine")},
-    **{f"track, MRCLAM {n}, bearings": TrackGuard(_robot(n, BEARINGS), 0.9, 0.005) for n in (1, 2, 5)},
-    **{f"track, MRCLAM {n}, bearings and ranges": TrackGuard(_robot(n, BOTH), 0.9, 0.015) for n in (1, 2, 5)},
+    **{f"track, MRCLAM {n}, bearings": TrackGuard(_robot(n, BEARINGS), 0.88, 0.005) for n in (1, 2, 5)},
+    **{f"track, MRCLAM {n}, bearings and ranges": TrackGuard(_robot(n, BOTH), 0.88, 0.015) for n in (1, 2, 5)},
 }
 
 
