@@ -8,6 +8,7 @@ reference station. c and its covariance are an exact sufficient statistic of the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from optloc.problem.problem import Problem
 # Eigenvalue, as a share of the largest, that is a zero: D holds 0 and +-1, so that the least eigenvalue on a chain of s
 # stations is some 1 / s^2, and rounding leaves 1e-15.
 _SINGULAR = 1e-9
+# Graphs that are kept, at some kilobytes each: a batch has the same ones for each set of rows that is left out.
+_GRAPHS = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +104,12 @@ def ranges(problem: Problem) -> Ranges | None:
     used = np.any(design != 0.0, axis=1)
     present = weight[:, used] > 0.0
     patterns, pattern = _patterns(present)
-    graphs = [_graph(design[used][rows], len(station)) for rows in patterns]
-    chosen = [_main(graph, len(station)) for graph in graphs]
+    rows, count = design[used], len(station)
+    graphs = [_graph(rows[own].tobytes(), rows.shape[1], count) for own in patterns]
+    chosen = [_main(graph, count) for graph in graphs]
     inside, sign, reference = (np.array([c[i] for c in chosen])[pattern] for i in range(3))
     groups = tuple(tuple(tuple(int(station[n]) for n in nodes) for nodes in _members(g, len(station))) for g in graphs)
-    offset, covariance, cost = _least_squares(problem, design, _pin(graphs, chosen, len(station))[pattern])
+    offset, covariance, cost = _least_squares(problem, design, _pin(graphs, chosen, count)[pattern])
     s = len(station)
     # emission times are nodes behind the stations: they have done their part
     known = covariance[:, :s, :s]
@@ -235,9 +239,10 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
     return design, np.array([n[1] for n in stations], dtype=int), np.array([n[2] for n in stations], dtype=int)
 
 
-def _graph(design: Array, stations: int) -> Graph:
-    """Return the connected groups of nodes and the null vector of each."""
-    count = design.shape[1]
+@lru_cache(maxsize=_GRAPHS)
+def _graph(rows: bytes, count: int, stations: int) -> Graph:
+    """Return the connected groups of nodes and the null vector of each, of the bytes of D, whose columns are nodes."""
+    design = np.frombuffer(rows).reshape(-1, count)
     # nodes that share a row; signs do not matter
     linked = (np.abs(design).T @ np.abs(design)) > 0.0
     group = np.full(count, -1)
