@@ -38,6 +38,8 @@ _ROWS = 64
 _TOGETHER = 2**12
 # Weighings of a repeated measurement, which begins at its true place: ten more change no ellipse that holds.
 _WEIGHINGS = 10
+# Standard deviations: a shorter last step changes no ellipse either.
+_TOLERANCE = 1e-3
 
 SEARCHED = "the minima of the loss come from a search, without a proof"
 NEEDS = "only one resting position without constraints is checked against its rows"
@@ -179,7 +181,7 @@ def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:
 def _refit(problem: Problem, loss: Loss, truth: Array) -> Repeats:
     """Return the minima of a loss next to true places, and covariances."""
     doubt = Doubt.of(problem, truth)
-    done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS)
+    done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS, tolerance=_TOLERANCE)
     information, _, ok = marginal(robust_equations(loss, problem, doubt, done.x, done.weight))
     spread, regular = linalg.inverse(information)
     return Repeats(done.x, spread, ok & regular & np.isin(done.status, (Status.OK, Status.MAX_ITERATIONS)))
