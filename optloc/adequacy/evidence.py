@@ -31,6 +31,8 @@ _OPEN = 1e-6
 # Eigenvalue of Q, in units of the weights, below which the other rows say nothing: above what rounding leaves of a
 # zero.
 _NOTHING = 1e-9
+# Rows and priors up to which P is a plain array: the square takes less time there than a sparse array.
+_DENSE = 128
 # Where the tail of a chi-square leaves the range of floating-point numbers, with room for what is computed from it.
 _TINY = 1e-290
 
@@ -43,7 +45,7 @@ class Influence:
     ----------
     pull : array (q,)
         Q y, of the rows and then of the means of the priors.
-    precision : sparse array (q, q)
+    precision : array (q, q), sparse for many rows
         P.
     shared : array (q, n)
         S, of the shared unknowns.
@@ -115,14 +117,22 @@ class Error:
 
 
 def influence(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()) -> Influence:
-    """Return the influence of the rows and priors of a problem.
+    """Return the influence of the rows and priors of a flat batch of one problem at a vector (size,).
+
+    See `influences`, also for what it raises.
+    """
+    return influences(problem, x[None], dropped)[0]
+
+
+def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()) -> list[Influence]:
+    """Return the influence of the rows and priors of each problem of a batch.
 
     Parameters
     ----------
     problem : Problem
-        Flat batch of one problem, whose noise ties no epochs.
-    x : array (size,)
-        Where it is linearised; it need not be a minimum.
+        Flat batch of N problems, whose noise ties no epochs.
+    x : array (N, size)
+        Where they are linearised; these need not be minima.
     dropped : frozenset of int
         Priors to do without.
 
@@ -131,82 +141,89 @@ def influence(problem: Problem, x: Array, dropped: frozenset[int] = frozenset())
     InvalidProblem
         Where a bias walks: rows of one epoch then say something of the next.
     """
-    from scipy.sparse import block_diag
-
     if walks(problem):
         what = f"the walk {walks(problem)[0].name!r} ties each epoch to the next, and errors are weighed epoch by epoch"
         raise InvalidProblem(what, "biases", "fix with a loss such as 'huber', or let the bias be a spline")
-    layout = problem.layout
+    layout, size = problem.layout, len(x)
     numbers = [j for j, p in enumerate(problem.priors) if j not in dropped and layout.find(p.name)[1]]
     problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))
     # whitened in neither: Q needs P and J apart
-    linear, equations = linearise(problem, x[None]), equations_at(problem, x[None])
+    linear, equations = linearise(problem, x), equations_at(problem, x)
     picks, means, inner = _prior_rows(problem)
-    cuts = np.cumsum([problem.count, *(len(mean) for mean in means)])
+    cuts = np.cumsum([problem.count, *(len(pick) for pick in picks)])
     more = int(cuts[-1]) - problem.count
-    present = np.broadcast_to(problem.weight > 0.0, linear.residual.shape)[0]
+    present = np.broadcast_to(problem.weight > 0.0, linear.residual.shape)
     n = layout.n_shared
-    left = [mean - pick @ x[:n] for mean, pick in zip(means, picks, strict=True)]
-    residual = np.concatenate([np.where(present, linear.residual[0], 0.0), *left])
-    precision = block_diag([_precision(linear, problem.count), *inner], format="csr")
-    A = np.concatenate([linear.shared[0], *picks])
-    B = np.concatenate([linear.local[0], np.zeros((more, layout.n_local))])
+    left = [mean - x[:, :n] @ pick.T for mean, pick in zip(means, picks, strict=True)]
+    residual = np.concatenate([np.where(present, linear.residual, 0.0), *left], axis=1)
+    picked = (np.broadcast_to(pick, (size, *pick.shape)) for pick in picks)
+    A = np.concatenate([linear.shared, *picked], axis=1)
+    B = np.concatenate([linear.local, np.zeros((size, more, layout.n_local))], axis=1)
     epoch = np.concatenate([problem.epoch, np.full(more, -1)])
     root, shared, local = _roots(equations, A, B, epoch)
     # x need not be a minimum: Q y is the residual after one more step
-    move, _ = step(equations, np.zeros(1))
-    by_run, by_epoch = layout.split(move[0])
-    fitted = A @ by_run + (B * by_epoch[epoch]).sum(-1)
-    return Influence(
-        precision @ (residual - fitted),
-        precision,
-        precision @ shared,
-        precision @ local,
-        epoch,
-        {j: np.arange(a, b) for j, a, b in zip(numbers, cuts, cuts[1:], strict=False)},
-        root,
-    )
+    move, _ = step(equations, np.zeros(size))
+    by_run, by_epoch = layout.split(move)
+    fitted = (A @ by_run[..., None])[..., 0] + (B * by_epoch[:, epoch]).sum(-1)
+    prior = {j: np.arange(a, b) for j, a, b in zip(numbers, cuts, cuts[1:], strict=False)}
+    return [
+        Influence(own @ rest, own, own @ by_shared, own @ by_local, epoch, prior, deviation)
+        for own, rest, by_shared, by_local, deviation in zip(
+            _precisions(linear, problem.count, inner, size), residual - fitted, shared, local, root, strict=True
+        )
+    ]
 
 
 def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]]:
-    """Return the picked unknowns (p, n), means (p,) and precisions (p, p) of the priors on shared unknowns."""
+    """Return the picked unknowns (p, n), means (N or 1, p) and precisions (p, p) of the priors on shared unknowns."""
     layout = problem.layout
     picks, means, inner = [], [], []
     for prior in problem.priors:
         slot, shared = layout.find(prior.name)
         if shared:
             picks.append(np.eye(layout.n_shared)[slot.start : slot.start + slot.size])
-            means.append(prior.mean.reshape(slot.size))
+            means.append(prior.mean.reshape(-1, slot.size))
             inner.append(linalg.inverse(prior.covariance.reshape(slot.size, slot.size))[0])
     return picks, means, inner
 
 
-def _precision(linear: Linear, count: int) -> Any:
-    """Return the inverse covariance of the rows as a sparse array; absent rows are zero."""
-    from scipy.sparse import coo_array
+def _precisions(linear: Linear, count: int, inner: Sequence[Array], size: int) -> list[Any]:
+    """Return the inverse covariances (q, q) of the rows and priors of each problem; absent rows are zero.
 
+    Arrays for few rows, sparse arrays for many.
+    """
     parts = []
     for whitener in linear.noise:
         own = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
         g, r = whitener.row.shape
-        own = np.broadcast_to(own.reshape(-1, r, r), (g, r, r))
+        own = np.broadcast_to(own, (size, g, r, r)).reshape(size, -1)
         i, j = np.broadcast_arrays(whitener.row[:, :, None], whitener.row[:, None, :])
-        parts.append((own.ravel(), i.ravel(), j.ravel()))
-    values, i, j = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return coo_array((values, (i, j)), shape=(count, count)).tocsr()
+        parts.append((own, i.ravel(), j.ravel()))
+    for block in inner:
+        i, j = (index.ravel() + count for index in np.indices(block.shape))
+        parts.append((np.broadcast_to(block.ravel(), (size, block.size)), i, j))
+        count += len(block)
+    values, i, j = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
+    if count <= _DENSE:
+        dense = np.zeros((size, count, count))
+        dense[:, i, j] = values
+        return list(dense)
+    from scipy.sparse import coo_array
+
+    return [coo_array((own, (i, j)), shape=(count, count)).tocsr() for own in values]
 
 
 def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, Array, Array]:
-    """Return a root (n, n) of (J'P J)^-1, and factors (q, n), (q, l) of J (J'P J)^-1 J', local unknowns eliminated."""
+    """Return roots (N, n, n) of (J'P J)^-1, and factors (N, q, n), (N, q, l) of J (J'P J)^-1 J', locals eliminated."""
     information, _, _ = marginal(equations)
-    root, _ = linalg.root(information[0])
-    if not B.shape[1]:
+    root, _ = linalg.root(information)
+    if not B.shape[-1]:
         return root, A @ root, B
-    inner, _ = linalg.root(equations.local[0])
-    gain = inner @ np.swapaxes(inner, -1, -2) @ np.swapaxes(equations.cross[0], -1, -2)
+    inner, _ = linalg.root(equations.local)
+    gain = inner @ np.swapaxes(inner, -1, -2) @ np.swapaxes(equations.cross, -1, -2)
     # J without what the unknowns of its own epoch explain: Schur's complement, row by row
-    left = A - (B[:, None, :] @ gain[epoch])[:, 0]
-    return root, left @ root, (B[:, None, :] @ inner[epoch])[:, 0]
+    left = A - (B[..., None, :] @ gain[:, epoch])[..., 0, :]
+    return root, left @ root, (B[..., None, :] @ inner[:, epoch])[..., 0, :]
 
 
 def log_tail(statistic: Array, dof: Array) -> Array:

@@ -8,6 +8,7 @@ reference station. c and its covariance are an exact sufficient statistic of the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from optloc.problem.problem import Problem
 # Eigenvalue, as a share of the largest, that is a zero: D holds 0 and +-1, so that the least eigenvalue on a chain of s
 # stations is some 1 / s^2, and rounding leaves 1e-15.
 _SINGULAR = 1e-9
+# Graphs that are kept, at some kilobytes each: a batch has the same ones for each set of rows that is left out.
+_GRAPHS = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,17 +32,23 @@ class Graph:
 
     Parameters
     ----------
-    group : int array (q,)
-        Connected group of each node; -1 for a node without rows. Nodes are (station, epoch), then emission times.
-    sign : int array (q,)
-        Sign with which the unknown of its group enters each node's range; 0 in a group that is determined.
-    main : int
-        Group with the most stations; -1 where there is none.
+    members : tuple of int array
+        Stations of each connected group, as nodes; nodes are (station, epoch), then emission times.
+    inside : bool array (s,)
+        Whether a node belongs to the main group, of the most stations.
+    sign : int array (s,)
+        Sign with which the range to the reference enters a node's range; 0 where that is determined.
+    reference : int
+        First node of the main group; 0 where there is none.
+    pinned : bool array (q,)
+        Nodes that hold no unknown of the least-squares problem: absent ones and one of each free group.
     """
 
-    group: Array
+    members: tuple[Array, ...]
+    inside: Array
     sign: Array
-    main: int
+    reference: int
+    pinned: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +110,12 @@ def ranges(problem: Problem) -> Ranges | None:
     used = np.any(design != 0.0, axis=1)
     present = weight[:, used] > 0.0
     patterns, pattern = _patterns(present)
-    graphs = [_graph(design[used][rows], len(station)) for rows in patterns]
-    chosen = [_main(graph, len(station)) for graph in graphs]
-    inside, sign, reference = (np.array([c[i] for c in chosen])[pattern] for i in range(3))
-    groups = tuple(tuple(tuple(int(station[n]) for n in nodes) for nodes in _members(g, len(station))) for g in graphs)
-    offset, covariance, cost = _least_squares(problem, design, _pin(graphs, chosen, len(station))[pattern])
+    rows, count = design[used], len(station)
+    graphs = [_graph(rows[own].tobytes(), rows.shape[1], count) for own in patterns]
+    parts = ("inside", "sign", "reference", "pinned")
+    inside, sign, reference, pinned = (np.array([getattr(g, part) for g in graphs])[pattern] for part in parts)
+    groups = tuple(tuple(tuple(int(station[n]) for n in nodes) for nodes in graph.members) for graph in graphs)
+    offset, covariance, cost = _least_squares(problem, design, pinned)
     s = len(station)
     # emission times are nodes behind the stations: they have done their part
     known = covariance[:, :s, :s]
@@ -235,8 +245,30 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
     return design, np.array([n[1] for n in stations], dtype=int), np.array([n[2] for n in stations], dtype=int)
 
 
-def _graph(design: Array, stations: int) -> Graph:
-    """Return the connected groups of nodes and the null vector of each."""
+@lru_cache(maxsize=_GRAPHS)
+def _graph(rows: bytes, count: int, stations: int) -> Graph:
+    """Return how nodes are linked, from the bytes of D, whose columns they are, stations before others."""
+    group, sign = _connect(np.frombuffer(rows).reshape(-1, count))
+    names = np.unique(group[group >= 0])
+    members = tuple(np.flatnonzero(group[:stations] == name) for name in names)
+    # most stations; of equals the first, so that the same rows always give the same group
+    main = max(range(len(names)), key=lambda i: (len(members[i]), -i)) if len(names) else -1
+    inside = (group == names[main])[:stations] if len(names) else np.zeros(stations, dtype=bool)
+    reference = int(np.flatnonzero(inside)[0]) if inside.any() else 0
+    pinned = group < 0
+    for name in np.unique(group[sign != 0]):
+        nodes = np.flatnonzero(group == name)
+        pinned[reference if main >= 0 and name == names[main] and group[reference] == name else nodes[0]] = True
+    # ranges grow with that of the reference: its own sign is plus
+    own = np.where(inside, sign[:stations], 0)
+    return Graph(members, inside, own * (own[reference] or 1), reference, pinned)
+
+
+def _connect(design: Array) -> tuple[Array, Array]:
+    """Return the connected group of each node (q,), -1 without rows, and the sign of its unknown in its range.
+
+    The sign is 0 where ranges are determined.
+    """
     count = design.shape[1]
     # nodes that share a row; signs do not matter
     linked = (np.abs(design).T @ np.abs(design)) > 0.0
@@ -263,33 +295,7 @@ def _graph(design: Array, stations: int) -> Graph:
         else:
             determined[nodes] = True
     group[determined] = count  # ranges that are all known belong together, linked or not
-    sizes = {int(name): int((group[:stations] == name).sum()) for name in np.unique(group[group >= 0])}
-    # most stations; of equals the first, so that the same rows always give the same group
-    main = max(sizes, key=lambda name: (sizes[name], -name)) if sizes else -1
-    return Graph(group, sign, main)
-
-
-def _members(graph: Graph, stations: int) -> list[Array]:
-    names = [name for name in np.unique(graph.group) if name >= 0]
-    return [np.flatnonzero(graph.group[:stations] == name) for name in names]
-
-
-def _main(graph: Graph, stations: int) -> tuple[Array, Array, int]:
-    inside = (graph.group == graph.main)[:stations] if graph.main >= 0 else np.zeros(stations, dtype=bool)
-    # ranges grow with that of the reference: its own sign is plus
-    sign = np.where(inside, graph.sign[:stations], 0)
-    reference = int(np.flatnonzero(inside)[0]) if inside.any() else 0
-    return inside, sign * (sign[reference] or 1), reference
-
-
-def _pin(graphs: list[Graph], chosen: list[tuple[Array, Array, int]], stations: int) -> Array:
-    """Return which nodes hold no unknown of the least-squares problem: absent ones and one of each free group."""
-    pinned = np.array([graph.group < 0 for graph in graphs])
-    for row, graph, (_, _, reference) in zip(pinned, graphs, chosen, strict=True):
-        for name in np.unique(graph.group[graph.sign != 0]):
-            nodes = np.flatnonzero(graph.group == name)
-            row[reference if name == graph.main and graph.group[reference] == name else nodes[0]] = True
-    return pinned
+    return group, sign
 
 
 def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Array, Array, Array]:

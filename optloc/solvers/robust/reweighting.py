@@ -33,6 +33,8 @@ _HALVINGS = 8
 _ROUNDING = 1e-12
 # Standard deviations: a shorter step ends the iteration, for a millionth of one is beyond what anybody reads.
 _TOLERANCE = 1e-6
+# Share of it to which least squares settles between two weighings: its own rest then does not count.
+_SHARE = 0.1
 # Length of a step that was not finished: longer than any tolerance, and finite, since what is not finite is a failure.
 _LONG = 1e300
 
@@ -176,6 +178,7 @@ def reweight(
     doubt: Doubt,
     *,
     limit: int = 50,
+    tolerance: float = _TOLERANCE,
     face: Face = (),
 ) -> Minima:
     """Return the minima of a robust cost next to starts.
@@ -196,6 +199,9 @@ def reweight(
         Of the same problems.
     limit : int
         Weighings at most.
+    tolerance : float
+        Standard deviations: a shorter step ends the iteration, once weights settle as well. Weights may change by this
+        much if it is more than what shows in a fix.
     face : Face
         Constraints that hold with equality.
     """
@@ -213,15 +219,15 @@ def reweight(
             part, own = (problem, doubt) if whole else (problem.take(active), doubt.take(active))
             here, before = x[active], weight[active]
             now = weigh_by(loss, part, own, here, before)
-            step = _step(part.with_rows(weight=own.row_weight(now)), here, last[active], face)
+            step = _step(part.with_rows(weight=own.row_weight(now)), here, last[active], face, tolerance)
             moved = _backtrack(loss, part, own, here, step.x, now) if uneven else step.x
             # the end of the series leaves a face that constraints hold: there only plain steps are taken
             if iteration >= _PATIENCE and iteration % _OFTEN == 0 and not face:
                 moved = _extrapolate(loss, part, own, step, now)
             x[active], weight[active], last[active] = moved, now, step.x - here
             # settled: neither weights nor place move; stalled: no step lowers the cost, though one was wanted
-            same = np.abs(now - before).max(-1, initial=0.0) <= _SETTLED
-            settled = same & (step.length <= _TOLERANCE)
+            same = np.abs(now - before).max(-1, initial=0.0) <= max(_SETTLED, tolerance)
+            settled = same & (step.length <= tolerance)
             status[active[settled]] = step.status[settled]
             status[active[same & ~settled & (moved == here).all(-1)]] = Status.STALLED
             status[active[~np.isfinite(step.length)]] = Status.NUMERICAL
@@ -244,10 +250,10 @@ class _Step:
     tried: Array
 
 
-def _step(problem: Problem, x: Array, last: Array, face: Face) -> _Step:
+def _step(problem: Problem, x: Array, last: Array, face: Face, tolerance: float) -> _Step:
     strata = strata_of(problem, face)
     if strata is None:
-        done = refine(problem, x, limit=_STEPS, face=face)
+        done = refine(problem, x, tolerance=_SHARE * tolerance, limit=_STEPS, face=face)
     else:
         done = refine_in_layers(problem, strata, x, np.arange(len(x)), face, _STEPS, cross=True)
     information, _, _ = marginal(done.equations)

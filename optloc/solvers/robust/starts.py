@@ -199,15 +199,16 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
     # by problem, the cheapest of each first
     order = np.lexsort((cost, item))
     order = order[np.isfinite(cost[order])]
-    x, u, item = x[order], u[order], item[order]
+    # residuals row by row: their largest is then found many starts at a time
+    x, u, item = x[order], np.ascontiguousarray(u[order].T), item[order]
     for slot in range(most):
         if not len(item):
             return chosen[:, :slot]
         begins = np.append(True, item[1:] != item[:-1])
         best = np.flatnonzero(begins)
         chosen[item[best], slot] = x[best]
-        left = np.abs(u - u[best[np.cumsum(begins) - 1]]).max(-1) >= _SAME
-        x, u, item = x[left], u[left], item[left]
+        left = np.abs(u - u[:, best[np.cumsum(begins) - 1]]).max(0) >= _SAME
+        x, u, item = x[left], u[:, left], item[left]
     return chosen
 
 

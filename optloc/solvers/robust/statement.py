@@ -24,7 +24,7 @@ from optloc.solvers.robust.reweighting import Doubt, reweight, robust_equations
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.findings import is_improbable
 from optloc.solvers.verdict.judge import fill, judge, verdict
-from optloc.solvers.verdict.repeats import Repeats, holds, is_repeatable, repeated
+from optloc.solvers.verdict.repeats import TOLERANCE, Repeats, holds, is_repeatable, repeated
 
 # Squared distance in standard deviations up to which the minima of the loss and of the rows that count are one
 # answer: with clean data nine in ten are nearer than half of it.
@@ -179,7 +179,7 @@ def _repeat(problem: Problem, loss: Loss, fix: Fix, doubted: Array) -> Array:
 def _refit(problem: Problem, loss: Loss, truth: Array) -> Repeats:
     """Return the minima of a loss next to true places, and covariances."""
     doubt = Doubt.of(problem, truth)
-    done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS)
+    done = reweight(problem, truth, loss, doubt, limit=_WEIGHINGS, tolerance=TOLERANCE)
     information, _, ok = marginal(robust_equations(loss, problem, doubt, done.x, done.weight))
     spread, regular = linalg.inverse(information)
     return Repeats(done.x, spread, ok & regular & np.isin(done.status, (Status.OK, Status.MAX_ITERATIONS)))

@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from optloc.adequacy.elements import batch_of
-from optloc.adequacy.evidence import Error, errors, influence
+from optloc.adequacy.evidence import Error, errors, influences
 from optloc.adequacy.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
 from optloc.adequacy.noise_level import SEVERAL, common_level_at
 from optloc.base import linalg
@@ -59,6 +59,7 @@ _GROSS = 10.0
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
 
 
+_Told = dict[int, Error]
 _Explained = list[tuple[Array, tuple[Group, ...], list[Outcome]]]
 
 
@@ -334,8 +335,10 @@ def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: S
             work = problem if given or arrivals is None else arrivals.problem
             proven = prove_rests(work.take(np.array(items)), groups, [chosen[i] for i in items])
             chosen |= dict(zip(items, proven, strict=True))
-    for i, best in chosen.items():
-        out[i] = _explained(cases[i], outcomes[i], best)
+    rests = {i: (best, *outcomes[i].rests[1:]) for i, best in chosen.items()}
+    told = _errors(problem if arrivals is None else arrivals.problem, groups, rests)
+    for i, own in rests.items():
+        out[i] = _explained(cases[i], outcomes[i], own, told[i])
     return out
 
 
@@ -420,11 +423,12 @@ def _best_rest(case: Case, outcome: Outcome) -> Rest | None:
     return best
 
 
-def _explained(case: Case, outcome: Outcome, best: Rest) -> Conclusion:
-    """Return the conclusion of a problem whose best rest is proven."""
-    first, *others = outcome.rests
+def _explained(case: Case, outcome: Outcome, rests: Sequence[Rest], told: Sequence[_Told]) -> Conclusion:
+    """Return the conclusion of a problem of which the first rest is proven, with the errors of each rest."""
+    (best, *_), (first, *others) = rests, outcome.rests
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
-    explanations = tuple(_explanation(case, rest, outcome) for rest in (best, *others))
+    pairs = zip(rests, told, strict=True)
+    explanations = tuple(_explanation(case, rest, outcome, found) for rest, found in pairs)
     spent, fix = int(case.whole.dof) - int(best.fix.dof), _in_layout(case, best.fix)
     return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere))
 
@@ -470,10 +474,9 @@ def _name_closest(case: Case, outcome: Outcome) -> str:
     return reason + (f"; {outcome.note}" if outcome.note else "")
 
 
-def _explanation(case: Case, rest: Rest, outcome: Outcome) -> Explanation:
+def _explanation(case: Case, rest: Rest, outcome: Outcome, told: _Told) -> Explanation:
     fix = rest.fix
     p_without = float(fix.p_value)
-    told = _errors(case, rest)
     # Errors of compass bearings are reported in the sense of the readings.
     senses = np.concatenate([np.full(rows.count, rows.sense) for rows in case.work.rows])
     suspects = []
@@ -489,24 +492,35 @@ def _explanation(case: Case, rest: Rest, outcome: Outcome) -> Explanation:
     return Explanation(tuple(suspects), case.vector(fix), float(fix.cost), int(fix.dof), p_without, rest.score)
 
 
-def _errors(case: Case, rest: Rest) -> dict[int, Error]:
-    """Return the estimated errors of what was left out, by number of the group; none without a fix."""
-    fix = rest.fix
-    if not np.isfinite(fix.x).all() or not rest.left:
-        return {}
-    offsets = [i for i in rest.left if case.groups[i].offset is not None]
-    others = [i for i in rest.left if case.groups[i].offset is None]
-    out = {}
-    for i in offsets:
-        name = case.groups[i].name
-        value, sigma = fix.take(name), fix.sigma(name)
-        statistic = float((value / sigma) @ (value / sigma)) if np.isfinite(sigma).all() else np.nan
-        out[i] = Error(value, sigma, statistic, len(value))
-    if others:
-        groups = [case.groups[i] for i in others]
-        work = leave_out_of(case.work, case.groups, offsets)
-        out |= dict(zip(others, errors(influence(work, fix.x), groups), strict=True))
+def _errors(work: Problem, groups: Sequence[Group], rests: dict[int, tuple[Rest, ...]]) -> dict[int, list[_Told]]:
+    """Return the estimated errors of what each rest of some problems leaves out, by number of the group.
+
+    Rests with the same offsets have the same unknowns: they are linearised together.
+    """
+    out: dict[int, list[_Told]] = {i: [{} for _ in own] for i, own in rests.items()}
+    alike: dict[tuple[int, ...], list[tuple[int, Rest, _Told]]] = {}
+    for i, own in rests.items():
+        for rest, told in zip(own, out[i], strict=True):
+            if not np.isfinite(rest.fix.x).all() or not rest.left:
+                continue
+            offsets = tuple(j for j in rest.left if groups[j].offset is not None)
+            told |= {j: _offset_error(groups[j], rest.fix) for j in offsets}
+            if len(offsets) < len(rest.left):
+                alike.setdefault(offsets, []).append((i, rest, told))
+    for offsets, members in alike.items():
+        part = leave_out_of(work.take(np.array([i for i, _, _ in members])), groups, offsets)
+        found = influences(part, np.stack([rest.fix.x for _, rest, _ in members]))
+        for at, (_, rest, told) in zip(found, members, strict=True):
+            others = [j for j in rest.left if j not in offsets]
+            told |= dict(zip(others, errors(at, [groups[j] for j in others]), strict=True))
     return out
+
+
+def _offset_error(group: Group, fix: Fix) -> Error:
+    """Return the error of a group that is one offset, from a fix that estimates it."""
+    value, sigma = fix.take(group.name), fix.sigma(group.name)
+    statistic = float((value / sigma) @ (value / sigma)) if np.isfinite(sigma).all() else np.nan
+    return Error(value, sigma, statistic, len(value))
 
 
 def _p_with(fix: Fix, error: Error | None) -> float:

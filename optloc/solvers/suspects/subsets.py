@@ -475,9 +475,10 @@ def prove_rests(problem: Problem, groups: Sequence[Group], rests: Sequence[Rest]
 
 
 def leave_out_of(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:
-    """Return one problem without some groups, and with their offsets."""
+    """Return problems without some groups, and with their offsets."""
     chosen = [groups[i] for i in left]
-    return leave_out(problem, mark_rows(chosen, problem.count)[None], [one for one in chosen if not one.rows])
+    rows = np.broadcast_to(mark_rows(chosen, problem.count), (*problem.batch_shape, problem.count))
+    return leave_out(problem, rows, [one for one in chosen if not one.rows])
 
 
 def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest: Fix, level: float) -> int | None:

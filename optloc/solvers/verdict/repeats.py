@@ -37,10 +37,13 @@ These shares keep 83 % of 6 423 fixes that were `ok` or `curved`. Of those kept,
 outside 99.9 %. In geometries with more than 70 % kept, 6.0 % are outside 95 %.
 """
 
+TOLERANCE = 1e-3
+"""Length of the last step of a repeat in standard deviations: it does not change an ellipse."""
+
 # Repeats of a measurement: the share of 95 % is then known to 3 %.
 _REPEATS = 48
-# Steps at most, and the length of the last step in standard deviations: it does not change an ellipse.
-_STEPS, _TOLERANCE = 30, 1e-3
+# Steps at most.
+_STEPS = 30
 # Vectors that are refined at a time: tens of megabytes of rows.
 _PART = 2**15
 
@@ -139,7 +142,7 @@ def _measured(problem: Problem, x: Array, covariance: Array, wrong: Array | None
 def _refine(problem: Problem, truth: Array) -> Repeats:
     """Return the least-squares fixes next to true places."""
     with np.errstate(all="ignore"):
-        done = refine(problem, truth, tolerance=_TOLERANCE, limit=_STEPS)
+        done = refine(problem, truth, tolerance=TOLERANCE, limit=_STEPS)
         information, _, ok = marginal(done.equations)
         spread, regular = linalg.inverse(information)
     return Repeats(done.x, spread, ok & regular & (done.status == Status.OK))
