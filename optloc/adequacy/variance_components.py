@@ -156,8 +156,6 @@ def fit(made: Elements, left: Array, single: Array) -> Fitted:
     level = np.where(alone, 0.0, begin[: len(kinds)])
     information, _ = _score(alike.tests, own, np.exp(begin[: len(kinds)]), alone)
     penalty = np.minimum(_PENALTY, _SHARE * np.diagonal(information))
-    # An error in common is kept only where the data show it. Where fixes follow it, the weight alone would size it.
-    penalty[made.common[used[kinds]]] = 0.0
     found = _maximise(made, own, level, alone, penalty)
     low, high = (np.where(alone, np.nan, end)[place] for end in _interval(found, own, alone))
 
