@@ -235,16 +235,15 @@ def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
     """Return a file's problem with its noise estimated for each station, pair or kind; unchanged where not asked."""
     if by is None:
         return loaded
-    if by == _AUTO:
-        return _with_levels(loaded, *with_estimated_noise(loaded.problem))
     grouping, plus, more = by.partition("+")
+    if grouping == _AUTO and plus:
+        raise InvalidProblem(
+            f"{_AUTO} chooses the error of an epoch itself", "--noise-from-data", f"write {_AUTO} alone"
+        )
     if plus and more != "epoch":
         raise InvalidProblem(f"unknown component {more!r}", "--noise-from-data", "write +epoch or nothing behind it")
-    group = grouping_of(grouping, "--noise-from-data")
-    return _with_levels(loaded, *with_estimated_noise(loaded.problem, group, common=bool(plus)))
-
-
-def _with_levels(loaded: Loaded, problem: Problem, levels: NoiseLevels) -> Loaded:
+    group = None if grouping == _AUTO else grouping_of(grouping, "--noise-from-data")
+    problem, levels = with_estimated_noise(loaded.problem, group, common=bool(plus))
     return replace(loaded, problem=problem, levels=levels)
 
 

@@ -13,6 +13,7 @@ from optloc.adequacy.variance_components import Fitted, Tested, cleaned, devianc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.linear.constraints import is_exact
+from optloc.problem.epochs import separable, tied
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.quality.levels import (
@@ -135,8 +136,8 @@ def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None =
 
 
 def _in_order(problem: Problem) -> bool:
-    """Return whether the fixes of a problem are its epochs: problems of a batch have no order in time."""
-    return problem.epochs > 1 and not problem.batch_shape
+    """Return whether the fixes of a problem are its epochs: a batch has no order in time, and a run is one fix."""
+    return separable(problem) and problem.epochs > 1 and not problem.batch_shape
 
 
 def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> NoiseStructure:
@@ -147,12 +148,15 @@ def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> N
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
-        plain, common = (_try(batch, x, "kind", shared) for shared in (None, "kind"))
+        # Noise that several epochs share has no place for an error of each epoch.
+        plain = _try(batch, x, "kind", None)
+        common = plain if tied(batch) else _try(batch, x, "kind", "kind")
         best = common if common.seen and common.tried.total < plain.tried.total else plain
         lasting = _lasting(batch, x, number, best)
         found = [plain, common] if common.seen else [plain]
         if best is plain and ordered and not lasting:
-            found += [_try(batch, x, by, None) for by in _groupings(batch)]
+            finer = [_try(batch, x, by, None) for by in _groupings(batch)]
+            found += [structure for structure in finer if structure.tried.levels > plain.tried.levels]
     tried = tuple(sorted((candidate.tried for candidate in found), key=lambda structure: structure.total))
     return NoiseStructure(tried, lasting, tuple(_sentences(tried, lasting, common if best is common else None)))
 
