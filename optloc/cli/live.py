@@ -210,7 +210,7 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
         return {"track": track}
     from optloc.cli.track import Wanted, dynamics_of, rules
     from optloc.live.tracks import Following
-    from optloc.track.run import Rules
+    from optloc.track.entry import Rules
     from optloc.track.updates import filter_of
 
     dynamics = dynamics_of(Wanted(model, noise=noise))

@@ -42,7 +42,8 @@ from optloc.problem.problem import Problem
 from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.report.formats.marks import Results
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
-from optloc.track.run import Entry, Rules, tracked
+from optloc.track.entry import Entry, Rules
+from optloc.track.run import tracked
 from optloc.track.several_targets import alone
 from optloc.track.updates import filter_of, reweighted
 

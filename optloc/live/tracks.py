@@ -19,7 +19,8 @@ from optloc.live.events import Event
 from optloc.live.metrics import Metrics
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics, polynomial
-from optloc.track.run import Entry, Follower, Rules
+from optloc.track.entry import Entry, Rules
+from optloc.track.run import Follower
 from optloc.track.several_targets import alone
 from optloc.track.updates import Update
 

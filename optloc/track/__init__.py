@@ -2,8 +2,9 @@
 
 from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.dynamics import Dynamics, current_statistical, polynomial, singer
+from optloc.track.entry import Entry, Rules
 from optloc.track.measurement_space import lines, simplified
-from optloc.track.run import Entry, Rules, collected, tracked
+from optloc.track.run import collected, tracked
 from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted
 from optloc.track.updates import UPDATES, Filter, Updated, ekf, gated, reweighted, whitened

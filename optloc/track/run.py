@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Literal
 
 import numpy as np
 
@@ -27,8 +25,10 @@ from optloc.problem.chart import tail_probability
 from optloc.problem.epochs import cut, joined
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
+from optloc.track.condition import Course
 from optloc.track.dynamics import Dynamics
-from optloc.track.lasting import LastingErrors
+from optloc.track.entry import Entry, Rules
+from optloc.track.rivals import Rival, remaining
 from optloc.track.scan_rows import Scans
 from optloc.track.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
 from optloc.track.track import (
@@ -46,86 +46,7 @@ from optloc.track.updates import Filter, Update, Updated, filter_of, innovation,
 
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
-# Scans of the window by which a track is judged, over those of `Rules.patience`.
-_WINDOW = 4
-# Mean squared innovation over the squared gate: a half where half of the rows are beyond the gate, as every place has
-# some by chance that agree; a quarter (5 sigma: two and a half times as large as stated) where no covariance covers.
-_LOST, _DOUBTFUL = 0.5, 0.25
-# Lasting error of the stations, in standard deviations of their rows, that refutes the noise. On real tracks up to four
-# were found, and the wider covariances covered the errors.
-_LASTING = 5.0
-# Gate, standard deviations: of a good row one in two million is left out.
-_USUAL = 5.0
-Event = Literal["starting", "started", "restarted", ""]
 Screen = tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """When a row is left out and when a track begins anew.
-
-    Parameters
-    ----------
-    gate : float
-        Rows further than this many standard deviations from the prediction are left out; infinite for none.
-    patience : int
-        So many scans in succession of whose rows most were left out end a track; so do four times as many of whose
-        rows half were, or whose innovations are as large on the whole as if half were.
-    gap : float, optional
-        Seconds without a valid row that end a track. Without it a gap ends a track where the predicted position has a
-        standard deviation beyond the spread of the stations, and beyond the range of the target.
-    speed, rate : float, optional
-        Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, for starts.
-    starts : str
-        By which starts are solved, as `optloc.solve`: "robust" where rows may be gross errors.
-    """
-
-    gate: float = _USUAL
-    patience: int = 5
-    gap: float | None = None
-    speed: float | None = None
-    rate: float | None = None
-    starts: str = "auto"
-
-    @property
-    def most(self) -> float:
-        """Return the squared innovation that a row counts as at most: that of the gate, or of the usual one."""
-        return float(min(self.gate, _USUAL) ** 2)
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """What became of one scan.
-
-    Parameters
-    ----------
-    time : float
-        Seconds.
-    updated : Updated
-        State after the scan, with errors that last in its covariance; NIS and rows used; NaN before the first start.
-    code : Status
-        Ok; too few rows where none was valid and the state was only predicted; rejected where most rows did not pass
-        the gate or are not finite; misfit where innovations or lasting errors are much larger than stated; unbounded
-        where the position is too vague; ambiguous where a start has alternatives; numerical where the update failed.
-    rejected : int
-        Rows left out.
-    event : "starting", "started", "restarted" or ""
-        The scan is one that a start needed; the state is a new fix; or nothing special.
-    reason : str
-        A sentence where the status or the event needs one.
-    """
-
-    time: float
-    updated: Updated
-    code: Status
-    rejected: int = 0
-    event: Event = ""
-    reason: str = ""
-
-    @property
-    def label(self) -> str:
-        """Return the event, else the status, in words; a start that is not clean is called by its status."""
-        return self.event if self.event and self.code == Status.OK else self.code.label
 
 
 def tracked(
@@ -168,7 +89,7 @@ def tracked(
     cleaned, broken = _clean(problem)
     # The checks above are made at the call, not at the first scan.
     rules = rules or Rules()
-    course = _Course.of(start, float(problem.times[0]) if start is None else start.time, rules)
+    course = Course.of(start, float(problem.times[0]) if start is None else start.time, rules)
     course.fresh = start is not None
     return _Run.of(cleaned, broken, dynamics, rule, rules).entries(course)
 
@@ -230,7 +151,7 @@ class _Run:
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
-    def entries(self, course: _Course, *, ends: bool = True) -> Iterator[Entry]:
+    def entries(self, course: Course, *, ends: bool = True) -> Iterator[Entry]:
         """Yield all entries, one for each scan, from where a track stands; `ends` as of `begin`."""
         times, k = self.problem.times.tolist(), 0
         while k < len(times):
@@ -239,6 +160,7 @@ class _Run:
                 start_here = begin(self.problem, k, self.dynamics, r.speed, r.rate, r.starts, ends=ends)
                 yield from self._starting(start_here, k, course)
                 k, course.state, course.missed = start_here.last + 1, start_here.state, 0
+                course.rivals = start_here.rivals
                 course.recent.begin(start_here)
                 course.heard = times[start_here.last]
                 continue
@@ -253,6 +175,7 @@ class _Run:
                 _check_agrees(entry)
                 course.fresh = False
             course.take(entry, fit, entry.rejected - self.bad[k])
+            course.rivals = self._remaining(course.rivals, k, entry, times[k] - course.heard)
             cov = course.lasting.take((self.scans, k, before), self.dynamics, entry.updated.cov, screen)
             k += 1
             wide = screen is None or screen[2] > self.near or cov is not entry.updated.cov
@@ -260,7 +183,7 @@ class _Run:
             yield course.judged(entry, cov, vague)
             course.judge(vague)
 
-    def _starting(self, begun: Beginning, k: int, course: _Course) -> Iterator[Entry]:
+    def _starting(self, begun: Beginning, k: int, course: Course) -> Iterator[Entry]:
         """Yield the scans of a start, of which the last one has the state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no state of their own: the fix of all of them holds at the last one.
@@ -278,12 +201,20 @@ class _Run:
             out = self.bad[i] + begun.left_out
             yield Entry(time, done, begun.code, out, "restarted" if why else "started", reason)
 
+    def _remaining(self, rivals: tuple[Rival, ...], k: int, entry: Entry, silence: float) -> tuple[Rival, ...]:
+        """Return the other states of a start that a scan does not refute."""
+        found = [self._update(k, rival.state, silence, None) for rival in rivals]
+        others = [None if isinstance(one, str) else one[0] for one in found]
+        return remaining(rivals, entry, others, self.rules.most)
+
     def _stretch(self, begun: Beginning) -> Problem:
         """Return the scans of a start."""
         motion = Motion(self.dynamics.order, reference=float(self.problem.times[begun.last]))
         return replace(cut(self.problem, begun.first, begun.last + 1), motions=(motion,))
 
-    def _update(self, k: int, state: State, silence: float, memory: Array) -> tuple[Entry, Fit, Screen | None] | str:
+    def _update(
+        self, k: int, state: State, silence: float, memory: Array | None
+    ) -> tuple[Entry, Fit, Screen | None] | str:
         """Return the entry of a scan, the fit of all rows to the prediction and the screen for lasting errors.
 
         Where the state is not followed the result is the reason.
@@ -370,129 +301,6 @@ _FINDINGS = (
 """All findings against one scan by itself."""
 
 
-class _Recent:
-    """How the rows of the last scans fit the prediction: their windowed NIS, no row further than the gate."""
-
-    def __init__(self, rules: Rules) -> None:
-        # As many scans as tell the loss of a track from a few wild rows in a row, where a scan has a single one: if one
-        # row in ten is wild, ten of twenty are in one window of a million.
-        self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
-        self.rules, self.most, self.since = rules, rules.most, 0
-        # The mean squared innovation as a share of the squared gate; 0 where the rows are too few to tell.
-        # Why the position is too vague, and the lasting error of the stations in standard deviations of their rows.
-        self.share, self.vague, self.lasting = 0.0, "", 0.0
-
-    def begin(self, start: Beginning) -> None:
-        """Take the rows of a start; what did not fit before is forgotten where they agree, and else still counts."""
-        if start.code == Status.OK:
-            self.scans.clear()
-        self.add(start.fit)
-        self.since = 0
-
-    def add(self, fit: Fit) -> None:
-        """Take how the rows of one more scan fit."""
-        square, count = fit
-        if count > 0:
-            self.scans.append((min(square, self.most * count), count))
-            self.since += 1
-        total, rows = 0.0, 0
-        for square, count in self.scans:
-            total, rows = total + square, rows + count
-        assert self.scans.maxlen is not None
-        self.share = total / (self.most * rows) if rows >= self.scans.maxlen else 0.0
-
-    @property
-    def lost(self) -> bool:
-        """Return whether a full window is as bad as if half of its rows were beyond the gate."""
-        return self.since >= len(self.scans) == self.scans.maxlen and self.share > _LOST
-
-    @property
-    def sentence(self) -> str:
-        """Return how large the innovations are."""
-        times = np.sqrt(self.share * self.most)
-        return f"the innovations of the last {len(self.scans)} scans are {times:.2g} times as large as stated"
-
-    def judge(self, entry: Entry) -> Entry:
-        """Return a scan with the status that those before it deserve, where its own is clean."""
-        found = objections(_RECENTLY, self) if entry.code == Status.OK else []
-        return replace(entry, code=found[0][0], reason=found[0][1]) if found else entry
-
-
-_RECENTLY = (
-    Finding(Status.UNBOUNDED, lambda recent: recent.vague, lambda recent: [recent.vague]),
-    Finding(Status.MISFIT, lambda recent: recent.share > _DOUBTFUL, lambda recent: [recent.sentence]),
-    Finding(
-        Status.MISFIT,
-        lambda recent: recent.lasting > _LASTING,
-        lambda recent: [f"errors that last for many scans are {recent.lasting:.2g} times as large as stated"],
-    ),
-)
-"""All findings against a scan by those before it."""
-
-
-@dataclass(slots=True)
-class _Course:
-    """Where a track stands between two scans.
-
-    Parameters
-    ----------
-    state : State or None
-        None before a start.
-    heard : float
-        Time of the last valid row.
-    recent : _Recent
-        How the last scans fit.
-    lasting : LastingErrors
-        Errors that last from scan to scan.
-    why : str
-        Why the state before was given up.
-    missed : int
-        Scans in succession whose rows the gate mostly refused.
-    fresh : bool
-        Whether a given state has yet to meet its first row.
-    """
-
-    state: State | None
-    heard: float
-    recent: _Recent
-    lasting: LastingErrors
-    why: str = ""
-    missed: int = 0
-    fresh: bool = False
-
-    @classmethod
-    def of(cls, state: State | None, heard: float, rules: Rules) -> _Course:
-        """Return a track before its first scan."""
-        return cls(state, heard, _Recent(rules), LastingErrors(_WINDOW * rules.patience))
-
-    def take(self, entry: Entry, fit: Fit, gated: int) -> None:
-        """Go on by a scan of whose rows the gate refused so many."""
-        # Rows that are not finite say nothing of the state: only those that the gate refused end a track. A scan
-        # without rows leaves the count as it was.
-        used = int(entry.updated.count)
-        self.missed = self.missed + 1 if gated > used else self.missed * int(used == 0)
-        self.heard = entry.time if used else self.heard
-        self.recent.add(fit)
-        self.state = State(entry.time, entry.updated.mean, entry.updated.cov)
-
-    def judged(self, entry: Entry, cov: Array, vague: str) -> Entry:
-        """Return a scan with its covariance (n, n) and status; `vague` is why its position is not followed."""
-        self.recent.vague, self.recent.lasting = vague, 0.0
-        if cov is not entry.updated.cov:
-            self.recent.lasting = self.lasting.size
-            entry = replace(entry, updated=replace(entry.updated, cov=cov))
-        return self.recent.judge(entry)
-
-    def judge(self, vague: str) -> None:
-        """Give the state up where it is lost, or too vague to follow."""
-        if vague:
-            self.state, self.why = None, vague
-        elif self.missed >= self.recent.rules.patience:
-            self.state, self.why = None, f"most rows of {self.missed} scans did not fit the prediction"
-        elif self.recent.lost:
-            self.state, self.why = None, self.recent.sentence
-
-
 # Scans that wait for a start, at most: a stretch of 63 is the tenth that is tried, and what so many leave open is not
 # a matter of the next few.
 _WAITING = 64
@@ -516,7 +324,7 @@ class Follower:
 
     def __init__(self, dynamics: Dynamics, update: Update | str = "iekf", rules: Rules | None = None) -> None:
         self._dynamics, self._rule, self._rules = dynamics, filter_of(update), rules or Rules()
-        self._course: _Course | None = None
+        self._course: Course | None = None
         self._waiting: list[Problem] = []
         self._needed = 1  # scans, for the next try of a start
         self.last = -np.inf
@@ -553,7 +361,7 @@ class Follower:
             return []
         cleaned, broken = _clean(reduce(joined, run))
         stretch = _Run.of(cleaned, broken, self._dynamics, self._rule, self._rules)
-        course = self._course or _Course.of(None, float(run[0].times[0]), self._rules)
+        course = self._course or Course.of(None, float(run[0].times[0]), self._rules)
         done: list[Entry] = []
         self._needed = 1
         try:

@@ -18,6 +18,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.track.dynamics import Dynamics
+from optloc.track.rivals import Rival
 from optloc.track.track import State, check_trackable
 
 # Metres: below every other error; of ECEF coordinates a millimetre has too few digits to converge on.
@@ -235,6 +236,8 @@ class Beginning:
         Rows of the last scan that a robust start leaves out.
     first : int
         First scan that was used.
+    rivals : tuple of Rival
+        Other states at the last scan, where the start is ambiguous.
     """
 
     last: int
@@ -245,6 +248,7 @@ class Beginning:
     fit: Fit = (0.0, 0)
     left_out: int = 0
     first: int = 0
+    rivals: tuple[Rival, ...] = ()
 
 
 class Undecided(Exception):  # noqa: N818  # no failure: more scans are to come
@@ -345,7 +349,13 @@ def begin(
         if found is not None and found.p >= _PLAUSIBLE:
             break
     if doubtful:
-        return _doubtful(min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1)))
+        best = min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1))
+        start = _doubtful(best)
+        if start.code != Status.AMBIGUOUS:
+            return start
+        run = cut(problem, best.first, problem.epochs)
+        posed = _first(run, best.last - best.first + 1, dynamics.order, speed, rate)
+        return replace(start, rivals=tuple(_rivals(posed, best)))
     if verdict == Status.CONTRADICTORY:  # of these scans; later ones may agree
         return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
     reason = f"the scans that are left do not determine a state: {verdict.label}"
@@ -355,6 +365,17 @@ def begin(
 def _doubtful(best: _Stretch) -> Beginning:
     """Return a start that is not clean, with a status that says what is wrong with it."""
     return best.beginning(*objections(_FINDINGS, best)[0])
+
+
+def _rivals(posed: Problem, best: _Stretch) -> Iterator[Rival]:
+    """Yield the other minima of a start as states, of its problem and the rows that it keeps."""
+    kept = posed.with_rows(weight=posed.weight * (best.fix.weights > 0.0))
+    others = best.fix.alternatives
+    for x, gap in zip(others.x, others.gap, strict=True):
+        if np.isfinite(gap) and np.isfinite(x).all():
+            mean, cov = solve(kept, "lsr", start=x).gaussian()
+            if np.isfinite(mean).all() and np.isfinite(cov).all():
+                yield Rival(State(best.state.time, np.array(mean), np.array(cov)), float(gap))
 
 
 _FINDINGS = (
