@@ -92,7 +92,7 @@ _RECENTLY = (
 
 
 @dataclass(slots=True)
-class Course:
+class Condition:
     """Condition of a track between two scans.
 
     Parameters
@@ -125,7 +125,7 @@ class Course:
     fresh: bool = False
 
     @classmethod
-    def of(cls, state: State | None, heard: float, rules: Rules) -> Course:
+    def of(cls, state: State | None, heard: float, rules: Rules) -> Condition:
         """Return a track before its first scan."""
         return cls(state, heard, Recent(rules), LastingErrors(_WINDOW * rules.patience))
 

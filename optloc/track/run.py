@@ -25,7 +25,7 @@ from optloc.problem.chart import tail_probability
 from optloc.problem.epochs import cut, joined
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
-from optloc.track.condition import Course
+from optloc.track.condition import Condition
 from optloc.track.dynamics import Dynamics
 from optloc.track.entry import Entry, Rules
 from optloc.track.rivals import Rival, remaining
@@ -89,7 +89,7 @@ def tracked(
     cleaned, broken = _clean(problem)
     # The checks above are made at the call, not at the first scan.
     rules = rules or Rules()
-    course = Course.of(start, float(problem.times[0]) if start is None else start.time, rules)
+    course = Condition.of(start, float(problem.times[0]) if start is None else start.time, rules)
     course.fresh = start is not None
     return _Run.of(cleaned, broken, dynamics, rule, rules).entries(course)
 
@@ -151,7 +151,7 @@ class _Run:
         near = 0.5 * float(np.ptp(problem.stations.places.reshape(-1, problem.dimension), axis=0).max())
         return cls(problem, Scans.of(problem, dynamics.order), bad, dynamics, rule, rules, how, near**2)
 
-    def entries(self, course: Course, *, ends: bool = True) -> Iterator[Entry]:
+    def entries(self, course: Condition, *, ends: bool = True) -> Iterator[Entry]:
         """Yield all entries, one for each scan, from where a track stands; `ends` as of `begin`."""
         times, k = self.problem.times.tolist(), 0
         while k < len(times):
@@ -183,7 +183,7 @@ class _Run:
             yield course.judged(entry, cov, vague)
             course.judge(vague)
 
-    def _starting(self, begun: Beginning, k: int, course: Course) -> Iterator[Entry]:
+    def _starting(self, begun: Beginning, k: int, course: Condition) -> Iterator[Entry]:
         """Yield the scans of a start, of which the last one has the state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
         # Scans of a start have no state of their own: the fix of all of them holds at the last one.
@@ -324,7 +324,7 @@ class Follower:
 
     def __init__(self, dynamics: Dynamics, update: Update | str = "iekf", rules: Rules | None = None) -> None:
         self._dynamics, self._rule, self._rules = dynamics, filter_of(update), rules or Rules()
-        self._course: Course | None = None
+        self._course: Condition | None = None
         self._waiting: list[Problem] = []
         self._needed = 1  # scans, for the next try of a start
         self.last = -np.inf
@@ -361,7 +361,7 @@ class Follower:
             return []
         cleaned, broken = _clean(reduce(joined, run))
         stretch = _Run.of(cleaned, broken, self._dynamics, self._rule, self._rules)
-        course = self._course or Course.of(None, float(run[0].times[0]), self._rules)
+        course = self._course or Condition.of(None, float(run[0].times[0]), self._rules)
         done: list[Entry] = []
         self._needed = 1
         try:
