@@ -21,12 +21,6 @@ from optloc.problem.problem import Problem
 
 # Everything else loads when its name is first used: solvers, proofs and tables take half a second together.
 if TYPE_CHECKING:
-    from optloc.adequacy.advice import advise, explained
-    from optloc.adequacy.coplanar import distance_from_plane
-    from optloc.adequacy.determine import determined
-    from optloc.adequacy.evidence import Reliability, reliability
-    from optloc.adequacy.geometry import Advice
-    from optloc.adequacy.noise_level import CommonLevel, LateSignals
     from optloc.base import frames, units
     from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
     from optloc.base.frames import CARTESIAN, ECEF, Frame
@@ -46,6 +40,12 @@ if TYPE_CHECKING:
     from optloc.linear.normal import Linear, Normal, linearise, normal
     from optloc.linear.simulate import simulate
     from optloc.linear.walks import wander
+    from optloc.model_checks.advice import advise, explained
+    from optloc.model_checks.coplanar import distance_from_plane
+    from optloc.model_checks.determine import determined
+    from optloc.model_checks.evidence import Reliability, reliability
+    from optloc.model_checks.geometry import Advice
+    from optloc.model_checks.noise_level import CommonLevel, LateSignals
     from optloc.models import MODELS, Model
     from optloc.models.medium import Atmosphere, Layers
     from optloc.placement.chosen import Placement, place
@@ -207,10 +207,10 @@ __all__ = [
 
 # Where each public name lives; the imports above say the same to whoever checks types, a test holds both equal.
 _HOMES = {
-    "adequacy.advice": "advise explained",
-    "adequacy.evidence": "Reliability reliability",
-    "adequacy.geometry": "Advice",
-    "adequacy.noise_level": "CommonLevel LateSignals",
+    "model_checks.advice": "advise explained",
+    "model_checks.evidence": "Reliability reliability",
+    "model_checks.geometry": "Advice",
+    "model_checks.noise_level": "CommonLevel LateSignals",
     "base.errors": "InvalidProblem NoSolution OptlocError",
     "base.frames": "CARTESIAN ECEF Frame",
     "base.inputs": "Budget",
@@ -255,8 +255,8 @@ _HOMES = {
     "solvers.status_shares": "StatusShares status_shares",
     "linear.least_squares_ranges": "reduce",
     "solvers.suspects.stage": "suspects",
-    "adequacy.coplanar": "distance_from_plane",
-    "adequacy.determine": "determined",
+    "model_checks.coplanar": "distance_from_plane",
+    "model_checks.determine": "determined",
     "uncertainty.arc": "Arc trace_arc",
     "uncertainty.posterior": "Mixture Samples mixture samples",
     "uncertainty.radii": "Accuracy accuracy",

@@ -20,7 +20,7 @@ LAYERS = (
     "linear",
     "compute datasets",
     "engine",
-    "proof bounds adequacy",
+    "proof bounds model_checks",
     "solvers uncertainty",
     "track quality",
     "files papers several plot plugins",

@@ -15,10 +15,10 @@ from verdicts import alone
 
 import optloc
 from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, simulate, solve, with_bias
-from optloc.adequacy.evidence import errors, influence, log_tail, reliability, significance
-from optloc.adequacy.groups import groups_of
 from optloc.cli import app
 from optloc.compute.least_squares import refine
+from optloc.model_checks.evidence import errors, influence, log_tail, reliability, significance
+from optloc.model_checks.groups import groups_of
 from optloc.problem.arrivals import as_arrivals, restore_order
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP

@@ -91,7 +91,7 @@ def departure(lik: Likelihood, at: Estimate, told: Determined) -> float:
     """Return how far the cost departs from that of a Gaussian with the covariance found.
 
     Three deviations to either side along each principal axis of stations and clocks, the pulses wherever they then fit
-    best: the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|``, as of a fix (`optloc.adequacy.shape`).
+    best: the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|``, as of a fix (`optloc.model_checks.shape`).
 
     Parameters
     ----------

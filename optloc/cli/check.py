@@ -11,9 +11,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from optloc.adequacy.elements import By, batch_of
-from optloc.adequacy.geometry import Advice
-from optloc.adequacy.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import together
 from optloc.base.types import Array, Bias, Stations
@@ -33,6 +30,9 @@ from optloc.cli.output import (
 from optloc.files import Loaded
 from optloc.files.readings import Told
 from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
+from optloc.model_checks.elements import By, batch_of
+from optloc.model_checks.geometry import Advice
+from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem

@@ -10,7 +10,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from optloc.adequacy.evidence import Reliability, reliability
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import at_most
 from optloc.base.linalg import error_ellipse
@@ -21,6 +20,7 @@ from optloc.cli.options import coordinates
 from optloc.cli.output import PICTURES, Screen, claim_outputs, dumps, say, write_picture, write_text
 from optloc.files import Loaded, read
 from optloc.files.schema import Units
+from optloc.model_checks.evidence import Reliability, reliability
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable, tied
 from optloc.problem.fix import Suspect

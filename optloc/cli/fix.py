@@ -12,10 +12,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from optloc.adequacy.advice import advise, advise_at, explained_at
-from optloc.adequacy.elements import GROUPINGS, By, batch_of
-from optloc.adequacy.geometry import Advice
-from optloc.adequacy.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import claim, together
 from optloc.base.types import ANSWERED, Array, Status
@@ -39,6 +35,10 @@ from optloc.cli.output import (
 from optloc.files import Loaded
 from optloc.files.readings import Told
 from optloc.files.schema import ConstraintTable
+from optloc.model_checks.advice import advise, advise_at, explained_at
+from optloc.model_checks.elements import GROUPINGS, By, batch_of
+from optloc.model_checks.geometry import Advice
+from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.quality.levels import (

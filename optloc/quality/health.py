@@ -8,12 +8,12 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from optloc.adequacy.elements import By, Elements, batch_of, elements, ends_of
-from optloc.adequacy.evidence import NOTICEABLE
-from optloc.adequacy.variance_components import Tested, snooped, tested
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.base.units import SI_UNIT
+from optloc.model_checks.elements import By, Elements, batch_of, elements, ends_of
+from optloc.model_checks.evidence import NOTICEABLE
+from optloc.model_checks.variance_components import Tested, snooped, tested
 from optloc.models import MODELS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.adequacy.elements import (
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.model_checks.elements import (
     By,
     Elements,
     batch_of,
@@ -16,11 +18,9 @@ from optloc.adequacy.elements import (
     ends_of,
     split,
 )
-from optloc.adequacy.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
-from optloc.adequacy.overbound import tail_factors
-from optloc.adequacy.variance_components import Fitted, Tested, fit, tested, total, visible, without
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
+from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.model_checks.overbound import tail_factors
+from optloc.model_checks.variance_components import Fitted, Tested, fit, tested, total, visible, without
 from optloc.problem.arrivals import as_arrivals
 from optloc.problem.epochs import tied
 from optloc.problem.fix import Fix

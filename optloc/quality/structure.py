@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.adequacy.elements import By, Elements, batch_of, common_name, elements, ends_of, kinds_of
-from optloc.adequacy.score import descend
-from optloc.adequacy.variance_components import Fitted, Tested, cleaned, deviance, tested
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.linear.constraints import is_exact
+from optloc.model_checks.elements import By, Elements, batch_of, common_name, elements, ends_of, kinds_of
+from optloc.model_checks.score import descend
+from optloc.model_checks.variance_components import Fitted, Tested, cleaned, deviance, tested
 from optloc.problem.epochs import separable, tied
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

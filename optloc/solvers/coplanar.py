@@ -11,12 +11,19 @@ from time import perf_counter
 
 import numpy as np
 
-from optloc.adequacy.coplanar import JOINED, Across, information_in_square, interval_across, is_coplanar, is_symmetric
 from optloc.base import linalg
 from optloc.base.records import take
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import TOLERANCE, exact, violation
+from optloc.model_checks.coplanar import (
+    JOINED,
+    Across,
+    information_in_square,
+    interval_across,
+    is_coplanar,
+    is_symmetric,
+)
 from optloc.problem.fix import Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import is_hidden

@@ -9,7 +9,6 @@ from time import perf_counter
 
 import numpy as np
 
-from optloc.adequacy.shape import BENT
 from optloc.base.cache import Cache
 from optloc.base.records import take
 from optloc.base.types import Array, Motion, Status
@@ -23,6 +22,7 @@ from optloc.linear.evaluate import block_links
 from optloc.linear.normal import depends_on_place, weighed
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.vectors import vectors, without_biases
+from optloc.model_checks.shape import BENT
 from optloc.problem.fix import Active, Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem

@@ -51,7 +51,7 @@ class Curvature:
         Covariance of the states that targets have at each epoch of a run.
     kappa : array (N, 2), optional
         By how much the cost departs from that of a Gaussian three sigma away, in metres and in inverse range
-        (`optloc.adequacy.shape`); NaN where nobody has looked.
+        (`optloc.model_checks.shape`); NaN where nobody has looked.
     repeats : array (N, 3), optional
         Shares of repeated measurements whose ellipses hold, and the inflation with which 95 % would
         (`optloc.solvers.verdict.repeats`); NaN if not tried.

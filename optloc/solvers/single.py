@@ -17,8 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.adequacy.coplanar import normal_of
-from optloc.adequacy.truncation import are_near, has_law
 from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
@@ -30,6 +28,8 @@ from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer,
 from optloc.engine.shape import STRAIGHT
 from optloc.linear.constraints import is_exact, violation_names
 from optloc.linear.redundancy import largest
+from optloc.model_checks.coplanar import normal_of
+from optloc.model_checks.truncation import are_near, has_law
 from optloc.problem.chart import CARTESIAN, CURVED, Chart, quantile
 from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable

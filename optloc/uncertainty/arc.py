@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.adequacy.shape import cost_at_infinity
 from optloc.base.types import Array
+from optloc.model_checks.shape import cost_at_infinity
 from optloc.problem.chart import CARTESIAN, basis, jacobian
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

@@ -13,10 +13,10 @@ from itertools import product
 
 import numpy as np
 
-from optloc.adequacy.shape import profile
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.linear.constraints import Face, exact, levels, restore
+from optloc.model_checks.shape import profile
 from optloc.problem.chart import CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

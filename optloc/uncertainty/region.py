@@ -7,7 +7,6 @@ from itertools import product
 
 import numpy as np
 
-from optloc.adequacy.shape import BENT, cost_at_infinity, departure, profile
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
@@ -15,6 +14,7 @@ from optloc.compute.jit import enabled
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.normal import covariance
+from optloc.model_checks.shape import BENT, cost_at_infinity, departure, profile
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

@@ -8,9 +8,9 @@ from often import few
 from scipy.stats import binom
 
 import optloc
-from optloc.adequacy.advice import advise_at
-from optloc.adequacy.score import FALSE_ALARM, candidates, score
 from optloc.files import load
+from optloc.model_checks.advice import advise_at
+from optloc.model_checks.score import FALSE_ALARM, candidates, score
 from optloc.problem.bias import with_bias
 
 PLACE = np.array([[0.0, 0.0], [9.0, 1.0], [8.0, 9.0], [1.0, 8.0], [5.0, 12.0], [-3.0, 4.0], [4.0, -5.0]]) * 1e3

@@ -5,12 +5,12 @@ import pytest
 from typer.testing import CliRunner
 
 import optloc
-from optloc.adequacy.score import descend, explain_misfit
 from optloc.base.frames import Frame
 from optloc.cli import app
 from optloc.linear.constraints import box, height, violation
 from optloc.linear.equalities import Equalities, spare_rows
 from optloc.linear.redundancy import degrees_of_freedom
+from optloc.model_checks.score import descend, explain_misfit
 from optloc.problem.epochs import by_epoch
 
 FREE = (optloc.Motion(0, span="epoch"),)

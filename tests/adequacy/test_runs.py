@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc import Status
-from optloc.adequacy.advice import advise_at, explained, misfit_of
-from optloc.adequacy.score import FALSE_ALARM, Candidate, explain_misfit
 from optloc.cli import app
 from optloc.files import load
+from optloc.model_checks.advice import advise_at, explained, misfit_of
+from optloc.model_checks.score import FALSE_ALARM, Candidate, explain_misfit
 from optloc.problem.epochs import cut, thinned
 from tests.monte_carlo.tables import write
 

@@ -6,8 +6,8 @@ from cases import CASES
 from waves import Scene, air, plate
 
 from optloc import InvalidProblem, solve, with_bias
-from optloc.adequacy.scaled_rows import profile_by_rows, runs_backwards
-from optloc.adequacy.shape import cost_at_infinity, profile
+from optloc.model_checks.scaled_rows import profile_by_rows, runs_backwards
+from optloc.model_checks.shape import cost_at_infinity, profile
 from optloc.problem.forms import FORMS
 
 SCENES = [

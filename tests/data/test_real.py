@@ -12,8 +12,8 @@ from data.windows import report
 from monte_carlo.tables import ledger
 
 from optloc import InvalidProblem, Problem, Status, datasets, solve
-from optloc.adequacy.elements import batch_of
 from optloc.datasets import mrclam, plaza, uwb
+from optloc.model_checks.elements import batch_of
 from optloc.quality.structure import with_estimated_noise
 from optloc.track import polynomial, tracked
 

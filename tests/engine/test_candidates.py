@@ -5,12 +5,12 @@ import pytest
 
 import optloc
 from optloc import assemble, constraints, measured, simulate, solve
-from optloc.adequacy.shape import cost_at_infinity
 from optloc.compute.jit import enabled
 from optloc.compute.polynomial import DEGREE, real_roots
 from optloc.engine.memory import BY_HEIGHT, BY_PLACES
 from optloc.engine.plan import plan_of
 from optloc.engine.shape import STRAIGHT
+from optloc.model_checks.shape import cost_at_infinity
 from optloc.models.primitives import WGS84_A
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.stages import gtrs, lsr_with_mirror

@@ -220,8 +220,8 @@ def test_the_stages_find_the_same_rivals():
 
 
 def test_thresholds_are_those_of_the_policy():
-    from optloc.adequacy.shape import BENT
     from optloc.engine.images import LISTED, SAME
     from optloc.engine.shape import STRAIGHT
+    from optloc.model_checks.shape import BENT
 
     assert (LISTED, SAME, STRAIGHT) == (policy.LISTED_GAP, policy.SAME_PLACE, BENT)

@@ -11,8 +11,8 @@ from scipy.stats import exponnorm, norm
 from typer.testing import CliRunner
 
 from optloc import LOSSES, InvalidProblem, assemble, common_level, late_signals, measured, solve
-from optloc.adequacy.elements import batch_of
 from optloc.cli import app
+from optloc.model_checks.elements import batch_of
 
 STATED = 10.0
 

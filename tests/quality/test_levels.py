@@ -11,10 +11,10 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from optloc import InvalidProblem, assemble, linearise, measured, noise_levels, solve, with_noise_levels
-from optloc.adequacy import variance_components as rules
-from optloc.adequacy.elements import batch_of, elements
-from optloc.adequacy.score import descend
 from optloc.compute.sums import equations_at
+from optloc.model_checks import variance_components as rules
+from optloc.model_checks.elements import batch_of, elements
+from optloc.model_checks.score import descend
 from optloc.problem.epochs import by_epoch
 from optloc.problem.noise import Block, Noise, variances
 from optloc.quality.levels import levels_of

@@ -9,10 +9,10 @@ from quality.rings import FREE, RING, ranged
 from quality.test_health import RUN, written
 
 from optloc import assemble, common_level, measured, solve
-from optloc.adequacy.elements import batch_of
-from optloc.adequacy.noise_level import common_level_at
-from optloc.adequacy.score import descend
 from optloc.cli import app
+from optloc.model_checks.elements import batch_of
+from optloc.model_checks.noise_level import common_level_at
+from optloc.model_checks.score import descend
 
 STATED = 10.0
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from optloc import InvalidProblem, assemble, measured, noise_structure, solve
-from optloc.adequacy.elements import batch_of, elements
-from optloc.adequacy.variance_components import deviance
 from optloc.base.types import Motion, Status
+from optloc.model_checks.elements import batch_of, elements
+from optloc.model_checks.variance_components import deviance
 from optloc.quality.levels import fitted
 from optloc.quality.structure import with_estimated_noise
 

@@ -13,7 +13,6 @@ from typing import Annotated
 
 import numpy as np
 
-from optloc.adequacy.truncation import has_law
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import Axes, overwrite, take
 from optloc.base.types import Array, Status
@@ -30,6 +29,7 @@ from optloc.linear.constraints import (
     violation_names,
 )
 from optloc.linear.vectors import vectors
+from optloc.model_checks.truncation import has_law
 from optloc.problem.claims import GLOBAL, REGION, Claims, untried
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage

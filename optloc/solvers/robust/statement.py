@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.adequacy.groups import ROW_PRICE
 from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.compute.least_squares import refine
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import marginal
 from optloc.linear.redundancy import degrees_of_freedom
+from optloc.model_checks.groups import ROW_PRICE
 from optloc.problem.chart import quantile
 from optloc.problem.fix import Fix
 from optloc.problem.loss import Loss

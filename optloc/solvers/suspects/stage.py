@@ -9,14 +9,14 @@ from time import perf_counter
 
 import numpy as np
 
-from optloc.adequacy.elements import batch_of
-from optloc.adequacy.evidence import Error, errors, influences
-from optloc.adequacy.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
-from optloc.adequacy.noise_level import SEVERAL, common_level_at
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.linear.vectors import complete
+from optloc.model_checks.elements import batch_of
+from optloc.model_checks.evidence import Error, errors, influences
+from optloc.model_checks.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
+from optloc.model_checks.noise_level import SEVERAL, common_level_at
 from optloc.problem.arrivals import Arrivals, as_arrivals, restore_order, shared_places
 from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.adequacy.evidence import Influence, drops, embed, errors, influence, significance
-from optloc.adequacy.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.base.records import join, take
 from optloc.base.types import Array
 from optloc.compute.jit import enabled
+from optloc.model_checks.evidence import Influence, drops, embed, errors, influence, significance
+from optloc.model_checks.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.problem.claims import GLOBAL
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.adequacy.shape import BENT, cost_at_infinity, departure
-from optloc.adequacy.truncation import Law, departure_inwards, has_law, law_of
 from optloc.base.linalg import centre_and_spread, centre_of_points
 from optloc.base.records import present, take
 from optloc.base.types import PRECEDENCE, Array, Certificate, Status
 from optloc.linear.constraints import faces
 from optloc.linear.mirror import one_position, rows_of_stations
 from optloc.linear.redundancy import largest
+from optloc.model_checks.shape import BENT, cost_at_infinity, departure
+from optloc.model_checks.truncation import Law, departure_inwards, has_law, law_of
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile, tail_probability
 from optloc.problem.claims import GLOBAL, Claims, claim
 from optloc.problem.problem import Problem

@@ -8,13 +8,13 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtrc
 
-from optloc.adequacy.advice import misfit_of
-from optloc.adequacy.truncation import covariance_of
 from optloc.base.records import join, overwrite, present, take
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.linear.least_squares_ranges import ranges
+from optloc.model_checks.advice import misfit_of
+from optloc.model_checks.truncation import covariance_of
 from optloc.models import MODELS
 from optloc.models.layers import Layers
 from optloc.problem.claims import Claims, alike, choose, claim

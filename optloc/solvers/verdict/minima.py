@@ -8,7 +8,6 @@ from itertools import product
 
 import numpy as np
 
-from optloc.adequacy.scaled_rows import runs_backwards
 from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
@@ -17,6 +16,7 @@ from optloc.linear.mirror import one_position
 from optloc.linear.normal import Normal, local_covariance, marginal
 from optloc.linear.vectors import vectors
 from optloc.linear.walks import walk_names
+from optloc.model_checks.scaled_rows import runs_backwards
 from optloc.problem.fix import Active, Stage
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.adequacy.scaled_rows import cost_beyond_speed, has_scales, profile_by_rows
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread, normalised, spread_directions
 from optloc.base.types import Array
@@ -14,6 +13,7 @@ from optloc.compute.damping import FIRST_GROWTH, judge
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import Face, exact, levels, restore, tangent_at, violation
 from optloc.linear.normal import decrement, depends_on_place, marginal, step
+from optloc.model_checks.scaled_rows import cost_beyond_speed, has_scales, profile_by_rows
 from optloc.problem.chart import INVERSE_RANGE, Chart, basis
 from optloc.problem.problem import Problem
 

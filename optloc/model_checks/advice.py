@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from optloc.adequacy.geometry import Advice, advise_on_geometry
-from optloc.adequacy.misread import advise_on_values
-from optloc.adequacy.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
+from optloc.model_checks.geometry import Advice, advise_on_geometry
+from optloc.model_checks.misread import advise_on_values
+from optloc.model_checks.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
 from optloc.problem.bias import family
 from optloc.problem.epochs import by_epoch, separable, thinned, tied
 from optloc.problem.fix import Fix
@@ -113,7 +113,8 @@ def explained(problem: Problem, fix: Fix) -> Problem | None:
 
     References
     ----------
-    C. R. Rao, Math. Proc. Cambridge Philos. Soc. 44 (1948): the score test; see `optloc.adequacy.score.explain_misfit`.
+    C. R. Rao, Math. Proc. Cambridge Philos. Soc. 44 (1948): the score test; see
+    `optloc.model_checks.score.explain_misfit`.
     """
     return explained_at(problem, fix.x)
 

@@ -63,7 +63,7 @@ def runs_backwards(problem: Problem, x: Array) -> Array:
 def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple[Array, Array, Array]:
     """Return the least cost over all unknowns but the position, and its normal equations there.
 
-    Arguments and results are as for `optloc.adequacy.shape.profile`. More passes make the slope along the position
+    Arguments and results are as for `optloc.model_checks.shape.profile`. More passes make the slope along the position
     exact, which depends on the scales. Factors of ranges, times and levels are not negative.
     """
     slot, _ = problem.layout.find("position")

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.adequacy.score import descend, one_place
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band
 from optloc.linear.constraints import is_exact, violation
 from optloc.linear.redundancy import degrees_of_freedom
+from optloc.model_checks.score import descend, one_place
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.noise import variances

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.adequacy.elements import Elements, elements, kinds_of
-from optloc.adequacy.groups import ROW_PRICE
-from optloc.adequacy.score import descend
-from optloc.adequacy.variance_components import Tested, fit, shown, snooped, tested, total, without
 from optloc.base.types import Array
+from optloc.model_checks.elements import Elements, elements, kinds_of
+from optloc.model_checks.groups import ROW_PRICE
+from optloc.model_checks.score import descend
+from optloc.model_checks.variance_components import Tested, fit, shown, snooped, tested, total, without
 from optloc.problem.loss import LATE
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.adequacy.shape import AWAY, Look
 from optloc.base.records import take
 from optloc.base.types import Array, Polygon
 from optloc.linear.constraints import Level, bounds, exact, is_exact, is_flat, levels, outwards
 from optloc.linear.mirror import one_position
+from optloc.model_checks.shape import AWAY, Look
 from optloc.problem.problem import Problem
 from optloc.problem.truncated import Truncated, factor_of
 

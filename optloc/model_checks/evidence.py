@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from optloc.adequacy.groups import Group
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import Linear, Normal, linearise, marginal, step
 from optloc.linear.walks import walks
+from optloc.model_checks.groups import Group
 from optloc.problem.arrivals import as_arrivals, shared_places
 from optloc.problem.fix import Suspect
 from optloc.problem.layout import Layout

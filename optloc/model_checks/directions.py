@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.adequacy.scaled_rows import has_scales, profile_by_rows
-from optloc.adequacy.shape import profile
 from optloc.base import linalg
 from optloc.base.linalg import normalised, spread_directions
 from optloc.base.types import Array
@@ -22,6 +20,8 @@ from optloc.compute.damping import FIRST_GROWTH, judge
 from optloc.linear.mirror import mirror, one_position, plane_of_stations
 from optloc.linear.normal import depends_on_place
 from optloc.linear.vectors import vectors
+from optloc.model_checks.scaled_rows import has_scales, profile_by_rows
+from optloc.model_checks.shape import profile
 from optloc.problem.chart import basis, jacobian, quantile
 from optloc.problem.determined import LEVEL, Direction, holds
 from optloc.problem.problem import Problem

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.adequacy.elements import Elements
-from optloc.adequacy.variance_components import Fitted, Tested, snooped, tested, without
 from optloc.base.types import Array
+from optloc.model_checks.elements import Elements
+from optloc.model_checks.variance_components import Fitted, Tested, snooped, tested, without
 
 # Sizes of a test, standard deviations, at which tails are compared: beyond them are 5 %, 1 % and 0.1 % of normal
 # errors.

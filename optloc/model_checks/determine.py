@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.adequacy.coplanar import Across, information_in_square, interval_across, is_coplanar
-from optloc.adequacy.directions import INFINITY, View, directions_of, extent_of, has_directions, minima_of
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN
 from optloc.base.types import Array, Status
 from optloc.linear.mirror import plane_of_stations
+from optloc.model_checks.coplanar import Across, information_in_square, interval_across, is_coplanar
+from optloc.model_checks.directions import INFINITY, View, directions_of, extent_of, has_directions, minima_of
 from optloc.models import MODELS
 from optloc.problem.chart import AXES, Extent, quantile
 from optloc.problem.determined import LEVEL, Determined, Quantity

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.adequacy.elements import Elements
-from optloc.adequacy.groups import ROW_PRICE
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
+from optloc.model_checks.elements import Elements
+from optloc.model_checks.groups import ROW_PRICE
 
 CUT = 3.5
 """Size of a test, in standard deviations, from which an error counts as gross.
