@@ -63,15 +63,6 @@ if TYPE_CHECKING:
     from optloc.problem.noise import Noise
     from optloc.problem.problem import Problem
     from optloc.problem.signal import Signal
-    from optloc.quality.health import Health, health
-    from optloc.quality.levels import (
-        NoiseLevels,
-        common_level,
-        late_signals,
-        noise_levels,
-        with_noise_levels,
-    )
-    from optloc.quality.structure import NoiseStructure, noise_structure, with_estimated_noise
     from optloc.several import Emitters, separate
     from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
     from optloc.solvers.certify.admitted import certify
@@ -80,6 +71,15 @@ if TYPE_CHECKING:
     from optloc.solvers.running import Running
     from optloc.solvers.status_shares import StatusShares, status_shares
     from optloc.solvers.suspects.stage import suspects
+    from optloc.station_health.health import Health, health
+    from optloc.station_health.levels import (
+        NoiseLevels,
+        common_level,
+        late_signals,
+        noise_levels,
+        with_noise_levels,
+    )
+    from optloc.station_health.structure import NoiseStructure, noise_structure, with_estimated_noise
     from optloc.uncertainty.arc import Arc, trace_arc
     from optloc.uncertainty.posterior import Mixture, Samples, mixture, samples
     from optloc.uncertainty.radii import Accuracy, accuracy
@@ -243,9 +243,9 @@ _HOMES = {
     "problem.noise": "Noise",
     "problem.problem": "Problem",
     "problem.signal": "Signal",
-    "quality.health": "Health health",
-    "quality.levels": "NoiseLevels common_level late_signals noise_levels with_noise_levels",
-    "quality.structure": "NoiseStructure noise_structure with_estimated_noise",
+    "station_health.health": "Health health",
+    "station_health.levels": "NoiseLevels common_level late_signals noise_levels with_noise_levels",
+    "station_health.structure": "NoiseStructure noise_structure with_estimated_noise",
     "several": "Emitters separate",
     "solvers": "FORMULATIONS METHODS SOLVERS Formulation solve",
     "solvers.certify.admitted": "certify",

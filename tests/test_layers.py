@@ -22,7 +22,7 @@ LAYERS = (
     "engine",
     "proof bounds model_checks",
     "solvers uncertainty",
-    "track quality",
+    "track station_health",
     "files papers several plot plugins",
     "calibration",
     "study",

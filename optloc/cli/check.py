@@ -36,10 +36,10 @@ from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_lev
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem
-from optloc.quality.health import Health, health_of
 from optloc.report.columns import Columns, records
 from optloc.report.fixes import with_sigma
 from optloc.solvers import Method
+from optloc.station_health.health import Health, health_of
 
 # Members of a bias that are named; the others are counted.
 _MEMBERS = 8

@@ -41,12 +41,6 @@ from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.quality.levels import (
-    NoiseLevels,
-    common_level,
-    late_signals,
-)
-from optloc.quality.structure import with_estimated_noise
 from optloc.report.columns import Columns, records
 from optloc.report.fixes import (
     SHOWN,
@@ -62,6 +56,12 @@ from optloc.report.fixes import (
 )
 from optloc.report.formats.marks import geojson
 from optloc.solvers.policy import REFUTED
+from optloc.station_health.levels import (
+    NoiseLevels,
+    common_level,
+    late_signals,
+)
+from optloc.station_health.structure import with_estimated_noise
 
 # What a screen holds of each list; the rest is counted, and --json and --out have all of it.
 _STATES, _FAILURES = SHOWN, 10

@@ -53,8 +53,8 @@ from optloc.problem.noise import Block, Noise, arrivals, group, together
 from optloc.problem.problem import Problem
 from optloc.problem.signal import Signal
 from optloc.problem.validation import checked
-from optloc.quality.levels import NoiseLevels
-from optloc.quality.structure import with_estimated_noise
+from optloc.station_health.levels import NoiseLevels
+from optloc.station_health.structure import with_estimated_noise
 
 LOG = logging.getLogger("optloc.read")
 

@@ -17,7 +17,7 @@ from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, fini
 from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
-from optloc.quality.health import Health
+from optloc.station_health.health import Health
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

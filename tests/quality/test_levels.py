@@ -17,8 +17,8 @@ from optloc.model_checks.elements import batch_of, elements
 from optloc.model_checks.score import descend
 from optloc.problem.epochs import by_epoch
 from optloc.problem.noise import Block, Noise, variances
-from optloc.quality.levels import levels_of
-from optloc.quality.structure import with_estimated_noise
+from optloc.station_health.levels import levels_of
+from optloc.station_health.structure import with_estimated_noise
 
 
 def differences(rng, epochs, sigma):

@@ -8,8 +8,8 @@ from optloc import InvalidProblem, assemble, measured, noise_structure, solve
 from optloc.base.types import Motion, Status
 from optloc.model_checks.elements import batch_of, elements
 from optloc.model_checks.variance_components import deviance
-from optloc.quality.levels import fitted
-from optloc.quality.structure import with_estimated_noise
+from optloc.station_health.levels import fitted
+from optloc.station_health.structure import with_estimated_noise
 
 MARKS = np.array([[0.0, 0.0], [8.0, 1.0], [7.0, 9.0], [-1.0, 8.0], [3.0, -2.0], [10.0, 5.0]])
 # Marks on one side: fixes follow most of a heading.

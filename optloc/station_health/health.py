@@ -17,7 +17,7 @@ from optloc.model_checks.variance_components import Tested, snooped, tested
 from optloc.models import MODELS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.quality.levels import NoiseLevels, levels_of, usable
+from optloc.station_health.levels import NoiseLevels, levels_of, usable
 
 # Where Huber's function turns, in sigmas: 95 % efficient for normal errors (Holland and Welsch 1977).
 _HUBER = 1.345

@@ -16,7 +16,7 @@ from optloc.model_checks.variance_components import Fitted, Tested, cleaned, dev
 from optloc.problem.epochs import separable, tied
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.quality.levels import (
+from optloc.station_health.levels import (
     NoiseLevels,
     fitted,
     levels_of,
