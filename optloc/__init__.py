@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from optloc.model_checks.noise_level import CommonLevel, LateSignals
     from optloc.models import MODELS, Model
     from optloc.models.medium import Atmosphere, Layers
+    from optloc.multi_target import Emitters, separate
     from optloc.placement.chosen import Placement, place
     from optloc.placement.sites import SiteSelection
     from optloc.problem import epochs, noise
@@ -63,7 +64,6 @@ if TYPE_CHECKING:
     from optloc.problem.noise import Noise
     from optloc.problem.problem import Problem
     from optloc.problem.signal import Signal
-    from optloc.several import Emitters, separate
     from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
     from optloc.solvers.certify.admitted import certify
     from optloc.solvers.prepared import Prepared, prepare
@@ -246,7 +246,7 @@ _HOMES = {
     "station_health.health": "Health health",
     "station_health.levels": "NoiseLevels common_level late_signals noise_levels with_noise_levels",
     "station_health.structure": "NoiseStructure noise_structure with_estimated_noise",
-    "several": "Emitters separate",
+    "multi_target": "Emitters separate",
     "solvers": "FORMULATIONS METHODS SOLVERS Formulation solve",
     "solvers.certify.admitted": "certify",
     "solvers.prepared": "Prepared prepare",

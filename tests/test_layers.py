@@ -23,7 +23,7 @@ LAYERS = (
     "proof bounds model_checks",
     "solvers uncertainty",
     "track station_health",
-    "files papers several plot plugins",
+    "files papers multi_target plot plugins",
     "calibration",
     "study",
     "report",

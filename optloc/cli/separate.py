@@ -14,8 +14,8 @@ from optloc.base.types import Status
 from optloc.cli.crlb import vector
 from optloc.cli.output import Screen, dumps, write_text
 from optloc.files import Loaded, read
+from optloc.multi_target import Emitters, evenly, separate
 from optloc.problem.problem import Problem
-from optloc.several import Emitters, evenly, separate
 
 # Digits of a number of rows: no file holds more.
 _DIGITS = 12

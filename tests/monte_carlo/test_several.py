@@ -12,7 +12,7 @@ from several.brute import every_set, grown_sets, packed, true_sets
 from several.scenes import EVERY, STAR, drawn
 
 from optloc import Status
-from optloc.several import separate
+from optloc.multi_target import separate
 
 FULL, SEED = 500, 20_000
 SAME = 1e-3

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import optloc
-from optloc.several import Clutter
+from optloc.multi_target import Clutter
 
 RADIUS, SIGMA, BEARING, DETECTION = 10e3, 10.0, 2e-3, 0.9
 TURN = 2.0 * np.pi * np.arange(6) / 6

@@ -1,7 +1,7 @@
 """Several emitters at once: which rows of an epoch are whose, how many emitters there are, and where each is."""
 
-from optloc.several.answer import Emitters, Ghost, evenly
-from optloc.several.assign import separate
+from optloc.multi_target.answer import Emitters, Ghost, evenly
+from optloc.multi_target.assign import separate
 from optloc.track.associate import Clutter
 
 __all__ = ["Clutter", "Emitters", "Ghost", "evenly", "separate"]

@@ -8,9 +8,9 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
+from optloc.multi_target.sets import value_width
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.several.sets import value_width
 from optloc.track.associate import Clutter
 
 
@@ -118,7 +118,7 @@ def evenly(problem: Problem, detection: float, false: float) -> Clutter:
         width = value_width(problem, block)
         if width is None:
             what = f"there is no end to possible values of {block.kind}"
-            raise InvalidProblem(what, "false", "give the density of false rows, optloc.several.Clutter")
+            raise InvalidProblem(what, "false", "give the density of false rows, optloc.multi_target.Clutter")
         if block.count:
             # One density for a kind: pairs of stations differ in width, and the mean keeps the mean number of false
             # rows.

@@ -9,8 +9,8 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
-from optloc.several.set_packing import Prices
-from optloc.several.sets import Scene, around, changes, cheapest_rows, correlation, of_picks, own_variance
+from optloc.multi_target.set_packing import Prices
+from optloc.multi_target.sets import Scene, around, changes, cheapest_rows, correlation, of_picks, own_variance
 from optloc.track.associate import misfits
 
 TOLERANCE = 0.05

@@ -14,12 +14,23 @@ from optloc.base.types import Array, Status, first_status
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
+from optloc.multi_target.answer import Emitters, Ghost
+from optloc.multi_target.pricing_search import TOLERANCE, Region, Searched, search
+from optloc.multi_target.set_packing import Prices, cheapest_sets, price_rows
+from optloc.multi_target.sets import (
+    Scene,
+    Tuples,
+    merge,
+    no_sets,
+    of_picks,
+    refine_sets,
+    row_worth,
+    scenes,
+    sets_near,
+    thin,
+)
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.several.answer import Emitters, Ghost
-from optloc.several.pricing_search import TOLERANCE, Region, Searched, search
-from optloc.several.set_packing import Prices, cheapest_sets, price_rows
-from optloc.several.sets import Scene, Tuples, merge, no_sets, of_picks, refine_sets, row_worth, scenes, sets_near, thin
 from optloc.solvers import solve
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
 from optloc.track.associate import Clutter
@@ -55,7 +66,7 @@ def separate(
 
     Each emitter gives at most one row to a channel (a kind at its stations), and a row is at most one emitter's. Of
     all assignments the one with the greatest likelihood is sought, every emitter at the best place for its own rows,
-    and with as many emitters as pay their penalty: see `optloc.several.sets.Scene`. Sets of rows are columns of a set
+    and with as many emitters as pay their penalty: see `optloc.multi_target.sets.Scene`. Sets of rows are columns of a set
     packing; they are proposed by closed-form fixes of as few rows as it takes, and branch and bound over all places of
     the region adds columns until no other can lower the cost.
 

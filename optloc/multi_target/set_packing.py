@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 
 from optloc.base.types import Array
-from optloc.several.sets import Tuples
+from optloc.multi_target.sets import Tuples
 
 # Weight of even prices against the value of the bound: small enough to choose among duals of one value
 # without moving the bound.

@@ -198,7 +198,7 @@ class Tuples:
     x : array (q, d)
         Place of least chi-square found, metres.
     cost : array (q,)
-        See `optloc.several.sets.Scene`.
+        See `optloc.multi_target.sets.Scene`.
     """
 
     picks: Array
