@@ -47,7 +47,7 @@ def pytest_sessionstart(session):
         return
     from optloc.cli.compile import make, missing
     from optloc.cli.output import meter
-    from optloc.compute.jit import enabled
+    from optloc.kernels.jit import enabled
 
     if enabled() and missing():
         with meter("making machine code", quiet=False) as tell:
@@ -87,7 +87,7 @@ def one_form_of_machine_code():
     """Whatever Python hands to machine code is of the types for which `optloc compile` made it: nobody waits twice."""
     yield
     from optloc.cli.compile import PARTS
-    from optloc.compute import jit
+    from optloc.kernels import jit
 
     if not jit.enabled():
         return

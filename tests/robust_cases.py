@@ -8,7 +8,7 @@ import numpy as np
 from verdicts import alone
 
 from optloc import Fix, Motion, Problem, assemble, measured, solve
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.solvers.certify.admitted import certified
 from optloc.solvers.pool import in_parts
 from optloc.solvers.stages import search_widely

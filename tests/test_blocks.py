@@ -5,7 +5,7 @@ import pytest
 from runs import drawn, run, truth
 
 import optloc
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.normal import weighed
 from optloc.problem.noise import dense
 from optloc.solvers.starts.block_averages import average_blocks

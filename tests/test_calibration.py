@@ -14,7 +14,7 @@ from optloc.calibration.calibrated import refuted_blocks
 from optloc.calibration.gauge import departure, determined
 from optloc.calibration.likelihood import Estimate, likelihood
 from optloc.calibration.rounds import starts_of
-from optloc.compute.jit import plain
+from optloc.kernels.jit import plain
 
 EXACT = 1e-6
 

@@ -10,7 +10,7 @@ from verdicts import alone
 
 from optloc import Frame, InvalidProblem, Motion, Status, assemble, measured, simulate, solve
 from optloc.base.types import Band, Polygon
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import box, exact, faces, height, on_face, polygon, speed, visible
 from optloc.solvers.certify.admitted import _is_dear
 from optloc.solvers.certify.position_cost import eliminate_nuisance

@@ -14,8 +14,8 @@ from optloc import Frame, InvalidProblem, Motion, Status, assemble, constraints,
 from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef
 from optloc.base.types import Stations
 from optloc.bounds.crlb import crlb
-from optloc.compute.sums import equations_at
 from optloc.files import read
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact, restore, violation
 from optloc.linear.courses import course_at, elapsed
 from optloc.linear.evaluate import differentiate, predict

@@ -15,7 +15,7 @@ import optloc
 from optloc import Status, solve
 from optloc.cli.app import app
 from optloc.cli.options import shipped_problems
-from optloc.compute.jit import plain
+from optloc.kernels.jit import plain
 
 SECTIONS = [("1. A fix", "ok"), ("2. Two possible places", "ambiguous"), ("3. A registration", "ok")]
 # Seconds from the prompt to the last section, on two processors that have nothing else to do.

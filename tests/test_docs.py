@@ -21,7 +21,7 @@ from typer.main import get_command
 import optloc
 from optloc.base.errors import OptlocError
 from optloc.cli import app
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 
 # Generated pages hold no code; the recipes of contributors have a test of their own.
 ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")

@@ -18,7 +18,7 @@ LAYERS = (
     "models",
     "problem",
     "linear",
-    "compute datasets",
+    "kernels datasets",
     "engine",
     "proof bounds model_checks",
     "solvers uncertainty",

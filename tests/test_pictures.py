@@ -15,7 +15,7 @@ from optloc import plot
 from optloc.base.errors import InvalidProblem
 from optloc.bounds.bound_map import bound_map
 from optloc.cli import app
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.plot.landscape import limits, plane
 from optloc.plot.style import scene_of
 from optloc.solvers.landscape import End, basins, profile_cost

@@ -24,8 +24,8 @@ from optloc import (
     with_bias,
 )
 from optloc.base.types import Band
-from optloc.compute.jit import enabled
 from optloc.engine.plan import plan_of
+from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
 from optloc.solvers import solve_in_stages
 from optloc.solvers.methods import Method

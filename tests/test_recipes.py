@@ -19,8 +19,8 @@ from verdicts import alone
 import optloc
 from optloc import MODELS, InvalidProblem, Motion, Status, solve
 from optloc.cli import app
-from optloc.compute.sums import equations_at
-from optloc.compute.trace import evaluate, trace
+from optloc.kernels.sums import equations_at
+from optloc.kernels.trace import evaluate, trace
 from optloc.linear.evaluate import block_links, given
 from optloc.linear.normal import linearise
 from optloc.study.trial import compute

@@ -17,7 +17,7 @@ from verdicts import alone
 import optloc
 from optloc import Frame, Status, crlb, observability, simulate, solve
 from optloc.base.types import Motion, Stations
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import box, height, speed
 from optloc.papers.registration import PRINTED, Setting, rms, wander
 from optloc.solvers.starts.registration import turn_courses

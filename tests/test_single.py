@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from optloc import ECEF, Frame, Motion, Status, assemble, measured, prepare, simulate, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.solvers.methods import Method
 from optloc.solvers.single import single
 

@@ -16,7 +16,7 @@ from verdicts import alone
 import optloc
 from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, simulate, solve, with_bias
 from optloc.cli import app
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.model_checks.evidence import errors, influence, log_tail, reliability, significance
 from optloc.model_checks.groups import groups_of
 from optloc.problem.arrivals import as_arrivals, restore_order

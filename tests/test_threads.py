@@ -18,8 +18,8 @@ from formulations.nls import Program
 from optloc import Fix, InvalidProblem, Problem, assemble, measured, simulate, solve
 from optloc.base.cache import Cache
 from optloc.base.threads import flow, mapped, thread_count
-from optloc.compute import tables, trace
 from optloc.engine import plan
+from optloc.kernels import tables, trace
 from optloc.linear import evaluate
 from optloc.solvers import ipopt
 

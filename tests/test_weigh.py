@@ -7,8 +7,8 @@ import pytest
 from runs import drawn, estimated, run, truth
 
 import optloc
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.normal import linearise, marginal, weighed
 from optloc.problem.noise import dense
 

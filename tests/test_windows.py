@@ -9,7 +9,7 @@ from runs import drawn, estimated, run, truth
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Motion
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.normal import linearise, normal, with_priors
 from optloc.problem import epochs as stretches
 from optloc.problem.epochs import cut, joined, windows

@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.compute.sums import equations_at, summed
+from optloc.kernels.sums import equations_at, summed
 from optloc.linear.constraints import exact, levels, tangent_at
 from optloc.linear.normal import Linear, Normal, covariance, linearise, marginal, normal, prior_parts, with_priors
 from optloc.linear.walks import walks

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.bounds.crlb import OPEN, free_directions, shared_information, shared_priors, with_local_priors
-from optloc.compute.sums import summed
+from optloc.kernels.sums import summed
 from optloc.problem.layout import Layout, Slot
 from optloc.problem.problem import Problem
 

@@ -9,7 +9,7 @@ import numpy as np
 from optloc.base.types import Array, Prior
 from optloc.calibration.likelihood import Estimate, Likelihood, clock_signs, together
 from optloc.calibration.network import Network
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.vectors import vectors
 from optloc.models import MODELS
 from optloc.problem.build import Measured, assemble, measured

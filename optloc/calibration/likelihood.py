@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base.types import Array, Bias, Motion, Stations
 from optloc.calibration.network import CLOCKED, Network
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.evaluate import differentiate, predict
 from optloc.models import BETWEEN
 from optloc.problem.build import Measured, assemble, measured

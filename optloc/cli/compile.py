@@ -26,10 +26,10 @@ from rich.table import Table
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Motion, Stations
 from optloc.cli.output import Screen, dumps, meter
-from optloc.compute.filter import filter_scan
-from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, named, names_in, plain
-from optloc.compute.kept import CALLEES, alone, is_checkout, is_kept, kept_in
-from optloc.compute.manifest import installed
+from optloc.kernels.filter import filter_scan
+from optloc.kernels.jit import REPORTER, compiling, enabled, insist_on, named, names_in, plain
+from optloc.kernels.kept import CALLEES, alone, is_checkout, is_kept, kept_in
+from optloc.kernels.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
 from optloc.placement import SiteSelection, place
@@ -175,13 +175,13 @@ PARTS: Mapping[str, Part] = {
     ),
     "refinements": Part(
         "refinements and filters",
-        "optloc.compute",
+        "optloc.kernels",
         (_refine, _filter),
         (
-            "optloc.compute.filter.filter_scan",
-            "optloc.compute.refine.refine_block",
-            "optloc.compute.equations.normal_block",
-            *(f"optloc.compute.runs.{name}" for name in ("refine_runs", "sum_runs")),
+            "optloc.kernels.filter.filter_scan",
+            "optloc.kernels.refine.refine_block",
+            "optloc.kernels.equations.normal_block",
+            *(f"optloc.kernels.runs.{name}" for name in ("refine_runs", "sum_runs")),
         ),
     ),
     "runs": Part(

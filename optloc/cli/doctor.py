@@ -92,13 +92,13 @@ def machine() -> dict[str, Any]:
 
 def machine_code() -> dict[str, Any]:
     """Return where machine code is kept, for which processor, and which parts of it are there."""
-    from optloc.compute.jit import enabled
+    from optloc.kernels.jit import enabled
 
     if not enabled():
         return {"folder": None, "made_for": None, "installed": False, "parts": {}}
     from optloc.cli.compile import PARTS
-    from optloc.compute.kept import kept_in
-    from optloc.compute.manifest import installed, of_this_process
+    from optloc.kernels.kept import kept_in
+    from optloc.kernels.manifest import installed, of_this_process
 
     place = kept_in()
     return {

@@ -24,7 +24,7 @@ from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
 from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.base.units import LARGEST
-from optloc.compute.progress import keep_quiet
+from optloc.kernels.progress import keep_quiet
 
 if TYPE_CHECKING:
     from optloc.files.schema import ConstraintTable

@@ -17,7 +17,7 @@ from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible
-from optloc.compute.progress import Reporter
+from optloc.kernels.progress import Reporter
 from optloc.report.columns import Columns, plain
 
 if TYPE_CHECKING:

@@ -11,10 +11,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array, Band
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, factor_plain, solve_plain
-from optloc.compute.tape_table import INPUT, OUTPUT, run_tape, tape_table
-from optloc.compute.trace import Recorder, Tape, tape
 from optloc.engine.evaluator import equations
 from optloc.engine.memory import (
     BASE,
@@ -40,6 +36,10 @@ from optloc.engine.memory import (
     Room,
     X,
 )
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES, factor_plain, solve_plain
+from optloc.kernels.tape_table import INPUT, OUTPUT, run_tape, tape_table
+from optloc.kernels.trace import Recorder, Tape, tape
 from optloc.linear.constraints import TOLERANCE, bounded, is_exact
 from optloc.models.primitives import WGS84_A, WGS84_F, Jet
 from optloc.problem.problem import Problem

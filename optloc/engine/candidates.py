@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES
 from optloc.engine.admission import admit, restore
 from optloc.engine.evaluator import complete, costs
 from optloc.engine.images import LISTED, NEAR
@@ -35,6 +33,8 @@ from optloc.engine.memory import (
     X,
 )
 from optloc.engine.refine import refine
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES
 
 CANDIDATES = 4
 """Of a fix: roots of a quartic, or sectors of places."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from optloc.base.linalg import project_out, whitening
 from optloc.base.types import Array, Band
-from optloc.compute.pack import pack
 from optloc.engine.candidates import directions
 from optloc.engine.lifts import Lifts, lift
 from optloc.engine.memory import (
@@ -27,6 +26,7 @@ from optloc.engine.memory import (
 )
 from optloc.engine.ranges import RangeRows
 from optloc.engine.tapes import TapeRows
+from optloc.kernels.pack import pack
 from optloc.linear.constraints import is_exact
 from optloc.linear.evaluate import block_links, columns
 from optloc.linear.least_squares_ranges import Ranges, ranges

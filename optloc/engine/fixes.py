@@ -12,9 +12,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, factor_plain, solve_plain
 from optloc.engine import ranges, tapes
 from optloc.engine.admission import admit, evaluate, find_multipliers, hold_covariance, restore
 from optloc.engine.evaluator import (
@@ -76,6 +73,9 @@ from optloc.engine.memory import (
 from optloc.engine.refine import refine
 from optloc.engine.shape import STRAIGHT, find_even, measure_shape
 from optloc.engine.start import begin, read, stand
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES, factor_plain, solve_plain
 
 # Steps after which the problems of a block that still move wait for each other: fixes near their stations take two to
 # five.

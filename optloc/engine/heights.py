@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.polynomial import real_roots
-from optloc.compute.systems import LANES
 from optloc.engine.candidates import CANDIDATES
 from optloc.engine.memory import LOWER_BOUND, ORIGIN, SIGN, Model, Room
+from optloc.kernels.jit import compiled
+from optloc.kernels.polynomial import real_roots
+from optloc.kernels.systems import LANES
 from optloc.models.primitives import WGS84_A, WGS84_F
 
 # Vectors of scratch for one lane: the names of the rows are below.

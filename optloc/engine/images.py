@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, factor_plain, principal_axes, solve_plain
 from optloc.engine.admission import admit, coarsen, evaluate, hold, restore
 from optloc.engine.evaluator import bend, bow_of, note_nearest
 from optloc.engine.memory import (
@@ -48,6 +45,9 @@ from optloc.engine.memory import (
     X,
 )
 from optloc.engine.refine import decide, propose
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES, factor_plain, principal_axes, solve_plain
 
 LISTED = 25.0
 """Cost above the fix up to which a rival counts (`optloc.solvers.policy.LISTED_GAP`)."""

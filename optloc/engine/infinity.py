@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES
 from optloc.engine.admission import restore
 from optloc.engine.candidates import look_around
 from optloc.engine.images import keep_fix
@@ -26,6 +24,8 @@ from optloc.engine.memory import (
     X,
 )
 from optloc.engine.refine import refine
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES
 
 # Distance in the place of infinity, spreads of the stations: wave fronts bend by 5e-8 of the spread there, and rounding
 # of a difference of ranges is 1e-9 of it.

@@ -14,9 +14,9 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.types import Array, Rows
-from optloc.compute.tables import starts
-from optloc.compute.tape_table import TapeTable, tape_table
-from optloc.compute.trace import Recorder, Symbol, Tape, tape
+from optloc.kernels.tables import starts
+from optloc.kernels.tape_table import TapeTable, tape_table
+from optloc.kernels.trace import Recorder, Symbol, Tape, tape
 from optloc.linear.least_squares_ranges import Ranges
 from optloc.models import MODELS, Model, distance, lifted_row, namespace
 from optloc.models.primitives import Components, Point, dot

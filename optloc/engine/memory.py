@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.gtrs import scratch
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES
-from optloc.compute.tape_table import TapeTable
+from optloc.kernels.gtrs import scratch
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES
+from optloc.kernels.tape_table import TapeTable
 
 ROUNDING = 4.0 * 2.220446049250313e-16
 """Share of a measurement that is rounding: four of a double lie between it and its residual."""
@@ -216,7 +216,7 @@ class Room(NamedTuple):
     squared, rows : array (s, d + 2, W), (s + l, d + 2, W)
         Squared-range rows as they are; and weighed, behind them the l linear rows of other kinds.
     y, second, work : array (d + 1, W), (d + 1, W), (n, W)
-        Squared-range answers, second ones, and scratch of `optloc.compute.gtrs.minimise`.
+        Squared-range answers, second ones, and scratch of `optloc.kernels.gtrs.minimise`.
     vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (23, W)
         See the names of their rows. Positions count from the origin, row ORIGIN. Where RADIUS is not zero, they are
         held at this distance from CENTRE.

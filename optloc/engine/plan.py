@@ -16,7 +16,6 @@ from optloc.base.cache import Cache
 from optloc.base.frames import Frame
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Band
-from optloc.compute.jit import enabled, ready, usable
 from optloc.engine.admission import admission_of, levels_of
 from optloc.engine.draw import draw_ranges, draw_tapes
 from optloc.engine.fixes import fix_one_by_ranges, fix_one_by_tapes, fix_ranges, fix_tapes
@@ -27,6 +26,7 @@ from optloc.engine.memory import (
     Model,
 )
 from optloc.engine.tapes import TapeRows
+from optloc.kernels.jit import enabled, ready, usable
 from optloc.linear.constraints import exact, face_names, is_exact
 from optloc.linear.normal import depends_on_place
 from optloc.linear.redundancy import degrees_of_freedom

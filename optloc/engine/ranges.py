@@ -7,9 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.gtrs import minimise
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, principal_axes
 from optloc.engine.memory import (
     AXES,
     BEYOND,
@@ -35,6 +32,9 @@ from optloc.engine.memory import (
     Room,
     X,
 )
+from optloc.kernels.gtrs import minimise
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES, principal_axes
 
 
 class RangeRows(NamedTuple):

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton of many problems side by side: the rules of `optloc.compute.least_squares`, lane by lane."""
+"""Damped Gauss-Newton of many problems side by side: the rules of `optloc.kernels.least_squares`, lane by lane."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.linalg import PIVOT
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, factor_plain, solve_plain
 from optloc.engine.admission import coarsen, evaluate, hold, restore
 from optloc.engine.memory import (
     ALIVE,
@@ -36,6 +33,9 @@ from optloc.engine.memory import (
     Room,
     X,
 )
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES, factor_plain, solve_plain
 
 
 @compiled

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, eliminate_last, principal_axes
 from optloc.engine.admission import restore
 from optloc.engine.evaluator import costs
 from optloc.engine.memory import (
@@ -34,6 +32,8 @@ from optloc.engine.memory import (
     Room,
     X,
 )
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES, eliminate_last, principal_axes
 
 STRAIGHT = 0.3
 """Greatest kappa of a Gaussian that covers: the cost at three sigma is between 6.67 and 12.15 instead of 9."""

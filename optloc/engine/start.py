@@ -7,9 +7,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.gtrs import meet
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES
 from optloc.engine.admission import restore
 from optloc.engine.evaluator import complete, minimise_start, scout
 from optloc.engine.memory import (
@@ -28,6 +25,9 @@ from optloc.engine.memory import (
     Room,
     X,
 )
+from optloc.kernels.gtrs import meet
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES
 
 NEAR = 1e-3
 """Least distance from a station that weighs a row, in units of the stations' spread: at the station itself a squared

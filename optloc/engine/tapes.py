@@ -7,15 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.gtrs import minimise
-from optloc.compute.jit import compiled
-from optloc.compute.lanes import Cells, arrange, blur_of, gather, memory, price
-from optloc.compute.lanes import load as load_lane
-from optloc.compute.pack import Numbers
-from optloc.compute.polynomial import DEGREE
-from optloc.compute.systems import LANES, eliminate_last, factor_plain, solve_plain
-from optloc.compute.tables import Tables
-from optloc.compute.tape_table import INPUT, OUTPUT, run_tape
 from optloc.engine.candidates import CANDIDATES, RINGS, look_around, refine_candidates
 from optloc.engine.heights import VECTORS, meet_ellipsoid
 from optloc.engine.infinity import search_sphere
@@ -42,6 +33,15 @@ from optloc.engine.memory import (
     X,
 )
 from optloc.engine.start import NEAR
+from optloc.kernels.gtrs import minimise
+from optloc.kernels.jit import compiled
+from optloc.kernels.lanes import Cells, arrange, blur_of, gather, memory, price
+from optloc.kernels.lanes import load as load_lane
+from optloc.kernels.pack import Numbers
+from optloc.kernels.polynomial import DEGREE
+from optloc.kernels.systems import LANES, eliminate_last, factor_plain, solve_plain
+from optloc.kernels.tables import Tables
+from optloc.kernels.tape_table import INPUT, OUTPUT, run_tape
 
 
 class TapeRows(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import access
 from optloc.base.outputs import Growing, write_text
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.simulate import simulate
 from optloc.live import events as of_events
 from optloc.live.answers import FORMATS, OF_RECORDS, Latest, Record, to_line

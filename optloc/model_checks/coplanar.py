@@ -13,8 +13,8 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.mirror import Folded, is_of_ranges, one_position, plane_of_stations
 from optloc.linear.normal import depends_on_place, marginal, prior_parts
 from optloc.models import MODELS

@@ -16,7 +16,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.linalg import normalised, spread_directions
 from optloc.base.types import Array
-from optloc.compute.damping import FIRST_GROWTH, judge
+from optloc.kernels.damping import FIRST_GROWTH, judge
 from optloc.linear.mirror import mirror, one_position, plane_of_stations
 from optloc.linear.normal import depends_on_place
 from optloc.linear.vectors import vectors

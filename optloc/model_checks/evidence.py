@@ -17,7 +17,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.normal import Linear, Normal, linearise, marginal, step
 from optloc.linear.walks import walks
 from optloc.model_checks.groups import Group

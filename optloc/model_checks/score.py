@@ -12,8 +12,8 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Bias, FormName
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.equalities import Equalities, spare_rows
 from optloc.models import MODELS

@@ -9,8 +9,8 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread, normalised, spread_directions
 from optloc.base.types import Array
-from optloc.compute.damping import FIRST_GROWTH, judge
-from optloc.compute.sums import equations_at
+from optloc.kernels.damping import FIRST_GROWTH, judge
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import Face, exact, levels, restore, tangent_at, violation
 from optloc.linear.normal import decrement, depends_on_place, marginal, step
 from optloc.model_checks.scaled_rows import cost_beyond_speed, has_scales, profile_by_rows

@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status, first_status
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.multi_target.answer import Emitters, Ghost

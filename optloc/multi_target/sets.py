@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.evaluate import differentiate
 from optloc.linear.normal import covariance
 from optloc.models import MODELS

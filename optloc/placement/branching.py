@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, put_rows
+from optloc.kernels.jit import compiled, put_rows
 from optloc.placement.criteria import gather, invert, measure
 from optloc.placement.relaxation import relax
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, put_rows
+from optloc.kernels.jit import compiled, put_rows
 from optloc.placement.branching import IN, OUT, number_left
 from optloc.placement.criteria import TRACE, VOLUME, invert, measure
 

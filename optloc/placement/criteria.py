@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 
 TRACE, VOLUME, AXIS = 0, 1, 2
 """Criteria: tr Cov, log det Cov, and the largest eigenvalue of Cov."""

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, put
-from optloc.compute.systems import cholesky, solve_factored
+from optloc.kernels.jit import compiled, put
+from optloc.kernels.systems import cholesky, solve_factored
 from optloc.placement.criteria import VOLUME, add_square, derive, evaluate
 
 # Multipliers below this share of the largest are left out: they cost as much as the others, and move the bound by less.

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put, put_rows
+from optloc.kernels.jit import compiled, inlined, put, put_rows
 from optloc.proof.nodes.node import Triple, blend, inner, reach, triple, write
 
 

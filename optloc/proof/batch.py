@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, worth_loading
+from optloc.kernels.jit import FEW, compiled, enabled, plain, ready, usable, worth_loading
 from optloc.proof.box import bound_nodes, cost_at, rounding
 from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.groups import empty_groups

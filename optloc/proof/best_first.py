@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import FEW, compiled, enabled, inlined, plain, ready, usable, zero
+from optloc.kernels.jit import FEW, compiled, enabled, inlined, plain, ready, usable, zero
 from optloc.proof.atlas import atlas_of, one_more
 from optloc.proof.batch import FIRST_BOXES, PLAIN_BOXES, SMALL, plainly, present_in
 from optloc.proof.box import (

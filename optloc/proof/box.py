@@ -7,8 +7,8 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
-from optloc.compute.systems import inverse
+from optloc.kernels.jit import compiled, inlined
+from optloc.kernels.systems import inverse
 from optloc.proof.nodes.dispatch import bound_others, infinity_of, points_of
 from optloc.proof.nodes.node import (
     BALANCED,

@@ -7,8 +7,8 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put
-from optloc.compute.systems import principal
+from optloc.kernels.jit import compiled, inlined, put
+from optloc.kernels.systems import principal
 from optloc.proof.atlas import Atlas, home_of, infinity, set_centre
 from optloc.proof.box import J0, cost_at, linearise_rows, rounding
 from optloc.proof.curvature import FAINT, G0, G1, G2, NOISE0, bend_axes, convex, least_of, sum_up

@@ -11,7 +11,7 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put, put_rows, zero
+from optloc.kernels.jit import compiled, inlined, put, put_rows, zero
 from optloc.proof.atlas import Atlas, atlas_of, one_more, within
 from optloc.proof.box import (
     CENTRE,

@@ -7,8 +7,8 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
-from optloc.compute.systems import inverse, positive, positive_along, principal
+from optloc.kernels.jit import compiled, inlined
+from optloc.kernels.systems import inverse, positive, positive_along, principal
 from optloc.proof.box import clip, digits, is_empty
 from optloc.proof.nodes.dispatch import curve_others, shape_of
 from optloc.proof.nodes.node import (

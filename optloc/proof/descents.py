@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from math import inf, sqrt
 
-from optloc.compute.jit import compiled, inlined, put
-from optloc.compute.systems import inverse, positive_along
+from optloc.kernels.jit import compiled, inlined, put
+from optloc.kernels.systems import inverse, positive_along
 from optloc.proof.curvature import G0, G1, G2
 from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22
 from optloc.proof.search_space import Box, Chart, Cost, blur_at, curve_box, value_at

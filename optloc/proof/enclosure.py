@@ -7,8 +7,8 @@ from math import inf, pi, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, zero
-from optloc.compute.systems import inverse, invert
+from optloc.kernels.jit import compiled, inlined, zero
+from optloc.kernels.systems import inverse, invert
 from optloc.proof.box import rounding
 from optloc.proof.groups import LOOSE
 from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of

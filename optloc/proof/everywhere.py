@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put, with_constants, zero
+from optloc.kernels.jit import compiled, inlined, put, with_constants, zero
 from optloc.proof.atlas import (
     Atlas,
     atlas_of,

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, zero
-from optloc.compute.systems import invert
+from optloc.kernels.jit import compiled, zero
+from optloc.kernels.systems import invert
 from optloc.proof.nodes.node import RANGE
 
 # Nodes whose rows are tied to each other by less than this share count as independent: what the rounding of whitened

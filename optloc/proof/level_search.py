@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, zero
+from optloc.kernels.jit import compiled, zero
 from optloc.proof.atlas import Atlas, infinity, one_more, set_centre
 from optloc.proof.box import DEPTH, LEAST, PIECE, least_left, reaches
 from optloc.proof.convex_boxes import is_known, widen_core
@@ -30,7 +30,7 @@ from optloc.proof.space import Space, in_atlas, place_of, set_place
 # levels took the same time.
 _NEAR = 10.0
 
-# What differs between costs: kernels of these names take the places of these (`optloc.compute.jit.with_constants`).
+# What differs between costs: kernels of these names take the places of these (`optloc.kernels.jit.with_constants`).
 
 
 @compiled

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put
+from optloc.kernels.jit import compiled, inlined, put
 from optloc.proof.box import (
     DEPTH,
     DIRECTION,

@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.atlas import Atlas, coordinates_on, infinity, within
 from optloc.proof.box import CENTRE, HALF, PIECE, cut_out, push, push_around, push_halves
 from optloc.proof.search_space import Box

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from optloc.base.types import Array, Band
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, put_rows
-from optloc.compute.systems import roughly_principal
+from optloc.kernels.jit import compiled, inlined, put_rows
+from optloc.kernels.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
 from optloc.proof.atlas import Atlas, Minima
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, cube, digits, reaches_infinity, rounding

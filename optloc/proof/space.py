@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.atlas import Atlas, position, set_centre, widen_around
 from optloc.proof.box import bound_nodes
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, zero
+from optloc.kernels.jit import compiled, zero
 from optloc.proof.atlas import Atlas, frame_of, scaled_station, set_line
 from optloc.proof.box import (
     DIRECTION,

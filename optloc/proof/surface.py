@@ -15,8 +15,8 @@ from math import sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, put_rows
-from optloc.compute.systems import roughly_principal
+from optloc.kernels.jit import compiled, put_rows
+from optloc.kernels.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
 from optloc.proof.nodes.level import EXACT, HEIGHT_WIDTH, LEAST_RADIUS, curve_height, normal_at
 from optloc.proof.nodes.node import (

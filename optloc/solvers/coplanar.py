@@ -14,7 +14,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.records import take
 from optloc.base.types import Array, Status
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import TOLERANCE, exact, violation
 from optloc.model_checks.coplanar import (
     JOINED,

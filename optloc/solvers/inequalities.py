@@ -10,9 +10,9 @@ import numpy as np
 from optloc.base.frames import Frame
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Status
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at
 from optloc.engine.admission import GRAZE, GROUND, SATELLITE
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_held, levels, outwards, violation
 from optloc.linear.normal import marginal
 from optloc.models import MODELS

@@ -14,7 +14,7 @@ from formulations.nls import Program
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
 from optloc.linear.normal import decrement, prior_parts, step, weighed
 from optloc.linear.symbolic import bounds, constrained, parameters, residual

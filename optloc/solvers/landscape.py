@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Band, Status
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import exact
 from optloc.linear.vectors import vectors
 from optloc.problem.fix import Fix

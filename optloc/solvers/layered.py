@@ -13,8 +13,8 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Band, Status
-from optloc.compute.least_squares import Limits, Refined, refine
-from optloc.compute.sums import equations_at
+from optloc.kernels.least_squares import Limits, Refined, refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import Face, Level, exact, levels
 from optloc.linear.mirror import one_position
 from optloc.linear.normal import Normal, marginal

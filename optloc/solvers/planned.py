@@ -12,12 +12,12 @@ import numpy as np
 from optloc.base.cache import Cache
 from optloc.base.records import take
 from optloc.base.types import Array, Motion, Status
-from optloc.compute.damping import Rules
-from optloc.compute.jit import enabled
-from optloc.compute.pack import PackedRuns, fold, folding, pack_runs
-from optloc.compute.sums import equations_at, serves
 from optloc.engine.memory import COST_OF_FIX, COST_OF_RIVAL, KAPPA, Answer
 from optloc.engine.plan import LIMIT, TOLERANCE, Load, Plan, key_of, plan_of
+from optloc.kernels.damping import Rules
+from optloc.kernels.jit import enabled
+from optloc.kernels.pack import PackedRuns, fold, folding, pack_runs
+from optloc.kernels.sums import equations_at, serves
 from optloc.linear.evaluate import block_links
 from optloc.linear.normal import depends_on_place, weighed
 from optloc.linear.redundancy import degrees_of_freedom
@@ -233,7 +233,7 @@ class RunPlan:
 
     def settle(self, problem: Problem, otherwise: Callable[[Problem], Pool]) -> Pool:
         """Return the settled pools of a flat batch of N runs; those that are not plainly good take another way."""
-        from optloc.compute.runs import fixed_runs
+        from optloc.kernels.runs import fixed_runs
 
         began, count = perf_counter(), problem.batch_shape[0]
         z = np.broadcast_to(problem.z, (count, problem.count))[:, self.rows].reshape(-1, self.rows.shape[1])

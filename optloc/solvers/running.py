@@ -10,8 +10,8 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import summed
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import summed
 from optloc.linear.normal import Normal, covariance, eliminated, with_priors
 from optloc.linear.vectors import complete
 from optloc.linear.walks import walks

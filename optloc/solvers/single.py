@@ -21,11 +21,11 @@ from optloc.base.cache import Cache
 from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band, Certificate, Status, first_status
-from optloc.compute.jit import usable
 from optloc.engine.admission import levels_of
 from optloc.engine.memory import Answer, Found
 from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
+from optloc.kernels.jit import usable
 from optloc.linear.constraints import is_exact, violation_names
 from optloc.linear.redundancy import largest
 from optloc.model_checks.coplanar import normal_of

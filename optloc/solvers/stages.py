@@ -14,8 +14,8 @@ from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
 from optloc.base.types import Array, Status
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.mirror import mirror, one_position
 from optloc.linear.normal import decrement, step

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.compute.kept import folder
+from optloc.kernels.kept import folder
 
 # Seconds in which a solver ends on programs of two unknowns, which take milliseconds; and to begin a process.
 _PATIENCE, _START = 5.0, 60.0

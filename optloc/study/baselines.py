@@ -22,8 +22,8 @@ from optloc.base.types import Array, Status
 from optloc.calibration.likelihood import Estimate, likelihood
 from optloc.calibration.network import Network
 from optloc.calibration.rounds import starts_of
-from optloc.compute.least_squares import WEIGHINGS
-from optloc.compute.sums import equations_at
+from optloc.kernels.least_squares import WEIGHINGS
+from optloc.kernels.sums import equations_at
 from optloc.linear.evaluate import differentiate
 from optloc.linear.mirror import one_position
 from optloc.linear.normal import depends_on_place, prior_parts, step, weighed

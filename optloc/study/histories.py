@@ -18,9 +18,9 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at
 from optloc.files import read
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.normal import depends_on_place
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem

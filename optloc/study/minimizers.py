@@ -17,9 +17,9 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import load_plugin, plugin_module
 from optloc.base.types import Array
-from optloc.compute.jit import FEW, usable
-from optloc.compute.pack import pack
-from optloc.compute.sums import equations_at
+from optloc.kernels.jit import FEW, usable
+from optloc.kernels.pack import pack
+from optloc.kernels.sums import equations_at
 from optloc.linear.normal import Normal
 from optloc.linear.walks import walks
 from optloc.problem.fix import Fix
@@ -73,7 +73,7 @@ def _equations(one: Problem) -> Callable[[Array], Normal]:
 
     By machine code, for what is timed is the minimizer: one evaluation after the other takes numpy six times as long.
     """
-    from optloc.compute.equations import normal_at, normal_block
+    from optloc.kernels.equations import normal_at, normal_block
 
     white, alone = whiten(one.noise, one.weight), np.zeros(1, dtype=np.int64)
     # A minimizer asks many times: that is worth waiting for.

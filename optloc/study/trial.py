@@ -18,7 +18,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.bounds.crlb import crlb
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import TOLERANCE, exact, violation
 from optloc.linear.normal import covariance, eliminated
 from optloc.problem.claims import PROOFS

@@ -28,7 +28,7 @@ import numpy as np
 
 from optloc.base.errors import NUMERICAL
 from optloc.base.types import Array
-from optloc.compute.filter import COLUMNS, ScanRows
+from optloc.kernels.filter import COLUMNS, ScanRows
 from optloc.linear.normal import linearise, weighed
 from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
@@ -90,7 +90,7 @@ class _Rows:
 
     @classmethod
     def written(cls, rows: ScanRows, item: int, memory: Array, n: int, stations: int) -> _Rows:
-        """Return the rows of a scan as machine code wrote them to a memory, see `optloc.compute.filter`."""
+        """Return the rows of a scan as machine code wrote them to a memory, see `optloc.kernels.filter`."""
         m = rows.z.shape[2]
         line = memory[len(memory) - m * (n + 2) :].reshape(m, n + 2)
         R = rows.covariance[item if len(rows.covariance) > 1 else 0]
@@ -299,7 +299,7 @@ Taken = tuple[Scans, int, State]
 class LastingErrors:
     """The lasting errors of a track, and its covariance with them.
 
-    Machine code screens each scan, see `REPEATS` and `EXCESS` of `optloc.compute.filter`. Where the screen finds an
+    Machine code screens each scan, see `REPEATS` and `EXCESS` of `optloc.kernels.filter`. Where the screen finds an
     error, `_Recursion` takes the last scans again. From then on it takes each scan, until no error is left. It always
     takes scans of the general form.
 
@@ -317,7 +317,7 @@ class LastingErrors:
         self._memory = np.zeros(COLUMNS)
 
     def memory(self, size: int) -> Array:
-        """Return the memory of the screen with at least so large a size, see `optloc.compute.filter.filter_scan`."""
+        """Return the memory of the screen with at least so large a size, see `optloc.kernels.filter.filter_scan`."""
         if len(self._memory) < size:
             self._memory = np.zeros(size)
         return self._memory

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion, Status
-from optloc.compute.filter import (
+from optloc.kernels.filter import (
     CODE,
     EXCESS,
     GENERAL,

@@ -12,10 +12,10 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.cache import Cache
 from optloc.base.types import Array, Motion
-from optloc.compute.filter import COLUMNS, VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
-from optloc.compute.jit import at_hand
-from optloc.compute.pack import sources
-from optloc.compute.tables import tables
+from optloc.kernels.filter import COLUMNS, VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
+from optloc.kernels.jit import at_hand
+from optloc.kernels.pack import sources
+from optloc.kernels.tables import tables
 from optloc.linear.normal import depends_on_place, weighed
 from optloc.problem.epochs import cut, tied
 from optloc.problem.noise import gathered, variances

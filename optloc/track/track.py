@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.errors import NUMERICAL, InvalidProblem
 from optloc.base.types import Array, Motion, Status
-from optloc.compute.filter import CODE, GENERAL, Move
+from optloc.kernels.filter import CODE, GENERAL, Move
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

@@ -11,7 +11,7 @@ from optloc.base import linalg
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Table
 from optloc.base.types import Array
-from optloc.compute.filter import (
+from optloc.kernels.filter import (
     CODE,
     COUNT,
     EKF,

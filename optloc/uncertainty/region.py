@@ -10,8 +10,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
-from optloc.compute.jit import enabled
-from optloc.compute.sums import equations_at
+from optloc.kernels.jit import enabled
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.normal import covariance
 from optloc.model_checks.shape import BENT, cost_at_infinity, departure, profile

@@ -12,7 +12,7 @@ import pytest
 from monte_carlo.tables import write
 
 import optloc
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")
 # Ten thousand proven fixes as a program's first ones.

@@ -10,11 +10,11 @@ from benchmarks.speed import SCENES, batch
 from monte_carlo.tables import write
 from runs import drawn, estimated, run, truth
 
-from optloc.compute.damping import Rules
-from optloc.compute.jit import enabled
-from optloc.compute.least_squares import refine
-from optloc.compute.pack import pack
-from optloc.compute.refine import answers, refine_block
+from optloc.kernels.damping import Rules
+from optloc.kernels.jit import enabled
+from optloc.kernels.least_squares import refine
+from optloc.kernels.pack import pack
+from optloc.kernels.refine import answers, refine_block
 from optloc.linear.normal import weighed
 from optloc.problem.noise import whiten
 
@@ -63,7 +63,7 @@ def iteration(scene):
 def by_numpy(scene, monkeypatch):
     """Microseconds of a fix by numpy."""
     problem, start = array(scene)
-    monkeypatch.setattr(import_module("optloc.compute.least_squares"), "serves", lambda problem, starts: False)
+    monkeypatch.setattr(import_module("optloc.kernels.least_squares"), "serves", lambda problem, starts: False)
     many = problem.take(np.arange(1000)), start[:1000]
     return 1e6 * quickest(lambda: refine(*many), 3) / 1000
 

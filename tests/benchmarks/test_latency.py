@@ -13,10 +13,10 @@ from benchmarks.with_general import scipy_from_the_truth
 from monte_carlo.tables import write
 
 from optloc import assemble, locate, measured, prepare, solve
-from optloc.compute.jit import enabled
 from optloc.engine.fixes import fix_one_by_ranges
 from optloc.engine.memory import Answer
 from optloc.engine.plan import LIMIT, TOLERANCE
+from optloc.kernels.jit import enabled
 from optloc.proof.batch import prove_here
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")

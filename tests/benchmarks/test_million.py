@@ -9,7 +9,7 @@ from benchmarks.speed import COUNT, SCENES, SIGMA, STATIONS, batch, general_micr
 from monte_carlo.tables import write
 
 from optloc import prepare, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 
 MILLION, THREADS = 1_000_000, (1, 2)
 pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")

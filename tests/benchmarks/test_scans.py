@@ -8,7 +8,7 @@ import pytest
 from monte_carlo.tables import write
 
 from optloc import Motion, assemble, measured
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.track import State, collected, polynomial, tracked
 from optloc.track.several_models import imm
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from optloc.compute.compilation import callee_compiler
-from optloc.compute.jit import compiled, enabled
+from optloc.kernels.compilation import callee_compiler
+from optloc.kernels.jit import compiled, enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.box import least_residual
 from optloc.proof.curvature import spread_of, sum_up

@@ -18,8 +18,8 @@ import pytest
 
 import optloc
 from optloc.cli.compile import PARTS
-from optloc.compute import digests, kept
-from optloc.compute.jit import _KERNELS, compiled, enabled, inlined, named, replace, with_constants
+from optloc.kernels import digests, kept
+from optloc.kernels.jit import _KERNELS, compiled, enabled, inlined, named, replace, with_constants
 from optloc.proof.nodes.dispatch import NODES, text_of
 
 # Of the lines of all kernels, what an edit of one module may renew on average.
@@ -102,8 +102,8 @@ def test_digests_do_not_depend_on_the_order_of_sets(order):
     """Code under a digest that the next process does not compute is compiled by every process."""
     code = """
 from optloc.cli.compile import PARTS
-from optloc.compute import digests
-from optloc.compute.jit import named
+from optloc.kernels import digests
+from optloc.kernels.jit import named
 print(*(digests.digest_of(named(name)) for part in PARTS.values() for name in part.entries))
 """
     command, environment = [sys.executable, "-P", "-c", code], {**os.environ, "PYTHONHASHSEED": order}

@@ -9,10 +9,10 @@ from runs import drawn, estimated, run, truth
 from test_normal import regular_sink
 
 from optloc import MODELS, Motion, Prior, assemble, measured, simulate, station_array
-from optloc.compute import sums as hooks
-from optloc.compute.equations import normal_at
-from optloc.compute.pack import pack
-from optloc.compute.sums import equations_at, summed
+from optloc.kernels import sums as hooks
+from optloc.kernels.equations import normal_at
+from optloc.kernels.pack import pack
+from optloc.kernels.sums import equations_at, summed
 from optloc.linear.normal import linearise, normal, whitener_at, with_priors
 from optloc.models.primitives import distance
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from formulations.squared_range import cone, minimiser, paraboloid
-from optloc.compute.gtrs import minimise, scratch
-from optloc.compute.jit import enabled
-from optloc.compute.systems import LANES
+from optloc.kernels.gtrs import minimise, scratch
+from optloc.kernels.jit import enabled
+from optloc.kernels.systems import LANES
 
 BLOCKS = 40 if enabled() else 1
 

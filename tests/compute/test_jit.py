@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from optloc.compute import jit
-from optloc.compute.jit import Constant, compiled, enabled, with_constants
+from optloc.kernels import jit
+from optloc.kernels.jit import Constant, compiled, enabled, with_constants
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba nothing is compiled")
 WIDTH, UNIT = 3, 1.0

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from optloc.compute import kept, manifest
-from optloc.compute.jit import enabled
+from optloc.kernels import kept, manifest
+from optloc.kernels.jit import enabled
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
 
 CALLER = """
 from callee import level
 
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 
 
 @compiled
@@ -26,7 +26,7 @@ def answer(x):
     return level(x) + 1
 """
 CALLEE = """
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 
 
 @compiled
@@ -41,7 +41,7 @@ import sys
 import numba
 from numba.core import event
 
-import optloc.compute.jit
+import optloc.kernels.jit
 
 numba.njit(lambda x: x + 1)(0)
 for line in sys.stdin:

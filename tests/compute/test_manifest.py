@@ -16,9 +16,9 @@ from often import few
 import optloc
 from optloc.cli import wheel
 from optloc.cli.compile import make
-from optloc.compute import manifest
-from optloc.compute.jit import enabled
-from optloc.compute.kept import folder
+from optloc.kernels import manifest
+from optloc.kernels.jit import enabled
+from optloc.kernels.kept import folder
 from optloc.track.updates import ekf
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
@@ -31,7 +31,7 @@ import numpy as np
 from numba.core import event
 
 import optloc
-from optloc.compute.manifest import installed
+from optloc.kernels.manifest import installed
 from optloc.track.updates import ekf
 
 places, mean = np.array({places}), np.array({mean})
@@ -67,8 +67,8 @@ def site(tmp_path):
     assert make() == []
     few = tmp_path / "few"
     few.mkdir()
-    for file in folder().glob("optloc.compute.*.nb[ic]"):
-        if file.name.startswith(("optloc.compute.filter.", "optloc.compute.lanes.", "optloc.compute.systems.")):
+    for file in folder().glob("optloc.kernels.*.nb[ic]"):
+        if file.name.startswith(("optloc.kernels.filter.", "optloc.kernels.lanes.", "optloc.kernels.systems.")):
             (few / file.name).write_bytes(file.read_bytes())
             (few / re.sub(r"-[0-9a-f]{16}\.", f"-{BEFORE}.", file.name)).write_bytes(b"of a version before")
     packed = wheel.pack(few, tmp_path / "dist")

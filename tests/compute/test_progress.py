@@ -10,14 +10,14 @@ from time import monotonic
 import pytest
 
 import optloc
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(optloc.__file__).parents[1])}
 # A compiler that takes its time: kernels of three seconds and of about one, of which nothing is kept.
 SLEEPS = """
 import time
 
-from optloc.compute import jit
+from optloc.kernels import jit
 
 
 class Sleeps:
@@ -76,7 +76,7 @@ def test_standard_error_is_never_quiet_for_long():
     ("code", "line"),
     [
         ("run(False, 2.4)", "loading machine code\n"),
-        ("from optloc.compute.progress import keep_quiet\nkeep_quiet(True)\nrun(True, 2.4)", ""),
+        ("from optloc.kernels.progress import keep_quiet\nkeep_quiet(True)\nrun(True, 2.4)", ""),
     ],
 )
 def test_loading_is_no_compilation_and_quiet_is_quiet(code, line):
@@ -90,7 +90,7 @@ def test_the_option_quiet_switches_progress_off_and_its_absence_on():
     from typer.testing import CliRunner
 
     from optloc.cli import app
-    from optloc.compute.progress import Reporter
+    from optloc.kernels.progress import Reporter
 
     for options, quiet in ((["--quiet"], True), ([], False)):
         assert CliRunner().invoke(app, ["new", "range", *options]).exit_code == 0

@@ -12,12 +12,12 @@ from test_normal import regular_sink
 from optloc import Bias, Motion, Prior, assemble, measured, simulate, station_array
 from optloc.base.linalg import inverse
 from optloc.base.types import Status
-from optloc.compute.damping import judge, judge_lane
-from optloc.compute.jit import enabled
+from optloc.kernels.damping import judge, judge_lane
+from optloc.kernels.jit import enabled
 from optloc.linear.normal import marginal
 
-hooks = import_module("optloc.compute.least_squares")
-choice = import_module("optloc.compute.least_squares")
+hooks = import_module("optloc.kernels.least_squares")
+choice = import_module("optloc.kernels.least_squares")
 COUNT = 100 if enabled() else 3
 
 
@@ -136,7 +136,7 @@ def test_an_open_direction_stalls_or_ends_as_with_numpy(both):
 def test_threads_change_nothing(monkeypatch, both):
     problem, start = started(CASES["tdoa-3d"])
     one, _ = both(problem, start)
-    monkeypatch.setattr("optloc.compute.equations._SHARE", 7)
+    monkeypatch.setattr("optloc.kernels.equations._SHARE", 7)
     monkeypatch.setenv("OPTLOC_THREADS", "4")
     several, _ = both(problem, start)
     for name in ("x", "cost", "status", "iterations"):

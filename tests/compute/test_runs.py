@@ -9,9 +9,9 @@ from runs import drawn, estimated, run, truth
 
 from optloc import Motion, Prior, Status, assemble, measured, solve, with_bias
 from optloc.base import linalg
-from optloc.compute.jit import enabled
-from optloc.compute.least_squares import refine
-from optloc.compute.pack import fold, folding, pack_runs
+from optloc.kernels.jit import enabled
+from optloc.kernels.least_squares import refine
+from optloc.kernels.pack import fold, folding, pack_runs
 from optloc.linear.normal import linearise, local_covariance, marginal, normal, whitener_at, with_priors
 from optloc.solvers import planned
 
@@ -68,7 +68,7 @@ def start_of(problem):
 
 @pytest.mark.parametrize("name", RUNS)
 def test_sums_are_those_of_numpy(name):
-    from optloc.compute.runs import sums_of_runs
+    from optloc.kernels.runs import sums_of_runs
 
     problem = RUNS[name]().flat()
     x, item = start_of(problem), np.arange(problem.batch_shape[0])
@@ -86,7 +86,7 @@ def test_answers_are_those_of_numpy(name, monkeypatch):
     else:
         start = solve(problem, "gtrs").x.reshape(problem.batch_shape[0], -1)
     ours = refine(problem, start)
-    monkeypatch.setattr(import_module("optloc.compute.least_squares"), "serves", lambda problem, starts: False)
+    monkeypatch.setattr(import_module("optloc.kernels.least_squares"), "serves", lambda problem, starts: False)
     theirs = refine(problem, start)
     assert (ours.status == theirs.status).all()
     np.testing.assert_allclose(ours.cost, theirs.cost, rtol=1e-9)
@@ -96,8 +96,8 @@ def test_answers_are_those_of_numpy(name, monkeypatch):
 
 
 def test_covariances_are_those_of_the_normal_equations():
-    from optloc.compute.damping import Rules
-    from optloc.compute.runs import fixed_runs, sums_of_runs
+    from optloc.kernels.damping import Rules
+    from optloc.kernels.runs import fixed_runs, sums_of_runs
 
     problem = free(70, trials=2)[0].flat()
     x, item = solve(problem, "gtrs+lsr").x, np.arange(2)

@@ -7,7 +7,7 @@ import pytest
 from cases import CASES, kitchen_sink, random_vector
 
 from optloc import MODELS
-from optloc.compute.trace import OPERATIONS, Recorder, Symbol, evaluate, operate, tape, trace
+from optloc.kernels.trace import OPERATIONS, Recorder, Symbol, evaluate, operate, tape, trace
 from optloc.linear.evaluate import block_links, given, points
 from optloc.models.primitives import Jet, namespace
 

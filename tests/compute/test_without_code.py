@@ -11,7 +11,7 @@ import pytest
 import optloc
 from optloc import InvalidProblem
 from optloc.cli.compile import PARTS
-from optloc.compute.jit import enabled, names_in, usable
+from optloc.kernels.jit import enabled, names_in, usable
 from optloc.proof.batch import _loop
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
@@ -23,7 +23,7 @@ from collections import Counter
 
 import numpy as np
 from optloc import assemble, measured, prepare, simulate, solve
-from optloc.compute import jit
+from optloc.kernels import jit
 
 begun, callers = [], []
 jit.begin_child = lambda: begun.append(1)
@@ -69,8 +69,8 @@ def test_a_batch_goes_on_in_plain_python_while_a_child_compiles(tmp_path):
 )
 def test_who_waits(monkeypatch, way, few, many):
     begun = []
-    monkeypatch.setattr("optloc.compute.jit.is_kept", lambda name: False)
-    monkeypatch.setattr("optloc.compute.jit.begin_child", lambda: begun.append(1))
+    monkeypatch.setattr("optloc.kernels.jit.is_kept", lambda name: False)
+    monkeypatch.setattr("optloc.kernels.jit.begin_child", lambda: begun.append(1))
     monkeypatch.setattr(_loop, "ready", False)
     monkeypatch.setattr(_loop, "seen", False)
     monkeypatch.setenv("OPTLOC_COMPILE", way)
@@ -79,7 +79,7 @@ def test_who_waits(monkeypatch, way, few, many):
 
 
 def test_another_way_is_named(monkeypatch):
-    monkeypatch.setattr("optloc.compute.jit.is_kept", lambda name: False)
+    monkeypatch.setattr("optloc.kernels.jit.is_kept", lambda name: False)
     monkeypatch.setattr(_loop, "ready", False)
     monkeypatch.setattr(_loop, "seen", False)
     monkeypatch.setenv("OPTLOC_COMPILE", "later")
@@ -136,7 +136,7 @@ def test_who_looks_on_does_not_wait(command, looked_at, way):
 RUN = """
 import numpy as np
 import optloc
-from optloc.compute import jit
+from optloc.kernels import jit
 
 rng = np.random.default_rng(1)
 places = rng.uniform(-1e4, 1e4, (6, 3)) + 10.0 * np.arange(6)[:, None, None] * rng.uniform(-100.0, 100.0, (6, 3))

@@ -9,9 +9,9 @@ from cases import ENU
 import optloc
 from optloc import assemble, measured
 from optloc.base.types import Band
-from optloc.compute import jit
 from optloc.engine.admission import admission_of, levels_of
 from optloc.engine.plan import plan_of
+from optloc.kernels import jit
 from optloc.linear.constraints import box, height, violation, visible
 from optloc.models.primitives import WGS84_A
 from optloc.solvers.inequalities import is_hidden

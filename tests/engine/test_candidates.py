@@ -5,11 +5,11 @@ import pytest
 
 import optloc
 from optloc import assemble, constraints, measured, simulate, solve
-from optloc.compute.jit import enabled
-from optloc.compute.polynomial import DEGREE, real_roots
 from optloc.engine.memory import BY_HEIGHT, BY_PLACES
 from optloc.engine.plan import plan_of
 from optloc.engine.shape import STRAIGHT
+from optloc.kernels.jit import enabled
+from optloc.kernels.polynomial import DEGREE, real_roots
 from optloc.model_checks.shape import cost_at_infinity
 from optloc.models.primitives import WGS84_A
 from optloc.solvers.inequalities import is_hidden

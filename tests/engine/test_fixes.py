@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 
 from optloc import Status, assemble, measured, solve
 from optloc.base.types import Array
-from optloc.compute.jit import enabled
 from optloc.engine.plan import plan_of
+from optloc.kernels.jit import enabled
 from optloc.problem.chart import basis
 from optloc.solvers import policy
 from optloc.solvers.stages import gtrs, lsr_with_mirror

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from optloc import assemble, measured, simulate
-from optloc.compute import jit
-from optloc.compute.tape_table import INPUT, OUTPUT, run_tape
-from optloc.compute.trace import evaluate
 from optloc.engine import lifts
 from optloc.engine.lifts import lift
 from optloc.engine.plan import plan_of
+from optloc.kernels import jit
+from optloc.kernels.tape_table import INPUT, OUTPUT, run_tape
+from optloc.kernels.trace import evaluate
 from optloc.linear.least_squares_ranges import ranges
 from optloc.models.primitives import Point
 from optloc.solvers.starts.squared_range import Coordinates, lift_rows

@@ -14,7 +14,7 @@ from verdicts import alone
 
 import optloc
 from optloc import Problem
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 
 Array = np.ndarray
 SLACK = 1e-3

@@ -10,7 +10,7 @@ from proof.doppler import FAMILIES, SEED, Scenes, Trial, scenes_of
 from scipy.stats import chi2
 
 from optloc import ECEF, Fix, Status, crlb, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.solvers.policy import LISTED_GAP
 
 SLACK, SAME = 1e-5, 1e-2

@@ -8,7 +8,7 @@ from monte_carlo.tables import ledger
 from proof.layouts import BY_NAME, CELLS, SEED
 
 from optloc import Status, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 
 DEFAULT, FULL = 60, 2000
 HEADER = [

@@ -14,8 +14,8 @@ from proof.test_moving_targets import limits
 from proof.test_targets_over_ground import drawn as over_ground
 
 from optloc import Problem, Status, simulate, solve
-from optloc.compute.jit import enabled
-from optloc.compute.least_squares import refine
+from optloc.kernels.jit import enabled
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import exact, restore
 from optloc.linear.vectors import vectors
 from optloc.solvers.certify.position_cost import state_columns

@@ -5,7 +5,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from optloc.compute.jit import plain
+from optloc.kernels.jit import plain
 
 
 @pytest.fixture(params=["plain", pytest.param("machine", marks=pytest.mark.full)])

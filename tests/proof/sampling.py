@@ -4,7 +4,7 @@ import numpy as np
 from proof.costs import WIDTH
 
 from optloc import MODELS
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.models import Point, range_rate
 from optloc.proof.nodes.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
 from optloc.proof.nodes.level import bound_height, curve_height

@@ -6,7 +6,7 @@ All there is to it is this file and one entry point, ``[project.entry-points."op
 
 from math import sqrt
 
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 from optloc.models import Model
 from optloc.proof.nodes.node import CONVEX, GROWS, Node, inner, pull, reach, triple, write
 

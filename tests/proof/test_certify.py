@@ -10,7 +10,7 @@ from proof.plain import cost_of
 
 import optloc
 from optloc import Fix, InvalidProblem, Status, assemble, certify, measured, simulate, solve, with_bias
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
 from optloc.solvers.certify import branch_and_bound
 

@@ -10,7 +10,7 @@ from proof.plain import node_values
 
 from optloc import Motion, Stations, assemble, certify, measured, simulate, solve
 from optloc.base.types import Band
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.constraints import height
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.proof.everywhere import UNBOUNDED

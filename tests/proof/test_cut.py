@@ -9,8 +9,8 @@ from proof.sampling import bounded, many, numbers, rotation, value
 from proof.test_soundness import verdicts
 
 from optloc import assemble, measured
-from optloc.compute.jit import enabled
-from optloc.compute.systems import inverse
+from optloc.kernels.jit import enabled
+from optloc.kernels.systems import inverse
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.box import cube, is_empty, least_residual, linearise_rows, rounding, shrink, uncut
 from optloc.proof.convex_boxes import accuracy_floor_far

@@ -9,7 +9,7 @@ import pytest
 from proof.doppler import FAMILIES, Trial, scenes_of
 
 from optloc import Status, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 
 EQUAL = 1e-6
 # Random descents of each trial, beside those from the truth and from the best dozen places of a grid.

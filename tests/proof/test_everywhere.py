@@ -10,7 +10,7 @@ from proof.sampling import many
 from scipy.optimize import least_squares, minimize_scalar
 
 from optloc import Status, assemble, measured, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.batch import Asked, prove_all
 from optloc.proof.box import cube, reaches_infinity

@@ -12,7 +12,7 @@ import pytest
 from often import few
 
 from optloc import Status, assemble, measured, solve
-from optloc.compute.jit import FEW, _Kernel, enabled
+from optloc.kernels.jit import FEW, _Kernel, enabled
 from optloc.proof import batch, best_first
 from optloc.proof.batch import FIRST_BOXES
 

@@ -11,7 +11,7 @@ from often import few
 from proof.sampling import many
 
 from optloc import Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import (

@@ -14,7 +14,7 @@ from recipes import write_package
 from scipy.optimize import least_squares
 
 from optloc.base.errors import InvalidProblem
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.models import MODELS
 from optloc.proof.nodes.dispatch import NODES, code_of, named, text_of
 from optloc.proof.nodes.node import RANGE
@@ -145,7 +145,7 @@ def test_it_mixes_with_kinds_that_optloc_has(package):
 CHOICES = """
 import numpy as np
 import squared_range
-from optloc.compute.jit import plain
+from optloc.kernels.jit import plain
 from optloc.proof.search_space import empty_box
 from optloc.proof.curvature import curve_nodes
 from optloc.proof.box import bound_nodes

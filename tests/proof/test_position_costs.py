@@ -9,7 +9,7 @@ from proof.plain import cost_of
 
 from optloc import MODELS, Motion, Prior, Stations, assemble, measured, simulate, with_bias
 from optloc.base.types import Bias
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.proof.position_costs import position_costs
 from optloc.proof.scope import unsupported
 

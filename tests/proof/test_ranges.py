@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from proof.costs import WIDTH, random_case
 
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.proof.box import bound_nodes, cut_out, least_residual, linearise_rows, shrink
 from optloc.proof.nodes.node import NODE_WIDTH, RANGE, greatest
 from optloc.proof.nodes.range import bound_ranges

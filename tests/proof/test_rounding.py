@@ -9,7 +9,7 @@ import pytest
 from proof.sampling import many
 
 from optloc.base.linalg import project_out
-from optloc.compute.jit import plain
+from optloc.kernels.jit import plain
 from optloc.proof.box import bound_nodes, rounding
 from optloc.proof.nodes.node import PHI, RANGE
 from optloc.proof.search_space import chart_on, cost_of, empty_box, place

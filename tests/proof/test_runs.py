@@ -10,7 +10,7 @@ from proof.layouts import SEED
 from proof.sampling import many
 
 from optloc import Frame, Stations, assemble, measured, with_bias
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.batch import costs_at
 from optloc.proof.box import cube

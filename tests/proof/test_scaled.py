@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from waves import air, plate
 
 from optloc import Problem, assemble, measured, solve, with_bias
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.proof.atlas import atlas_of, position, set_centre
 from optloc.proof.box import cube
 from optloc.proof.convex_boxes import accuracy_floor_far

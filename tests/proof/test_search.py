@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from proof.costs import NO_REGION, beside, combined, differences, random_case
 
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 from optloc.proof.search_space import cost_of, empty_box
 

@@ -12,7 +12,7 @@ from waves import air
 
 from optloc import Prior, assemble, measured, solve, with_bias
 from optloc.base.types import Bias
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.model_checks.scaled_rows import runs_backwards
 from optloc.model_checks.shape import cost_at_infinity
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled

@@ -8,7 +8,7 @@ from proof.independent import Trial
 from proof.layouts import BY_NAME, CELLS, rows
 
 from optloc import assemble, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.proof.batch import Asked, prove_all
 from optloc.proof.near import UNIQUE, VALUE
 from optloc.proof.position_costs import position_costs

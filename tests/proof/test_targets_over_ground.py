@@ -9,7 +9,7 @@ from often import few
 from proof.sampling import many
 
 from optloc import Frame, Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.constraints import exact, levels, restore
 from optloc.models.course import carry
 from optloc.proof.runs.ground import (

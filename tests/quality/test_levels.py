@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from optloc import InvalidProblem, assemble, linearise, measured, noise_levels, solve, with_noise_levels
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.model_checks import variance_components as rules
 from optloc.model_checks.elements import batch_of, elements
 from optloc.model_checks.score import descend

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.study.baselines import BASELINES, start_of, whiten_one
 from optloc.study.design import design_of_text
 from optloc.study.draws import draw

@@ -5,8 +5,8 @@ import pytest
 from often import few
 
 from optloc import Motion, assemble, measured
-from optloc.compute.filter import COLUMNS, filter_scan
-from optloc.compute.jit import at_hand
+from optloc.kernels.filter import COLUMNS, filter_scan
+from optloc.kernels.jit import at_hand
 from optloc.problem.epochs import cut
 from optloc.track import Rules, State, lasting, polynomial, tracked
 from optloc.track.run import Follower

@@ -8,8 +8,8 @@ import pytest
 from cases import ENU
 
 from optloc import Motion, Stations, Status, assemble, measured
-from optloc.compute.filter import CODE, GENERAL, NIS
-from optloc.compute.jit import enabled
+from optloc.kernels.filter import CODE, GENERAL, NIS
+from optloc.kernels.jit import enabled
 from optloc.track import (
     UPDATES,
     Rules,

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from optloc import Status, assemble, measured, prepare, solve
 from optloc.base.types import Band
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
 from optloc.solvers import solve_in_stages
 from optloc.solvers.certify.out_of_reach import edges_of, lay_planes, question

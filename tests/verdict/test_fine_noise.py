@@ -8,7 +8,7 @@ from often import few
 from verdict.exact import COUNT, draw
 
 from optloc import ECEF, Frame, Motion, Status, assemble, certify, constraints, measured, solve
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.evaluate import predict
 from optloc.proof.near import COARSE
 from optloc.solvers.certify.branch_and_bound import FINE

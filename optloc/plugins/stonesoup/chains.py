@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from optloc.base.types import Array, Motion, Prior, Status
-from optloc.compute.least_squares import Refined, refine
+from optloc.kernels.least_squares import Refined, refine
 from optloc.linear.normal import covariance, linearise
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.plugins.stonesoup.models import problem_of, rows_by_kind, values_of

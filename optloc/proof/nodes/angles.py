@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import atan, atan2, cos, hypot, inf, pi, sin, sqrt
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 from optloc.proof.nodes.node import (
     AZIMUTH,
     SCALED,

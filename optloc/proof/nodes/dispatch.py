@@ -14,7 +14,7 @@ from threading import Lock
 from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.compute.jit import compiled, inlined, replace
+from optloc.kernels.jit import compiled, inlined, replace
 from optloc.proof.atlas import frame_of, set_line
 from optloc.proof.nodes import node as columns
 from optloc.proof.nodes.angles import HORIZONTAL_ANGLE, VERTICAL_ANGLE

@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import sqrt
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.node import (

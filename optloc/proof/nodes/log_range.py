@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import inf, log, log1p
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 from optloc.proof.nodes.node import (
     BALANCED,
     Node,

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.kernels.jit import compiled, inlined
 from optloc.problem.problem import Problem
 
 # Codes of the shipped nodes, by which machine code knows them; nodes from outside are counted on. ANY stands for a node
@@ -120,7 +120,7 @@ Kernel = Callable[..., Any]
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """One kind of node. Its functions of scalars and arrays are compiled (`optloc.compute.jit.compiled`).
+    """One kind of node. Its functions of scalars and arrays are compiled (`optloc.kernels.jit.compiled`).
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import sqrt
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 from optloc.proof.nodes.node import (
     SCALED,
     Node,

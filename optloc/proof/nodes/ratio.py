@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, sqrt
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.nodes.node import (
     SCALED,
     Node,

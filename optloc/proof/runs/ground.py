@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.proof.nodes.level import EXACT, LEAST_RADIUS, normal_at
 from optloc.proof.nodes.node import Triple, blend, inner, triple, write

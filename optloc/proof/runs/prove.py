@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, inlined, put, usable, zero
+from optloc.kernels.jit import compiled, enabled, inlined, put, usable, zero
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, home_of, set_centre, with_minima
 from optloc.proof.batch import Answered, Asked, plainly, without_rivals
 from optloc.proof.box import (

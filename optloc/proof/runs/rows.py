@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.systems import positive_along
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import positive_along
 from optloc.proof.curvature import (
     BLUR0,
     C00,

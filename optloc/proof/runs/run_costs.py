@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.linalg import project_out, span_of
 from optloc.base.types import Array
-from optloc.compute.jit import plain, usable
+from optloc.kernels.jit import plain, usable
 from optloc.linear.normal import prior_parts, weighed
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, put
-from optloc.compute.systems import positive_along
+from optloc.kernels.jit import compiled, put
+from optloc.kernels.systems import positive_along
 from optloc.proof.atlas import set_centre
 from optloc.proof.box import (
     PIECE,

@@ -7,8 +7,8 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, put
-from optloc.compute.systems import invert
+from optloc.kernels.jit import compiled, put
+from optloc.kernels.systems import invert
 from optloc.proof.batch import plainly
 from optloc.proof.nodes.node import HIGH, LOW, SLOPE0
 from optloc.proof.runs.ground import errors_of

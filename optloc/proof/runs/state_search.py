@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, zero
-from optloc.compute.systems import invert
+from optloc.kernels.jit import compiled, zero
+from optloc.kernels.systems import invert
 from optloc.proof.box import reaches
 from optloc.proof.near import (
     ANOTHER,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 from optloc.models.primitives import WGS84_A
 from optloc.proof.box import bound_nodes
 from optloc.proof.curvature import curve_nodes, entry

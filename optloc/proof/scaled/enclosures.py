@@ -7,8 +7,8 @@ from math import inf
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, zero
-from optloc.compute.systems import invert
+from optloc.kernels.jit import compiled, zero
+from optloc.kernels.systems import invert
 from optloc.proof.box import reaches_infinity
 from optloc.proof.enclosure import SLACK, around_node
 from optloc.proof.groups import NONE, empty_groups

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from math import inf, sqrt
 
-from optloc.compute.jit import compiled, inlined
-from optloc.compute.systems import positive_along
+from optloc.kernels.jit import compiled, inlined
+from optloc.kernels.systems import positive_along
 from optloc.proof.box import digits, is_empty, uncut
 from optloc.proof.curvature import C00, G0, LENGTH0, NOISE0, bends_down, clip_newton, entry
 from optloc.proof.nodes.node import CHI, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, SLOPE0, TURN0

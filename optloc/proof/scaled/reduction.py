@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.box import DIRECTION, ROW_WIDTH, digits, least_residual, linearise_rows, shrink, uncut
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, SLOPE0
 from optloc.proof.search_space import Box, Cost

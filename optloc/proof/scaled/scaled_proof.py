@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, plain, put, usable, worth_loading, zero
+from optloc.kernels.jit import compiled, enabled, plain, put, usable, worth_loading, zero
 from optloc.linear.normal import prior_parts
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, with_constants
+from optloc.kernels.jit import compiled, inlined, with_constants
 from optloc.proof.atlas import Atlas, home_of, infinity
 from optloc.proof.box import (
     PIECE,

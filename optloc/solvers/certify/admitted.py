@@ -16,7 +16,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import Axes, overwrite, take
 from optloc.base.types import Array, Status
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import (
     Face,
     exact,

@@ -11,8 +11,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import change, overwrite, present, take
 from optloc.base.types import Array, Certificate
-from optloc.compute.jit import enabled
-from optloc.compute.least_squares import refine
+from optloc.kernels.jit import enabled
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
 from optloc.linear.vectors import vectors
 from optloc.problem.chart import quantile

@@ -6,7 +6,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Band, Polygon
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact, is_exact
 from optloc.linear.normal import eliminated, step
 from optloc.models.primitives import geodetic_normal

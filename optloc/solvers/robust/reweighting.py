@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Status
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at, summed
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at, summed
 from optloc.linear.constraints import Face
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import Normal, marginal, weighed, with_priors

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from optloc.base.types import Array, Status
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import exact
 from optloc.linear.courses import elapsed
 from optloc.linear.mirror import one_position, rows_of_stations

@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Status
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import marginal
 from optloc.linear.redundancy import degrees_of_freedom

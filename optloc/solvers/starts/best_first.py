@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array, Band
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.linear.constraints import is_exact
 from optloc.problem.problem import Problem
 from optloc.proof.best_first import Places, find_minima

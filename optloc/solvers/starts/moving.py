@@ -14,7 +14,7 @@ from math import sqrt
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import plain
+from optloc.kernels.jit import plain
 from optloc.linear.constraints import exact
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import Atlas, atlas_of, position, set_centre

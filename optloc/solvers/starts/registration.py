@@ -11,8 +11,8 @@ import numpy as np
 from formulations.registration import Course, candidates
 from optloc.base import linalg
 from optloc.base.types import Array, Bias, Status
-from optloc.compute.least_squares import refine
-from optloc.compute.sums import equations_at
+from optloc.kernels.least_squares import refine
+from optloc.kernels.sums import equations_at
 from optloc.linear.courses import elapsed
 from optloc.linear.evaluate import block_links
 from optloc.linear.least_squares_ranges import Ranges, ranges

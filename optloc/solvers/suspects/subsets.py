@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.records import join, take
 from optloc.base.types import Array
-from optloc.compute.jit import enabled
+from optloc.kernels.jit import enabled
 from optloc.model_checks.evidence import Influence, drops, embed, errors, influence, significance
 from optloc.model_checks.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.problem.claims import GLOBAL

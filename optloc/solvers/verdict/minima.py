@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Status
-from optloc.compute.sums import equations_at
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import Face, face_names, faces, levels, tangent_at
 from optloc.linear.mirror import one_position
 from optloc.linear.normal import Normal, local_covariance, marginal

@@ -16,7 +16,7 @@ import numpy as np
 
 from optloc.base import arrays, linalg
 from optloc.base.types import Array, Prior, Status
-from optloc.compute.least_squares import refine
+from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import exact
 from optloc.linear.evaluate import predict
 from optloc.linear.mirror import one_position

@@ -10,9 +10,9 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge
-from optloc.compute.pack import PackedRuns, coarseness
-from optloc.compute.sums import equations_at, packed, serves, sums_at
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge
+from optloc.kernels.pack import PackedRuns, coarseness
+from optloc.kernels.sums import equations_at, packed, serves, sums_at
 from optloc.linear.constraints import Face, is_height
 from optloc.linear.equalities import Equalities
 from optloc.linear.mirror import Folded
@@ -377,8 +377,8 @@ def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener,
     found = packed(problem, noise)
     if found is None:
         return None
-    from optloc.compute import refine
-    from optloc.compute.runs import refined_runs
+    from optloc.kernels import refine
+    from optloc.kernels.runs import refined_runs
 
     if isinstance(found, PackedRuns):
         done, lost = refined_runs(found, item, start, rules)

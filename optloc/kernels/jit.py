@@ -15,10 +15,10 @@ from typing import Any, TypeAlias, TypeVar, cast
 from optloc.base.errors import InvalidProblem
 from optloc.base.threads import held_by_forks
 from optloc.base.types import Array
-from optloc.compute.compilation import options
-from optloc.compute.digests import Compilable, callers, closure
-from optloc.compute.kept import begin_child, folder, is_kept, kept, locked, name_of
-from optloc.compute.progress import Reporter
+from optloc.kernels.compilation import options
+from optloc.kernels.digests import Compilable, callers, closure
+from optloc.kernels.kept import begin_child, folder, is_kept, kept, locked, name_of
+from optloc.kernels.progress import Reporter
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 
 DEGREE = 4
 """Greatest degree."""

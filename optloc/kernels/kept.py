@@ -1,9 +1,9 @@
-"""Machine code on disk: each kernel is kept under the digest of its call graph (`optloc.compute.digests`).
+"""Machine code on disk: each kernel is kept under the digest of its call graph (`optloc.kernels.digests`).
 
 numba renews its files of a function when the file of that function changes. But machine code contains all functions
 that it calls, in any file: after an edit or an upgrade of one of those, stale code would answer. So numba's own
 stamp is not used. The folder of machine code is named by the versions of the compilers and by the processor. The
-folder of an installed distribution (`optloc.compute.manifest`) comes first.
+folder of an installed distribution (`optloc.kernels.manifest`) comes first.
 
 Callees are kept too where they save time: in a checkout, and while `optloc compile` makes everything.
 """
@@ -23,9 +23,9 @@ from tempfile import TemporaryFile
 from types import SimpleNamespace
 from typing import IO, Any
 
-from optloc.compute.compilation import callee_library
-from optloc.compute.digests import Compilable, digest_of
-from optloc.compute.manifest import PACKAGE, PREFIX, installed, of_this_process
+from optloc.kernels.compilation import callee_library
+from optloc.kernels.digests import Compilable, digest_of
+from optloc.kernels.manifest import PACKAGE, PREFIX, installed, of_this_process
 
 # Folders for other compilers that are left, the last used ones, and versions of one function: branches of a checkout
 # and releases that share a folder by NUMBA_CACHE_DIR take turns.

@@ -14,13 +14,13 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
-from optloc.compute.equations import Sums
-from optloc.compute.jit import compiled
-from optloc.compute.lanes import Cells, add_priors, arrange, blocks, blur_of, clear, gather, load, memory
-from optloc.compute.pack import Packed, PackedRuns
-from optloc.compute.refine import CLOSED, DAMPING, LIMIT, NUMERICAL, SOLVABLE, Answers, answers
-from optloc.compute.systems import backward, complete, eliminate, factor, factor_local, forward
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
+from optloc.kernels.equations import Sums
+from optloc.kernels.jit import compiled
+from optloc.kernels.lanes import Cells, add_priors, arrange, blocks, blur_of, clear, gather, load, memory
+from optloc.kernels.pack import Packed, PackedRuns
+from optloc.kernels.refine import CLOSED, DAMPING, LIMIT, NUMERICAL, SOLVABLE, Answers, answers
+from optloc.kernels.systems import backward, complete, eliminate, factor, factor_local, forward
 from optloc.linear.normal import OPEN, Normal
 
 _OK, _STALLED = int(Status.OK), int(Status.STALLED)

@@ -9,8 +9,8 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.compute.jit import enabled, usable
-from optloc.compute.pack import Packed, PackedRuns, folding, pack, pack_runs
+from optloc.kernels.jit import enabled, usable
+from optloc.kernels.pack import Packed, PackedRuns, folding, pack, pack_runs
 from optloc.linear.evaluate import fitting
 from optloc.linear.normal import Normal, depends_on_place, linearise, normal, total, whitener_at, with_priors
 from optloc.linear.walks import walks
@@ -86,8 +86,8 @@ def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | PackedRuns
 
 def sums_at(found: Packed | PackedRuns, x: Array, item: Array, *, priors: bool = False) -> Normal:
     """Return the normal equations of problems at vectors x (M, size) of given problems (M,), by machine code."""
-    from optloc.compute.equations import normal_at
-    from optloc.compute.runs import sums_of_runs
+    from optloc.kernels.equations import normal_at
+    from optloc.kernels.runs import sums_of_runs
 
     if isinstance(found, PackedRuns):
         return sums_of_runs(found, x, item, priors=priors)
@@ -103,9 +103,9 @@ def serves(problem: Problem, starts: int) -> bool:
     """Return whether machine code is at hand, or may be waited for, for a number of vectors of a problem."""
     if not starts or not enabled() or walks(problem):
         return False
-    from optloc.compute.equations import normal_block
-    from optloc.compute.refine import refine_block
-    from optloc.compute.runs import refine_runs, sum_runs
+    from optloc.kernels.equations import normal_block
+    from optloc.kernels.refine import refine_block
+    from optloc.kernels.runs import refine_runs, sum_runs
 
     count = prod(problem.batch_shape)
     if is_run(problem) and folding(problem) is not None:

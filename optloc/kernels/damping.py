@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.kernels.jit import compiled
 
 FIRST_DAMPING = 1e-6
 """Starts are closed forms near the minimum, where steps should be those of Gauss and Newton (Nielsen's tau)."""
@@ -35,7 +35,7 @@ _FALL, _QUICK_FALL, _AGREED = 1.0 / 3.0, 0.1, 0.9
 
 
 class Rules(NamedTuple):
-    """When a refinement ends; see `optloc.compute.least_squares.refine`, whose defaults these are."""
+    """When a refinement ends; see `optloc.kernels.least_squares.refine`, whose defaults these are."""
 
     tolerance: float = 1e-7
     limit: int = 60

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.lanes import run
-from optloc.compute.tables import starts
-from optloc.compute.trace import Tape
+from optloc.kernels.jit import compiled
+from optloc.kernels.lanes import run
+from optloc.kernels.tables import starts
+from optloc.kernels.trace import Tape
 
 CODE, CONSTANT, INPUT, OUTPUT = range(4)
 """Columns of the first lines of `TapeTable.table`."""
@@ -24,7 +24,7 @@ class TapeTable(NamedTuple):
     ----------
     table : int64 array (n, 4)
         A line for each tape, and one behind: where its operations, constants, inputs and outputs begin in this table.
-        Then the operations of all tapes, see `optloc.compute.trace.Tape`; registers of constants; registers of inputs,
+        Then the operations of all tapes, see `optloc.kernels.trace.Tape`; registers of constants; registers of inputs,
         and the seed of each; registers of outputs, -1 for what is zero.
     value : array (c,)
         What the registers of constants hold.

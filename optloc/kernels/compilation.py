@@ -10,7 +10,7 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-from optloc.compute.borrowing import borrowing
+from optloc.kernels.borrowing import borrowing
 
 
 def options(*, callee: bool, taken_in: bool) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.compute.least_squares`, lane by lane.
+"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.kernels.least_squares`, lane by lane.
 
 A lane whose problem is finished takes the next one, so that the lanes are full until the problems run out.
 """
@@ -12,10 +12,10 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
-from optloc.compute.equations import chunks, normal_at
-from optloc.compute.jit import compiled
-from optloc.compute.lanes import (
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
+from optloc.kernels.equations import chunks, normal_at
+from optloc.kernels.jit import compiled
+from optloc.kernels.lanes import (
     Cells,
     add_groups,
     add_priors,
@@ -28,9 +28,9 @@ from optloc.compute.lanes import (
     memory,
     price,
 )
-from optloc.compute.pack import Numbers, Packed
-from optloc.compute.systems import backward, complete, eliminate, factor, factor_local, forward, step
-from optloc.compute.tables import Tables
+from optloc.kernels.pack import Numbers, Packed
+from optloc.kernels.systems import backward, complete, eliminate, factor, factor_local, forward, step
+from optloc.kernels.tables import Tables
 from optloc.linear.normal import OPEN, Normal
 
 _OK, LIMIT, _STALLED, NUMERICAL = (

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, cast
 PACKAGE = Path(__file__).resolve().parents[1]
 """The folder of optloc."""
 
-# How kernels are compiled. Their own code is known by digests of each (`optloc.compute.digests`).
-COMPILERS = ("compute/borrowing.py", "compute/compilation.py")
+# How kernels are compiled. Their own code is known by digests of each (`optloc.kernels.digests`).
+COMPILERS = ("kernels/borrowing.py", "kernels/compilation.py")
 
 PREFIX = "optloc-"
 """How the names of folders of machine code begin."""

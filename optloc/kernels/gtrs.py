@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.systems import LANES, factor_plain, principal_axes, solve_plain
+from optloc.kernels.jit import compiled
+from optloc.kernels.systems import LANES, factor_plain, principal_axes, solve_plain
 
 # Newton's steps: with range differences and ranges of five and six stations all lanes settled in three or four; what
 # has not settled after three times as many needs the other tool.

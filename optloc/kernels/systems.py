@@ -14,8 +14,8 @@ import numpy as np
 
 from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
-from optloc.compute.lanes import Cells
+from optloc.kernels.jit import compiled, inlined
+from optloc.kernels.lanes import Cells
 
 # Scaled systems in the memory of a block of lanes.
 

@@ -9,13 +9,13 @@ import numpy as np
 
 from optloc.base.threads import mapped, thread_count
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.compute.lanes import Cells, add_groups, add_priors, arrange, blocks, clear, gather, load, memory
-from optloc.compute.pack import Numbers, Packed
-from optloc.compute.tables import Tables
+from optloc.kernels.jit import compiled
+from optloc.kernels.lanes import Cells, add_groups, add_priors, arrange, blocks, clear, gather, load, memory
+from optloc.kernels.pack import Numbers, Packed
+from optloc.kernels.tables import Tables
 from optloc.linear.normal import Normal
 
-# Starts that are worth a thread of their own: one block of lanes, see `optloc.compute.lanes`.
+# Starts that are worth a thread of their own: one block of lanes, see `optloc.kernels.lanes`.
 _SHARE = 64
 
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array, Status
-from optloc.compute.jit import compiled, put
-from optloc.compute.lanes import Cells, arrange, load, measure, memory
-from optloc.compute.pack import Numbers
-from optloc.compute.systems import cholesky, solve_factored, substitute
-from optloc.compute.tables import FIRST, GROUP_COLUMN, Tables
+from optloc.kernels.jit import compiled, put
+from optloc.kernels.lanes import Cells, arrange, load, measure, memory
+from optloc.kernels.pack import Numbers
+from optloc.kernels.systems import cholesky, solve_factored, substitute
+from optloc.kernels.tables import FIRST, GROUP_COLUMN, Tables
 
 EKF, IEKF, MGEKF, MVEKF = range(4)
 """Forms of an update, see `optloc.track.updates`."""

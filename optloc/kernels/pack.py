@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.types import Array, Bias, Rows
-from optloc.compute.tables import Sources, Tables, tables
+from optloc.kernels.tables import Sources, Tables, tables
 from optloc.linear.courses import over_ground
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
@@ -171,7 +171,7 @@ class Divided:
 
 
 def sources(problem: Problem) -> Divided:
-    """Return the data arrays of a flat batch of problems, see `optloc.compute.tables.Sources`."""
+    """Return the data arrays of a flat batch of problems, see `optloc.kernels.tables.Sources`."""
     parts = [_plain(array, core) for array, core in Sources.of(problem).arrays]
     return Divided.of([np.zeros((1, 1)), *parts])
 

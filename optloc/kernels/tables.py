@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.types import Array
-from optloc.compute.trace import Traced, trace
+from optloc.kernels.trace import Traced, trace
 from optloc.linear.evaluate import BlockLinks, Terms, block_links, given
 from optloc.problem.problem import Problem
 

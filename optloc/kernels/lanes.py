@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import Constant, compiled
-from optloc.compute.pack import AT, FULL, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
-from optloc.compute.tables import (
+from optloc.kernels.jit import Constant, compiled
+from optloc.kernels.pack import AT, FULL, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
+from optloc.kernels.tables import (
     DERIVATIVE,
     FIRST,
     GROUP_COLUMN,
@@ -40,7 +40,7 @@ from optloc.compute.tables import (
     TERM_SLOT,
     Tables,
 )
-from optloc.compute.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN, SQRT, SUB
+from optloc.kernels.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN, SQRT, SUB
 
 # Working memory of a block of lanes, and where everything stands in it.
 
@@ -153,7 +153,7 @@ def blur_of(sigma: Array, size: Array, m: Array, room: Cells, lane: int, item: i
         if not room.absent or m[room.present + i, lane] != 0.0:
             ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
             squares += ratio * ratio
-    # Four roundings, as in `optloc.compute.least_squares`.
+    # Four roundings, as in `optloc.kernels.least_squares`.
     coarse = 4.0 * _EPSILON * np.sqrt(squares)
     return coarse if np.isfinite(coarse) else 0.0
 
