@@ -278,7 +278,7 @@ def __getattr__(name: str) -> Any:
     elif name in _MODULES:
         found = import_module(_MODULES[name])
     elif not name.startswith("_") and find_spec(f"optloc.{name}") is not None:
-        return import_module(f"optloc.{name}")  # a folder, such as `optloc.track`, is its own attribute from then on
+        return import_module(f"optloc.{name}")  # a folder, such as `optloc.tracking`, is its own attribute from then on
     else:
         raise AttributeError(f"module 'optloc' has no attribute {name!r}")
     globals()[name] = found

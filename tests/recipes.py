@@ -9,7 +9,7 @@ import pytest
 
 from optloc import FORMULATIONS, LOSSES, MODELS, SOLVERS
 from optloc.study.baselines import BASELINES
-from optloc.track import UPDATES
+from optloc.tracking import UPDATES
 
 PAGE = Path(__file__).parents[1] / "docs" / "contributing.md"
 TABLES = {

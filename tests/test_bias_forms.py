@@ -15,8 +15,8 @@ from optloc.base.types import FormName, Stations
 from optloc.problem.bias import with_known_bias
 from optloc.problem.forms import FORMS, BiasForm
 from optloc.proof.scope import unsupported
-from optloc.track.constants import begun_with_constants
-from optloc.track.dynamics import polynomial
+from optloc.tracking.constants import begun_with_constants
+from optloc.tracking.dynamics import polynomial
 
 ROOT = Path(__file__).resolve().parents[1]
 OWNER = ROOT / "optloc/problem/forms.py"

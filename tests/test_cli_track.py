@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from optloc.cli import app
 from optloc.files import read
-from optloc.track import collected, polynomial, tracked
+from optloc.tracking import collected, polynomial, tracked
 
 RUN = CliRunner()
 SHIPPED = package_files("optloc") / "scenarios" / "run.toml"
@@ -193,7 +193,7 @@ def test_rows_in_any_order_are_sorted(tmp_path):
 
 @pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
 def test_rows_are_there_as_they_are_made(tmp_path, monkeypatch, name):
-    from optloc.track import UPDATES
+    from optloc.tracking import UPDATES
 
     seen, partial = [], tmp_path / f"{name}.partial"
 
@@ -213,7 +213,7 @@ def test_rows_are_there_as_they_are_made(tmp_path, monkeypatch, name):
 def test_a_killed_run_leaves_its_rows(tmp_path):
     """The process ends between two scans, without a word: what was tracked is a readable table."""
     script = (
-        "import os, time, optloc.track as track\n"
+        "import os, time, optloc.tracking as track\n"
         "from optloc.cli import app\n"
         "ekf, calls = track.UPDATES['ekf'], []\n"
         "def dying(scan, mean, cov):\n"
@@ -231,7 +231,7 @@ def test_a_killed_run_leaves_its_rows(tmp_path):
 
 
 def test_the_track_so_far_is_kept(tmp_path, monkeypatch):
-    from optloc.track import UPDATES
+    from optloc.tracking import UPDATES
 
     calls = []
 

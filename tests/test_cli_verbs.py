@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from optloc.cli import app
 from optloc.cli.listing import LISTS, describe
-from optloc.track import UPDATES
+from optloc.tracking import UPDATES
 
 RUN = CliRunner()
 

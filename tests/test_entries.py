@@ -9,7 +9,7 @@ from recipes import installed, write_package
 
 from optloc import MODELS, InvalidProblem, Model
 from optloc.base.registry import Table
-from optloc.track import UPDATES
+from optloc.tracking import UPDATES
 
 BAD = {
     "does not import": ("raise OSError('no driver')", {"bad": "module"}, ["does not load", "OSError: no driver"]),

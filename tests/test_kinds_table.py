@@ -6,7 +6,7 @@ from benchmarks.kinds_table import HEADER, cells, changes, measure, read_table
 from monte_carlo.tables import FOLDER
 
 from optloc.kernels.jit import enabled
-from optloc.track.updates import UPDATES
+from optloc.tracking.updates import UPDATES
 
 OTHERS = ("registration, 200 x 5", "calibration, 6 x 24", "CSV to CSV, an event")
 QUICK = {"tdoa", "tdoa, independent errors", "toa", "range", "range_sum", "range + tdoa"}

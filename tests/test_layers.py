@@ -22,7 +22,7 @@ LAYERS = (
     "engine",
     "proof bounds model_checks",
     "solvers uncertainty",
-    "track station_health",
+    "tracking station_health",
     "files papers multi_target plot plugins",
     "calibration",
     "study",

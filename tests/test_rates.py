@@ -18,7 +18,7 @@ from optloc.files import load, read
 from optloc.linear.normal import linearise, normal
 from optloc.models import Point, distance
 from optloc.problem import noise as noises
-from optloc.track import begun, followed, polynomial
+from optloc.tracking import begun, followed, polynomial
 
 C, CARRIER = 299_792_458.0, 1090e6
 RUN = CliRunner()

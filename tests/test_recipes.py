@@ -24,7 +24,7 @@ from optloc.kernels.trace import evaluate, trace
 from optloc.linear.evaluate import block_links, given
 from optloc.linear.normal import linearise
 from optloc.study.trial import compute
-from optloc.track import collected, polynomial, tracked
+from optloc.tracking import collected, polynomial, tracked
 
 TRIALS = 200
 RADIUS = 5e3 * np.array([1.0, 0.6, 1.2, 0.5, 1.0, 0.7, 1.1, 0.4])

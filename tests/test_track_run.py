@@ -8,8 +8,8 @@ from often import few
 
 from optloc import ECEF, InvalidProblem, Motion, Status, assemble, measured, station_array
 from optloc.linear.constraints import box, height
-from optloc.track import Rules, State, collected, current_statistical, followed, polynomial, singer, tracked
-from optloc.track.several_targets import alone
+from optloc.tracking import Rules, State, collected, current_statistical, followed, polynomial, singer, tracked
+from optloc.tracking.several_targets import alone
 
 STATIONS = np.array([[0.0, 0, 0], [1000, 0, 300], [0, 1000, 250], [1000, 1000, 20], [500, 1300, 400], [-200, 500, 120]])
 PAIRS = np.array([[1, 0], [2, 0], [3, 0], [4, 0], [5, 0]])
@@ -242,7 +242,7 @@ def test_what_was_tracked_stays_when_a_later_scan_fails():
     problem, calls = run(np.arange(20.0)), []
 
     def failing(scan, mean, cov):
-        from optloc.track import UPDATES
+        from optloc.tracking import UPDATES
 
         calls.append(scan)
         if len(calls) > 5:
@@ -257,7 +257,7 @@ def test_what_was_tracked_stays_when_a_later_scan_fails():
 
 @pytest.mark.parametrize("error", [np.linalg.LinAlgError("no convergence"), FloatingPointError("overflow")])
 def test_an_update_that_fails_is_the_status_of_its_scan(error):
-    from optloc.track import UPDATES
+    from optloc.tracking import UPDATES
 
     problem, calls = run(np.arange(20.0)), []
 
@@ -276,7 +276,7 @@ def test_an_update_that_fails_is_the_status_of_its_scan(error):
 
 
 def test_an_update_that_fails_for_one_of_a_batch_leaves_the_others():
-    from optloc.track import UPDATES
+    from optloc.tracking import UPDATES
 
     problem = run(np.arange(5.0))
     means = np.concatenate([START, SPEED]) + np.array([0.0, 3.0, -3.0])[:, None]

@@ -10,8 +10,8 @@ from importlib.resources import files
 from optloc.files import read
 from optloc.plot import plot_tracks
 from optloc.plot.track import Drawn
-from optloc.track.dynamics import polynomial
-from optloc.track.run import tracked
+from optloc.tracking.dynamics import polynomial
+from optloc.tracking.run import tracked
 
 problem = read(files("optloc") / "scenarios" / "run.toml").problem
 entries = tuple(tracked(problem, polynomial(1, 1.0)))

@@ -42,7 +42,7 @@ from optloc.solvers import solve
 from optloc.solvers.certify.admitted import certify
 from optloc.solvers.prepared import prepare
 from optloc.solvers.starts.best_first import best_first_starts
-from optloc.track.updates import ekf
+from optloc.tracking.updates import ekf
 from optloc.uncertainty.region import likelihood_region
 
 _STATIONS = 1e3 * np.array([[0.0, 0, 0], [10, 0, 1], [0, 10, 2], [-9, 1, 0.5], [1, -8, 3], [6, 7, 0]])

@@ -167,7 +167,7 @@ LISTS: dict[str, Callable[[], Rows]] = {
     "solvers": _solvers,
     "methods": _registry("method", "optloc:METHODS"),
     "losses": _registry("loss", "optloc:LOSSES"),
-    "trackers": _registry("tracker", "optloc.track:UPDATES"),
+    "trackers": _registry("tracker", "optloc.tracking:UPDATES"),
     "motions": _registry("motion", "optloc.cli.track:MOTIONS"),
     "baselines": _registry("baseline", "optloc.study.baselines:BASELINES"),
     "formats": _registry("format", "optloc.report.formats:FORMATS"),

@@ -210,8 +210,8 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
         return {"track": track}
     from optloc.cli.track import Wanted, dynamics_of, rules
     from optloc.live.tracks import Following
-    from optloc.track.entry import Rules
-    from optloc.track.updates import filter_of
+    from optloc.tracking.entry import Rules
+    from optloc.tracking.updates import filter_of
 
     dynamics = dynamics_of(Wanted(model, noise=noise))
     return {"track": track, "following": Following(dynamics, filter_of(name), rules(Rules().gate, gap))}

@@ -41,11 +41,11 @@ from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.report.formats.marks import Results
-from optloc.track import Dynamics, State, current_statistical, polynomial, singer
-from optloc.track.entry import Entry, Rules
-from optloc.track.run import tracked
-from optloc.track.several_targets import alone
-from optloc.track.updates import filter_of, reweighted
+from optloc.tracking import Dynamics, State, current_statistical, polynomial, singer
+from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.run import tracked
+from optloc.tracking.several_targets import alone
+from optloc.tracking.updates import filter_of, reweighted
 
 
 @dataclass(frozen=True, slots=True)

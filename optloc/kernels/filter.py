@@ -21,10 +21,10 @@ from optloc.kernels.systems import cholesky, solve_factored, substitute
 from optloc.kernels.tables import FIRST, GROUP_COLUMN, Tables
 
 EKF, IEKF, MGEKF, MVEKF = range(4)
-"""Forms of an update, see `optloc.track.updates`."""
+"""Forms of an update, see `optloc.tracking.updates`."""
 
 NIS, LOGLIKELIHOOD, COUNT, CODE, REJECTED_ROWS, INNOVATION, PRESENT, SPREAD, REPEATS, EXCESS = range(10)
-"""Columns of `Filtered.values`: three of `optloc.track.updates.Updated`, and the status.
+"""Columns of `Filtered.values`: three of `optloc.tracking.updates.Updated`, and the status.
 
 REJECTED_ROWS counts the rows that did not pass the gate. INNOVATION is the sum of the squared innovations in their
 standard deviations, each at most `Filtering.most`, and PRESENT the number of their rows. SPREAD is the trace of the
@@ -37,7 +37,7 @@ VALUES = 10
 # rows. The scores for the errors of the stations follow. The last ``m (n + 2)`` numbers are the rows of the scan:
 # derivatives, residual and weight.
 _PRODUCT, _PRODUCT_VARIANCE, _NIS, _NIS_VARIANCE, COLUMNS = range(5)
-# Weight of earlier scans in a memory: as in `optloc.track.lasting`.
+# Weight of earlier scans in a memory: as in `optloc.tracking.lasting`.
 _KEEP = 0.98
 
 GENERAL = -1.0

@@ -18,7 +18,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.report import formats
 from optloc.report.formats.marks import Mark, Other, mark_of
-from optloc.track.entry import Entry
+from optloc.tracking.entry import Entry
 
 Record = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""Tracks of the targets of a stream: the state of each after each of its events, by the trackers of `optloc.track`."""
+"""Tracks of the targets of a stream: the state of each after each of its events, by the trackers of `optloc.tracking`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from optloc.live.answers import UNNAMED, Record, track_record, unsolved
 from optloc.live.events import Event
 from optloc.live.metrics import Metrics
 from optloc.problem.problem import Problem
-from optloc.track.dynamics import Dynamics, polynomial
-from optloc.track.entry import Entry, Rules
-from optloc.track.run import Follower
-from optloc.track.several_targets import alone
-from optloc.track.updates import Update
+from optloc.tracking.dynamics import Dynamics, polynomial
+from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.run import Follower
+from optloc.tracking.several_targets import alone
+from optloc.tracking.updates import Update
 
 LOG = logging.getLogger("optloc.live")
 
@@ -39,7 +39,7 @@ class Following:
     dynamics : Dynamics
         Model of motion; by default constant velocity driven by 1 m/s^2, as of ``optloc track``.
     update : callable or str
-        A filter, or its name in `optloc.track.UPDATES`.
+        A filter, or its name in `optloc.tracking.UPDATES`.
     rules : Rules
         When rows are left out and tracks begin anew.
     most : int

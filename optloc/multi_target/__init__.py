@@ -2,6 +2,6 @@
 
 from optloc.multi_target.answer import Emitters, Ghost, evenly
 from optloc.multi_target.assign import separate
-from optloc.track.associate import Clutter
+from optloc.tracking.associate import Clutter
 
 __all__ = ["Clutter", "Emitters", "Ghost", "evenly", "separate"]

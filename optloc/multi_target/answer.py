@@ -11,7 +11,7 @@ from optloc.base.types import Array, Status
 from optloc.multi_target.sets import value_width
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.track.associate import Clutter
+from optloc.tracking.associate import Clutter
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
-from optloc.track.associate import Clutter
+from optloc.tracking.associate import Clutter
 
 # Fixes of few rows that are tried, and those that are followed: one batch. What they miss the
 # search finds, box by box.

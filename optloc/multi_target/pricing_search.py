@@ -11,7 +11,7 @@ from optloc.base.types import Array
 from optloc.linear.evaluate import predict
 from optloc.multi_target.set_packing import Prices
 from optloc.multi_target.sets import Scene, around, changes, cheapest_rows, correlation, of_picks, own_variance
-from optloc.track.associate import misfits
+from optloc.tracking.associate import misfits
 
 TOLERANCE = 0.05
 """Reduced costs above minus this are as good as none: at a smaller one the boxes around every set that is taken, whose

@@ -15,9 +15,9 @@ from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
-from optloc.track.associate import Clutter, offsets
-from optloc.track.several_targets import candidates, channels_of
-from optloc.track.track import State
+from optloc.tracking.associate import Clutter, offsets
+from optloc.tracking.several_targets import candidates, channels_of
+from optloc.tracking.track import State
 
 # Share of its variance that a row must have of its own, or the likelihood of sets of rows is endless; below it the
 # eigenvalue is rounding.

@@ -20,9 +20,9 @@ from optloc.problem.epochs import by_epoch, cut
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.starts.angles import courses
-from optloc.track import Dynamics, State, Track, current_statistical, followed, singer
-from optloc.track.dynamics import correlated
-from optloc.track.whole_run import fitted, posterior_bound
+from optloc.tracking import Dynamics, State, Track, current_statistical, followed, singer
+from optloc.tracking.dynamics import correlated
+from optloc.tracking.whole_run import fitted, posterior_bound
 
 # The three simulations of the paper, as printed where they can be and repaired where not.
 

@@ -59,7 +59,7 @@ from optloc.papers.report import (
     tabulate,
     typeset,
 )
-from optloc.track import Dynamics, State, current_statistical, polynomial
+from optloc.tracking import Dynamics, State, current_statistical, polynomial
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,7 +77,7 @@ PRINTED_WINDING = (0.16, 0.267, 0.47)
 # Filters in the three simulations: errors against time, bounds and lost tracks.
 
 UPDATES = ("ekf", "iekf", "mgekf", "mvekf")
-"""Names in `optloc.track.UPDATES`, in the order of the tables."""
+"""Names in `optloc.tracking.UPDATES`, in the order of the tables."""
 
 SETTLED = 20
 """Seconds of simulation 3 that are not scored, two time constants of the model: it begins at the fix of one second."""

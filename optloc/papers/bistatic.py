@@ -38,10 +38,10 @@ from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.starts.angles import course_starts
-from optloc.track.dynamics import polynomial
-from optloc.track.measurement_space import lines, simplified
-from optloc.track.start import first_fix, state_of
-from optloc.track.track import Track, followed
+from optloc.tracking.dynamics import polynomial
+from optloc.tracking.measurement_space import lines, simplified
+from optloc.tracking.start import first_fix, state_of
+from optloc.tracking.track import Track, followed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

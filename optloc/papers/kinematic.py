@@ -20,12 +20,12 @@ from optloc.problem.build import assemble, measured
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
-from optloc.track import Dynamics, State, Track, followed, polynomial
-from optloc.track.associate import Associate, Clutter, assigned, joint, nearest
-from optloc.track.several_models import imm, parallel, resized
-from optloc.track.several_targets import Candidates, Missing, associated
-from optloc.track.updates import Update, Updated, joseph, whitened
-from optloc.track.whole_run import posterior_bound
+from optloc.tracking import Dynamics, State, Track, followed, polynomial
+from optloc.tracking.associate import Associate, Clutter, assigned, joint, nearest
+from optloc.tracking.several_models import imm, parallel, resized
+from optloc.tracking.several_targets import Candidates, Missing, associated
+from optloc.tracking.updates import Update, Updated, joseph, whitened
+from optloc.tracking.whole_run import posterior_bound
 
 # The scene of the paper: three targets, four stations, twenty updates behind one fix.
 

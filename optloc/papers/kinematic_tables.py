@@ -50,7 +50,7 @@ from optloc.papers.report import (
 )
 from optloc.problem.epochs import cut
 from optloc.solvers import solve
-from optloc.track.several_models import parallel
+from optloc.tracking.several_models import parallel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

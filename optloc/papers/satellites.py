@@ -38,11 +38,11 @@ from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
-from optloc.track.constants import begun_with_constants, followed_with_constants
-from optloc.track.dynamics import Dynamics, polynomial
-from optloc.track.start import two_point, with_height_rows
-from optloc.track.track import State, Track, followed
-from optloc.track.whole_run import posterior_bound
+from optloc.tracking.constants import begun_with_constants, followed_with_constants
+from optloc.tracking.dynamics import Dynamics, polynomial
+from optloc.tracking.start import two_point, with_height_rows
+from optloc.tracking.track import State, Track, followed
+from optloc.tracking.whole_run import posterior_bound
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -150,7 +150,7 @@ def truth(epochs: int, course: Array = COURSE) -> Array:
 
 
 FILTERS = ("ekf", "iekf", "mgekf", "mvekf")
-"""Names in `optloc.track.UPDATES`, in the order of the tables."""
+"""Names in `optloc.tracking.UPDATES`, in the order of the tables."""
 
 SPEED = 50.0
 """Standard deviation of each coordinate of the velocity in starts that are far off, m/s: the ship makes 28."""

@@ -26,7 +26,7 @@ from optloc.plot.style import (
     unit_of,
 )
 from optloc.problem.problem import Problem
-from optloc.track.entry import Entry
+from optloc.tracking.entry import Entry
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,10 +22,10 @@ from optloc import Motion, Problem, assemble, measured, with_bias
 from optloc.calibration import calibrate, network_of
 from optloc.cli.fix import run_fix
 from optloc.files.readings import Told
-from optloc.track import State, polynomial
-from optloc.track.scan_rows import Scans
-from optloc.track.track import step
-from optloc.track.updates import UPDATES, filter_of
+from optloc.tracking import State, polynomial
+from optloc.tracking.scan_rows import Scans
+from optloc.tracking.track import step
+from optloc.tracking.updates import UPDATES, filter_of
 
 Array = np.ndarray
 Call = Callable[[], Any]

@@ -22,7 +22,7 @@ from benchmarks.kinds_table import (
 from monte_carlo.tables import FOLDER, write
 
 from optloc.kernels.jit import enabled
-from optloc.track.updates import UPDATES
+from optloc.tracking.updates import UPDATES
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")
 STORED = FOLDER / "kinds.md"

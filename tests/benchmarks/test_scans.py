@@ -9,8 +9,8 @@ from monte_carlo.tables import write
 
 from optloc import Motion, assemble, measured
 from optloc.kernels.jit import enabled
-from optloc.track import State, collected, polynomial, tracked
-from optloc.track.several_models import imm
+from optloc.tracking import State, collected, polynomial, tracked
+from optloc.tracking.several_models import imm
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")
 filters = pytest.importorskip("filterpy.kalman", reason="FilterPy is not installed")

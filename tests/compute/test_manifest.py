@@ -19,7 +19,7 @@ from optloc.cli.compile import make
 from optloc.kernels import manifest
 from optloc.kernels.jit import enabled
 from optloc.kernels.kept import folder
-from optloc.track.updates import ekf
+from optloc.tracking.updates import ekf
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
 
@@ -32,7 +32,7 @@ from numba.core import event
 
 import optloc
 from optloc.kernels.manifest import installed
-from optloc.track.updates import ekf
+from optloc.tracking.updates import ekf
 
 places, mean = np.array({places}), np.array({mean})
 problem = optloc.assemble(places, optloc.measured("range", {z}, a=np.arange(4), sigma=1.0))

@@ -15,7 +15,7 @@ from optloc import InvalidProblem, Problem, Status, datasets, solve
 from optloc.datasets import mrclam, plaza, uwb
 from optloc.model_checks.elements import batch_of
 from optloc.station_health.structure import with_estimated_noise
-from optloc.track import polynomial, tracked
+from optloc.tracking import polynomial, tracked
 
 pytestmark = [pytest.mark.data, pytest.mark.full]
 

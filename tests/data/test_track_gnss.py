@@ -8,7 +8,7 @@ from often import few
 
 from optloc import ECEF
 from optloc.datasets import gnss
-from optloc.track import UPDATES, collected, polynomial, tracked
+from optloc.tracking import UPDATES, collected, polynomial, tracked
 
 pytestmark = pytest.mark.data
 

@@ -12,7 +12,7 @@ from monte_carlo.tables import write
 from often import few
 
 from optloc.datasets import uwb
-from optloc.track import Rules, collected, polynomial, tracked
+from optloc.tracking import Rules, collected, polynomial, tracked
 
 pytestmark = pytest.mark.data
 

@@ -21,7 +21,7 @@ from optloc.files import read  # noqa: E402
 from optloc.live.serve import serve  # noqa: E402
 from optloc.live.stream import Settings, Stream  # noqa: E402
 from optloc.live.tracks import Following  # noqa: E402
-from optloc.track import polynomial, tracked  # noqa: E402
+from optloc.tracking import polynomial, tracked  # noqa: E402
 
 ON_EARTH = SITE.replace("[stations]", '[frame]\nkind = "enu"\norigin = { lat_deg = 47.5, lon_deg = 8.0 }\n\n[stations]')
 

@@ -95,7 +95,7 @@ def test_the_clamp_saves_tracks():
 
 def slope_free(z, S, start, cov, limit):
     """Return the end of the filter of the paper with the principal arctangent of station minus target, in the plane."""
-    from optloc.track import current_statistical
+    from optloc.tracking import current_statistical
 
     model, s, P = current_statistical(10.0, limit), start, cov
     for row in z:

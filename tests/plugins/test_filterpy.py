@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("filterpy", reason="FilterPy is not installed")
 
 import optloc
-from optloc.track import begun, followed, polynomial
+from optloc.tracking import begun, followed, polynomial
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tracking.md"
 

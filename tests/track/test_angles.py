@@ -28,8 +28,8 @@ from optloc.papers.angles import (
     track_all,
 )
 from optloc.problem.epochs import cut
-from optloc.track import State, begun, current_statistical, followed, polynomial, singer
-from optloc.track.whole_run import posterior_bound
+from optloc.tracking import State, begun, current_statistical, followed, polynomial, singer
+from optloc.tracking.whole_run import posterior_bound
 
 # --- a second implementation, in the order [x vx ax | y vy ay | z vz az] -------------------------------------------
 

@@ -13,11 +13,11 @@ from optloc.base.types import Motion, Status
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
 from optloc.papers.kinematic import Scenario, draw, start_from_fix, strip_labels
-from optloc.track import State, followed, gated, polynomial
-from optloc.track.associate import Clutter, assigned, joint, nearest, scored
-from optloc.track.several_targets import Candidates, associated, candidates
-from optloc.track.track import scans
-from optloc.track.updates import innovation
+from optloc.tracking import State, followed, gated, polynomial
+from optloc.tracking.associate import Clutter, assigned, joint, nearest, scored
+from optloc.tracking.several_targets import Candidates, associated, candidates
+from optloc.tracking.track import scans
+from optloc.tracking.updates import innovation
 
 STATIONS = np.array([[0.0, 0.0], [20e3, 1e3], [-3e3, 18e3], [12e3, -15e3]])
 TARGETS = np.array([[40e3, 25e3], [40.2e3, 25.1e3], [39.9e3, 25.2e3]])

@@ -11,7 +11,7 @@ from optloc import InvalidProblem, Motion, assemble, crlb, linearise, measured, 
 from optloc.base.types import Stations, Status
 from optloc.linear.constraints import box
 from optloc.solvers.starts.angles import course_starts
-from optloc.track.measurement_space import lines, simplified
+from optloc.tracking.measurement_space import lines, simplified
 
 D, R0, AZ0, EL0 = 150e3, 81.2e3, 1.446, 0.123
 PATH, ANGLE = 20e-9 * 299792458.0, np.radians(1.0)

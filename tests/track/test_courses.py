@@ -11,8 +11,8 @@ from optloc import InvalidProblem, Status
 from optloc.base.types import Motion, Stations
 from optloc.papers.angles import STRAIGHT, WINDING, draw, errors, start_at_truth, track_all
 from optloc.solvers.starts.angles import courses
-from optloc.track import State, current_statistical, fitted, polynomial, posterior_bound, smoothed
-from optloc.track.whole_run import along
+from optloc.tracking import State, current_statistical, fitted, polynomial, posterior_bound, smoothed
+from optloc.tracking.whole_run import along
 
 
 def course_of(scenario, order, trials=None, seed=1):

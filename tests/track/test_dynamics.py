@@ -6,8 +6,8 @@ from scipy.linalg import expm
 
 from optloc import InvalidProblem
 from optloc.papers.angles import printed_transition, printed_variance
-from optloc.track import current_statistical, polynomial, singer
-from optloc.track.dynamics import correlated
+from optloc.tracking import current_statistical, polynomial, singer
+from optloc.tracking.dynamics import correlated
 
 SHARES = [1e-4, 1e-3, 0.01, 0.05, 0.1, 0.2, 0.5, 0.999999, 1.000001, 2.0, 10.0]
 

@@ -6,9 +6,9 @@ import pytest
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Status
 from optloc.papers.kinematic import FILTERS, Scenario, draw, score_track
-from optloc.track import UPDATES, State, polynomial, predicted
-from optloc.track.several_models import imm, mixed, moments, parallel, resized
-from optloc.track.track import scans
+from optloc.tracking import UPDATES, State, polynomial, predicted
+from optloc.tracking.several_models import imm, mixed, moments, parallel, resized
+from optloc.tracking.track import scans
 
 CHAIN = np.array([[0.9, 0.07, 0.03], [0.05, 0.9, 0.05], [0.1, 0.1, 0.8]])
 MODELS = (polynomial(0), polynomial(1, 50.0), polynomial(2, 20.0))

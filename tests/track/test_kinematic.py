@@ -11,8 +11,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Motion, Status
 from optloc.papers.kinematic import Scenario, draw, start_from_fix
 from optloc.problem.epochs import cut
-from optloc.track import State, followed, polynomial
-from optloc.track.several_models import parallel, resized, softmax
+from optloc.tracking import State, followed, polynomial
+from optloc.tracking.several_models import parallel, resized, softmax
 
 C = 299792.458  # km/s
 STATIONS = np.array([[0.0, 0.0]] + [[100.0 * np.cos(a), 100.0 * np.sin(a)] for a in np.radians([90.0, 210.0, 330.0])])
@@ -120,7 +120,7 @@ def test_a_model_that_loses_the_state_is_never_chosen(drawn):
     own = drawn[0]
 
     def broken(scan, mean, cov):
-        done = optloc.track.UPDATES["ekf"](scan, mean, cov)
+        done = optloc.tracking.UPDATES["ekf"](scan, mean, cov)
         return replace(done, mean=np.full_like(done.mean, np.nan)) if mean.shape[-1] == 4 else done
 
     made = parallel(own.runs, own.fix, [polynomial(1), polynomial(0)], speed=2e3, update=broken)

@@ -8,11 +8,11 @@ from optloc import Motion, assemble, measured
 from optloc.kernels.filter import COLUMNS, filter_scan
 from optloc.kernels.jit import at_hand
 from optloc.problem.epochs import cut
-from optloc.track import Rules, State, lasting, polynomial, tracked
-from optloc.track.run import Follower
-from optloc.track.scan_rows import Scans
-from optloc.track.track import move_of, predicted, scan_at
-from optloc.track.updates import ekf, reweighted
+from optloc.tracking import Rules, State, lasting, polynomial, tracked
+from optloc.tracking.run import Follower
+from optloc.tracking.scan_rows import Scans
+from optloc.tracking.track import move_of, predicted, scan_at
+from optloc.tracking.updates import ekf, reweighted
 
 STATIONS = np.array([[0.0, 0], [100, 0], [0, 100], [100, 100], [50, 140], [-30, 50]])
 SCANS, DRIVE = 60, 1.0

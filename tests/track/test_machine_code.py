@@ -10,7 +10,7 @@ from cases import ENU
 from optloc import Motion, Stations, Status, assemble, measured
 from optloc.kernels.filter import CODE, GENERAL, NIS
 from optloc.kernels.jit import enabled
-from optloc.track import (
+from optloc.tracking import (
     UPDATES,
     Rules,
     State,
@@ -22,8 +22,8 @@ from optloc.track import (
     scan_rows,
     tracked,
 )
-from optloc.track.scan_rows import Scans
-from optloc.track.track import scan_at
+from optloc.tracking.scan_rows import Scans
+from optloc.tracking.track import scan_at
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no machine code")
 STATIONS = 1e3 * np.array([[0, 0, 0], [8, 0, 0.2], [0, 8, -0.15], [-7, 1, 0.4], [1, -8, 0.1], [5, 5, 0.9]])

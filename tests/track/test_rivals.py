@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optloc import Motion, Status, assemble, measured
-from optloc.track import polynomial, tracked
+from optloc.tracking import polynomial, tracked
 
 LINE = np.array([[0.0, 0.0], [60.0, 0.0], [120.0, 0.0]])
 

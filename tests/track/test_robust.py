@@ -8,8 +8,8 @@ from scipy.optimize import minimize
 
 from optloc import LOSSES, InvalidProblem, Motion, assemble, measured, simulate
 from optloc.linear.evaluate import predict
-from optloc.track import Rules, State, collected, polynomial, reweighted, tracked
-from optloc.track.updates import iekf
+from optloc.tracking import Rules, State, collected, polynomial, reweighted, tracked
+from optloc.tracking.updates import iekf
 
 RING = 1e3 * np.array([[3.0, 0.0], [2.0, 2.0], [0.0, 3.0], [-2.0, 2.5], [-3.0, 0.0], [-2.0, -2.0], [0.0, -3.5]])
 SIGMA = 10.0

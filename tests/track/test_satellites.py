@@ -11,11 +11,11 @@ from optloc.base.frames import ecef_to_geodetic, geodetic_to_ecef
 from optloc.base.types import Status
 from optloc.linear.constraints import height as known_height
 from optloc.problem.epochs import cut
-from optloc.track import followed, polynomial
-from optloc.track.constants import begun_with_constants, followed_with_constants
-from optloc.track.start import first_fix, state_of, two_point, with_height_rows
-from optloc.track.track import State
-from optloc.track.whole_run import posterior_bound
+from optloc.tracking import followed, polynomial
+from optloc.tracking.constants import begun_with_constants, followed_with_constants
+from optloc.tracking.start import first_fix, state_of, two_point, with_height_rows
+from optloc.tracking.track import State
+from optloc.tracking.whole_run import posterior_bound
 
 SAT = geodetic_to_ecef(np.radians([24.44, 25.09, 24.44]), np.radians([125.21, 125.68, 125.99]), np.full(3, 800e3))
 P0 = geodetic_to_ecef(np.radians(25.80), np.radians(127.37), 0.0)

@@ -9,8 +9,8 @@ import optloc
 from optloc.base.errors import InvalidProblem, NoSolution
 from optloc.base.types import Motion, Status
 from optloc.problem.epochs import cut
-from optloc.track import State, begun, followed, polynomial, predicted
-from optloc.track.start import two_point
+from optloc.tracking import State, begun, followed, polynomial, predicted
+from optloc.tracking.start import two_point
 
 STATIONS = np.array([[0.0, 0.0], [20e3, 1e3], [-3e3, 18e3], [12e3, -15e3]])
 START = np.array([9e3, 5e3, 90.0, -40.0])

@@ -7,9 +7,9 @@ import pytest
 
 import optloc
 from optloc.base.types import Motion
-from optloc.track import UPDATES, State, followed, polynomial
-from optloc.track.track import scans
-from optloc.track.updates import whitened
+from optloc.tracking import UPDATES, State, followed, polynomial
+from optloc.tracking.track import scans
+from optloc.tracking.updates import whitened
 
 STATIONS = np.array([[0.0, 0.0, 0.0], [9e3, 1e3, 300.0], [-2e3, 8e3, 100.0], [5e3, -7e3, 500.0], [3e3, 3e3, 2e3]])
 START = np.array([20e3, 14e3, 4e3, -150.0, 60.0, 5.0])

@@ -24,7 +24,7 @@ from optloc.plugins.stonesoup.models import StationMeasurement, values_of
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
-from optloc.track.start import is_one_gaussian
+from optloc.tracking.start import is_one_gaussian
 from optloc.uncertainty.posterior import mixture
 
 # Chains that wait for more scans: of those that no detection has continued for long the oldest are forgotten.

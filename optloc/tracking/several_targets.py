@@ -14,12 +14,12 @@ from optloc.linear.evaluate import predict
 from optloc.problem import noise as noises
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
-from optloc.track.associate import Associate
-from optloc.track.dynamics import Dynamics
-from optloc.track.scan_rows import Scans
-from optloc.track.several_models import spread
-from optloc.track.track import State, Track, check_state, collect, predicted, scans, step
-from optloc.track.updates import Update, filter_of
+from optloc.tracking.associate import Associate
+from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.scan_rows import Scans
+from optloc.tracking.several_models import spread
+from optloc.tracking.track import State, Track, check_state, collect, predicted, scans, step
+from optloc.tracking.updates import Update, filter_of
 
 Missing = Literal["drop", "expect"]
 """What a channel without a row does; see `associated`."""
@@ -61,7 +61,7 @@ def associated(
     dynamics : Dynamics
         Model of motion.
     rule : callable
-        For instance `nearest`, `joint` or `assigned` of `optloc.track.associate`.
+        For instance `nearest`, `joint` or `assigned` of `optloc.tracking.associate`.
     update : callable or str
         A filter, or its name in `UPDATES`.
     missing : "drop" or "expect"

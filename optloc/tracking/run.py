@@ -25,13 +25,13 @@ from optloc.problem.chart import tail_probability
 from optloc.problem.epochs import cut, joined
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
-from optloc.track.condition import Condition
-from optloc.track.dynamics import Dynamics
-from optloc.track.entry import Entry, Rules
-from optloc.track.rivals import Rival, remaining
-from optloc.track.scan_rows import Scans
-from optloc.track.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
-from optloc.track.track import (
+from optloc.tracking.condition import Condition
+from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.rivals import Rival, remaining
+from optloc.tracking.scan_rows import Scans
+from optloc.tracking.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
+from optloc.tracking.track import (
     State,
     Track,
     check_state,
@@ -42,7 +42,7 @@ from optloc.track.track import (
     scan_at,
     take_scan,
 )
-from optloc.track.updates import Filter, Update, Updated, filter_of, innovation, read, weights_within
+from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovation, read, weights_within
 
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9

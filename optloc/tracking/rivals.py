@@ -9,8 +9,8 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.solvers.policy import AMBIGUOUS_GAP
-from optloc.track.entry import Entry
-from optloc.track.track import State
+from optloc.tracking.entry import Entry
+from optloc.tracking.track import State
 
 # Gap from which a rival is refuted: five standard deviations. Errors that last count again in every scan, so that the
 # gap of a fix, three of them, would come too early.

@@ -13,8 +13,8 @@ from optloc.linear.evaluate import predict
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem.problem import Problem
-from optloc.track.track import State
-from optloc.track.updates import check_width, innovation
+from optloc.tracking.track import State
+from optloc.tracking.updates import check_width, innovation
 
 Associate = Callable[[Problem, State, Array], Array]
 """Maps a scan of one row a channel, predicted targets (..., t) and candidates (..., m, c) to picks, ints (..., t, m).
@@ -208,7 +208,7 @@ class Sets:
 
 
 def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
-    """Return the scores of all sets of candidates within their gates; see `optloc.track.associate.joint`.
+    """Return the scores of all sets of candidates within their gates; see `optloc.tracking.associate.joint`.
 
     Sets grow channel by channel: the density of the rows of a set is the product of those of each row given the rows
     before it. Where there are too many, the best beginnings are followed.

@@ -10,10 +10,10 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.problem.problem import Problem
-from optloc.track.dynamics import Dynamics
-from optloc.track.scan_rows import Scans
-from optloc.track.track import State, Track, check_state, check_trackable, collect, followed, step
-from optloc.track.updates import Update, Updated, filter_of
+from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.scan_rows import Scans
+from optloc.tracking.track import State, Track, check_state, check_trackable, collect, followed, step
+from optloc.tracking.updates import Update, Updated, filter_of
 
 # Side by side from one start: the data say which model is right.
 

@@ -14,9 +14,9 @@ from optloc.kernels.filter import CODE, GENERAL, Move
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.track.dynamics import Dynamics
-from optloc.track.scan_rows import Scans
-from optloc.track.updates import Filter, Update, Updated, filter_of, read
+from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.scan_rows import Scans
+from optloc.tracking.updates import Filter, Update, Updated, filter_of, read
 
 # Eigenvalue below zero, as a share of the largest entry, that rounding makes of a covariance which is singular.
 _NEGATIVE = 1e-9

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from optloc.base.types import Status
-from optloc.track.updates import Updated
+from optloc.tracking.updates import Updated
 
 # Gate, standard deviations: of a good row one in two million is left out.
 _USUAL = 5.0

@@ -12,9 +12,9 @@ from optloc.base.types import Array, Motion, Status
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
-from optloc.track.dynamics import Dynamics, polynomial
-from optloc.track.track import State, Track, check_trackable, collect, scans, status_of_scans
-from optloc.track.updates import Updated, joseph, whitened
+from optloc.tracking.dynamics import Dynamics, polynomial
+from optloc.tracking.track import State, Track, check_trackable, collect, scans, status_of_scans
+from optloc.tracking.updates import Updated, joseph, whitened
 
 
 def fitted(problem: Problem, order: int, *, reference: float | None = None, method: str = "auto") -> Fix:
@@ -90,7 +90,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
     -------
     Track
         States at the scans given all of them. `nis` is what the rows of a scan add to the chi-square of the fit, and
-        the status of all scans is that of the fit (see `optloc.track.track.status_of_scans`), but for those without a
+        the status of all scans is that of the fit (see `optloc.tracking.track.status_of_scans`), but for those without a
         row.
 
     Raises
@@ -129,7 +129,7 @@ def posterior_bound(problem: Problem, truth: Array, start: State, dynamics: Dyna
     Parameters
     ----------
     problem : Problem
-        A run of k epochs, see `optloc.track.track.scans`; its measurements do not matter.
+        A run of k epochs, see `optloc.tracking.track.scans`; its measurements do not matter.
     truth : array (..., k, n)
         True state [p, v, a] at every epoch.
     start : State

@@ -17,9 +17,9 @@ from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.verdict.findings import Finding, objections
-from optloc.track.dynamics import Dynamics
-from optloc.track.rivals import Rival
-from optloc.track.track import State, check_trackable
+from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.rivals import Rival
+from optloc.tracking.track import State, check_trackable
 
 # Metres: below every other error; of ECEF coordinates a millimetre has too few digits to converge on.
 _EXACT = 1e-2

@@ -35,7 +35,7 @@ from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
 from optloc.solvers.robust.reweighting import Doubt, fold_signs
-from optloc.track.scan_rows import Scans, size_of
+from optloc.tracking.scan_rows import Scans, size_of
 
 # Turns of weights and updates, and the change of all weights that ends them: it moves a state by less than a thousandth
 # of a sigma. A turn costs what a plain update does and takes about two thirds off the change: seven as a rule.
@@ -113,7 +113,7 @@ class Filter:
         return self._general(scan, mean, cov)
 
     def _general(self, scan: Problem, mean: Array, cov: Array) -> Updated:
-        """Return the update in NumPy: for what `optloc.track.scan_rows.Scans` does not serve."""
+        """Return the update in NumPy: for what `optloc.tracking.scan_rows.Scans` does not serve."""
         form, gate = self.how.form, self.how.gate
         if np.isfinite(gate):
             scan = scan.with_rows(weight=weights_within(scan, mean, cov, gate))

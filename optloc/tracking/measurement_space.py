@@ -17,7 +17,7 @@ from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.starts.angles import course_starts, pair
-from optloc.track.track import Track, check_trackable, status_of_scans
+from optloc.tracking.track import Track, check_trackable, status_of_scans
 
 # What a scan of the simplified recursion holds, in the order of its state: range, azimuth, elevation.
 _KINDS = ("range_sum", "azimuth", "elevation")

@@ -32,9 +32,9 @@ from optloc.kernels.filter import COLUMNS, ScanRows
 from optloc.linear.normal import linearise, weighed
 from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
-from optloc.track.dynamics import Dynamics
-from optloc.track.scan_rows import Scans, touched
-from optloc.track.track import State, scan_at
+from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.scan_rows import Scans, touched
+from optloc.tracking.track import State, scan_at
 
 # Correlation times, scans: a decade apart. Measured on real tracks: one of 100 scans alone finds most errors, and finer
 # steps find no more.

@@ -12,9 +12,9 @@ from optloc.problem.epochs import cut
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
-from optloc.track.dynamics import Dynamics
-from optloc.track.track import State, Track, check_state, check_trackable, follow
-from optloc.track.updates import Update, filter_of
+from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.track import State, Track, check_state, check_trackable, follow
+from optloc.tracking.updates import Update, filter_of
 
 
 def begun_with_constants(problem: Problem, dynamics: Dynamics, epochs: int) -> State:

@@ -9,11 +9,11 @@ import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.solvers.verdict.findings import Finding, objections
-from optloc.track.entry import Entry, Rules
-from optloc.track.lasting import LastingErrors
-from optloc.track.rivals import Rival
-from optloc.track.start import Beginning, Fit
-from optloc.track.track import State
+from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.lasting import LastingErrors
+from optloc.tracking.rivals import Rival
+from optloc.tracking.start import Beginning, Fit
+from optloc.tracking.track import State
 
 # Scans of the window by which a track is judged, over those of `Rules.patience`.
 _WINDOW = 4
