@@ -1,4 +1,4 @@
-"""Tracks of the targets of a stream: the state of each after each of its events, by the trackers of `optloc.tracking`."""
+"""Tracks of the targets of a stream: the state of each after each of its events."""
 
 from __future__ import annotations
 

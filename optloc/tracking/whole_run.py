@@ -90,8 +90,8 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
     -------
     Track
         States at the scans given all of them. `nis` is what the rows of a scan add to the chi-square of the fit, and
-        the status of all scans is that of the fit (see `optloc.tracking.track.status_of_scans`), but for those without a
-        row.
+        the status of all scans is that of the fit (see `optloc.tracking.track.status_of_scans`), but for those without
+        a row.
 
     Raises
     ------
