@@ -67,8 +67,8 @@ def separate(
     Each emitter gives at most one row to a channel (a kind at its stations), and a row is at most one emitter's. Of
     all assignments the one with the greatest likelihood is sought, every emitter at the best place for its own rows,
     and with as many emitters as pay their penalty: see `optloc.multi_target.sets.Scene`. Sets of rows are columns of a
-    set packing; they are proposed by closed-form fixes of as few rows as it takes, and branch and bound over all places of
-    the region adds columns until no other can lower the cost.
+    set packing; they are proposed by closed-form fixes of as few rows as it takes, and branch and bound over all places
+    of the region adds columns until no other can lower the cost.
 
     Parameters
     ----------

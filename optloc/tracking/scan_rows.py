@@ -30,8 +30,8 @@ class Scans:
     """The scans of a run of one target for the compiled update.
 
     All shipped filters take this form. The general form of `optloc.tracking.updates` serves kinds without a tape,
-    biases among the states, and station errors whose noise depends on the position. It also serves noise that ties epochs,
-    batches in which stations or noise differ, and arrays of other libraries.
+    biases among the states, and station errors whose noise depends on the position. It also serves noise that ties
+    epochs, batches in which stations or noise differ, and arrays of other libraries.
 
     Parameters
     ----------
