@@ -84,7 +84,7 @@ def words() -> str:
 
 def formats() -> str:
     """Return the formats as a table: what of the uncertainty each carries, and what of a fix that is not ok."""
-    from optloc.report.formats import FORMATS
+    from optloc.show.formats import FORMATS
 
     head = [
         "| ending | for | uncertainty of a fix that is ok | a fix that is not ok | stream |",

@@ -289,7 +289,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-told_by(lambda: import_module("optloc.report.fixes"))
+told_by(lambda: import_module("optloc.show.fixes"))
 
 
 def _from_table(*args: Any, **options: Any) -> Problem:

@@ -120,7 +120,7 @@ def test_names_of_outputs_are_asked_for_before_the_search(folder, monkeypatch):
 
 
 def test_residuals_are_drawn_beside_the_law_that_is_left_of_the_noise():
-    from optloc.plot.network_map import plot_network
+    from optloc.show.pictures.network_map import plot_network
 
     rng = np.random.default_rng(0)
     stations, pulses = rng.standard_normal((4, 2)), rng.standard_normal((9, 2))

@@ -13,8 +13,8 @@ from optloc.cli import app
 from optloc.cli.track import differences
 from optloc.problem.build import station_array
 from optloc.problem.epochs import by_epoch, states_by_epoch
-from optloc.report.columns import fix_columns
-from optloc.report.fixes import with_sigma
+from optloc.show.columns import fix_columns
+from optloc.show.fixes import with_sigma
 from optloc.station_health.health import health
 
 FREE = (optloc.Motion(0, span="epoch"),)
@@ -147,7 +147,7 @@ def test_two_unknown_targets_have_no_single_position():
 @pytest.mark.parametrize("unknown", [0, 2])
 def test_a_picture_has_the_lines_of_the_unknown_target(unknown):
     pytest.importorskip("matplotlib")
-    from optloc.plot.fixes import lines_of_position, plot_fixes
+    from optloc.show.pictures.fixes import lines_of_position, plot_fixes
 
     problem, _ = with_known(("toa",), unknown)
     fix = solve(problem)

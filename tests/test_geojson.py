@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from optloc.base.frames import ECEF
 from optloc.cli import app
-from optloc.plot.outlines import earth_line, line_geometry, polygon_geometry
+from optloc.show.pictures.outlines import earth_line, line_geometry, polygon_geometry
 
 RUN = CliRunner()
 # Latitude and longitude of a middle, and semi-axes of an ellipse about it, metres.

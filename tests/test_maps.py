@@ -10,8 +10,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.bounds.bound_map import bound_map, extent
 from optloc.bounds.crlb import crlb
 from optloc.files import from_table, read
-from optloc.plot.bound_map import isolines, levels, map_geojson, plot_bound_map
-from optloc.report.map import land, rings
+from optloc.show.map import land, rings
+from optloc.show.pictures.bound_map import isolines, levels, map_geojson, plot_bound_map
 
 DEMOS = package_files("optloc") / "scenarios"
 

@@ -26,7 +26,7 @@ from optloc.models import layers as rays
 from optloc.models import medium as media
 from optloc.models.layers import first_arrival
 from optloc.models.primitives import Jet, Point
-from optloc.plot import plot_fixes
+from optloc.show.pictures import plot_fixes
 
 # A summer sea: a warm surface, a thermocline, a channel with its axis at 1 300 m, and the deep.
 SEA = Layers((0, 30, 80, 300, 1300, 5000), (1530, 1529, 1508, 1497, 1485, 1548))
@@ -364,7 +364,7 @@ def test_pictures_are_drawn_of_rates_along_rays():
     stations = Stations(floor_and_surface()[None], tuple("ABCDEF"), velocity=np.ones((1, 6, 3)))
     rows = [rows_of("toa", 6, 0.3), measured("range_rate", a=np.arange(6), sigma=0.01)]
     problem = simulate(assemble(stations, *rows, medium=CRUST), np.array([300.0, 500.0, -700.0, 0.0]), 1)
-    with mock.patch("optloc.plot.fixes._GRID", 63):
+    with mock.patch("optloc.show.pictures.fixes._GRID", 63):
         figure = plot_fixes(problem, solve(problem))
     assert any("one toa alone" in text.get_text() for text in figure.legends[0].get_texts())
 

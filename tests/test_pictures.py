@@ -11,13 +11,13 @@ from often import few
 from typer.testing import CliRunner
 
 import optloc
-from optloc import plot
 from optloc.base.errors import InvalidProblem
 from optloc.bounds.bound_map import bound_map
 from optloc.cli import app
 from optloc.kernels.sums import equations_at
-from optloc.plot.landscape import limits, plane
-from optloc.plot.style import scene_of
+from optloc.show import pictures as plot
+from optloc.show.pictures.landscape import limits, plane
+from optloc.show.pictures.style import scene_of
 from optloc.solvers.landscape import End, basins, profile_cost
 from optloc.solvers.running import growing
 

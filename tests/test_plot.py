@@ -11,9 +11,9 @@ from optloc.base.frames import ECEF
 from optloc.base.linalg import error_ellipse
 from optloc.cli.file_fixes import fix_file
 from optloc.files import from_table, read
-from optloc.plot import plot_fixes, save
-from optloc.plot.fixes import isodopplers, lines_of_position
-from optloc.plot.style import scene_of
+from optloc.show.pictures import plot_fixes, save
+from optloc.show.pictures.fixes import isodopplers, lines_of_position
+from optloc.show.pictures.style import scene_of
 from optloc.solvers import solve
 
 DEMOS = package_files("optloc") / "scenarios"

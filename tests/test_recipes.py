@@ -258,7 +258,7 @@ def test_files_and_commands_know_it(file, tmp_path):
 
 
 def test_it_is_drawn(file):
-    from optloc.plot import plot_fixes
+    from optloc.show.pictures import plot_fixes
 
     path, _ = file
     problem = optloc.load(path)

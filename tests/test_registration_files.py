@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from optloc.cli import app
 from optloc.cli.file_fixes import fix_file
 from optloc.files import load, read
-from optloc.plot import plot_course, plot_fixes
-from optloc.plot.style import scene_of
+from optloc.show.pictures import plot_course, plot_fixes
+from optloc.show.pictures.style import scene_of
 
 DEMO = package_files("optloc") / "scenarios" / "registration.toml"
 RUN = CliRunner()

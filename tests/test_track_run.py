@@ -409,8 +409,8 @@ def test_other_equalities_are_refused():
 @pytest.mark.slow
 def test_pictures_of_tracks_in_space_and_on_earth(tmp_path):
     pytest.importorskip("matplotlib")
-    from optloc.plot import plot_tracks, save
-    from optloc.plot.track import Drawn
+    from optloc.show.pictures import plot_tracks, save
+    from optloc.show.pictures.track import Drawn
 
     for name, problem in (("space", run(np.arange(15.0), wild=(6,))), ("earth", earth(12)[0])):
         figure = plot_tracks([Drawn(name, problem, tuple(tracked(problem, polynomial(1, 0.1))))], title=name)

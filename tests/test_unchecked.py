@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from optloc import InvalidProblem, NoSolution, Prior, Status, assemble, constraints, locate, measured, solve
 from optloc.cli.app import app
-from optloc.report import fix_page
+from optloc.show import fix_page
 
 SENTENCE = "no redundancy: a wrong measurement would not be noticed"
 AT = np.array([400.0, 700.0])

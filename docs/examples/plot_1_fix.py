@@ -8,7 +8,7 @@ Six receivers hear one pulse. The fix needs no first guess; the ellipse holds th
 from importlib.resources import files
 
 import optloc
-from optloc.plot import plot_fixes
+from optloc.show.pictures import plot_fixes
 
 problem = optloc.load(files("optloc") / "scenarios" / "demo.toml")
 fix = optloc.solve(problem)

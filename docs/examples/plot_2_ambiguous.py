@@ -9,7 +9,7 @@ cost by which it is worse.
 from importlib.resources import files
 
 import optloc
-from optloc.plot import plot_fixes
+from optloc.show.pictures import plot_fixes
 
 problem = optloc.load(files("optloc") / "scenarios" / "ambiguous.toml")
 fix = optloc.solve(problem)

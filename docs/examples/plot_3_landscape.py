@@ -9,7 +9,7 @@ the line that holds 95 % by the cost is bent; the ellipse is what remains of it 
 from importlib.resources import files
 
 import optloc
-from optloc.plot import plot_landscape
+from optloc.show.pictures import plot_landscape
 
 problem = optloc.load(files("optloc") / "scenarios" / "ambiguous.toml")
 figure = plot_landscape(problem, optloc.solve(problem), "Three receivers, two possible places")

@@ -9,7 +9,7 @@ damped least squares from more; the fix without a start is proven to be the best
 from importlib.resources import files
 
 import optloc
-from optloc.plot import plot_convergence
+from optloc.show.pictures import plot_convergence
 
 problem = optloc.load(files("optloc") / "scenarios" / "demo.toml")
 figure = plot_convergence(problem, optloc.solve(problem), "Six receivers, one pulse")

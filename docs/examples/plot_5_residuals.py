@@ -8,7 +8,7 @@ Thirty fixes of a drive past five beacons: what every range and bearing says aga
 from importlib.resources import files
 
 import optloc
-from optloc.plot import plot_residuals
+from optloc.show.pictures import plot_residuals
 
 run = optloc.by_epoch(optloc.load(files("optloc") / "scenarios" / "run.toml"))
 figure = plot_residuals(run, optloc.solve(run), "A drive past five beacons")

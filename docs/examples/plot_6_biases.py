@@ -11,7 +11,7 @@ import numpy as np
 
 import optloc
 from optloc import units
-from optloc.plot import plot_biases
+from optloc.show.pictures import plot_biases
 from optloc.solvers.running import growing
 
 problem = optloc.load(files("optloc") / "scenarios" / "registration.toml")

@@ -12,7 +12,7 @@ import numpy as np
 
 import optloc
 from optloc.bounds.bound_map import bound_map
-from optloc.plot import plot_bound_map
+from optloc.show.pictures import plot_bound_map
 
 problem = optloc.load(files("optloc") / "scenarios" / "demo.toml")
 lon, lat = np.linspace(10.95, 11.5, 96), np.linspace(47.65, 47.95, 96)

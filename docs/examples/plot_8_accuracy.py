@@ -9,7 +9,7 @@ Cramer-Rao bound; one that takes the rows for independent does not.
 import numpy as np
 
 import optloc
-from optloc.plot import plot_accuracy
+from optloc.show.pictures import plot_accuracy
 
 stations = np.array([[0, 0], [10, 1], [2, 9], [11, 8], [5, -4], [-3, 5]]) * 1e3
 pairs, truth, noise = {"a": [1, 2, 3, 4, 5], "b": 0}, np.array([6e3, 14e3]), np.array([1.0, 3.0, 10.0, 30.0])

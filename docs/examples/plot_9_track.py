@@ -8,8 +8,8 @@ The drive past five beacons again, now as a track: its start is a fix of the fir
 from importlib.resources import files
 
 from optloc.files import read
-from optloc.plot import plot_tracks
-from optloc.plot.track import Drawn
+from optloc.show.pictures import plot_tracks
+from optloc.show.pictures.track import Drawn
 from optloc.tracking.dynamics import polynomial
 from optloc.tracking.run import tracked
 

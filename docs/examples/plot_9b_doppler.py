@@ -11,7 +11,7 @@ from importlib.resources import files
 import numpy as np
 
 import optloc
-from optloc.plot import plot_fixes
+from optloc.show.pictures import plot_fixes
 
 problem = optloc.load(files("optloc") / "starters" / "range_rate.toml")
 fix = optloc.solve(problem)

@@ -143,7 +143,7 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
 
 
 def _picture(found: Calibration, title: str) -> Any:
-    from optloc.plot.network_map import plot_network
+    from optloc.show.pictures.network_map import plot_network
 
     net = found.network
     known = np.where(np.isfinite(net.place_sigma), net.place, np.nan)

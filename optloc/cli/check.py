@@ -36,8 +36,8 @@ from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_lev
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem
-from optloc.report.columns import Columns, records
-from optloc.report.fixes import with_sigma
+from optloc.show.columns import Columns, records
+from optloc.show.fixes import with_sigma
 from optloc.solvers import Method
 from optloc.station_health.health import Health, health_of
 
@@ -383,6 +383,6 @@ def _write_health(health: Health, title: str, asked: Asked) -> None:
         if asked.out is not None:
             write_table(asked.out, _health_columns(health))
         if asked.plot is not None:
-            from optloc.plot.residuals import plot_health
+            from optloc.show.pictures.residuals import plot_health
 
             write_picture(plot_health(health, title=title), asked.plot)

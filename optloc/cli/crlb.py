@@ -104,7 +104,7 @@ def _solve(file: Path) -> Array:
 
 
 def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | None) -> None:
-    from optloc.plot import plot_course
+    from optloc.show.pictures import plot_course
 
     if over_time is None:
         advice = "give the epochs something in common, a motion or biases, but not hundreds of targets"
@@ -374,7 +374,7 @@ def _limits(text: str, problem: Problem) -> tuple[float, float, float, float]:
 
 
 def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
-    from optloc.plot.bound_map import map_geojson, plot_bound_map
+    from optloc.show.pictures.bound_map import map_geojson, plot_bound_map
 
     ending = out.suffix.lower()
     if ending in PICTURES:
@@ -385,7 +385,7 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
     if ending == ".geojson":
         write_text(out, dumps(map_geojson(found)))
         return
-    from optloc.report import map_page
+    from optloc.show import map_page
 
     write_text(out, map_page(found, title))
 
@@ -445,7 +445,7 @@ def _show_status(found: StatusShares, title: str) -> None:
 
 def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> None:
     """Write the map of the share of `ok` fixes of a file."""
-    from optloc.plot import plot_status_map, status_geojson
+    from optloc.show.pictures import plot_status_map, status_geojson
     from optloc.solvers.status_shares import status_map
 
     ending = out.suffix.lower()

@@ -21,9 +21,9 @@ from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.report import columns as told
-from optloc.report.columns import Columns, fix_detail, level_covariance, records
-from optloc.report.formats.marks import Results
+from optloc.show import columns as told
+from optloc.show.columns import Columns, fix_detail, level_covariance, records
+from optloc.show.formats.marks import Results
 
 LOG = logging.getLogger("optloc.problem.fix")
 

@@ -41,8 +41,8 @@ from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report.columns import Columns, records
-from optloc.report.fixes import (
+from optloc.show.columns import Columns, records
+from optloc.show.fixes import (
     SHOWN,
     Sheet,
     alternative_sheet,
@@ -54,7 +54,7 @@ from optloc.report.fixes import (
     whose,
     with_sigma,
 )
-from optloc.report.formats.marks import geojson
+from optloc.show.formats.marks import geojson
 from optloc.solvers.policy import REFUTED
 from optloc.station_health.levels import (
     NoiseLevels,
@@ -142,7 +142,7 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
         if plot is not None:
             draw(found, plot)
         if html is not None:
-            from optloc.report import fix_page
+            from optloc.show import fix_page
 
             labels = [str(label) for label in found.columns["epoch"]]
             write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels))
@@ -150,7 +150,7 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
 
 def draw(found: FileFixes, path: Path) -> None:
     """Draw fixes to a picture file; raise InvalidProblem where that fails."""
-    from optloc.plot import plot_fixes
+    from optloc.show.pictures import plot_fixes
 
     write_picture(plot_fixes(found.loaded.problem, (found.fix,), title=found.loaded.title), path)
 

@@ -170,7 +170,7 @@ LISTS: dict[str, Callable[[], Rows]] = {
     "trackers": _registry("tracker", "optloc.tracking:UPDATES"),
     "motions": _registry("motion", "optloc.cli.track:MOTIONS"),
     "baselines": _registry("baseline", "optloc.study.baselines:BASELINES"),
-    "formats": _registry("format", "optloc.report.formats:FORMATS"),
+    "formats": _registry("format", "optloc.show.formats:FORMATS"),
     "executors": _registry("executor", "optloc.study.execute:EXECUTORS"),
     "studies": _studies,
     "papers": _registry("paper", "optloc.papers:PAPERS"),

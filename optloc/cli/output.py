@@ -18,12 +18,12 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible
 from optloc.kernels.progress import Reporter
-from optloc.report.columns import Columns, plain
+from optloc.show.columns import Columns, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from optloc.report.formats import Results
+    from optloc.show.formats import Results
 
 LOG = logging.getLogger("optloc.write")
 
@@ -74,7 +74,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_table(path: Path, columns: Columns) -> None:
     """Write a long table as CSV or Parquet, by the ending of its name; NaN is an empty cell."""
-    from optloc.report.formats import write_csv, write_parquet
+    from optloc.show.formats import write_csv, write_parquet
 
     (write_csv if is_csv(path) else write_parquet)(path, columns)
     LOG.info("wrote %s: %d rows", path, len(next(iter(columns.values()))))
@@ -82,7 +82,7 @@ def write_table(path: Path, columns: Columns) -> None:
 
 def write_results(path: Path, results: Results) -> None:
     """Write fixes or tracks in the format that the ending of the name says."""
-    from optloc.report.formats import format_of
+    from optloc.show.formats import format_of
 
     format_of(path).write(path, results)
     LOG.info("wrote %s: %d rows", path, len(results.columns["status"]))
@@ -118,7 +118,7 @@ def claim_outputs(
         raise InvalidProblem(what, str(table), "use .csv or .parquet")
     fixes, frame = results or (None, None)
     if fixes is not None:
-        from optloc.report.formats import format_of
+        from optloc.show.formats import format_of
 
         format_of(fixes, frame)
     if picture is not None and picture.suffix.lower() not in PICTURES and not is_stream(picture):
@@ -129,7 +129,7 @@ def claim_outputs(
 
 def write_picture(figure: Figure, path: Path) -> None:
     """Write a picture; raise InvalidProblem where that fails."""
-    from optloc.plot import save
+    from optloc.show.pictures import save
 
     save(figure, path)
     LOG.info("wrote %s", path)

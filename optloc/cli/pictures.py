@@ -79,7 +79,7 @@ def _solve_one(asked: Asked) -> tuple[Problem, Fix, str]:
 
 def _fix(asked: Asked) -> None:
     """Stations, fix, 95 % ellipse and alternatives."""
-    from optloc.plot import plot_fixes
+    from optloc.show.pictures import plot_fixes
 
     loaded, _, fix = _solve_all(asked)
     write_picture(plot_fixes(loaded.problem, fix, loaded.title), asked.out)
@@ -87,7 +87,7 @@ def _fix(asked: Asked) -> None:
 
 def _residuals(asked: Asked) -> None:
     """Residuals by station."""
-    from optloc.plot import plot_residuals
+    from optloc.show.pictures import plot_residuals
 
     loaded, problem, fix = _solve_all(asked)
     write_picture(plot_residuals(problem, fix, loaded.title), asked.out)
@@ -100,21 +100,21 @@ def _draw_one(draw: Callable[..., Figure], asked: Asked) -> None:
 
 def _landscape(asked: Asked) -> None:
     """Cost over the place of the target."""
-    from optloc.plot import plot_landscape
+    from optloc.show.pictures import plot_landscape
 
     _draw_one(plot_landscape, asked)
 
 
 def _convergence(asked: Asked) -> None:
     """Where iterations from many starts end."""
-    from optloc.plot import plot_convergence
+    from optloc.show.pictures import plot_convergence
 
     _draw_one(plot_convergence, asked)
 
 
 def _biases(asked: Asked) -> None:
     """Biases of a run against time, with 95 %."""
-    from optloc.plot import plot_biases
+    from optloc.show.pictures import plot_biases
     from optloc.solvers.running import growing
 
     loaded, problem, fix = _solve_all(asked)
@@ -137,7 +137,7 @@ def _track(asked: Asked) -> None:
 
 def _accuracy(asked: Asked) -> None:
     """Errors of a study's methods against the bound."""
-    from optloc.plot import plot_accuracy
+    from optloc.show.pictures import plot_accuracy
     from optloc.study import summary
     from optloc.study.folder import read_frame
 

@@ -155,7 +155,7 @@ def report(
 
     A study that is not finished has a report too: of what is there.
     """
-    from optloc.report import write_report
+    from optloc.show import write_report
 
     console = Screen(stderr=True)
     shown = console.is_terminal and not quiet
@@ -283,7 +283,7 @@ def profiles(
     known = references(design_of_manifest(read_manifest(folder)))
     found = profiled(frame, tau=tau, work=work, out=known)
     if plot is not None:
-        from optloc.report.figures import marks, profile_picture
+        from optloc.show.figures import marks, profile_picture
 
         write_picture(profile_picture(found, marks(list(found.methods))), plot)
     if as_json:
@@ -339,7 +339,7 @@ def histories(
     if out is not None:
         write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})
     if plot is not None:
-        from optloc.report.figures import history_picture, marks
+        from optloc.show.figures import history_picture, marks
 
         write_picture(history_picture(found, marks(list(found.methods))), plot)
     if as_json:
@@ -490,7 +490,7 @@ def _profile_record(found: Any) -> dict[str, Any]:
 
 
 def _show_profiles(found: Any, console: Console) -> None:
-    from optloc.report.sheets import duration, number, percent, solved_within
+    from optloc.show.sheets import duration, number, percent, solved_within
     from optloc.study.profiles import RATIOS, shares
 
     table = Table("method")

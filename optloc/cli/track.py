@@ -39,8 +39,8 @@ from optloc.linear.least_squares_ranges import reduce
 from optloc.problem.epochs import cut
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
-from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
-from optloc.report.formats.marks import Results
+from optloc.show.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
+from optloc.show.formats.marks import Results
 from optloc.tracking import Dynamics, State, current_statistical, polynomial, singer
 from optloc.tracking.entry import Entry, Rules
 from optloc.tracking.run import tracked
@@ -345,8 +345,8 @@ def track_columns(one: TargetTrack) -> Columns:
 
 def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
     """Return the page with the map of all tracks."""
-    from optloc.report import track_page
-    from optloc.report.map import degrees, sentence, spots
+    from optloc.show import track_page
+    from optloc.show.map import degrees, sentence, spots
 
     problem, d = loaded.problem, loaded.problem.dimension
     entries = [(one.name, label, e) for one in ones for label, e in zip(one.labels, one.entries, strict=False)]
@@ -380,7 +380,7 @@ def _write(
         if table is not None:
             table.file.discard()
     if plot is not None:
-        from optloc.plot.track import Drawn, plot_tracks
+        from optloc.show.pictures.track import Drawn, plot_tracks
 
         drawn = [Drawn(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
         write_picture(plot_tracks(drawn, title=loaded.title), plot)

@@ -12,12 +12,12 @@ import numpy as np
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Status
 from optloc.live.events import Event
-from optloc.plot.outlines import earth_points
 from optloc.problem.claims import PROOFS, UNKNOWN
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report import formats
-from optloc.report.formats.marks import Mark, Other, mark_of
+from optloc.show import formats
+from optloc.show.formats.marks import Mark, Other, mark_of
+from optloc.show.pictures.outlines import earth_points
 from optloc.tracking.entry import Entry
 
 Record = dict[str, Any]

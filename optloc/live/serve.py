@@ -191,7 +191,7 @@ def _questions(stream: Stream) -> list[Any]:
 
 def page_of(site: Site) -> str:
     """Return the page of a site's map; raise InvalidProblem where it has no place on Earth."""
-    from optloc.report import live_page
+    from optloc.show import live_page
 
     ready = site.ready((), site.rows)
     assert ready is not None  # a site has rows

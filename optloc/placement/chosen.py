@@ -414,7 +414,7 @@ def picture(selection: SiteSelection, found: Placement) -> Figure:
     InvalidProblem
         Where rows were chosen, which have no map.
     """
-    from optloc.plot.placement_map import plot_placement
+    from optloc.show.pictures.placement_map import plot_placement
 
     problem, names = selection.problem, np.array(selection.problem.stations.names)
     if selection.by == "row":

@@ -581,7 +581,7 @@ _TELLER: list[Callable[[], Any]] = []
 
 
 def told_by(teller: Callable[[], Any]) -> None:
-    """Say which module, loaded when it is needed, tells fixes in words and tables: `optloc.report.fixes`."""
+    """Say which module, loaded when it is needed, tells fixes in words and tables: `optloc.show.fixes`."""
     _TELLER[:] = [teller]
 
 

@@ -13,9 +13,9 @@ import optloc
 from optloc.base.frames import Frame
 from optloc.base.types import Status
 from optloc.problem.determined import WITHOUT_PLACE
-from optloc.report.columns import fix_columns
-from optloc.report.formats.marks import Results
-from optloc.report.formats.markup import kml
+from optloc.show.columns import fix_columns
+from optloc.show.formats.marks import Results
+from optloc.show.formats.markup import kml
 
 SQUARE = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0.0]])
 SIX = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1], [0.08, 0.08, 0.09], [0.02, 0.09, 0.06]])
@@ -256,7 +256,7 @@ def test_it_is_shown_in_text_json_geojson_kml_and_pictures(kind):
     text = kml(Results(fix_columns(fix), fix.frame, (fix,), problem))
     assert "direction, 95 %, cut off" in text
     assert "<LineString>" in text
-    labels = [each.get_label() for each in optloc.plot.plot_fixes(problem, fix).axes[0].collections]
+    labels = [each.get_label() for each in optloc.show.pictures.plot_fixes(problem, fix).axes[0].collections]
     assert "95 % direction" in labels
 
 

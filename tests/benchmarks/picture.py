@@ -9,8 +9,8 @@ from typing import Any
 from benchmarks.scaling import Curve
 from benchmarks.table import Line
 
-from optloc.plot import save
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, figure_class
+from optloc.show.pictures import save
+from optloc.show.pictures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, figure_class
 
 GROUPS = {"optloc": (BLUE, "optloc"), "general": (GREY, "general solvers"), "peer": (ORANGE, "libraries of the field")}
 COLOURS = (BLUE, SKY, GREEN, ORANGE, PURPLE, BLACK)

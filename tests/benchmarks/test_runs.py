@@ -10,8 +10,8 @@ from monte_carlo.layouts import SEED
 from monte_carlo.tables import FOLDER, write
 
 from optloc import solve
-from optloc.plot import save
-from optloc.plot.style import BLUE, GREY, ORANGE, figure_class
+from optloc.show.pictures import save
+from optloc.show.pictures.style import BLUE, GREY, ORANGE, figure_class
 
 PICTURE = FOLDER / "runs.png"
 HEADER = ["what", "seconds", "working memory, MB", "the problem itself, MB", "update by one epoch, ms"]

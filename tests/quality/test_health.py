@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from optloc import InvalidProblem, assemble, by_epoch, health, measured, predict, reliability, solve, with_noise_levels
 from optloc.cli import app
 from optloc.files import read
-from optloc.plot import save
-from optloc.plot.residuals import plot_health
+from optloc.show.pictures import save
+from optloc.show.pictures.residuals import plot_health
 from optloc.station_health.health import _sentences
 
 RUN = CliRunner()

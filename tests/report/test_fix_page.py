@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.report import fix_page
-from optloc.report.map import fixed_spots, ground_tracks, lines_on_map
+from optloc.show import fix_page
+from optloc.show.map import fixed_spots, ground_tracks, lines_on_map
 
 RUN = CliRunner()
 DEMO = package_files("optloc") / "scenarios" / "demo.toml"
@@ -138,7 +138,7 @@ _POINT = """(() => { const dot = document.querySelector('[data-layer=fix] .dot')
 
 def test_an_ellipse_that_does_not_cover_is_dotted_on_the_map(monkeypatch):
     """Of many curved fixes no region is enclosed, which takes a tenth of a second each: here from the first on."""
-    monkeypatch.setattr("optloc.plot.outlines._MOST", 0)
+    monkeypatch.setattr("optloc.show.pictures.outlines._MOST", 0)
     lat, lon = np.radians([47.812, 47.751, 47.79]), np.radians([11.183, 11.148, 11.31])
     stations = optloc.station_array(optloc.ECEF.from_geodetic(lat, lon, np.array([612.0, 640.0, 842.0])), "ABC")
     rows = optloc.measured("range", np.array([9000.0, 12300.0, 1500.0]), a=[0, 1, 2], sigma=800.0)

@@ -18,10 +18,10 @@ from typer.testing import CliRunner
 import optloc
 from optloc.base.frames import CARTESIAN, ECEF, Frame
 from optloc.cli import app
-from optloc.report.formats import FORMATS, Results, write_fixes
-from optloc.report.formats.marks import ellipse
-from optloc.report.formats.markup import cot, gpx, kml
-from optloc.report.formats.sentences import g2o, nmea, ros
+from optloc.show.formats import FORMATS, Results, write_fixes
+from optloc.show.formats.marks import ellipse
+from optloc.show.formats.markup import cot, gpx, kml
+from optloc.show.formats.sentences import g2o, nmea, ros
 
 RUN = CliRunner()
 DEMOS = Path(optloc.__file__).parent / "scenarios"
@@ -55,7 +55,7 @@ def level_axes(lat, lon):
 
 def columns_of(frame, position, covariance, status="ok", chart="cartesian", **more):
     """Return a table of one row, made by hand."""
-    from optloc.report.columns import covariance_columns, geodetic_columns
+    from optloc.show.columns import covariance_columns, geodetic_columns
 
     axes, spread = "xyz"[: len(position)], np.asarray(covariance)[None]
     table = {"status": np.array([status], object), "reason": np.array([""], object), "chart": np.array([chart], object)}
@@ -120,7 +120,7 @@ def test_what_does_not_cover_has_no_ellipse_anywhere(status, chart):
     assert "EDGE" not in g2o(results)
     assert "covariance" not in ros(results)
     assert ET.fromstring(gpx(results)).find(f".//{OWN}covariance_enu_m2") is None
-    assert "Polygon" not in json.dumps(optloc.report.formats.geojson(results))
+    assert "Polygon" not in json.dumps(optloc.show.formats.geojson(results))
 
 
 def test_alternatives_are_shown(tmp_path):

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.papers.report import Table
-from optloc.report import write_report
-from optloc.report.figures import marks as looks_of
-from optloc.report.figures import panel, svg_text
-from optloc.report.map import Canvas, Curve, Label
-from optloc.report.page import Part, write_page
-from optloc.report.sheets import Sheet, duration, latex, number, percent
+from optloc.show import write_report
+from optloc.show.figures import marks as looks_of
+from optloc.show.figures import panel, svg_text
+from optloc.show.map import Canvas, Curve, Label
+from optloc.show.page import Part, write_page
+from optloc.show.sheets import Sheet, duration, latex, number, percent
 from optloc.study.design import design_of
 from optloc.study.execute import executor, run_design
 from optloc.study.folder import begin, read_frame

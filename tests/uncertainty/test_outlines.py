@@ -11,11 +11,11 @@ from uncertainty.scenes import fixed
 import optloc
 from optloc.cli.file_fixes import fix_file, results_of
 from optloc.files import read
-from optloc.plot import plot_fixes
-from optloc.plot.outlines import outlines_of
 from optloc.problem.chart import quantile
-from optloc.report.formats.marks import geojson
-from optloc.report.map import fixed_spots
+from optloc.show.formats.marks import geojson
+from optloc.show.map import fixed_spots
+from optloc.show.pictures import plot_fixes
+from optloc.show.pictures.outlines import outlines_of
 from optloc.uncertainty.contour import holds
 from optloc.uncertainty.region import Surface
 

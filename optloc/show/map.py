@@ -13,12 +13,12 @@ import numpy as np
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status
 from optloc.models import MODELS
-from optloc.plot.fixes import lines_of_position
-from optloc.plot.outlines import level_planes
-from optloc.plot.style import figure_class, is_local, regions_of, states_of, thinned
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report.columns import UNCHECKED
+from optloc.show.columns import UNCHECKED
+from optloc.show.pictures.fixes import lines_of_position
+from optloc.show.pictures.outlines import level_planes
+from optloc.show.pictures.style import figure_class, is_local, regions_of, states_of, thinned
 from optloc.uncertainty.outline import Outline
 
 # Coastlines for maps without a network.
@@ -38,7 +38,7 @@ def rings() -> tuple[Array, ...]:
     Each is in one piece, so that some go beyond 180 degrees; that of Antarctica goes along the pole.
     """
     # Differences in hundredths of a degree: integers that a zip archive makes small.
-    with (files("optloc.report") / "natural-earth-50m.npz").open("rb") as file, np.load(file) as data:
+    with (files("optloc.show") / "natural-earth-50m.npz").open("rb") as file, np.load(file) as data:
         delta, length = data["delta"].astype(np.int64), data["length"]
     starts = np.cumsum(length)[:-1]
     return tuple(np.cumsum(part, axis=0) / 100.0 for part in np.split(delta, starts))

@@ -12,10 +12,10 @@ from optloc.base.frames import Frame
 from optloc.base.outputs import is_stream, written
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report.columns import Columns, fix_columns, plain
-from optloc.report.formats.marks import Mark, Results, geojson, need_earth
-from optloc.report.formats.markup import cot, event, gpx, kml
-from optloc.report.formats.sentences import g2o, nmea, ros, sentences
+from optloc.show.columns import Columns, fix_columns, plain
+from optloc.show.formats.marks import Mark, Results, geojson, need_earth
+from optloc.show.formats.markup import cot, event, gpx, kml
+from optloc.show.formats.sentences import g2o, nmea, ros, sentences
 
 __all__ = ["FORMATS", "Format", "Mark", "Results", "format_of", "write_csv", "write_fixes", "write_parquet"]
 

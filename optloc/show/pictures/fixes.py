@@ -15,8 +15,12 @@ from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS, RAY, Point
 from optloc.models.layers import Layers
-from optloc.plot import style
-from optloc.plot.style import (
+from optloc.problem.determined import WITHOUT_PLACE
+from optloc.problem.fix import Fix
+from optloc.problem.layout import state_names
+from optloc.problem.problem import Problem
+from optloc.show.pictures import style
+from optloc.show.pictures.style import (
     BLACK,
     BLUE,
     GREEN,
@@ -38,10 +42,6 @@ from optloc.plot.style import (
     unit_of,
     xy,
 )
-from optloc.problem.determined import WITHOUT_PLACE
-from optloc.problem.fix import Fix
-from optloc.problem.layout import state_names
-from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,7 +92,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
     """
     every = [fixes] if isinstance(fixes, Fix) else fixes
     scene = scene_of(problem, every, outlined=True)

@@ -16,11 +16,11 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.outputs import visible, written
 from optloc.base.types import Array, Band, Polygon, Status
 from optloc.linear.courses import course_at, elapsed
-from optloc.plot.outlines import outlines_of
 from optloc.problem.chart import CARTESIAN
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.show.pictures.outlines import outlines_of
 from optloc.uncertainty.outline import Outline
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import numpy as np
 
 from optloc.base.outputs import visible
 from optloc.base.types import Array
-from optloc.report.formats.marks import Mark, Results, ellipse
+from optloc.show.formats.marks import Mark, Results, ellipse
 
 # NMEA 0183.
 

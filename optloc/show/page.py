@@ -19,13 +19,11 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap
-from optloc.plot.bound_map import COLOURS, isolines, levels
-from optloc.plot.style import BLACK, BLUE, ORANGE
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report.columns import UNCHECKED
-from optloc.report.figures import Drawing, Mark
-from optloc.report.map import (
+from optloc.show.columns import UNCHECKED
+from optloc.show.figures import Drawing, Mark
+from optloc.show.map import (
     Canvas,
     Curve,
     Drawn,
@@ -42,7 +40,9 @@ from optloc.report.map import (
     path,
     station_spots,
 )
-from optloc.report.sheets import Sheet
+from optloc.show.pictures.bound_map import COLOURS, isolines, levels
+from optloc.show.pictures.style import BLACK, BLUE, ORANGE
+from optloc.show.sheets import Sheet
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -131,7 +131,7 @@ def _environment() -> Environment:
 
     # Strict: a misspelt value is an error and not a hole in the page.
     made = Environment(
-        loader=PackageLoader("optloc.report"),
+        loader=PackageLoader("optloc.show"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -143,7 +143,7 @@ def _environment() -> Environment:
 
 def _asset(name: str) -> str:
     """Return a style sheet or a script, whose braces must not be read as those of a template."""
-    return (files("optloc.report") / "templates" / name).read_text(encoding="utf-8")
+    return (files("optloc.show") / "templates" / name).read_text(encoding="utf-8")
 
 
 # Pages with a map that moves: fixes or tracks with ellipses and lines of position; a bound, as reports show it.

@@ -3,13 +3,13 @@
 matplotlib is imported where it is used. Colours are those of Okabe and Ito, and every kind of point has its own mark.
 """
 
-from optloc.plot.bound_map import map_geojson, plot_bound_map, plot_status_map, status_geojson
-from optloc.plot.fixes import plot_fixes
-from optloc.plot.landscape import plot_convergence, plot_landscape
-from optloc.plot.residuals import plot_health, plot_residuals
-from optloc.plot.runs import plot_accuracy, plot_biases, plot_course
-from optloc.plot.style import save
-from optloc.plot.track import plot_tracks
+from optloc.show.pictures.bound_map import map_geojson, plot_bound_map, plot_status_map, status_geojson
+from optloc.show.pictures.fixes import plot_fixes
+from optloc.show.pictures.landscape import plot_convergence, plot_landscape
+from optloc.show.pictures.residuals import plot_health, plot_residuals
+from optloc.show.pictures.runs import plot_accuracy, plot_biases, plot_course
+from optloc.show.pictures.style import save
+from optloc.show.pictures.track import plot_tracks
 
 __all__ = [
     "map_geojson",

@@ -16,7 +16,7 @@ import numpy as np
 
 from optloc.base.outputs import visible
 from optloc.base.types import Array
-from optloc.report.formats.marks import Area, Mark, Other, Results, ellipse
+from optloc.show.formats.marks import Area, Mark, Other, Results, ellipse
 
 # Decimals of a degree and of a metre: a tenth of a millimetre, and one.
 _DEGREES, _METRES = 9, 3

@@ -16,8 +16,8 @@ from optloc.base.types import Array, Status
 from optloc.problem.chart import CARTESIAN, NAMES
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.report.columns import UNCHECKED, Columns, records
-from optloc.report.knowledge import known_features
+from optloc.show.columns import UNCHECKED, Columns, records
+from optloc.show.knowledge import known_features
 
 if TYPE_CHECKING:
     from optloc.uncertainty.outline import Outline
@@ -211,7 +211,7 @@ class Results:
 
     def stations(self) -> list[tuple[str, Array]]:
         """Return names of the stations, and their longitudes, latitudes (degrees) and heights (3,)."""
-        from optloc.plot.outlines import earth_points
+        from optloc.show.pictures.outlines import earth_points
 
         if self.problem is None or not self.frame.geodetic:
             return []
@@ -277,7 +277,7 @@ class Results:
         gap, doubt = fix.alternatives.gap[i], fix.alternatives.doubt[i]
         place = np.full((len(gap), 3), np.nan)
         if self.frame.geodetic and len(gap):
-            from optloc.plot.outlines import earth_points
+            from optloc.show.pictures.outlines import earth_points
 
             with np.errstate(invalid="ignore"):
                 place = earth_points(self.frame, position)
@@ -297,7 +297,7 @@ class Results:
 
     def _outlines(self, problem: Problem) -> dict[int, Outline]:
         """Return the plans of the regions of rows whose ellipses do not cover; of those that are known."""
-        from optloc.plot.outlines import level_planes, outlines_of
+        from optloc.show.pictures.outlines import level_planes, outlines_of
 
         if not self.frame.geodetic:
             return {}
@@ -315,7 +315,7 @@ class Results:
 
 def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:
     """Return the plan of a region along east and north as a geometry."""
-    from optloc.plot.outlines import earth_line, polygon_geometry
+    from optloc.show.pictures.outlines import earth_line, polygon_geometry
 
     axes = frame.enu_axes(centre)[:2]
     return polygon_geometry([[earth_line(frame, centre + line @ axes) for line in each] for each in region.polygons])
@@ -323,7 +323,7 @@ def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:
 
 def _ellipse(frame: Frame, centre: Array, level: Array) -> dict[str, Any]:
     """Return the horizontal 95 % ellipse of a level covariance (2, 2) as a geometry, counter-clockwise."""
-    from optloc.plot.outlines import earth_line, polygon_geometry
+    from optloc.show.pictures.outlines import earth_line, polygon_geometry
 
     semi_axes, directions = error_ellipse(level)
     # Eigenvectors may be left-handed: the sign of the turn makes up for it.
@@ -338,7 +338,7 @@ def geojson(results: Results) -> dict[str, Any]:
 
     An ellipse where it covers, else the outline of the region; what is not ok, or curved without a region, has neither.
     """
-    from optloc.plot.outlines import feature, point_geometry
+    from optloc.show.pictures.outlines import feature, point_geometry
 
     need_earth(results.frame, "GeoJSON", results.title)
     features = [feature(point_geometry(place), {"role": "station", "name": name}) for name, place in results.stations()]

@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.papers.report import Picture
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, literal
+from optloc.show.pictures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, literal
 from optloc.study.histories import COUNTS, Histories, band
 from optloc.study.profiles import WORK, Profiles
 from optloc.study.summary import accuracy_rows, distribution, noise_text, wilson

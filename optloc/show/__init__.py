@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from optloc.report.page import fix_page, live_page, map_page, track_page
-    from optloc.report.study_page import Tell, write_report
+    from optloc.show.page import fix_page, live_page, map_page, track_page
+    from optloc.show.study_page import Tell, write_report
 
 __all__ = ["Tell", "fix_page", "live_page", "map_page", "track_page", "write_report"]
 
@@ -14,6 +14,6 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     for place in ("page", "study_page"):
-        if name in __all__ and hasattr(module := import_module(f"optloc.report.{place}"), name):
+        if name in __all__ and hasattr(module := import_module(f"optloc.show.{place}"), name):
             return getattr(module, name)
-    raise AttributeError(f"module 'optloc.report' has no attribute {name!r}")
+    raise AttributeError(f"module 'optloc.show' has no attribute {name!r}")

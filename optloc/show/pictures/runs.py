@@ -10,7 +10,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.bounds.crlb import Course
-from optloc.plot.style import (
+from optloc.problem.layout import Slot
+from optloc.show.pictures.style import (
     BLACK,
     BLUE,
     GREEN,
@@ -25,7 +26,6 @@ from optloc.plot.style import (
     literal,
     panels_for,
 )
-from optloc.problem.layout import Slot
 from optloc.solvers.running import Growing
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def plot_accuracy(
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def plot_course(
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
     """
     slots = [slot for slot in course.layout.shared if names is None or slot.name in names]
     figure, panels = panels_for(len(slots), 3, 4.8, 4.2)
@@ -182,7 +182,7 @@ def plot_biases(
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
 
     Raises
     ------

@@ -10,8 +10,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.bounds.bound_map import BoundMap, Grid
-from optloc.plot.outlines import feature, line_geometry, point_geometry
-from optloc.plot.style import BLACK, GREY, apart, figure_class, literal
+from optloc.show.pictures.outlines import feature, line_geometry, point_geometry
+from optloc.show.pictures.style import BLACK, GREY, apart, figure_class, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +53,7 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
     """
     from matplotlib.colors import Normalize
 

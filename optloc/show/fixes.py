@@ -24,7 +24,7 @@ from optloc.problem.chart import AXES, CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.determined import Determined
 from optloc.problem.fix import Active, Fix, Suspect
 from optloc.problem.problem import Problem
-from optloc.report.columns import (
+from optloc.show.columns import (
     RESCALED,
     ROBUST,
     TAILS,
@@ -40,7 +40,7 @@ from optloc.report.columns import (
     plain,
     records,
 )
-from optloc.report.knowledge import has_place, known_rows
+from optloc.show.knowledge import has_place, known_rows
 
 # What a coordinate that an equality holds may have as its sigma, as a share of it: rounding.
 _HELD = 1e-12
@@ -408,6 +408,6 @@ def frame_of(fix: Fix) -> Any:
 
 def geojson_of(fix: Fix, problem: Problem | None = None) -> dict[str, Any]:
     """Return fixes as a GeoJSON feature collection, with the stations where their problem is given."""
-    from optloc.report.formats.marks import Results, geojson
+    from optloc.show.formats.marks import Results, geojson
 
     return geojson(Results(fix_columns(fix), fix.frame, (fix,), problem))

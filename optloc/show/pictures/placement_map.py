@@ -9,8 +9,8 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap
-from optloc.plot.bound_map import COLOURS, levels
-from optloc.plot.style import BLACK, GREY, apart, figure_class, literal
+from optloc.show.pictures.bound_map import COLOURS, levels
+from optloc.show.pictures.style import BLACK, GREY, apart, figure_class, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,10 +8,12 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.plot import style
-from optloc.plot.bound_map import levels
-from optloc.plot.fixes import draw_lines, lines_of_position
-from optloc.plot.style import (
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.show.pictures import style
+from optloc.show.pictures.bound_map import levels
+from optloc.show.pictures.fixes import draw_lines, lines_of_position
+from optloc.show.pictures.style import (
     BLACK,
     BLUE,
     ORANGE,
@@ -25,8 +27,6 @@ from optloc.plot.style import (
     scene_of,
     unit_of,
 )
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
 from optloc.solvers.landscape import Basins, End, basins, profile_cost
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
 
     Raises
     ------
@@ -222,7 +222,7 @@ def plot_convergence(
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
 
     Raises
     ------

@@ -15,7 +15,7 @@ from optloc.bounds.observability import Observability
 from optloc.problem.chart import AXES, CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
 from optloc.problem.fix import Active, Explanation, Fix
-from optloc.report.knowledge import is_shown
+from optloc.show.knowledge import is_shown
 
 Columns = dict[str, Array]
 """A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""

@@ -113,7 +113,7 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
     frame : Frame
         Its frame, on Earth.
     """
-    from optloc.plot.outlines import earth_line, line_geometry, polygon_geometry
+    from optloc.show.pictures.outlines import earth_line, line_geometry, polygon_geometry
 
     if not is_shown(fix):
         return []

@@ -10,7 +10,8 @@ import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.types import Array
-from optloc.plot.style import (
+from optloc.problem.problem import Problem
+from optloc.show.pictures.style import (
     BLACK,
     BLUE,
     GREEN,
@@ -25,7 +26,6 @@ from optloc.plot.style import (
     ring,
     unit_of,
 )
-from optloc.problem.problem import Problem
 from optloc.tracking.entry import Entry
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def plot_tracks(drawn: Sequence[Drawn], title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
     """
     lines, stations, axes = _along(drawn)
     names = ["height", "sigma", "nis"][3 - stations.shape[-1] :]

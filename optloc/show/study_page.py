@@ -16,13 +16,13 @@ from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
 from optloc.files.writer import harmless_column
 from optloc.papers.report import Picture
-from optloc.plot.bound_map import plot_bound_map
-from optloc.plot.style import figure_class
-from optloc.report import figures as drawn
-from optloc.report.figures import Drawing, Mark, inline, marks, svg_text, with_legend
-from optloc.report.map import Canvas
-from optloc.report.page import Part, map_element, write_page
-from optloc.report.sheets import Sheet, latex, sheets
+from optloc.show import figures as drawn
+from optloc.show.figures import Drawing, Mark, inline, marks, svg_text, with_legend
+from optloc.show.map import Canvas
+from optloc.show.page import Part, map_element, write_page
+from optloc.show.pictures.bound_map import plot_bound_map
+from optloc.show.pictures.style import figure_class
+from optloc.show.sheets import Sheet, latex, sheets
 from optloc.study import summary
 from optloc.study.design import StudyDesign
 from optloc.study.draws import Case, draw

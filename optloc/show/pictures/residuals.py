@@ -13,10 +13,10 @@ from optloc.base.units import SI_UNIT
 from optloc.linear.evaluate import differentiate
 from optloc.linear.normal import weighed
 from optloc.models import MODELS
-from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid, literal
 from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
+from optloc.show.pictures.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid, literal
 from optloc.station_health.health import Health
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `optloc.plot.save`.
+        To be written with `optloc.show.pictures.save`.
     """
     units = list(dict.fromkeys(health.units))
     chosen = [_choose(health, unit) for unit in units]
