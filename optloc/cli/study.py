@@ -283,7 +283,8 @@ def profiles(
     known = references(design_of_manifest(read_manifest(folder)))
     found = profiled(frame, tau=tau, work=work, out=known)
     if plot is not None:
-        from optloc.show.figures import marks, profile_picture
+        from optloc.show.drawing import marks
+        from optloc.show.figures import profile_picture
 
         write_picture(profile_picture(found, marks(list(found.methods))), plot)
     if as_json:
@@ -339,7 +340,8 @@ def histories(
     if out is not None:
         write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})
     if plot is not None:
-        from optloc.show.figures import history_picture, marks
+        from optloc.show.drawing import marks
+        from optloc.show.figures import history_picture
 
         write_picture(history_picture(found, marks(list(found.methods))), plot)
     if as_json:

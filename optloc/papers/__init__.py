@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.papers.report import Report, Reproduction, Size, Table, write
+from optloc.papers.report import Report, Reproduction, Size, write
+from optloc.show.sheet import TextTable
 
-__all__ = ["PAPERS", "Paper", "Report", "Reproduction", "Size", "Table", "paper", "reproduction", "write"]
+__all__ = ["PAPERS", "Paper", "Report", "Reproduction", "Size", "TextTable", "paper", "reproduction", "write"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,12 +44,10 @@ from optloc.papers.angles import (
     whole_track_bound,
 )
 from optloc.papers.report import (
-    ABSENT,
     Ink,
     Report,
     Size,
     Study,
-    Table,
     Tick,
     canvas,
     explain,
@@ -59,6 +57,7 @@ from optloc.papers.report import (
     tabulate,
     typeset,
 )
+from optloc.show.sheet import ABSENT, TextTable
 from optloc.tracking import Dynamics, State, current_statistical, polynomial
 
 if TYPE_CHECKING:
@@ -284,13 +283,13 @@ def _row(values: Iterable[float]) -> tuple[str, ...]:
     return tuple(map(short, values))
 
 
-def table_straight(curves: Sequence[Curve]) -> Table:
+def table_straight(curves: Sequence[Curve]) -> TextTable:
     """Return the errors of simulation 1 over the whole track."""
     lines = [("printed", *_row(PRINTED_STRAIGHT)), *((c.label, *_row(c.total())) for c in curves)]
     return tabulate("simulation-1", ("", *_PARTS), lines)
 
 
-def table_winding(curves: Sequence[Curve]) -> Table:
+def table_winding(curves: Sequence[Curve]) -> TextTable:
     """Return the errors of simulation 2, over the whole track and without its first ten seconds."""
     lines = [("0 to 50 s", "printed", *_row(PRINTED_WINDING))]
     for first in (0, 10):
@@ -298,7 +297,7 @@ def table_winding(curves: Sequence[Curve]) -> Table:
     return tabulate("simulation-2", ("scored", "", *_PARTS), lines)
 
 
-def table_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> Table:
+def table_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> TextTable:
     """Return the position errors of the repaired simulation 3."""
     lines = [(ABSENT, "bound of every second by itself", *_row(snapshot.phases(REPAIRED)))]
     for limit, curves in found.items():
@@ -306,7 +305,7 @@ def table_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> Ta
     return tabulate("simulation-3", ("a_max", "", "straight", "circle", "straight again"), lines)
 
 
-def table_readings(found: Sequence[Reading]) -> Table:
+def table_readings(found: Sequence[Reading]) -> TextTable:
     """Return the position errors of simulation 3 as printed."""
     lines = []
     for each in found:
@@ -316,7 +315,7 @@ def table_readings(found: Sequence[Reading]) -> Table:
     return tabulate("readings", header, lines)
 
 
-def table_starts(found: Lost) -> Table:
+def table_starts(found: Lost) -> TextTable:
     """Return the shares of lost tracks."""
     header = ("start", "a_max", "single step", "converged", "modified gain", "modified covariance")
     lines = [
@@ -326,18 +325,18 @@ def table_starts(found: Lost) -> Table:
     return tabulate("starts", header, lines)
 
 
-def table_clamps(found: Mapping[str, float]) -> Table:
+def table_clamps(found: Mapping[str, float]) -> TextTable:
     """Return the shares of lost tracks with and without a clamped variance."""
     return tabulate("clamp", ("variance", "lost"), [(name, percent(share)) for name, share in found.items()])
 
 
-def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> Table:
+def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> TextTable:
     """Return the errors at the end of simulation 1 of fits to the whole track."""
     lines = [("Cramér-Rao bound", *_row(bound)), *((name, *_row(error)) for name, error in found)]
     return tabulate("whole-track", ("", *_PARTS), lines)
 
 
-def table_rays(found: Sequence[Rays]) -> Table:
+def table_rays(found: Sequence[Rays]) -> TextTable:
     """Return bias and error of fixes of a target that stays."""
     names = ("plain", "weighted", "instrumental", "maximum likelihood")
     lines = [

@@ -18,12 +18,10 @@ from optloc.linear.constraints import box
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
 from optloc.papers.report import (
-    ABSENT,
     Ink,
     Report,
     Size,
     Study,
-    Table,
     Tick,
     canvas,
     explain,
@@ -36,6 +34,7 @@ from optloc.papers.report import (
 from optloc.problem.build import assemble, measured
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
+from optloc.show.sheet import ABSENT, TextTable
 from optloc.solvers import solve
 from optloc.solvers.starts.angles import course_starts
 from optloc.tracking.dynamics import polynomial
@@ -344,7 +343,7 @@ def _cells(errors: Array) -> tuple[str, str, str]:
     return kilometres(errors[0]), f"{errors[1]:.5f}", f"{errors[2]:.5f}"
 
 
-def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> Table:
+def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> TextTable:
     """Return root mean square errors of a target that stays.
 
     Parameters
@@ -361,7 +360,7 @@ def table_still(found: Mapping[str, Errors], bounds: Mapping[int, Array]) -> Tab
     return tabulate("still", ("epochs", "estimator", "range, km", "azimuth, rad", "elevation, rad"), lines)
 
 
-def table_claims(found: Mapping[str, Errors]) -> Table:
+def table_claims(found: Mapping[str, Errors]) -> TextTable:
     """Return the share of runs in which the paper's claims for 10 epochs hold."""
     lines = []
     for name, column, limit, claim in CLAIMS:
@@ -375,7 +374,7 @@ def table_claims(found: Mapping[str, Errors]) -> Table:
 
 def table_slow(
     tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]], bounds: Mapping[int, Array]
-) -> Table:
+) -> TextTable:
     """Return root mean square errors of the slow target.
 
     Parameters
@@ -403,7 +402,7 @@ def table_slow(
     return tabulate("slow", header, lines)
 
 
-def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: Tick) -> Table:
+def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: Tick) -> TextTable:
     """Return batch fits of ten epochs and their bound, with the noise of the paper and a path ten times as noisy."""
     lines = []
     for sequence, (name, path) in zip(sequences, {"20 ns": PATH, "200 ns": 10.0 * PATH}.items(), strict=True):
@@ -416,13 +415,13 @@ def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: 
     )
 
 
-def table_directions() -> Table:
+def table_directions() -> TextTable:
     """Return the bound of the range of one epoch against azimuth."""
     lines = [(f"{azimuth:.3f}", kilometres(bound_single(azimuth))) for azimuth in _AZIMUTHS]
     return tabulate("directions", ("azimuth, rad", "bound of the range, km"), lines)
 
 
-def table_ground(trials: int, sequence: np.random.SeedSequence, tick: Tick) -> Table:
+def table_ground(trials: int, sequence: np.random.SeedSequence, tick: Tick) -> TextTable:
     """Return what a ground or a known height is worth in all `CASES`."""
     lines = []
     for (name, direction), child in zip(CASES.items(), sequence.spawn(len(CASES)), strict=True):
@@ -432,7 +431,7 @@ def table_ground(trials: int, sequence: np.random.SeedSequence, tick: Tick) -> T
     return tabulate("ground", ("case", "known", "range, km", "height, km", "in space, km"), lines)
 
 
-def table_printed(azimuth: Array) -> Table:
+def table_printed(azimuth: Array) -> TextTable:
     """Return the error of the angle step as printed; azimuth errors are (trials, epochs), radians."""
     spread = np.sqrt((azimuth**2).mean(0))
     last = azimuth.shape[1]

@@ -33,22 +33,9 @@ from optloc.papers.kinematic import (
     track_all,
     weighting,
 )
-from optloc.papers.report import (
-    ABSENT,
-    Ink,
-    Report,
-    Size,
-    Study,
-    Table,
-    Tick,
-    canvas,
-    explain,
-    label,
-    percent,
-    tabulate,
-    typeset,
-)
+from optloc.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, percent, tabulate, typeset
 from optloc.problem.epochs import cut
+from optloc.show.sheet import ABSENT, TextTable
 from optloc.solvers import solve
 from optloc.tracking.several_models import parallel
 
@@ -102,7 +89,7 @@ def km(value: float) -> str:
     return f"{size:.3f}" if size < 100.0 else f"{size:.3g}" if size < 1000.0 else f"{size:.0f}"
 
 
-def table_errors(lines: Sequence[Line]) -> Table:
+def table_errors(lines: Sequence[Line]) -> TextTable:
     """Return table 1 of the paper."""
     header = ("algorithm on motion", "printed", "reproduced", "standard error", "bound", "printed ms", "ms")
     rows = []
@@ -114,7 +101,7 @@ def table_errors(lines: Sequence[Line]) -> Table:
     return tabulate("table-1", header, rows)
 
 
-def table_ratios(fix: Score, matched: Mapping[str, Score], steps: int) -> Table:
+def table_ratios(fix: Score, matched: Mapping[str, Score], steps: int) -> TextTable:
     """Return what is left of table 1 when its noise is divided out."""
     rows = []
     for name, score in matched.items():
@@ -123,7 +110,7 @@ def table_ratios(fix: Score, matched: Mapping[str, Score], steps: int) -> Table:
     return tabulate("ratios", ("", "printed", "reproduced", "theory"), rows)
 
 
-def table_efficiency(drawn: Mapping[str, Draw]) -> Table:
+def table_efficiency(drawn: Mapping[str, Draw]) -> TextTable:
     """Return last-step errors of filter, iterated filter and batch beside the bound."""
     rows = []
     for name in ("CV", "CA"):
@@ -137,19 +124,19 @@ def table_efficiency(drawn: Mapping[str, Draw]) -> Table:
     return tabulate("efficiency", header, rows)
 
 
-def table_models(found: Mapping[str, Sequence[Score]]) -> Table:
+def table_models(found: Mapping[str, Sequence[Score]]) -> TextTable:
     """Return mean errors of filters on several motions."""
     header = ("filter", "CV", "CA", f"CV, CA from step {_HALFWAY}")
     return tabulate("models", header, [(name, *(km(each.mean) for each in scores)) for name, scores in found.items()])
 
 
-def table_choice(found: Mapping[str, Array]) -> Table:
+def table_choice(found: Mapping[str, Array]) -> TextTable:
     """Return how often the likelihood prefers the right model."""
     rows = [(name, *(f"{100.0 * shares[step - 1]:.1f}" for step in _STEPS)) for name, shares in found.items()]
     return tabulate("choice", ("motion", *(f"step {step}" for step in _STEPS)), rows)
 
 
-def table_association(found: Mapping[str, Association]) -> Table:
+def table_association(found: Mapping[str, Association]) -> TextTable:
     """Return the association test."""
     rows = []
     for motion, test in found.items():
@@ -165,7 +152,7 @@ def _size(value: float) -> str:
 
 def table_equations(
     seed: int, drawn: Mapping[str, Draw], matched: Mapping[str, Score], tests: Mapping[str, Association]
-) -> Table:
+) -> TextTable:
     """Return what the printed equations do beside their corrected form."""
     # One row for each equation of the list on the page that can be run.
     rows: list[tuple[str, ...]] = [*_steps_of_a_fix(seed, drawn["static"])]

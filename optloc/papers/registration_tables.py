@@ -31,12 +31,10 @@ from optloc.papers.registration import (
 )
 from optloc.papers.registration_recursion import FIRST
 from optloc.papers.report import (
-    ABSENT,
     Ink,
     Report,
     Size,
     Study,
-    Table,
     Tick,
     canvas,
     explain,
@@ -46,6 +44,7 @@ from optloc.papers.report import (
     tabulate,
     typeset,
 )
+from optloc.show.sheet import ABSENT, TextTable
 from optloc.solvers import solve
 
 if TYPE_CHECKING:
@@ -64,13 +63,13 @@ ACCURACY_FIXED = {
     300: (99.97, 98.42, 99.36, 99.02),
     400: (99.99, 99.29, 99.98, 99.86),
 }
-"""Table 2: accuracy of the four biases at given seconds, per cent."""
+"""TextTable 2: accuracy of the four biases at given seconds, per cent."""
 
 INITIAL = {1: (39.3, 0.0), 5: (37.1, 0.0), 10: (36.7, 0.0), 15: (37.8, 0.0), 20: (38.0, 2.5)}
-"""Table 3: root mean square error in metres and divergence in per cent, for starts n sigma0 wide."""
+"""TextTable 3: root mean square error in metres and divergence in per cent, for starts n sigma0 wide."""
 
 NOISE = {20: (39.3, 36.7, 0.0), 30: (74.6, 73.3, 1.0), 40: (120.6, 110.0, 8.5), 50: (153.6, 146.7, 15.0)}
-"""Table 4: error and bound in metres and divergence in per cent, for a noise labelled in nanoseconds."""
+"""TextTable 4: error and bound in metres and divergence in per cent, for a noise labelled in nanoseconds."""
 
 BOUND = 36.7
 """The bound of table 3, metres."""
@@ -81,7 +80,7 @@ ACCURACY_MOVING = {
     550: (99.14, 99.34, 87.71, 79.19),
     700: (99.92, 99.68, 95.69, 93.08),
 }
-"""Table 5: the same as table 2 for the moving target."""
+"""TextTable 5: the same as table 2 for the moving target."""
 
 ACCURACY_JOINT = {
     150: (99.50, 97.39, 98.17, 96.89, 99.88, 99.97, 99.97, 99.93),
@@ -89,7 +88,7 @@ ACCURACY_JOINT = {
     300: (99.98, 98.04, 98.13, 96.91, 99.98, 99.96, 99.96, 99.96),
     400: (99.94, 99.51, 99.23, 98.69, 99.99, 99.99, 99.98, 99.98),
 }
-"""Table 6: the same with gain ratios, four delays and four gains."""
+"""TextTable 6: the same with gain ratios, four delays and four gains."""
 
 # Figures 1 to 3.
 FIXED = {"5 m": 75.0, "1 m": 39.0}
@@ -213,7 +212,7 @@ def accuracy(error: Array, bias: Array) -> Array:
     return np.asarray(np.maximum(0.0, 100.0 * (1.0 - np.abs(error) / np.abs(bias))))
 
 
-def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]]) -> Table:
+def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]]) -> TextTable:
     """Return a table of bias accuracies at the seconds that the paper prints (its tables 2, 5 and 6).
 
     Parameters
@@ -261,7 +260,7 @@ def _single(score: Score, n: int, exact: Array) -> Array:
     return accuracy(np.sqrt((error**2).mean(0)), exact[n:]) if len(error) else np.zeros(0)
 
 
-def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[str, float]) -> Table:
+def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[str, float]) -> TextTable:
     """Return root mean square errors, bounds and lost trials against time: the numbers behind a figure.
 
     Parameters
@@ -291,7 +290,7 @@ def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[s
 _COMPARED = ("recursion", "optloc", "bound", "recursion lost", "ended at the image", "optloc lost")
 
 
-def table_starts(cases: Sequence[Case]) -> Table:
+def table_starts(cases: Sequence[Case]) -> TextTable:
     """Return table 3: the width of the initial error."""
     lines = []
     for case in cases:
@@ -300,7 +299,7 @@ def table_starts(cases: Sequence[Case]) -> Table:
     return tabulate("table-3", ("n", "printed error", "printed bound", "printed divergence", *_COMPARED), lines)
 
 
-def table_noises(cases: Sequence[Case], sure: Sequence[Score], later: Sequence[float]) -> Table:
+def table_noises(cases: Sequence[Case], sure: Sequence[Score], later: Sequence[float]) -> TextTable:
     """Return table 4: the noise.
 
     Parameters
@@ -380,7 +379,7 @@ def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
 # Tables that the paper lacks: how to read its noise, its second minimum, and a scene that is not degenerate.
 
 
-def table_readings() -> Table:
+def table_readings() -> TextTable:
     """Return the bounds of the fixed target under each reading of the noise, metres."""
     shapes: dict[Shape, str] = {"full": "I + 11'", "half": "(I + 11') / 2", "diag": "I"}
     named = (f"{FIXED['1 m']:.0f}", f"{FIXED['5 m']:.0f}", f"{BOUND:.1f}")
@@ -400,7 +399,7 @@ def _bound(epochs: int, sigma: float, station_sigma: float, shape: Shape) -> flo
     return rms(crlb(made, truth(PRINTED, made)))
 
 
-def table_minima() -> Table:
+def table_minima() -> TextTable:
     """Return the second minimum of the printed scene with a fixed target."""
     lines = []
     for epochs in (40, 100, 200, 300, 600, 700):
@@ -422,7 +421,7 @@ def _chance(share: float) -> str:
     return f"{share:.2g}" if share >= 1e-9 else "< 1e-9"
 
 
-def table_gains() -> Table:
+def table_gains() -> TextTable:
     """Return what gain ratios of growing accuracy add to the bound of the fixed target."""
     lines = []
     for sigma in (None, _GAIN, 0.1 * _GAIN, 0.01 * _GAIN, 0.001 * _GAIN):
@@ -431,7 +430,7 @@ def table_gains() -> Table:
     return tabulate("gains", ("standard deviation of a ratio", "bound, m"), lines)
 
 
-def table_scenes(cases: Mapping[str, Case]) -> Table:
+def table_scenes(cases: Mapping[str, Case]) -> TextTable:
     """Return what the printed stations and those that span space make of the same target."""
     lines = []
     for (name, case), scenario in zip(cases.items(), (PRINTED, SPATIAL), strict=True):
@@ -572,7 +571,7 @@ def _starts(setting: Setting, epochs: int, tick: Tick) -> list[Case]:
     return cases
 
 
-def _noises(settings: Sequence[Setting], epochs: int, tick: Tick) -> Table:
+def _noises(settings: Sequence[Setting], epochs: int, tick: Tick) -> TextTable:
     """Return table 4, whose labels are 10 ns too large; the recursion is started at the truth itself as well."""
     cases: list[Case] = []
     sure: list[Score] = []

@@ -21,13 +21,15 @@ from functools import partial
 from importlib import import_module
 from importlib.metadata import version
 from importlib.resources import files
-from math import floor, isfinite, log10, nan
+from math import floor, isfinite, log10
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import make_folder, together, write_text, written
+from optloc.show.drawing import Picture
+from optloc.show.sheet import ABSENT, TextTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,78 +44,6 @@ Size = Literal["quick", "full"]
 """How much is drawn."""
 
 
-ABSENT = "–"
-"""What stands for a number that there is not: of a smaller sample, or of a trial that is lost."""
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A table of text cells.
-
-    Parameters
-    ----------
-    name : str
-        Name of its files.
-    title : str
-        What it shows.
-    header : tuple of str
-        One name for each column.
-    rows : tuple of tuple of str
-        Cells.
-    note : str
-        How to read it.
-    """
-
-    name: str
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-
-    def markdown(self) -> str:
-        """Return the table with its note."""
-        rule = ("---", *["---:"] * (len(self.header) - 1))
-        lines = ["| " + " | ".join(cells) + " |" for cells in (self.header, rule, *self.rows)]
-        return "\n".join(lines) + (f"\n\n{self.note}" if self.note else "")
-
-    def cell(self, *place: str) -> str:
-        """Return the cell of a row, named by its first cells, and a column; a dash where a sample was too small for it.
-
-        Parameters
-        ----------
-        *place : str
-            First cells of the row, then the name of the column.
-        """
-        *row, column = place
-        # The first that fits: rows are told apart by as many cells as the page cares to name.
-        found = next((cells for cells in self.rows if list(cells[: len(row)]) == row), None)
-        return ABSENT if found is None or column not in self.header else found[self.header.index(column)]
-
-    def value(self, *place: str, part: int = 0) -> float:
-        """Return a number of such a cell, the first by default; NaN where there is none."""
-        found = re.findall(r"-?\d+\.?\d*(?:e[-+]?\d+)?", self.cell(*place))
-        return float(found[part]) if part < len(found) else nan
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A figure and what it shows.
-
-    Parameters
-    ----------
-    name : str
-        Name of its file.
-    title : str
-        What it shows.
-    figure : matplotlib.figure.Figure
-        The drawing.
-    """
-
-    name: str
-    title: str
-    figure: Figure
-
-
 @dataclass(frozen=True, slots=True)
 class Report:
     """A reproduced paper.
@@ -122,14 +52,14 @@ class Report:
     ----------
     page : str
         The whole page in Markdown.
-    tables : tuple of Table
+    tables : tuple of TextTable
         With the titles and notes that they have on the page.
     pictures : tuple of Picture
         The figures that the page shows.
     """
 
     page: str
-    tables: tuple[Table, ...]
+    tables: tuple[TextTable, ...]
     pictures: tuple[Picture, ...]
 
     def markdown(self) -> str:
@@ -186,12 +116,12 @@ class Study(Generic[S]):
 # The page: a Markdown template whose numbers are cells of the tables.
 
 
-def tabulate(name: str, header: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
+def tabulate(name: str, header: Iterable[str], rows: Iterable[tuple[str, ...]]) -> TextTable:
     """Return a table whose title and note stand on the page of its paper."""
-    return Table(name, "", tuple(header), tuple(rows))
+    return TextTable(name, "", tuple(header), tuple(rows))
 
 
-def typeset(name: str, sample: object, seed: int, tables: Sequence[Table], figures: Mapping[str, Figure]) -> Report:
+def typeset(name: str, sample: object, seed: int, tables: Sequence[TextTable], figures: Mapping[str, Figure]) -> Report:
     """Return the report of a paper: its page filled from the tables, and what the page says of each of them.
 
     Parameters
@@ -202,7 +132,7 @@ def typeset(name: str, sample: object, seed: int, tables: Sequence[Table], figur
         How much was drawn.
     seed : int
         What decided the draws.
-    tables : sequence of Table
+    tables : sequence of TextTable
         Everything that the page quotes.
     figures : mapping of str to matplotlib.figure.Figure
         By the names that the page gives to their files.
@@ -217,14 +147,14 @@ def typeset(name: str, sample: object, seed: int, tables: Sequence[Table], figur
     return Report(page, tuple(_entitle(each, page) for each in tables), tuple(pictures))
 
 
-def render(name: str, tables: Mapping[str, Table], *, made: str, seed: int, sample: object) -> str:
+def render(name: str, tables: Mapping[str, TextTable], *, made: str, seed: int, sample: object) -> str:
     """Return the page of a paper, filled from tables.
 
     Parameters
     ----------
     name : str
         The paper.
-    tables : mapping of str to Table
+    tables : mapping of str to TextTable
         By name.
     made : str
         Program and day.
@@ -270,7 +200,7 @@ def digits(number: float, count: int = 3) -> str:
     return f"{rounded:.{max(count - 1 - floor(log10(abs(rounded))), 0)}f}"
 
 
-def _entitle(table: Table, page: str) -> Table:
+def _entitle(table: TextTable, page: str) -> TextTable:
     """Return a table with the heading above it and the text below it on a page."""
     before, _, after = page.partition(table.markdown())
     title = before.rpartition("\n## ")[2].partition("\n")[0]

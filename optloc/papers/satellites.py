@@ -18,25 +18,12 @@ from optloc.base.units import SPEED_OF_LIGHT
 from optloc.bounds.crlb import crlb
 from optloc.linear.constraints import height as known_height
 from optloc.linear.simulate import simulate
-from optloc.papers.report import (
-    ABSENT,
-    Ink,
-    Report,
-    Size,
-    Study,
-    Table,
-    Tick,
-    canvas,
-    explain,
-    label,
-    scale,
-    tabulate,
-    typeset,
-)
+from optloc.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, scale, tabulate, typeset
 from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
+from optloc.show.sheet import ABSENT, TextTable
 from optloc.solvers import solve
 from optloc.tracking.constants import begun_with_constants, followed_with_constants
 from optloc.tracking.dynamics import Dynamics, polynomial
@@ -344,7 +331,7 @@ def metres(value: float) -> str:
     return f"{value:.1f}" if value < 1e3 else f"{value:.0f}"
 
 
-def table_fixed(found: Mapping[str, Run], bound: Array) -> Table:
+def table_fixed(found: Mapping[str, Run], bound: Array) -> TextTable:
     """Return the filters started by fixes; the bound is (steps,), metres."""
     steps = [step for step in _STEPS if step <= len(bound)]
     plain = found["ekf"].position
@@ -359,7 +346,7 @@ def table_fixed(found: Mapping[str, Run], bound: Array) -> Table:
     return tabulate("fixed", header, lines)
 
 
-def table_relative(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Table:
+def table_relative(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> TextTable:
     """Return what the paper's figure shows, in its unit: mean errors over 100 km, by start and filter."""
     longest = max(len(bound) for _, bound in panels.values())
     steps = [step for step in _STEPS if step <= longest]
@@ -373,7 +360,7 @@ def table_relative(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Tab
     return tabulate("relative", ("start", "filter", *(f"step {step}" for step in steps)), lines)
 
 
-def table_starts(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Table:
+def table_starts(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> TextTable:
     """Return the filters after starts that are far off, by the standard deviation of each coordinate, metres."""
     lines = []
     for width, (runs, bound) in found.items():
@@ -386,7 +373,7 @@ def table_starts(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Tabl
     return tabulate("starts", header, lines)
 
 
-def table_pairs(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Table:
+def table_pairs(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> TextTable:
     """Return in how many runs the modified covariance did better than its rivals at the end."""
     lines = []
     for width, (runs, _) in found.items():
@@ -396,7 +383,7 @@ def table_pairs(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Table
     return tabulate("pairs", ("start error", "better than EKF", "better than IEKF", "better than MGEKF"), lines)
 
 
-def table_heights(found: Mapping[str, Run]) -> Table:
+def table_heights(found: Mapping[str, Run]) -> TextTable:
     """Return errors and claims of the IEKF from fixes, by what is known of the height."""
     steps = [step for step in _STEPS_HEIGHT if step <= len(next(iter(found.values())).rms)]
     lines = [
@@ -406,7 +393,7 @@ def table_heights(found: Mapping[str, Run]) -> Table:
     return tabulate("heights", ("height", *(f"step {step}: rms (claimed), m" for step in steps)), lines)
 
 
-def table_moving(found: Mapping[str, tuple[Run, Array]], still: Array) -> Table:
+def table_moving(found: Mapping[str, tuple[Run, Array]], still: Array) -> TextTable:
     """Return errors and bounds with satellites that fly, by heading, beside the bound (steps,) of those that stay."""
     steps = [step for step in _STEPS_MOVING if step <= len(still)]
     lines = [("as printed: they stay", *(f"{ABSENT} ({metres(still[s - 1])})" for s in steps))]
@@ -419,7 +406,7 @@ def table_moving(found: Mapping[str, tuple[Run, Array]], still: Array) -> Table:
 _AWAY = (0.0, 5.0, 10.0, 20.0, 25.0)
 
 
-def table_one_shot() -> Table:
+def table_one_shot() -> TextTable:
     """Return the bounds of a single fix: by what is known, and by distance from the point below the satellites."""
     cases = {
         "50 ns each, height 500 m": problem(1, order=0),

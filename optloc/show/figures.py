@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from html import escape
-from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.papers.report import Picture
-from optloc.show.pictures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, literal
+from optloc.show.drawing import SIZE, Looks, Mark, Picture, panel, panels, with_legend
+from optloc.show.pictures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, literal
 from optloc.study.histories import COUNTS, Histories, band
 from optloc.study.profiles import WORK, Profiles
 from optloc.study.summary import accuracy_rows, distribution, noise_text, wilson
@@ -23,108 +19,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-# How methods look in every figure of a report: a colour, a mark and a dash each, told apart without colour too.
-
-# Colours and marks together repeat after 24 methods, and then the dashes differ: 96 methods look different. Dashes
-# change every second method, and once more where the colours begin again.
-_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW, BLACK, GREY)
-_MARKS = "osD^vP*X<>hp"
-_DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """The look of a method.
-
-    Parameters
-    ----------
-    number : int
-        Of the method, in the order of the report.
-    name : str
-        The method.
-    colour, mark : str
-        As matplotlib takes them.
-    dash : str or tuple
-        Line style of matplotlib.
-    """
-
-    number: int
-    name: str
-    colour: str
-    mark: str
-    dash: str | tuple[float, tuple[float, ...]]
-
-    @property
-    def dashes(self) -> str:
-        """Return its dashes as SVG has them, at twice the size of a figure; empty of a whole line."""
-        return "" if isinstance(self.dash, str) else " ".join(f"{2 * length:g}" for length in self.dash[1])
-
-    @property
-    def line(self) -> str:
-        """Return the identity of the method's lines in SVG, by which a page finds them."""
-        return f"method-{self.number}"
-
-
-def marks(methods: list[str]) -> dict[str, Mark]:
-    """Return the look of every method."""
-    return {
-        name: Mark(i, name, _COLOURS[i % len(_COLOURS)], _MARKS[i % len(_MARKS)], _DASHES[(i // 2 + i // 8) % 4])
-        for i, name in enumerate(methods)
-    }
-
-
-Looks = dict[str, Mark]
-
 # Noise levels of one panel, which share a method's row.
 _LEVELS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (BLACK, "v"), (GREY, "P"))
 # Panels of distributions at most: with more, one panel shows all noise levels of its case.
 _MOST = 12
 # Least cost above the best that is drawn: below it is what rounding leaves.
 _LEAST = 1e-6
-# Inches, with texts of 8 to 10 points: two panels beside each other on a desk, one on a phone, and both can be read.
-_SIZE = (5.2, 3.5)
-# Letters of a name with which only two columns of a legend fit the width of a figure; inches of one of its lines.
-_WIDE, _LEGEND_LINE = 22, 0.16
 # Points of a curve with steps: two for each pixel of a panel.
 _FINE = 480
 # Ranges of logarithmic axes: errors in units of the bound, costs above the best. Beyond them all is equally bad.
 _FARTHEST, _DEAREST = 1e4, 1e8
-
-
-def panel(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Axes]:
-    """Return an empty figure of one panel with a grid."""
-    figure, (axes,) = panels("", 1, size)
-    if title:
-        axes.set_title(literal(title), fontsize=10)
-    return figure, axes
-
-
-def panels(title: str, count: int, size: tuple[float, float] = _SIZE) -> tuple[Figure, list[Axes]]:
-    """Return an empty figure of panels with grids side by side."""
-    figure = figure_class()(figsize=(count * size[0], size[1]), layout="constrained")
-    made = figure.subplots(1, count, squeeze=False).ravel().tolist()
-    for axes in made:
-        axes.grid(color=GREY, alpha=0.3, linewidth=0.6)
-        axes.set_axisbelow(True)
-    if title:
-        figure.suptitle(literal(title), fontsize=10)
-    return figure, made
-
-
-def with_legend(figure: Figure) -> Figure:
-    """Return a figure with a legend of the methods of all its panels below them."""
-    shown: dict[str, Any] = {}
-    for axes in figure.axes:
-        handles, labels = axes.get_legend_handles_labels()
-        shown |= dict(zip(labels, handles, strict=True))
-    # Names of 22 letters leave room for two columns a panel, shorter ones for three.
-    columns = len(figure.axes) * (2 if max(map(len, shown), default=0) > _WIDE else 3)
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
-    width, height = figure.get_size_inches()
-    figure.set_size_inches(width, height + _LEGEND_LINE * -(-len(shown) // columns))
-    figure.set_layout_engine("constrained")
-    return figure
 
 
 def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
@@ -136,7 +40,7 @@ def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         # high at least, so that names of eight points do not touch.
         step = min(0.24, 0.8 / len(levels))
         height = 1.35 + len(names) * max(0.26, 0.12 * len(levels))
-        figure, axes = panel(str(case), (_SIZE[0], height))
+        figure, axes = panel(str(case), (SIZE[0], height))
         for i, level in enumerate(levels):
             some = part[part["noise_label"] == level].set_index("method").reindex(names)
             right, trials = some["right"].to_numpy(dtype=float), some["trials"].to_numpy(dtype=float)
@@ -394,51 +298,3 @@ def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         axes.set_xlabel("measurements of a trial")
         axes.set_ylabel("time of a fix (s)")
         yield Picture(f"time-{number + 1}", f"Time of a fix against its size: {kinds}", figure)
-
-
-# Figures of matplotlib as SVG that stands in the text of a page.
-
-_IDENTITY = re.compile(r'\bid="([^"]*)"')
-_METHOD = re.compile(r'<g id="(method-\d+)"')
-
-
-def svg_text(figure: Figure) -> str:
-    """Return a figure as an SVG file, with text as text and equal bytes for equal figures."""
-    from matplotlib import rc_context
-
-    text = StringIO()
-    # Text stays text, to be found and read aloud; the salt makes identities depend on the figure alone.
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "optloc"}):
-        figure.savefig(text, format="svg", metadata={"Date": None})
-    figure.set_layout_engine("none")  # what is drawn again stays where it is: to find the place takes as long
-    return text.getvalue()
-
-
-@dataclass(frozen=True, slots=True)
-class Drawing:
-    """A figure as SVG that stands in the text of a page, and its name."""
-
-    name: str
-    svg: str
-
-
-def inline(picture: Picture) -> Drawing:
-    """Return a figure as an element of a page.
-
-    Identities are made unique by the name of the figure, lines of methods get a class, and the width is that of the
-    place where it stands.
-    """
-    name, text = picture.name, svg_text(picture.figure)
-    text = text[text.index("<svg") :]
-    # Every figure would bring its own: who made it, and when.
-    text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = _METHOD.sub(r'<g class="\1"', text)
-    # Identities of one page must differ, and matplotlib gives equal ones to equal shapes of two figures.
-    known = set(_IDENTITY.findall(text))
-    text = _IDENTITY.sub(lambda m: f'id="{name}-{m[1]}"', text)
-    text = re.sub(r"url\(#([^)]*)\)", lambda m: f"url(#{name}-{m[1]})", text)
-    text = re.sub(r'href="#([^"]*)"', lambda m: f'href="#{name}-{m[1]}"' if m[1] in known else m[0], text)
-    opening, rest = text.split(">", 1)
-    opening = re.sub(r'\s(width|height)="[^"]*"', "", opening)
-    opening = re.sub(r"\s+", " ", opening)
-    return Drawing(name, f'{opening} role="img" aria-label="{escape(picture.title)}">{rest}')

@@ -22,7 +22,7 @@ from optloc.bounds.bound_map import BoundMap
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import UNCHECKED
-from optloc.show.figures import Drawing, Mark
+from optloc.show.drawing import Drawing, Mark
 from optloc.show.map import (
     Canvas,
     Curve,
@@ -42,7 +42,7 @@ from optloc.show.map import (
 )
 from optloc.show.pictures.bound_map import COLOURS, isolines, levels
 from optloc.show.pictures.style import BLACK, BLUE, ORANGE
-from optloc.show.sheets import Sheet
+from optloc.show.sheet import Sheet
 
 if TYPE_CHECKING:
     from jinja2 import Environment

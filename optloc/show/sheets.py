@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.papers.report import Table
+from optloc.show.sheet import Sheet, TextTable
 from optloc.study.profiles import RATIOS, Profiles, shares
 from optloc.study.summary import PROVEN, by_status, clopper_pearson, noise_text, ranking, wilson
 
@@ -19,25 +18,6 @@ if TYPE_CHECKING:
 
 SHIFT = 1e-5
 """Shift of geometric means of times, seconds: the time of a fast fix, below which faster counts for little."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sheet:
-    """A table twice.
-
-    Parameters
-    ----------
-    frame : DataFrame
-        Plain numbers in SI units, as CSV.
-    shown : Table
-        The same as text, as HTML and LaTeX.
-    words : int
-        How many columns at the left are words.
-    """
-
-    frame: pd.DataFrame
-    shown: Table
-    words: int = 1
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -90,7 +70,7 @@ Column = tuple[str, Callable[[Any], str]]
 
 def _sheet(name: str, title: str, note: str, frame: pd.DataFrame, columns: list[Column], words: int) -> Sheet:
     rows = tuple(tuple(show(row) for _, show in columns) for row in frame.itertuples(index=False))
-    return Sheet(frame, Table(name, title, tuple(head for head, _ in columns), rows, note), words)
+    return Sheet(frame, TextTable(name, title, tuple(head for head, _ in columns), rows, note), words)
 
 
 def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
@@ -340,12 +320,12 @@ def latex_text(text: str) -> str:
     return "".join(out)
 
 
-def latex(table: Table, words: int = 1) -> str:
+def latex(table: TextTable, words: int = 1) -> str:
     """Return a table that breaks across pages; it needs the packages booktabs and longtable.
 
     Parameters
     ----------
-    table : Table
+    table : TextTable
         Text cells.
     words : int
         How many columns at the left are words; the others stand to the right.

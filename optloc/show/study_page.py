@@ -15,14 +15,14 @@ from optloc.base.outputs import claim, make_folder, together, write_text, writte
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
 from optloc.files.writer import harmless_column
-from optloc.papers.report import Picture
 from optloc.show import figures as drawn
-from optloc.show.figures import Drawing, Mark, inline, marks, svg_text, with_legend
+from optloc.show.drawing import Drawing, Mark, Picture, inline, marks, svg_text, with_legend
 from optloc.show.map import Canvas
 from optloc.show.page import Part, map_element, write_page
 from optloc.show.pictures.bound_map import plot_bound_map
 from optloc.show.pictures.style import figure_class
-from optloc.show.sheets import Sheet, latex, sheets
+from optloc.show.sheet import Sheet
+from optloc.show.sheets import latex, sheets
 from optloc.study import summary
 from optloc.study.design import StudyDesign
 from optloc.study.draws import Case, draw

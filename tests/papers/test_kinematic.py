@@ -32,8 +32,9 @@ from optloc.papers.kinematic import (
     weighting,
 )
 from optloc.papers.kinematic_tables import km
-from optloc.papers.report import ABSENT, Study
+from optloc.papers.report import Study
 from optloc.problem.epochs import cut
+from optloc.show.sheet import ABSENT
 
 RUN = CliRunner()
 SCENE = Scenario()

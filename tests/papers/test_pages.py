@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from optloc.papers import PAPERS
-from optloc.papers.report import ABSENT, Table, digits, render, typeset
+from optloc.papers.report import digits, render, typeset
+from optloc.show.sheet import ABSENT, TextTable
 
 DOCS = Path(__file__).parents[2] / "docs" / "papers"
 # The size in which the committed page of each paper was drawn.
@@ -24,7 +25,7 @@ def committed(name):
     for path in sorted((DOCS / name).glob("*.csv")):
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = (tuple(row) for row in csv.reader(file))
-        found[path.stem] = Table(path.stem, "", header, tuple(rows))
+        found[path.stem] = TextTable(path.stem, "", header, tuple(rows))
     return found
 
 
@@ -34,7 +35,7 @@ def sample_of(name):
 
 @pytest.mark.parametrize("name", PAPERS)
 def test_a_committed_page_is_its_tables_and_every_cell_that_it_names_is_there(name, monkeypatch):
-    page, cell, missing = DOCS / name / "README.md", Table.cell, []
+    page, cell, missing = DOCS / name / "README.md", TextTable.cell, []
 
     def watch(self, *place):
         found = cell(self, *place)
@@ -42,7 +43,7 @@ def test_a_committed_page_is_its_tables_and_every_cell_that_it_names_is_there(na
             missing.append((self.name, *place))
         return found
 
-    monkeypatch.setattr(Table, "cell", watch)
+    monkeypatch.setattr(TextTable, "cell", watch)
     made = page.read_text(encoding="utf-8").splitlines()[2].split(", seed")[0]
     fresh = render(name, committed(name), made=made, seed=1, sample=sample_of(name))
     assert missing == []
@@ -64,7 +65,7 @@ def test_prose_follows_the_tables():
     tables = committed("bistatic")
     slow = tables["slow"]
     rows = tuple((*row[:2], "0.300", *row[3:]) if row[0] == "line fit" else row for row in slow.rows)
-    changed = {**tables, "slow": Table("slow", "", slow.header, rows)}
+    changed = {**tables, "slow": TextTable("slow", "", slow.header, rows)}
     page = render("bistatic", changed, made="", seed=1, sample=sample_of("bistatic"))
     assert "the line fit is 4.0 times better than the recursion, 0.300 km" in " ".join(page.split())
 
@@ -79,7 +80,7 @@ def test_titles_and_notes_are_those_of_the_page():
 
 
 def test_cells_are_named_by_their_row_and_column():
-    table = Table("t", "", ("a", "b", "c"), (("1", "x", "< 2.5 m"), ("1", "y", "3e-05 (4.1)")))
+    table = TextTable("t", "", ("a", "b", "c"), (("1", "x", "< 2.5 m"), ("1", "y", "3e-05 (4.1)")))
     assert table.cell("1", "x", "c") == "< 2.5 m"
     assert table.value("1", "x", "c") == 2.5
     assert (table.value("1", "y", "c"), table.value("1", "y", "c", part=1)) == (3e-5, 4.1)

@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.papers.report import Table
 from optloc.show import write_report
-from optloc.show.figures import marks as looks_of
-from optloc.show.figures import panel, svg_text
+from optloc.show.drawing import marks as looks_of
+from optloc.show.drawing import panel, svg_text
 from optloc.show.map import Canvas, Curve, Label
 from optloc.show.page import Part, write_page
-from optloc.show.sheets import Sheet, duration, latex, number, percent
+from optloc.show.sheet import Sheet, TextTable
+from optloc.show.sheets import duration, latex, number, percent
 from optloc.study.design import design_of
 from optloc.study.execute import executor, run_design
 from optloc.study.folder import begin, read_frame
@@ -137,7 +137,7 @@ def test_every_text_of_a_page_is_escaped():
     bad = "\"'><script>alert(1)</script>{{ 7 * 7 }}</pre>"
     marks = [Curve("dot", "M0 0h0", tell=bad), Label("name", 0.0, 0.0, bad)]
     canvas = Canvas("map-1", bad, {"stations": marks}, bad, "0 0 1 1", "", {"text": bad})
-    sheet = Sheet(None, Table("t", bad, (bad,), ((bad,),), bad))
+    sheet = Sheet(None, TextTable("t", bad, (bad,), ((bad,),), bad))
     part = Part("p", bad, bad, tables=[sheet], maps=[canvas], headings=True, folded=[sheet], source=bad, note=bad)
     page = write_page(bad, [part, part], opening=[bad], facts=bad, methods=looks_of([bad]).values())
     assert "<script>alert" not in page
@@ -296,7 +296,7 @@ def test_numbers_are_short_and_honest():
 
 
 def test_latex_escapes_and_has_all_columns():
-    table = Table("t", "A & B", ("method", "time"), (("a_b <c>", "2·10⁻⁷ s"), ("50 %", "3 µs")), "≤ 5 %")
+    table = TextTable("t", "A & B", ("method", "time"), (("a_b <c>", "2·10⁻⁷ s"), ("50 %", "3 µs")), "≤ 5 %")
     text = latex(table)
     assert r"a\_b \ensuremath{<}c\ensuremath{>} & 2\ensuremath{\cdot}10\ensuremath{^{-7}} s \\" in text
     assert r"50 \% & 3 \ensuremath{\mu}s \\" in text

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.show.figures import history_picture, marks, profile_picture
+from optloc.show.drawing import marks
+from optloc.show.figures import history_picture, profile_picture
 from optloc.show.pictures.style import save
 from optloc.solvers.methods import counting
 from optloc.study.baselines import BASELINES, Baseline, start_of, whiten_one
