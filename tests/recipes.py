@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from optloc import FORMULATIONS, LOSSES, MODELS, SOLVERS
-from optloc.study.baselines import BASELINES
+from optloc.lab.study.baselines import BASELINES
 from optloc.tracking import UPDATES
 
 PAGE = Path(__file__).parents[1] / "docs" / "contributing.md"

@@ -21,7 +21,7 @@ from optloc.base.inputs import Budget, access, budget_of, files_read, json_of, r
 from optloc.cli import app
 from optloc.files import table as tables
 from optloc.files.reader import read
-from optloc.study.design import design_of
+from optloc.lab.study.design import design_of
 
 RUN = CliRunner()
 ROWS = HEAD + '[[measurements]]\nkind = "tdoa"\nsigma = 1.0\n'

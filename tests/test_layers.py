@@ -32,7 +32,7 @@ LAYERS = (
 )
 LAYER = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms.split()}
 USERS_OF_FORMULATIONS = {"solvers", "placement", "calibration"}
-BASELINES = {"optloc.study.baselines"}
+BASELINES = {"optloc.lab.study.baselines"}
 # clarabel: the back end of cvxpy, whose data a warm solve updates directly
 GROUND = {"numpy", "scipy", "cvxpy", "casadi", "clarabel", "formulations"} | sys.stdlib_module_names
 

@@ -27,9 +27,9 @@ from cases import CASES
 
 from optloc import Stations, assemble, measured, simulate
 from optloc.files import read
-from optloc.study.draws import draw
-from optloc.study.networks import NetworkCase
-from optloc.study.design import design_of, design_of_text, shipped
+from optloc.lab.study.draws import draw
+from optloc.lab.study.networks import NetworkCase
+from optloc.lab.study.design import design_of, design_of_text, shipped
 
 
 def note(name, *data):

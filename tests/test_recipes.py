@@ -21,9 +21,9 @@ from optloc import MODELS, InvalidProblem, Motion, Status, solve
 from optloc.cli import app
 from optloc.kernels.sums import equations_at
 from optloc.kernels.trace import evaluate, trace
+from optloc.lab.study.trial import compute
 from optloc.linear.evaluate import block_links, given
 from optloc.linear.normal import linearise
-from optloc.study.trial import compute
 from optloc.tracking import collected, polynomial, tracked
 
 TRIALS = 200

@@ -16,11 +16,11 @@ from optloc.base.errors import InvalidProblem
 from optloc.files.reader import read
 from optloc.files.schema import ProblemFile
 from optloc.files.writer import toml_text
+from optloc.lab.study.design import design_of
+from optloc.lab.study.document import StudyFile
+from optloc.lab.study.methods import SETTINGS
+from optloc.lab.study.trial import compute
 from optloc.solvers import solve
-from optloc.study.design import design_of
-from optloc.study.document import StudyFile
-from optloc.study.methods import SETTINGS
-from optloc.study.trial import compute
 
 ROW = {"a": "A", "z": 5000.0}
 STATIONS = [{"name": name, "x": x, "y": y} for name, x, y in (("A", 0.0, 0.0), ("B", 9e3, 1e3), ("C", 2e3, 8e3))]

@@ -125,8 +125,8 @@ def _kinds() -> Rows:
 
 
 def _solvers() -> Rows:
+    from optloc.lab.study.methods import backends
     from optloc.solvers.methods import SOLVERS
-    from optloc.study.methods import backends
 
     # Back ends of the relaxations are found at run time: those of packages that are installed.
     found = {
@@ -139,7 +139,7 @@ def _solvers() -> Rows:
 def _studies() -> Rows:
     import tomllib
 
-    from optloc.study.design import shipped
+    from optloc.lab.study.design import shipped
 
     texts = {name: tomllib.loads(entry.read_text(encoding="utf-8")) for name, entry in shipped().items()}
     return [{"study": name, "summary": data.get("title", data["name"])} for name, data in texts.items()]
@@ -169,9 +169,9 @@ LISTS: dict[str, Callable[[], Rows]] = {
     "losses": _registry("loss", "optloc:LOSSES"),
     "trackers": _registry("tracker", "optloc.tracking:UPDATES"),
     "motions": _registry("motion", "optloc.cli.track:MOTIONS"),
-    "baselines": _registry("baseline", "optloc.study.baselines:BASELINES"),
+    "baselines": _registry("baseline", "optloc.lab.study.baselines:BASELINES"),
     "formats": _registry("format", "optloc.show.formats:FORMATS"),
-    "executors": _registry("executor", "optloc.study.execute:EXECUTORS"),
+    "executors": _registry("executor", "optloc.lab.study.execute:EXECUTORS"),
     "studies": _studies,
     "papers": _registry("paper", "optloc.papers:PAPERS"),
     "datasets": _datasets,

@@ -137,9 +137,9 @@ def _track(asked: Asked) -> None:
 
 def _accuracy(asked: Asked) -> None:
     """Errors of a study's methods against the bound."""
+    from optloc.lab.study import summary
+    from optloc.lab.study.folder import read_frame
     from optloc.show.pictures import plot_accuracy
-    from optloc.study import summary
-    from optloc.study.folder import read_frame
 
     if not asked.file.is_dir():
         raise InvalidProblem("the errors of methods are those of a study", str(asked.file), "name its output folder")

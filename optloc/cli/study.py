@@ -103,10 +103,10 @@ def run(
 ) -> None:
     """Run a study, or go on with one that was stopped: finished parts are kept, and new methods run alone."""
     from optloc.base.registry import load_plugin
-    from optloc.study.design import design_of
-    from optloc.study.execute import executor as chosen
-    from optloc.study.execute import run_design
-    from optloc.study.methods import added
+    from optloc.lab.study.design import design_of
+    from optloc.lab.study.execute import executor as chosen
+    from optloc.lab.study.execute import run_design
+    from optloc.lab.study.methods import added
 
     for name in plugin or ():
         load_plugin(name)
@@ -131,7 +131,7 @@ def run(
 @study.command(epilog=example("optloc study status runs/my"))
 def status(folder: Folder, as_json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Say how far a study is, and what its methods answered. Exit code 1 while something is left to do."""
-    from optloc.study.folder import progress
+    from optloc.lab.study.folder import progress
 
     found = progress(folder)
     if as_json:
@@ -176,7 +176,7 @@ def compare(
     """Set two studies side by side, cell by cell. Exit code 1 where a share of answers differs by 3 sigma."""
     from dataclasses import asdict
 
-    from optloc.study.summary import compared
+    from optloc.lab.study.summary import compared
 
     found = compared(one, two)
     if as_json:
@@ -207,11 +207,11 @@ def bench(
     """Solve the public test set by a few methods and yours, and write who is right how often as a page."""
     from optloc.base.registry import load_plugin
     from optloc.cli.output import write_text
-    from optloc.study.design import design_of
-    from optloc.study.execute import executor, run_design
-    from optloc.study.leaderboard import SET
-    from optloc.study.leaderboard import page as made
-    from optloc.study.methods import added
+    from optloc.lab.study.design import design_of
+    from optloc.lab.study.execute import executor, run_design
+    from optloc.lab.study.leaderboard import SET
+    from optloc.lab.study.leaderboard import page as made
+    from optloc.lab.study.methods import added
 
     claim(page)
     for name in plugin or ():
@@ -236,9 +236,9 @@ def pairs(
     """Compare methods on the same trials: who alone is right, differences of errors and times, with 95 % intervals."""
     from dataclasses import asdict
 
-    from optloc.study.folder import read_frame, read_manifest
-    from optloc.study.paired import paired
-    from optloc.study.summary import COLUMNS, judged
+    from optloc.lab.study.folder import read_frame, read_manifest
+    from optloc.lab.study.paired import paired
+    from optloc.lab.study.summary import COLUMNS, judged
 
     first = next(iter(read_manifest(folder).methods.values()), "")
     found = paired(judged(read_frame(folder, COLUMNS)), first if against is None else against)
@@ -272,9 +272,9 @@ def profiles(
 ) -> None:
     """Say which share of the trials each method solves, within how much work: data and performance profiles."""
     from optloc.cli.output import claim_outputs, write_picture
-    from optloc.study import summary
-    from optloc.study.folder import design_of_manifest, read_frame, read_manifest, references
-    from optloc.study.profiles import profiles as profiled
+    from optloc.lab.study import summary
+    from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest, references
+    from optloc.lab.study.profiles import profiles as profiled
 
     claim_outputs(picture=plot)
     frame = read_frame(folder, summary.COLUMNS)
@@ -329,8 +329,8 @@ def histories(
     """Follow methods on their way down: the cost against evaluations of it and against iterations."""
     from optloc.base.registry import load_plugin
     from optloc.cli.output import claim_outputs, write_picture, write_table
-    from optloc.study.histories import histories as followed
-    from optloc.study.histories import question, reach
+    from optloc.lab.study.histories import histories as followed
+    from optloc.lab.study.histories import question, reach
 
     claim_outputs(table=out, picture=plot, inputs=[] if place.is_dir() else [place])
     for name in plugin or ():
@@ -356,7 +356,7 @@ def histories(
 @study.command(epilog=example("optloc study schema > study.schema.json"))
 def schema(verbose: Verbose = False) -> None:
     """Print the JSON schema of study files."""
-    from optloc.study.document import study_schema
+    from optloc.lab.study.document import study_schema
 
     _print_json(study_schema())
 
@@ -473,7 +473,7 @@ def _show_pairs(found: list[Any], console: Console) -> None:
 def _profile_record(found: Any) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from optloc.study.profiles import RATIOS, shares
+    from optloc.lab.study.profiles import RATIOS, shares
 
     budgets = found.budgets
     return {
@@ -492,8 +492,8 @@ def _profile_record(found: Any) -> dict[str, Any]:
 
 
 def _show_profiles(found: Any, console: Console) -> None:
+    from optloc.lab.study.profiles import RATIOS, shares
     from optloc.show.sheets import duration, number, percent, solved_within
-    from optloc.study.profiles import RATIOS, shares
 
     table = Table("method")
     for name in ("trials", "solved, %", *(f"{ratio:g}×" for ratio in RATIOS), "median"):

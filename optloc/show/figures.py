@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.base.types import Array
+from optloc.lab.study.histories import COUNTS, Histories, band
+from optloc.lab.study.profiles import WORK, Profiles
+from optloc.lab.study.summary import accuracy_rows, distribution, noise_text, wilson
 from optloc.show.drawing import SIZE, Looks, Mark, Picture, panel, panels, with_legend
 from optloc.show.pictures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, literal
-from optloc.study.histories import COUNTS, Histories, band
-from optloc.study.profiles import WORK, Profiles
-from optloc.study.summary import accuracy_rows, distribution, noise_text, wilson
 
 if TYPE_CHECKING:
     import pandas as pd

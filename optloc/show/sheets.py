@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optloc.lab.study.profiles import RATIOS, Profiles, shares
+from optloc.lab.study.summary import PROVEN, by_status, clopper_pearson, noise_text, ranking, wilson
 from optloc.show.sheet import Sheet, TextTable
-from optloc.study.profiles import RATIOS, Profiles, shares
-from optloc.study.summary import PROVEN, by_status, clopper_pearson, noise_text, ranking, wilson
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,6 +15,13 @@ from optloc.base.outputs import claim, make_folder, together, write_text, writte
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
 from optloc.files.writer import harmless_column
+from optloc.lab.study import summary
+from optloc.lab.study.design import StudyDesign
+from optloc.lab.study.draws import Case, draw
+from optloc.lab.study.folder import Manifest, design_of_manifest, read_frame, read_manifest, references
+from optloc.lab.study.networks import NetworkCase
+from optloc.lab.study.profiles import Profiles, profiles
+from optloc.lab.study.summary import case_label, noise_text
 from optloc.show import figures as drawn
 from optloc.show.drawing import Drawing, Mark, Picture, inline, marks, svg_text, with_legend
 from optloc.show.map import Canvas
@@ -23,13 +30,6 @@ from optloc.show.pictures.bound_map import plot_bound_map
 from optloc.show.pictures.style import figure_class
 from optloc.show.sheet import Sheet
 from optloc.show.sheets import latex, sheets
-from optloc.study import summary
-from optloc.study.design import StudyDesign
-from optloc.study.draws import Case, draw
-from optloc.study.folder import Manifest, design_of_manifest, read_frame, read_manifest, references
-from optloc.study.networks import NetworkCase
-from optloc.study.profiles import Profiles, profiles
-from optloc.study.summary import case_label, noise_text
 
 if TYPE_CHECKING:
     import pandas as pd

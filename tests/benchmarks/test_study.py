@@ -6,9 +6,9 @@ from time import perf_counter
 import pytest
 from study.texts import design
 
-from optloc.study.design import workers
-from optloc.study.execute import executor, run_design
-from optloc.study.folder import read_frame
+from optloc.lab.study.design import workers
+from optloc.lab.study.execute import executor, run_design
+from optloc.lab.study.folder import read_frame
 
 MILLION = """
 format = 1

@@ -323,9 +323,9 @@ OF_STUDIES = (
 @cache
 def study_folder():
     """Return the files of a study that is done, by their names: computed once in a process."""
-    from optloc.study.design import design_of_text
-    from optloc.study.folder import begin, locked, store
-    from optloc.study.trial import compute
+    from optloc.lab.study.design import design_of_text
+    from optloc.lab.study.folder import begin, locked, store
+    from optloc.lab.study.trial import compute
 
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "out"

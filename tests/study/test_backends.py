@@ -12,12 +12,12 @@ import optloc
 from optloc import Status
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.lab.study import backends as module
+from optloc.lab.study.backends import backend_kind, backends, faults_of, installed, try_apart
+from optloc.lab.study.design import design_of_text
+from optloc.lab.study.folder import progress, read_frame
+from optloc.lab.study.summary import COLUMNS, judged, methods
 from optloc.solvers.methods import Choice, using
-from optloc.study import backends as module
-from optloc.study.backends import backend_kind, backends, faults_of, installed, try_apart
-from optloc.study.design import design_of_text
-from optloc.study.folder import progress, read_frame
-from optloc.study.summary import COLUMNS, judged, methods
 
 RUN = CliRunner()
 STATIONS = 1e4 * np.array([[0.0, 0.0], [1.0, 0.1], [0.2, 0.9], [-0.8, 0.5]])

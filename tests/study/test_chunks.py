@@ -5,11 +5,11 @@ import pytest
 from study.texts import design
 
 import optloc
-from optloc.study import trial
-from optloc.study.design import Chunk
-from optloc.study.draws import draw
-from optloc.study.methods import run
-from optloc.study.trial import COLUMNS, DIED, arrow_schema, compute
+from optloc.lab.study import trial
+from optloc.lab.study.design import Chunk
+from optloc.lab.study.draws import draw
+from optloc.lab.study.methods import run
+from optloc.lab.study.trial import COLUMNS, DIED, arrow_schema, compute
 
 
 def frame(made):

@@ -6,7 +6,7 @@ from scipy.spatial import Delaunay
 from study.texts import design
 
 from optloc import MODELS, predict
-from optloc.study.draws import block_size, draw
+from optloc.lab.study.draws import block_size, draw
 
 HEAD = 'format = 1\nname = "x"\nseed = 3\ntrials = 2000\n[[method]]\nmethod = "gtrs+lsr"\n[[scenario]]\nname = "s"\n'
 

@@ -13,9 +13,9 @@ import pytest
 from study.texts import QUICK, SMALL, assert_identical, design, run_here
 
 from optloc.base.errors import InvalidProblem
-from optloc.study import execute
-from optloc.study.execute import EXECUTORS, executor, run_design
-from optloc.study.folder import progress
+from optloc.lab.study import execute
+from optloc.lab.study.execute import EXECUTORS, executor, run_design
+from optloc.lab.study.folder import progress
 
 # Thirty parts or so: enough that a worker, and then the run, is killed between them.
 LONG = QUICK.replace("trials = 60", "trials = 200")
@@ -147,7 +147,7 @@ def test_an_unreachable_scheduler_is_one_sentence_and_nothing_is_lost(tmp_path, 
 
 
 PLUGIN = """
-from optloc.study.baselines import BASELINES, Baseline
+from optloc.lab.study.baselines import BASELINES, Baseline
 
 def same(drawn, start):
     return BASELINES["truth"].run(drawn, start)

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.lab.study.design import design_of, shipped
+from optloc.lab.study.methods import SETTINGS, backends, check_settings
+from optloc.lab.study.trial import compute
 from optloc.solvers.methods import Choice, counting, using
-from optloc.study.design import design_of, shipped
-from optloc.study.methods import SETTINGS, backends, check_settings
-from optloc.study.trial import compute
 
 RUN = CliRunner()
 # networks: its methods are those of tests/study/test_networks.py, of which some take seconds

@@ -14,9 +14,9 @@ from pyarrow import parquet
 from study.texts import QUICK, assert_identical, design, run_here, values
 
 from optloc.base.errors import InvalidProblem
-from optloc.study import draws, execute
-from optloc.study.execute import executor, run_design
-from optloc.study.folder import (
+from optloc.lab.study import draws, execute
+from optloc.lab.study.execute import executor, run_design
+from optloc.lab.study.folder import (
     finished_parts,
     part_files,
     progress,
@@ -27,8 +27,8 @@ from optloc.study.folder import (
     store,
     swept,
 )
-from optloc.study.summary import compared
-from optloc.study.trial import Part, compute
+from optloc.lab.study.summary import compared
+from optloc.lab.study.trial import Part, compute
 
 HERE = executor("processes", 1)
 
@@ -146,7 +146,7 @@ def test_folders_that_hold_no_study(tmp_path):
 def test_two_runs_do_not_write_to_one_folder(whole):
     pytest.importorskip("fcntl")
     held = (
-        "import pathlib, sys\nfrom optloc.study.folder import locked\n"
+        "import pathlib, sys\nfrom optloc.lab.study.folder import locked\n"
         "with locked(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
     )
     command = [sys.executable, "-c", held, str(whole)]

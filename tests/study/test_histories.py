@@ -13,19 +13,19 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.lab.study.baselines import BASELINES, Baseline, start_of, whiten_one
+from optloc.lab.study.design import design_of
+from optloc.lab.study.draws import draw
+from optloc.lab.study.folder import read_frame
+from optloc.lab.study.histories import Histories, band, histories, question, reach, way_of
+from optloc.lab.study.methods import added, run
+from optloc.lab.study.minimizers import Minimizer
+from optloc.lab.study.profiles import profiles
+from optloc.lab.study.summary import COLUMNS
 from optloc.show.drawing import marks
 from optloc.show.figures import history_picture, profile_picture
 from optloc.show.pictures.style import save
 from optloc.solvers.methods import counting
-from optloc.study.baselines import BASELINES, Baseline, start_of, whiten_one
-from optloc.study.design import design_of
-from optloc.study.draws import draw
-from optloc.study.folder import read_frame
-from optloc.study.histories import Histories, band, histories, question, reach, way_of
-from optloc.study.methods import added, run
-from optloc.study.minimizers import Minimizer
-from optloc.study.profiles import profiles
-from optloc.study.summary import COLUMNS
 
 RUN = CliRunner()
 TEXT = QUICK.replace("trials = 60", "trials = 8")

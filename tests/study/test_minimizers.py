@@ -16,15 +16,15 @@ from typer.testing import CliRunner
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.kernels.sums import equations_at
-from optloc.study.baselines import BASELINES, start_of, whiten_one
-from optloc.study.design import design_of_text
-from optloc.study.draws import draw
-from optloc.study.execute import executor, run_design
-from optloc.study.folder import part_files, progress, read_frame
-from optloc.study.methods import added
-from optloc.study.minimizers import Minimizer, baseline_of, cost_of
-from optloc.study.paired import median_of, paired
-from optloc.study.summary import COLUMNS, judged
+from optloc.lab.study.baselines import BASELINES, start_of, whiten_one
+from optloc.lab.study.design import design_of_text
+from optloc.lab.study.draws import draw
+from optloc.lab.study.execute import executor, run_design
+from optloc.lab.study.folder import part_files, progress, read_frame
+from optloc.lab.study.methods import added
+from optloc.lab.study.minimizers import Minimizer, baseline_of, cost_of
+from optloc.lab.study.paired import median_of, paired
+from optloc.lab.study.summary import COLUMNS, judged
 
 RUN, HERE = CliRunner(), executor("processes", 1)
 MINE = """
@@ -175,7 +175,7 @@ def test_the_cost_of_a_minimizer_is_the_one_that_judges_it_and_has_its_gradient(
     for drawn in problems(tmp_path):
         x = drawn.truth[0] + 10.0
         quick, judge = cost_of(drawn.problem)(x), float(equations_at(drawn.problem, x[None]).cost[0])
-        monkeypatch.setattr("optloc.study.minimizers.usable", lambda *_: False)
+        monkeypatch.setattr("optloc.lab.study.minimizers.usable", lambda *_: False)
         cost = cost_of(drawn.problem)
         value, slope = cost(x)
         monkeypatch.undo()

@@ -12,10 +12,10 @@ from recipes import installed, write_package
 from study.texts import assert_identical, design, run_here
 
 from optloc.base.errors import InvalidProblem
-from optloc.study import apart
-from optloc.study.execute import executor, run_design
-from optloc.study.folder import read_frame
-from optloc.study.trial import DIED, FAILED, INVALID, LATE
+from optloc.lab.study import apart
+from optloc.lab.study.execute import executor, run_design
+from optloc.lab.study.folder import read_frame
+from optloc.lab.study.trial import DIED, FAILED, INVALID, LATE
 
 FULL = pytest.mark.full
 HEAD = """
@@ -23,7 +23,7 @@ import ctypes, os, signal, subprocess, sys, threading, time
 from dataclasses import replace
 import numpy as np
 from optloc.base.errors import InvalidProblem
-from optloc.study.baselines import BASELINES, Baseline
+from optloc.lab.study.baselines import BASELINES, Baseline
 
 def good(drawn, start):
     return BASELINES["truth"].run(drawn, start)

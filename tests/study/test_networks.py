@@ -7,8 +7,8 @@ from scipy.stats import chi2
 from study.texts import QUICK, design
 
 from optloc.base.errors import InvalidProblem
-from optloc.study.networks import apart, rms
-from optloc.study.trial import compute
+from optloc.lab.study.networks import apart, rms
+from optloc.lab.study.trial import compute
 
 HALL = """
 format = 1

@@ -5,14 +5,14 @@ import pytest
 from study.texts import QUICK, design
 
 from optloc.base.types import Status
+from optloc.lab.study.baselines import BASELINES, recursion, single_step
+from optloc.lab.study.draws import draw
+from optloc.lab.study.trial import compute
 from optloc.papers.registration import PRINTED, Setting
 from optloc.papers.registration_recursion import recursion as printed
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import judge
-from optloc.study.baselines import BASELINES, recursion, single_step
-from optloc.study.draws import draw
-from optloc.study.trial import compute
 
 
 def test_the_recursion_is_that_of_the_paper():

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.study.folder import read_frame
-from optloc.study.methods import added
-from optloc.study.profiles import data_profile, profiles, shares
-from optloc.study.summary import COLUMNS
+from optloc.lab.study.folder import read_frame
+from optloc.lab.study.methods import added
+from optloc.lab.study.profiles import data_profile, profiles, shares
+from optloc.lab.study.summary import COLUMNS
 
 RUN = CliRunner()
 COUNTING = """

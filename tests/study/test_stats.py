@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from optloc.study.summary import clopper_pearson, distribution, over_bound, performance_profile, shifted_mean, wilson
+from optloc.lab.study.summary import (
+    clopper_pearson,
+    distribution,
+    over_bound,
+    performance_profile,
+    shifted_mean,
+    wilson,
+)
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 10), (1, 10), (81, 263), (15, 148), (0, 20), (29, 29), (500, 1000)])

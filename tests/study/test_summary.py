@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from optloc.base.types import ANSWERED
-from optloc.study.summary import by_status, case_label, cells, instances, judged, methods, noise_text, ranking
+from optloc.lab.study.summary import by_status, case_label, cells, instances, judged, methods, noise_text, ranking
 
 COMMON = {
     "noise": 10.0, "noise_unit": "m", "noise_label": "10 m", "rows": 5, "dimension": 3, "crlb": 2.0, "deviation": 1.0,

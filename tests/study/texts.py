@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.study.design import design_of_text
-from optloc.study.folder import begin, locked, read_arrow, store
-from optloc.study.trial import VALUES, compute
+from optloc.lab.study.design import design_of_text
+from optloc.lab.study.folder import begin, locked, read_arrow, store
+from optloc.lab.study.trial import VALUES, compute
 
 SMALL = """
 format = 1

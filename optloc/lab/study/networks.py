@@ -20,7 +20,7 @@ from optloc.calibration.gauge import determined
 from optloc.calibration.likelihood import Estimate, likelihood, together
 from optloc.calibration.network import Network, network_of
 from optloc.files.schema import Units, join
-from optloc.study.document import Amount, NetworkTable
+from optloc.lab.study.document import Amount, NetworkTable
 
 CALIBRATE = "calibrate"
 """The method of networks."""

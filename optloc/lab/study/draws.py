@@ -18,13 +18,13 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Bias
 from optloc.files.schema import Units, join
+from optloc.lab.study.document import Amount, LayoutTable, ScenarioTable, TruthTable, sigma_of
 from optloc.linear.simulate import simulate
 from optloc.linear.walks import walks, wander
 from optloc.problem.bias import with_bias
 from optloc.problem.forms import form_of
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.study.document import Amount, LayoutTable, ScenarioTable, TruthTable, sigma_of
 
 Rng = np.random.Generator
 

@@ -19,15 +19,10 @@ from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.bounds.crlb import crlb
 from optloc.kernels.sums import equations_at
-from optloc.linear.constraints import TOLERANCE, exact, violation
-from optloc.linear.normal import covariance, eliminated
-from optloc.problem.claims import PROOFS
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
-from optloc.study.design import Cell, Chunk
-from optloc.study.draws import Case, Drawn
-from optloc.study.methods import Nonsense, require_program, run, version_of
-from optloc.study.networks import (
+from optloc.lab.study.design import Cell, Chunk
+from optloc.lab.study.draws import Case, Drawn
+from optloc.lab.study.methods import Nonsense, require_program, run, version_of
+from optloc.lab.study.networks import (
     Found,
     KnownNetworks,
     NetworkCase,
@@ -36,6 +31,11 @@ from optloc.study.networks import (
     known_networks,
     true_columns,
 )
+from optloc.linear.constraints import TOLERANCE, exact, violation
+from optloc.linear.normal import covariance, eliminated
+from optloc.problem.claims import PROOFS
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
 
 # The long table of a study, one row for each trial of each method: columns, units and meaning in one place.
 

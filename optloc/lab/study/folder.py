@@ -18,10 +18,10 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import json_of, read_bytes
 from optloc.base.outputs import written
 from optloc.base.types import Status
-from optloc.study.baselines import BASELINES
-from optloc.study.design import StudyDesign, design_of_text
-from optloc.study.methods import version_of
-from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
+from optloc.lab.study.baselines import BASELINES
+from optloc.lab.study.design import StudyDesign, design_of_text
+from optloc.lab.study.methods import version_of
+from optloc.lab.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -456,7 +456,7 @@ def progress(folder: Path) -> Progress:
     return Progress(manifest, len(files), len(manifest.chunks), counts.total(), dict(counts), dict(methods), failures)
 
 
-# Read the parts of a study as one table; the columns are described in `optloc.study.trial`.
+# Read the parts of a study as one table; the columns are described in `optloc.lab.study.trial`.
 
 SORTED = ("scenario", "sweep", "noise", "method", "key", "trial")
 

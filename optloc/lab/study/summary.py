@@ -12,8 +12,8 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.study.folder import read_frame
-from optloc.study.trial import FAILED, VALUES
+from optloc.lab.study.folder import read_frame
+from optloc.lab.study.trial import FAILED, VALUES
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,13 +20,13 @@ from optloc.base.types import Array
 from optloc.kernels.jit import FEW, usable
 from optloc.kernels.pack import pack
 from optloc.kernels.sums import equations_at
+from optloc.lab.study.baselines import BASELINES, Baseline, claim, teller, weighed_at, weighings
+from optloc.lab.study.draws import Drawn
 from optloc.linear.normal import Normal
 from optloc.linear.walks import walks
 from optloc.problem.fix import Fix
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
-from optloc.study.baselines import BASELINES, Baseline, claim, teller, weighed_at, weighings
-from optloc.study.draws import Drawn
 
 Cost = Callable[[Array], tuple[float, Array]]
 """Returns the maximum-likelihood cost at a vector (size,) and its gradient (size,); SI units."""

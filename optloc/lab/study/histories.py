@@ -21,6 +21,14 @@ from optloc.base.types import Array
 from optloc.files import read
 from optloc.kernels.least_squares import refine
 from optloc.kernels.sums import equations_at
+from optloc.lab.study.baselines import Baseline, heard, start_of
+from optloc.lab.study.draws import Case, Drawn, draw
+from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest
+from optloc.lab.study.methods import SETTINGS, Method, added
+from optloc.lab.study.minimizers import baseline_of
+from optloc.lab.study.networks import NetworkCase
+from optloc.lab.study.profiles import check_accuracy
+from optloc.lab.study.summary import case_label, noise_text
 from optloc.linear.normal import depends_on_place
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem
@@ -28,14 +36,6 @@ from optloc.solvers import FORMULATIONS, SOLVERS, solve
 from optloc.solvers import Method as Pipeline
 from optloc.solvers.methods import Choice, counting, shortcut, using
 from optloc.solvers.pool import Pool, begin
-from optloc.study.baselines import Baseline, heard, start_of
-from optloc.study.draws import Case, Drawn, draw
-from optloc.study.folder import design_of_manifest, read_frame, read_manifest
-from optloc.study.methods import SETTINGS, Method, added
-from optloc.study.minimizers import baseline_of
-from optloc.study.networks import NetworkCase
-from optloc.study.profiles import check_accuracy
-from optloc.study.summary import case_label, noise_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -406,7 +406,7 @@ def question(
     place : Path
         Output folder of a study, or a problem file.
     names : sequence of str
-        Methods beside those of the study, as `optloc.study.methods.added` takes them; of a file all.
+        Methods beside those of the study, as `optloc.lab.study.methods.added` takes them; of a file all.
     count : int
         Trials at most: the first ones.
     case, noise : str, optional

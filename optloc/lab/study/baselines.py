@@ -24,6 +24,8 @@ from optloc.calibration.network import Network
 from optloc.calibration.rounds import starts_of
 from optloc.kernels.least_squares import WEIGHINGS
 from optloc.kernels.sums import equations_at
+from optloc.lab.study.draws import Drawn
+from optloc.lab.study.networks import Found, Networks, each, from_truth, refined
 from optloc.linear.evaluate import differentiate
 from optloc.linear.mirror import one_position
 from optloc.linear.normal import depends_on_place, prior_parts, step, weighed
@@ -37,8 +39,6 @@ from optloc.solvers.outside import given, judge_points
 from optloc.solvers.pool import offer
 from optloc.solvers.starts.position import spread_of
 from optloc.solvers.verdict.judge import judge
-from optloc.study.draws import Drawn
-from optloc.study.networks import Found, Networks, each, from_truth, refined
 
 _ASIDE = 0.2
 """Width of the box of guesses in the middle, in radii of the array: off every station by chance, near to all alike."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
-from optloc.study.summary import above_least, instances, performance_profile
+from optloc.lab.study.summary import above_least, instances, performance_profile
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -115,7 +115,7 @@ def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", 
     Parameters
     ----------
     frame : DataFrame
-        Rows with the columns `optloc.study.summary.COLUMNS` and `gap`.
+        Rows with the columns `optloc.lab.study.summary.COLUMNS` and `gap`.
     tau : float
         Cost above the least known, of all methods and of the truth, with which a trial counts as solved, whatever
         the status: profiles ask what was reached, not what was said of it.

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.study.design import StudyDesign
-from optloc.study.folder import Manifest, read_frame, read_manifest
-from optloc.study.paired import paired
-from optloc.study.summary import COLUMNS, judged, methods, wilson
+from optloc.lab.study.design import StudyDesign
+from optloc.lab.study.folder import Manifest, read_frame, read_manifest
+from optloc.lab.study.paired import paired
+from optloc.lab.study.summary import COLUMNS, judged, methods, wilson
 
 if TYPE_CHECKING:
     import pandas as pd

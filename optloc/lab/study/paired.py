@@ -95,7 +95,7 @@ def paired(frame: pd.DataFrame, against: str) -> list[Pair]:
     Parameters
     ----------
     frame : DataFrame
-        Judged rows of a study, see `optloc.study.summary.judged`.
+        Judged rows of a study, see `optloc.lab.study.summary.judged`.
     against : str
         Name of the method that the others are compared with.
 

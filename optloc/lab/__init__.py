@@ -1,0 +1,1 @@
+"""Studies of methods, reproduced papers and measured data sets."""

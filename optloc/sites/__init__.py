@@ -1,0 +1,1 @@
+"""Where stations stand: networks of unknown places, and the choice of sites."""
