@@ -9,9 +9,9 @@ from optloc import InvalidProblem, Motion, Prior, Stations, assemble, crlb, meas
 from optloc.base.frames import Frame
 from optloc.bounds.crlb import _inverse, crlb_course
 from optloc.bounds.observability import observability
+from optloc.lab.papers import registration as scenes
 from optloc.linear.constraints import height
 from optloc.linear.normal import linearise, prior_parts
-from optloc.papers import registration as scenes
 
 
 def problem_of(epochs, *, moving=True, prior=None, span="noise", station_sigma=1.0, scene=scenes.SPATIAL, gain=None):

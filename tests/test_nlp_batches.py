@@ -5,7 +5,7 @@ import pytest
 from cases import STATIONS, TARGET
 
 from optloc import assemble, measured, simulate, solve
-from optloc.papers.registration import SPATIAL, Setting
+from optloc.lab.papers.registration import SPATIAL, Setting
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from optloc import Motion, Prior, Stations, assemble, crlb, measured, simulate, solve, with_bias
 from optloc.base.frames import Frame
 from optloc.bounds.observability import observability
+from optloc.lab.papers import registration as scenes
 from optloc.linear.constraints import height
 from optloc.linear.normal import linearise
-from optloc.papers import registration as scenes
 
 NAMES = tuple("ABCDEF")
 PLACE = np.random.default_rng(3).uniform(-5e3, 5e3, (6, 3))

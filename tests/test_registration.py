@@ -18,8 +18,8 @@ import optloc
 from optloc import Frame, Status, crlb, observability, simulate, solve
 from optloc.base.types import Motion, Stations
 from optloc.kernels.least_squares import refine
+from optloc.lab.papers.registration import PRINTED, Setting, rms, wander
 from optloc.linear.constraints import box, height, speed
-from optloc.papers.registration import PRINTED, Setting, rms, wander
 from optloc.solvers.starts.registration import turn_courses
 
 TIE = 1e-3

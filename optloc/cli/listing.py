@@ -173,7 +173,7 @@ LISTS: dict[str, Callable[[], Rows]] = {
     "formats": _registry("format", "optloc.show.formats:FORMATS"),
     "executors": _registry("executor", "optloc.lab.study.execute:EXECUTORS"),
     "studies": _studies,
-    "papers": _registry("paper", "optloc.papers:PAPERS"),
+    "papers": _registry("paper", "optloc.lab.papers:PAPERS"),
     "datasets": _datasets,
     "pictures": _registry("picture", "optloc.cli.pictures:PICTURES"),
     "demos": _registry("demo", "optloc.cli.starters:titles"),

@@ -533,7 +533,7 @@ def _quartiles(values: tuple[float, ...] | None) -> str:
 def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
     """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
     from optloc.cli.output import bar, say
-    from optloc.papers import Size, paper, reproduction, write
+    from optloc.lab.papers import Size, paper, reproduction, write
 
     paper(name)
     if size not in get_args(Size):

@@ -7,9 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.papers import angles, angles_tables
-from optloc.papers.angles import READINGS, REPAIRED, STRAIGHT, WINDING, draw
-from optloc.papers.report import Study
+from optloc.lab.papers import angles, angles_tables
+from optloc.lab.papers.angles import READINGS, REPAIRED, STRAIGHT, WINDING, draw
+from optloc.lab.papers.report import Study
 
 RUN = CliRunner()
 

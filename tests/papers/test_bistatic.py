@@ -5,8 +5,8 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.papers import bistatic
-from optloc.papers.bistatic import (
+from optloc.lab.papers import bistatic
+from optloc.lab.papers.bistatic import (
     BASELINE,
     COURSE,
     ELEVATION,
@@ -22,7 +22,7 @@ from optloc.papers.bistatic import (
     run_still,
     truth,
 )
-from optloc.papers.report import Study
+from optloc.lab.papers.report import Study
 
 RUN = CliRunner()
 

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 from optloc import solve
 from optloc.base.types import Motion
 from optloc.cli import app
-from optloc.papers import kinematic_tables
-from optloc.papers.kinematic import (
+from optloc.lab.papers import kinematic_tables
+from optloc.lab.papers.kinematic import (
     FILTERS,
     ORDERS,
     PLAIN,
@@ -31,8 +31,8 @@ from optloc.papers.kinematic import (
     track_all,
     weighting,
 )
-from optloc.papers.kinematic_tables import km
-from optloc.papers.report import Study
+from optloc.lab.papers.kinematic_tables import km
+from optloc.lab.papers.report import Study
 from optloc.problem.epochs import cut
 from optloc.show.sheet import ABSENT
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optloc import by_epoch, simulate, solve
-from optloc.papers import angles, bistatic, kinematic, registration, satellites
+from optloc.lab.papers import angles, bistatic, kinematic, registration, satellites
 
 METHODS = ("sdp+lsr", "socp+lsr", "gtrs+nlp+lsr")
 TRIALS = {"registration": 1, "registration, prior": 1}

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from optloc.papers import PAPERS
-from optloc.papers.report import digits, render, typeset
+from optloc.lab.papers import PAPERS
+from optloc.lab.papers.report import digits, render, typeset
 from optloc.show.sheet import ABSENT, TextTable
 
 DOCS = Path(__file__).parents[2] / "docs" / "papers"
@@ -30,7 +30,7 @@ def committed(name):
 
 
 def sample_of(name):
-    return import_module(f"optloc.papers.{PAPERS[name].module}").STUDY.sizes[SIZE[name]]
+    return import_module(f"optloc.lab.papers.{PAPERS[name].module}").STUDY.sizes[SIZE[name]]
 
 
 @pytest.mark.parametrize("name", PAPERS)

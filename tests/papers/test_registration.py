@@ -12,11 +12,8 @@ from verdicts import alone
 from optloc import crlb, linearise, simulate, solve
 from optloc.cli import app
 from optloc.files import read
-from optloc.linear.evaluate import predict
-from optloc.linear.normal import normal
-from optloc.linear.normal import step as house_step
-from optloc.papers import registration, registration_tables
-from optloc.papers.registration import (
+from optloc.lab.papers import registration, registration_tables
+from optloc.lab.papers.registration import (
     MOVING,
     NANOSECOND,
     PRINTED,
@@ -32,9 +29,12 @@ from optloc.papers.registration import (
     truth,
     wander,
 )
-from optloc.papers.registration_recursion import FIRST, joint_recursion, joint_step, joint_weights, recursion, step
-from optloc.papers.registration_tables import accuracy, flatness, metres, separation
-from optloc.papers.report import Study
+from optloc.lab.papers.registration_recursion import FIRST, joint_recursion, joint_step, joint_weights, recursion, step
+from optloc.lab.papers.registration_tables import accuracy, flatness, metres, separation
+from optloc.lab.papers.report import Study
+from optloc.linear.evaluate import predict
+from optloc.linear.normal import normal
+from optloc.linear.normal import step as house_step
 
 RUN = CliRunner()
 

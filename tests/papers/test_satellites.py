@@ -6,9 +6,9 @@ from typer.testing import CliRunner
 
 from optloc import ECEF, crlb, predict
 from optloc.cli import app
-from optloc.papers import satellites
-from optloc.papers.report import Study
-from optloc.papers.satellites import (
+from optloc.lab.papers import satellites
+from optloc.lab.papers.report import Study
+from optloc.lab.papers.satellites import (
     COURSE,
     FILTERS,
     SATELLITES,

@@ -5,11 +5,11 @@ import pytest
 from study.texts import QUICK, design
 
 from optloc.base.types import Status
+from optloc.lab.papers.registration import PRINTED, Setting
+from optloc.lab.papers.registration_recursion import recursion as printed
 from optloc.lab.study.baselines import BASELINES, recursion, single_step
 from optloc.lab.study.draws import draw
 from optloc.lab.study.trial import compute
-from optloc.papers.registration import PRINTED, Setting
-from optloc.papers.registration_recursion import recursion as printed
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import judge

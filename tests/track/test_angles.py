@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 import optloc
 from optloc.base.types import Motion
-from optloc.papers.angles import (
+from optloc.lab.papers.angles import (
     READINGS,
     REPAIRED,
     STRAIGHT,

@@ -10,9 +10,9 @@ from scipy.stats import chi2
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Motion, Status
+from optloc.lab.papers.kinematic import Scenario, draw, start_from_fix, strip_labels
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
-from optloc.papers.kinematic import Scenario, draw, start_from_fix, strip_labels
 from optloc.tracking import State, followed, gated, polynomial
 from optloc.tracking.associate import Clutter, assigned, joint, nearest, scored
 from optloc.tracking.several_targets import Candidates, associated, candidates

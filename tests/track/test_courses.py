@@ -9,7 +9,7 @@ from verdicts import alone
 import optloc
 from optloc import InvalidProblem, Status
 from optloc.base.types import Motion, Stations
-from optloc.papers.angles import STRAIGHT, WINDING, draw, errors, start_at_truth, track_all
+from optloc.lab.papers.angles import STRAIGHT, WINDING, draw, errors, start_at_truth, track_all
 from optloc.solvers.starts.angles import courses
 from optloc.tracking import State, current_statistical, fitted, polynomial, posterior_bound, smoothed
 from optloc.tracking.whole_run import along

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from optloc import InvalidProblem
-from optloc.papers.angles import printed_transition, printed_variance
+from optloc.lab.papers.angles import printed_transition, printed_variance
 from optloc.tracking import current_statistical, polynomial, singer
 from optloc.tracking.dynamics import correlated
 

@@ -5,7 +5,7 @@ import pytest
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Status
-from optloc.papers.kinematic import FILTERS, Scenario, draw, score_track
+from optloc.lab.papers.kinematic import FILTERS, Scenario, draw, score_track
 from optloc.tracking import UPDATES, State, polynomial, predicted
 from optloc.tracking.several_models import imm, mixed, moments, parallel, resized
 from optloc.tracking.track import scans

@@ -9,7 +9,7 @@ from verdicts import alone
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Motion, Status
-from optloc.papers.kinematic import Scenario, draw, start_from_fix
+from optloc.lab.papers.kinematic import Scenario, draw, start_from_fix
 from optloc.problem.epochs import cut
 from optloc.tracking import State, followed, polynomial
 from optloc.tracking.several_models import parallel, resized, softmax

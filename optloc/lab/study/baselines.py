@@ -395,7 +395,7 @@ def _truth(drawn: Drawn, start: Array) -> Fix:
 
 def _printed(drawn: Drawn, start: Array) -> Fix:
     """Return the undamped iteration with the residual's sign as the paper prints it."""
-    from optloc.papers.kinematic import taylor
+    from optloc.lab.papers.kinematic import taylor
 
     size = drawn.problem.dimension
     x = start.copy()

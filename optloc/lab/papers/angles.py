@@ -1,6 +1,6 @@
 """Manoeuvring targets by azimuth and elevation with the current statistical model: three simulations.
 
-All trials of a setting run as one batch. The tables and figures are those of `optloc.papers.angles_tables`, the page is
+All trials of a setting run as one batch. The tables and figures are those of `optloc.lab.papers.angles_tables`, the page is
 ``angles.md``.
 """
 
@@ -13,8 +13,8 @@ import numpy as np
 
 from optloc.base.types import Array, Motion
 from optloc.bounds.crlb import crlb
+from optloc.lab.papers.report import Tick
 from optloc.linear.simulate import simulate
-from optloc.papers.report import Tick
 from optloc.problem.build import assemble, measured
 from optloc.problem.epochs import by_epoch, cut
 from optloc.problem.problem import Problem

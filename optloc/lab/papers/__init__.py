@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.papers.report import Report, Reproduction, Size, write
+from optloc.lab.papers.report import Report, Reproduction, Size, write
 from optloc.show.sheet import TextTable
 
 __all__ = ["PAPERS", "Paper", "Report", "Reproduction", "Size", "TextTable", "paper", "reproduction", "write"]
@@ -75,6 +75,6 @@ def reproduction(name: str, size: Size, seed: int) -> Reproduction:
     InvalidProblem
         For an unknown paper, or where matplotlib is missing.
     """
-    study = import_module(f"optloc.papers.{paper(name).module}").STUDY
+    study = import_module(f"optloc.lab.papers.{paper(name).module}").STUDY
     ready: Reproduction = study.reproduction(study.sizes[size], seed)
     return ready

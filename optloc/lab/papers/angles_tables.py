@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.papers.angles import (
+from optloc.lab.papers.angles import (
     CIRCLE_START,
     LOST,
     READINGS,
@@ -43,7 +43,7 @@ from optloc.papers.angles import (
     track_all,
     whole_track_bound,
 )
-from optloc.papers.report import (
+from optloc.lab.papers.report import (
     Ink,
     Report,
     Size,

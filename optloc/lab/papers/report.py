@@ -170,9 +170,9 @@ def render(name: str, tables: Mapping[str, TextTable], *, made: str, seed: int, 
         table=lambda key: tables[key].markdown(),
         cell=lambda key, *place: tables[key].cell(*place),
         value=lambda key, *place, part=0: tables[key].value(*place, part=part),
-        scene=import_module(f"optloc.papers.{name}"),
+        scene=import_module(f"optloc.lab.papers.{name}"),
     )
-    text = files("optloc.papers").joinpath(f"{name}.md").read_text(encoding="utf-8")
+    text = files("optloc.lab.papers").joinpath(f"{name}.md").read_text(encoding="utf-8")
     return _wrap(house.from_string(text).render(made=made, seed=seed, sample=sample)) + "\n"
 
 

@@ -14,10 +14,7 @@ import numpy as np
 from optloc.base.types import Array, Motion
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.bounds.crlb import crlb, crlb_course
-from optloc.linear.constraints import box
-from optloc.linear.evaluate import predict
-from optloc.linear.simulate import simulate
-from optloc.papers.report import (
+from optloc.lab.papers.report import (
     Ink,
     Report,
     Size,
@@ -31,6 +28,9 @@ from optloc.papers.report import (
     tabulate,
     typeset,
 )
+from optloc.linear.constraints import box
+from optloc.linear.evaluate import predict
+from optloc.linear.simulate import simulate
 from optloc.problem.build import assemble, measured
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem

@@ -1,7 +1,7 @@
 """Moving stations with biases, by time differences and gain ratios: the paper's recursion and the fix without a guess.
 
 Both run on the same data. The tables and figures that are made of them are those of
-`optloc.papers.registration_tables`, the page is ``registration.md``.
+`optloc.lab.papers.registration_tables`, the page is ``registration.md``.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from optloc.base.types import Array, Motion, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.bounds.crlb import crlb, crlb_course
+from optloc.lab.papers.registration_recursion import FIRST, joint_recursion, recursion
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
-from optloc.papers.registration_recursion import FIRST, joint_recursion, recursion
 from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix

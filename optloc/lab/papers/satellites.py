@@ -16,9 +16,9 @@ from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef
 from optloc.base.types import Array, Motion
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.bounds.crlb import crlb
+from optloc.lab.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, scale, tabulate, typeset
 from optloc.linear.constraints import height as known_height
 from optloc.linear.simulate import simulate
-from optloc.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, scale, tabulate, typeset
 from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.epochs import cut

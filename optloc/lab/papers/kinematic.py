@@ -1,6 +1,6 @@
 """Targets that stand, fly on or accelerate, by range differences: filters on the scene of the paper, and errors.
 
-The tables and figures that are made of them are those of `optloc.papers.kinematic_tables`, the page is
+The tables and figures that are made of them are those of `optloc.lab.papers.kinematic_tables`, the page is
 ``kinematic.md``.
 """
 

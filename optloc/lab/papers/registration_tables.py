@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.bounds.crlb import crlb
-from optloc.papers.registration import (
+from optloc.lab.papers.registration import (
     MOVING,
     NANOSECOND,
     PRINTED,
@@ -29,8 +29,8 @@ from optloc.papers.registration import (
     truth,
     wander,
 )
-from optloc.papers.registration_recursion import FIRST
-from optloc.papers.report import (
+from optloc.lab.papers.registration_recursion import FIRST
+from optloc.lab.papers.report import (
     Ink,
     Report,
     Size,

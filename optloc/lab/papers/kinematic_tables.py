@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from optloc.base.types import Array, Motion
-from optloc.papers.kinematic import (
+from optloc.lab.papers.kinematic import (
     FILTERS,
     LOST,
     ORDERS,
@@ -33,7 +33,7 @@ from optloc.papers.kinematic import (
     track_all,
     weighting,
 )
-from optloc.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, percent, tabulate, typeset
+from optloc.lab.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, percent, tabulate, typeset
 from optloc.problem.epochs import cut
 from optloc.show.sheet import ABSENT, TextTable
 from optloc.solvers import solve
