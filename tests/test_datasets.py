@@ -10,8 +10,8 @@ import pytest
 
 import optloc
 from optloc import InvalidProblem, datasets
-from optloc.datasets.catalogue import ENTRIES
-from optloc.datasets.reading import VARIABLE
+from optloc.lab.datasets.catalogue import ENTRIES
+from optloc.lab.datasets.reading import VARIABLE
 from optloc.problem.noise import variances
 
 

@@ -130,7 +130,7 @@ def advice(found: list[Package], code: dict[str, Any]) -> list[Advice]:
 
 
 def _datasets() -> dict[str, Any]:
-    from optloc.datasets import available
+    from optloc.lab.datasets import available
 
     folder = os.environ.get("OPTLOC_DATA")
     return {"folder": folder, "there": list(available()) if folder else []}

@@ -146,8 +146,8 @@ def _studies() -> Rows:
 
 
 def _datasets() -> Rows:
-    from optloc.datasets import available
-    from optloc.datasets.catalogue import ENTRIES
+    from optloc.lab.datasets import available
+    from optloc.lab.datasets.catalogue import ENTRIES
 
     here = available()
     return [

@@ -10,7 +10,7 @@ from data.windows import quantiles, report
 from verdicts import alone
 
 from optloc import Atmosphere, Status, solve
-from optloc.datasets import adsb
+from optloc.lab.datasets import adsb
 
 pytestmark = pytest.mark.data
 

@@ -5,7 +5,7 @@ import pytest
 from data.windows import quantiles, report, statuses
 
 from optloc import solve
-from optloc.datasets import adsb
+from optloc.lab.datasets import adsb
 
 pytestmark = pytest.mark.data
 

@@ -10,7 +10,7 @@ from data.windows import quantiles, report, statuses
 from verdicts import alone
 
 from optloc import Status, solve
-from optloc.datasets import gnss
+from optloc.lab.datasets import gnss
 
 pytestmark = pytest.mark.data
 

@@ -7,7 +7,7 @@ from data.windows import report
 from scipy.stats import spearmanr
 
 from optloc import health, solve
-from optloc.datasets import adsb
+from optloc.lab.datasets import adsb
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 

@@ -6,7 +6,7 @@ from data.registration import part
 from data.windows import report
 
 from optloc import health
-from optloc.datasets import uwb
+from optloc.lab.datasets import uwb
 
 pytestmark = pytest.mark.data
 

@@ -8,8 +8,8 @@ from data.windows import report, statuses
 from often import few
 
 from optloc import Motion, Problem, Status, assemble, by_epoch, measured, noise_levels, solve, with_noise_levels
-from optloc.datasets import mrclam, starloc, uwb
-from optloc.datasets.reading import Window
+from optloc.lab.datasets import mrclam, starloc, uwb
+from optloc.lab.datasets.reading import Window
 
 pytestmark = pytest.mark.data
 

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.datasets import adsb
+from optloc.lab.datasets import adsb
 
 pytestmark = pytest.mark.data
 

@@ -9,7 +9,7 @@ from often import few
 from verdicts import alone
 
 from optloc import solve
-from optloc.datasets import mrclam
+from optloc.lab.datasets import mrclam
 
 pytestmark = pytest.mark.data
 

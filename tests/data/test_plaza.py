@@ -4,7 +4,7 @@ import pytest
 from data.windows import judge, judge_consistency
 
 from optloc import solve
-from optloc.datasets import plaza
+from optloc.lab.datasets import plaza
 
 pytestmark = pytest.mark.data
 

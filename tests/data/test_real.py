@@ -12,7 +12,7 @@ from data.windows import report
 from monte_carlo.tables import ledger
 
 from optloc import InvalidProblem, Problem, Status, datasets, solve
-from optloc.datasets import mrclam, plaza, uwb
+from optloc.lab.datasets import mrclam, plaza, uwb
 from optloc.model_checks.elements import batch_of
 from optloc.station_health.structure import with_estimated_noise
 from optloc.tracking import polynomial, tracked

@@ -8,7 +8,7 @@ from often import few
 
 from optloc import solve, with_bias
 from optloc.bounds.observability import observability
-from optloc.datasets import adsb
+from optloc.lab.datasets import adsb
 
 pytestmark = pytest.mark.data
 

@@ -10,7 +10,7 @@ from often import few
 
 from optloc import Motion, Status, solve, with_bias
 from optloc.bounds.observability import observability
-from optloc.datasets import gnss
+from optloc.lab.datasets import gnss
 
 pytestmark = pytest.mark.data
 

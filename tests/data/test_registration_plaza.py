@@ -7,7 +7,7 @@ from data.windows import report
 
 from optloc import Status, by_epoch, solve, with_bias
 from optloc.bounds.observability import observability
-from optloc.datasets import plaza
+from optloc.lab.datasets import plaza
 
 pytestmark = pytest.mark.data
 

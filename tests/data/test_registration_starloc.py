@@ -9,7 +9,7 @@ from data.windows import report
 
 from optloc import Motion, solve, with_bias
 from optloc.bounds.observability import observability
-from optloc.datasets import starloc
+from optloc.lab.datasets import starloc
 
 pytestmark = pytest.mark.data
 

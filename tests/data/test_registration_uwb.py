@@ -12,7 +12,7 @@ from often import few
 
 from optloc import by_epoch, with_bias
 from optloc.bounds.observability import observability
-from optloc.datasets import uwb
+from optloc.lab.datasets import uwb
 
 pytestmark = pytest.mark.data
 

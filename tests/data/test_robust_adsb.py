@@ -6,7 +6,7 @@ from data import truths
 from data.windows import quantiles, report, statuses
 
 from optloc import solve
-from optloc.datasets import adsb
+from optloc.lab.datasets import adsb
 
 pytestmark = pytest.mark.data
 

@@ -8,7 +8,7 @@ from data.windows import quantiles, report, statuses
 from verdicts import alone
 
 from optloc import Prior, predict, rejected, solve
-from optloc.datasets import starloc
+from optloc.lab.datasets import starloc
 from optloc.problem.noise import independent
 
 pytestmark = pytest.mark.data

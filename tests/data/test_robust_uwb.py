@@ -8,7 +8,7 @@ from data.windows import quantiles, report, statuses
 from verdicts import alone
 
 from optloc import by_epoch, rejected, solve
-from optloc.datasets import uwb
+from optloc.lab.datasets import uwb
 
 pytestmark = pytest.mark.data
 

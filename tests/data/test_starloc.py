@@ -7,7 +7,7 @@ from data.reference import law
 from often import few
 
 from optloc import solve
-from optloc.datasets import starloc
+from optloc.lab.datasets import starloc
 
 pytestmark = pytest.mark.data
 

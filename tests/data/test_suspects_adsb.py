@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import spearmanr
 
 from optloc import solve
-from optloc.datasets import adsb
+from optloc.lab.datasets import adsb
 
 pytestmark = pytest.mark.data
 HEARD = 5

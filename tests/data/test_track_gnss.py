@@ -7,7 +7,7 @@ from data.windows import report
 from often import few
 
 from optloc import ECEF
-from optloc.datasets import gnss
+from optloc.lab.datasets import gnss
 from optloc.tracking import UPDATES, collected, polynomial, tracked
 
 pytestmark = pytest.mark.data

@@ -11,7 +11,7 @@ from data.windows import report
 from monte_carlo.tables import write
 from often import few
 
-from optloc.datasets import uwb
+from optloc.lab.datasets import uwb
 from optloc.tracking import Rules, collected, polynomial, tracked
 
 pytestmark = pytest.mark.data

@@ -8,7 +8,7 @@ from data.windows import judge, judge_consistency
 from often import few
 
 from optloc import solve
-from optloc.datasets import uwb
+from optloc.lab.datasets import uwb
 
 pytestmark = pytest.mark.data
 

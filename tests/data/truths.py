@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from data.reference import Reference, centred, descend, ecef, horizontal
 
-from optloc.datasets.adsb import ARRIVAL, HEIGHT, Heard
-from optloc.datasets.gnss import SIGMA, Receptions
-from optloc.datasets.mrclam import Sightings, sigmas
-from optloc.datasets.starloc import SIGMA as BEARING
-from optloc.datasets.starloc import Groups
+from optloc.lab.datasets.adsb import ARRIVAL, HEIGHT, Heard
+from optloc.lab.datasets.gnss import SIGMA, Receptions
+from optloc.lab.datasets.mrclam import Sightings, sigmas
+from optloc.lab.datasets.starloc import SIGMA as BEARING
+from optloc.lab.datasets.starloc import Groups
 
 RADIUS = 6.4e6
 

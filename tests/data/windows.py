@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from verdicts import alone
 
 from optloc import Fix, Status
-from optloc.datasets.reading import Window, Windows
+from optloc.lab.datasets.reading import Window, Windows
 
 
 def from_truth(data: Windows) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.types import Array, Motion
-from optloc.datasets.reading import choose, places, table
+from optloc.lab.datasets.reading import choose, places, table
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.problem import Problem
 

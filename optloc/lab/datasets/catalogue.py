@@ -12,7 +12,7 @@ from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
-from optloc.datasets.reading import check_files, root
+from optloc.lab.datasets.reading import check_files, root
 from optloc.problem.problem import Problem
 
 
@@ -56,7 +56,7 @@ class Entry:
 
     def reader(self, name: str) -> Callable[..., tuple[Problem, Array]]:
         """Return the function that reads the set: `dataset` of the module of that name."""
-        return import_module(f"optloc.datasets.{name}").dataset  # type: ignore[no-any-return]
+        return import_module(f"optloc.lab.datasets.{name}").dataset  # type: ignore[no-any-return]
 
 
 # SHA-256 of the files that the numbers of the documentation were made from.

@@ -20,7 +20,7 @@ import numpy as np
 from optloc.base.frames import ECEF
 from optloc.base.types import Array, Motion
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.datasets.reading import choose, places, table
+from optloc.lab.datasets.reading import choose, places, table
 from optloc.linear.constraints import height
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.problem import Problem

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from optloc.base.types import Array, Motion
-from optloc.datasets.reading import choose, places, table
+from optloc.lab.datasets.reading import choose, places, table
 from optloc.problem.build import assemble, measured
 from optloc.problem.problem import Problem
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion
-from optloc.datasets.reading import Window, Windows, along, choose, cut_windows, places, table
+from optloc.lab.datasets.reading import Window, Windows, along, choose, cut_windows, places, table
 from optloc.problem.build import assemble, measured
 from optloc.problem.noise import Block, Noise, group
 from optloc.problem.problem import Problem

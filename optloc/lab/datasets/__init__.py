@@ -1,5 +1,5 @@
 """Real measurements with true positions, read from a local folder; none of the data are part of optloc."""
 
-from optloc.datasets.catalogue import NAMES, Dataset, available, load
+from optloc.lab.datasets.catalogue import NAMES, Dataset, available, load
 
 __all__ = ["NAMES", "Dataset", "available", "load"]

@@ -16,7 +16,7 @@ import numpy as np
 
 from optloc.base.frames import ECEF
 from optloc.base.types import Array, Bias, Motion
-from optloc.datasets.reading import choose, places, table
+from optloc.lab.datasets.reading import choose, places, table
 from optloc.linear.constraints import height, visible
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.problem import Problem
