@@ -283,8 +283,8 @@ def profiles(
     known = references(design_of_manifest(read_manifest(folder)))
     found = profiled(frame, tau=tau, work=work, out=known)
     if plot is not None:
+        from optloc.lab.report.figures import profile_picture
         from optloc.show.drawing import marks
-        from optloc.show.figures import profile_picture
 
         write_picture(profile_picture(found, marks(list(found.methods))), plot)
     if as_json:
@@ -340,8 +340,8 @@ def histories(
     if out is not None:
         write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})
     if plot is not None:
+        from optloc.lab.report.figures import history_picture
         from optloc.show.drawing import marks
-        from optloc.show.figures import history_picture
 
         write_picture(history_picture(found, marks(list(found.methods))), plot)
     if as_json:
@@ -492,8 +492,8 @@ def _profile_record(found: Any) -> dict[str, Any]:
 
 
 def _show_profiles(found: Any, console: Console) -> None:
+    from optloc.lab.report.sheets import duration, number, percent, solved_within
     from optloc.lab.study.profiles import RATIOS, shares
-    from optloc.show.sheets import duration, number, percent, solved_within
 
     table = Table("method")
     for name in ("trials", "solved, %", *(f"{ratio:g}×" for ratio in RATIOS), "median"):

@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from optloc.lab.report.study_page import Tell, write_report
     from optloc.show.page import fix_page, live_page, map_page, track_page
-    from optloc.show.study_page import Tell, write_report
 
 __all__ = ["Tell", "fix_page", "live_page", "map_page", "track_page", "write_report"]
 

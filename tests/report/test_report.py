@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.lab.report.sheets import duration, latex, number, percent
 from optloc.lab.study.design import design_of
 from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import begin, read_frame
@@ -21,7 +22,6 @@ from optloc.show.drawing import panel, svg_text
 from optloc.show.map import Canvas, Curve, Label
 from optloc.show.page import Part, write_page
 from optloc.show.sheet import Sheet, TextTable
-from optloc.show.sheets import duration, latex, number, percent
 
 RUN = CliRunner()
 TEXT = """

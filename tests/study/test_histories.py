@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.lab.report.figures import history_picture, profile_picture
 from optloc.lab.study.baselines import BASELINES, Baseline, start_of, whiten_one
 from optloc.lab.study.design import design_of
 from optloc.lab.study.draws import draw
@@ -23,7 +24,6 @@ from optloc.lab.study.minimizers import Minimizer
 from optloc.lab.study.profiles import profiles
 from optloc.lab.study.summary import COLUMNS
 from optloc.show.drawing import marks
-from optloc.show.figures import history_picture, profile_picture
 from optloc.show.pictures.style import save
 from optloc.solvers.methods import counting
 

@@ -15,6 +15,8 @@ from optloc.base.outputs import claim, make_folder, together, write_text, writte
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
 from optloc.files.writer import harmless_column
+from optloc.lab.report import figures as drawn
+from optloc.lab.report.sheets import latex, sheets
 from optloc.lab.study import summary
 from optloc.lab.study.design import StudyDesign
 from optloc.lab.study.draws import Case, draw
@@ -22,14 +24,12 @@ from optloc.lab.study.folder import Manifest, design_of_manifest, read_frame, re
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import Profiles, profiles
 from optloc.lab.study.summary import case_label, noise_text
-from optloc.show import figures as drawn
 from optloc.show.drawing import Drawing, Mark, Picture, inline, marks, svg_text, with_legend
 from optloc.show.map import Canvas
 from optloc.show.page import Part, map_element, write_page
 from optloc.show.pictures.bound_map import plot_bound_map
 from optloc.show.pictures.style import figure_class
 from optloc.show.sheet import Sheet
-from optloc.show.sheets import latex, sheets
 
 if TYPE_CHECKING:
     import pandas as pd
