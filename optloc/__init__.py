@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from optloc.base.types import Bias, Certificate, Motion, Prior, Rows, Stations, Status
     from optloc.bounds.crlb import Course, crlb, crlb_course
     from optloc.bounds.observability import Observability, observability
-    from optloc.calibration.calibrated import Calibration, calibrate
-    from optloc.calibration.network import Network, network_of
     from optloc.files import from_table, load
     from optloc.files.locate import locate
     from optloc.files.orbits import satellites
@@ -49,8 +47,6 @@ if TYPE_CHECKING:
     from optloc.models import MODELS, Model
     from optloc.models.medium import Atmosphere, Layers
     from optloc.multi_target import Emitters, separate
-    from optloc.placement.chosen import Placement, place
-    from optloc.placement.sites import SiteSelection
     from optloc.problem import epochs, noise
     from optloc.problem.bias import with_bias, with_known_bias
     from optloc.problem.build import assemble, measured, station_array
@@ -64,6 +60,10 @@ if TYPE_CHECKING:
     from optloc.problem.noise import Noise
     from optloc.problem.problem import Problem
     from optloc.problem.signal import Signal
+    from optloc.sites.calibration.calibrated import Calibration, calibrate
+    from optloc.sites.calibration.network import Network, network_of
+    from optloc.sites.placement.chosen import Placement, place
+    from optloc.sites.placement.sites import SiteSelection
     from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
     from optloc.solvers.certify.admitted import certify
     from optloc.solvers.prepared import Prepared, prepare

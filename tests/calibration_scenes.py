@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.calibration.likelihood import Estimate
+from optloc.sites.calibration.likelihood import Estimate
 
 HALL = np.array([20.0, 20.0, 6.0])
 

@@ -7,9 +7,9 @@ import pytest
 from calibration_scenes import hall
 from typer.testing import CliRunner
 
-from optloc.calibration.network_file import read_network
 from optloc.cli import app
 from optloc.files import read
+from optloc.sites.calibration.network_file import read_network
 
 FILE = """format = 1
 [stations]
@@ -112,7 +112,7 @@ def test_names_of_outputs_are_asked_for_before_the_search(folder, monkeypatch):
     def never(*_, **__):
         raise AssertionError("it searched")
 
-    monkeypatch.setattr("optloc.calibration.calibrate", never)
+    monkeypatch.setattr("optloc.sites.calibration.calibrate", never)
     done = run("calibrate", folder / "hall.toml", "--out", folder / "surveyed.csv")
     assert done.exit_code == 2
     assert ".toml" in done.output
@@ -120,7 +120,7 @@ def test_names_of_outputs_are_asked_for_before_the_search(folder, monkeypatch):
 
 
 def test_residuals_are_drawn_beside_the_law_that_is_left_of_the_noise():
-    from optloc.show.pictures.network_map import plot_network
+    from optloc.sites.calibration.network_map import plot_network
 
     rng = np.random.default_rng(0)
     stations, pulses = rng.standard_normal((4, 2)), rng.standard_normal((9, 2))

@@ -9,12 +9,12 @@ from scipy.stats import chi2
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
-from optloc.calibration.blocks import settled
-from optloc.calibration.calibrated import refuted_blocks
-from optloc.calibration.gauge import departure, determined
-from optloc.calibration.likelihood import Estimate, likelihood
-from optloc.calibration.rounds import starts_of
 from optloc.kernels.jit import plain
+from optloc.sites.calibration.blocks import settled
+from optloc.sites.calibration.calibrated import refuted_blocks
+from optloc.sites.calibration.gauge import departure, determined
+from optloc.sites.calibration.likelihood import Estimate, likelihood
+from optloc.sites.calibration.rounds import starts_of
 
 EXACT = 1e-6
 

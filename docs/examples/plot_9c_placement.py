@@ -9,7 +9,7 @@ the best set against what no set can be better than, while it was searched.
 import numpy as np
 
 import optloc
-from optloc.placement import picture
+from optloc.sites.placement import picture
 
 rng = np.random.default_rng(3)
 masts = rng.uniform([-3000, -3000, 0], [3000, 3000, 300], (40, 3))

@@ -11,7 +11,7 @@ import typer
 from optloc.cli.options import Budget, Force, Json, Outside, ProblemPath, Quiet, Verbose
 
 if TYPE_CHECKING:
-    from optloc.calibration import Calibration
+    from optloc.sites.calibration import Calibration
 
 NETWORKS = (
     "optloc calibrate hall.toml",
@@ -60,9 +60,9 @@ def _run(
     quiet: bool,
 ) -> int:
     from optloc.base.types import Status
-    from optloc.calibration import calibrate as find
-    from optloc.calibration.network_file import check_name, read_network, write_calibrated
     from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
+    from optloc.sites.calibration import calibrate as find
+    from optloc.sites.calibration.network_file import check_name, read_network, write_calibrated
 
     claim_outputs(out, picture=plot, inputs=[file])
     if out is not None:
@@ -143,7 +143,7 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
 
 
 def _picture(found: Calibration, title: str) -> Any:
-    from optloc.show.pictures.network_map import plot_network
+    from optloc.sites.calibration.network_map import plot_network
 
     net = found.network
     known = np.where(np.isfinite(net.place_sigma), net.place, np.nan)

@@ -32,12 +32,12 @@ from optloc.kernels.kept import CALLEES, alone, is_checkout, is_kept, kept_in
 from optloc.kernels.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
-from optloc.placement import SiteSelection, place
 from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.scope import SHORT
+from optloc.sites.placement import SiteSelection, place
 from optloc.solvers import solve
 from optloc.solvers.certify.admitted import certify
 from optloc.solvers.prepared import prepare
@@ -204,11 +204,11 @@ PARTS: Mapping[str, Part] = {
     "searches": Part("searches for starts", "optloc.proof", (_search,), ("optloc.proof.best_first.search_minima",)),
     "placements": Part(
         "placements of stations",
-        "optloc.placement",
+        "optloc.sites.placement",
         (_place,),
         (
-            *(f"optloc.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
-            "optloc.placement.completions.exhaust",
+            *(f"optloc.sites.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
+            "optloc.sites.placement.completions.exhaust",
         ),
     ),
     "regions": Part("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.cover.cover",)),

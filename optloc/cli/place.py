@@ -14,11 +14,17 @@ from optloc.base.outputs import is_stream
 from optloc.cli.crlb import vector
 from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
 from optloc.files import read
-from optloc.placement import Placement, SiteSelection, picture, place
-from optloc.placement.chosen import PRIOR
-from optloc.placement.refinement import refined
-from optloc.placement.selection_file import LoadedSelection, criterion_name, is_selection, read_selection, write_chosen
 from optloc.problem.epochs import by_epoch, separable
+from optloc.sites.placement import Placement, SiteSelection, picture, place
+from optloc.sites.placement.chosen import PRIOR
+from optloc.sites.placement.refinement import refined
+from optloc.sites.placement.selection_file import (
+    LoadedSelection,
+    criterion_name,
+    is_selection,
+    read_selection,
+    write_chosen,
+)
 
 # Lines of a table of places or stations: what a screen holds.
 _LINES = 20

@@ -456,7 +456,7 @@ def read_document(path: Path) -> ProblemFile:
 def document_of(text: str, source: str) -> ProblemFile:
     """Return the contents of the text of a problem file; `source` is the place to name."""
     data = parse_toml(text, source, formats=(1, 2))
-    # these two a network alone has: `optloc.calibration.network_file`
+    # these two a network alone has: `optloc.sites.calibration.network_file`
     if isinstance(stations := data.get("stations"), dict) and {"dimension", "synchronised"} & set(stations):
         raise InvalidProblem("the stations of this file are yet to be found", source, "use optloc calibrate")
     return validate(data, source)

@@ -19,9 +19,9 @@ from scipy.sparse import csr_matrix
 
 import optloc
 from optloc import Motion, Problem, assemble, measured, with_bias
-from optloc.calibration import calibrate, network_of
 from optloc.cli.fix import run_fix
 from optloc.files.readings import Told
+from optloc.sites.calibration import calibrate, network_of
 from optloc.tracking import State, polynomial
 from optloc.tracking.scan_rows import Scans
 from optloc.tracking.track import step

@@ -13,11 +13,11 @@ from monte_carlo.tables import FOLDER, code_digest, ledger
 from scipy.stats import chi2
 
 from optloc import Status, calibrate, network_of
-from optloc.calibration.calibrated import refuted_blocks, spans
-from optloc.calibration.gauge import determined
-from optloc.calibration.likelihood import likelihood
-from optloc.calibration.outliers import truncated
-from optloc.calibration.rounds import starts_of
+from optloc.sites.calibration.calibrated import refuted_blocks, spans
+from optloc.sites.calibration.gauge import determined
+from optloc.sites.calibration.likelihood import likelihood
+from optloc.sites.calibration.outliers import truncated
+from optloc.sites.calibration.rounds import starts_of
 
 KEPT = FOLDER.parents[1] / "build" / "full"  # ignored by git
 # A part of the counts may be asked for.

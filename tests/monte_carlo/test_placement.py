@@ -11,8 +11,8 @@ import pytest
 from monte_carlo.tables import ledger
 from placement.scenes import every_set, task
 
-from optloc.placement import best_set
-from optloc.placement.best_set import exchanged, random_sets, search
+from optloc.sites.placement import best_set
+from optloc.sites.placement.best_set import exchanged, random_sets, search
 
 # A part of the counts may be asked for: a search that does not close takes its whole time.
 PART = float(os.environ.get("OPTLOC_PART", "1"))

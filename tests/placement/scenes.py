@@ -6,7 +6,7 @@ import numpy as np
 
 from formulations.placement import Design
 from optloc import assemble, measured
-from optloc.placement.best_set import Task
+from optloc.sites.placement.best_set import Task
 
 CRITERIA = ("A", "D", "E")
 CASES = [(criterion, worst, fail) for criterion in CRITERIA for worst in (False, True) for fail in (False, True)]

@@ -8,8 +8,8 @@ from often import few
 from placement.scenes import CASES, CRITERIA, every_set, task
 
 import formulations.placement as theory
-from optloc.placement import best_set
-from optloc.placement.best_set import exchanged, random_sets, search
+from optloc.sites.placement import best_set
+from optloc.sites.placement.best_set import exchanged, random_sets, search
 
 
 @pytest.fixture

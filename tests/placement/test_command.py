@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 import optloc
 from optloc.cli import app
 from optloc.files import read
-from optloc.placement.areas import convex_parts, inside, visible
-from optloc.placement.selection_file import read_selection
-from optloc.placement.sites import candidates_of
+from optloc.sites.placement.areas import convex_parts, inside, visible
+from optloc.sites.placement.selection_file import read_selection
+from optloc.sites.placement.sites import candidates_of
 
 SITES = "\n".join(
     ["name,x,y,z,cost,group"]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from placement.scenes import CASES, every_set, task
 
-from optloc.placement.best_set import _exhausted, exchanged, random_sets
-from optloc.placement.completions import Asked
+from optloc.sites.placement.best_set import _exhausted, exchanged, random_sets
+from optloc.sites.placement.completions import Asked
 
 ALL = np.array(np.meshgrid(*[[0, 1]] * 9)).reshape(9, -1).T
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, assemble, measured, place
-from optloc.placement.sites import Group, SiteSelection
+from optloc.sites.placement.sites import Group, SiteSelection
 
 SITES = 8
 

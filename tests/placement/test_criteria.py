@@ -5,7 +5,7 @@ import pytest
 from placement.scenes import CASES, CRITERIA, design, every_set, task
 
 import formulations.placement as theory
-from optloc.placement.branching import expand, propagate, settle
+from optloc.sites.placement.branching import expand, propagate, settle
 
 
 def relaxed(one, steps=80, enough=np.nan, state=None):

@@ -10,11 +10,11 @@ from placement.scenes import drawn, hall
 import optloc
 from formulations.placement import Ground, Region
 from optloc import InvalidProblem, SiteSelection, assemble, crlb, measured, place
-from optloc.placement import Draws, Group
-from optloc.placement import chosen as chosen_module
-from optloc.placement.chosen import drawn as simulated
-from optloc.placement.refinement import refined
-from optloc.placement.sites import candidates_of
+from optloc.sites.placement import Draws, Group
+from optloc.sites.placement import chosen as chosen_module
+from optloc.sites.placement.chosen import drawn as simulated
+from optloc.sites.placement.refinement import refined
+from optloc.sites.placement.sites import candidates_of
 
 EDGES = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
 

@@ -19,9 +19,6 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.registry import Table
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Status
-from optloc.calibration.likelihood import Estimate, likelihood
-from optloc.calibration.network import Network
-from optloc.calibration.rounds import starts_of
 from optloc.kernels.least_squares import WEIGHINGS
 from optloc.kernels.sums import equations_at
 from optloc.lab.study.draws import Drawn
@@ -35,6 +32,9 @@ from optloc.problem.epochs import tied, window
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
+from optloc.sites.calibration.likelihood import Estimate, likelihood
+from optloc.sites.calibration.network import Network
+from optloc.sites.calibration.rounds import starts_of
 from optloc.solvers.outside import given, judge_points
 from optloc.solvers.pool import offer
 from optloc.solvers.starts.position import spread_of

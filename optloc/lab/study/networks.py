@@ -15,12 +15,12 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import ANSWERED, Array, Status
-from optloc.calibration.calibrated import Calibration, calibrate
-from optloc.calibration.gauge import determined
-from optloc.calibration.likelihood import Estimate, likelihood, together
-from optloc.calibration.network import Network, network_of
 from optloc.files.schema import Units, join
 from optloc.lab.study.document import Amount, NetworkTable
+from optloc.sites.calibration.calibrated import Calibration, calibrate
+from optloc.sites.calibration.gauge import determined
+from optloc.sites.calibration.likelihood import Estimate, likelihood, together
+from optloc.sites.calibration.network import Network, network_of
 
 CALIBRATE = "calibrate"
 """The method of networks."""

@@ -1,6 +1,6 @@
 """The search for a set of sites: starts that are exchanged, and a branch and bound that says how good any set can be.
 
-Best first; a node is bounded by its relaxation (`optloc.placement.relaxation`), started from its parent's weights. What
+Best first; a node is bounded by its relaxation (`optloc.sites.placement.relaxation`), started from its parent's weights. What
 the reduced costs forbid is fixed at once.
 """
 
@@ -19,8 +19,8 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from formulations.placement import Criterion, Design
 from optloc.base.types import Array
-from optloc.placement.branching import FREE, IN, OUT, expand, propagate, score, settle
-from optloc.placement.completions import Asked, exhaust
+from optloc.sites.placement.branching import FREE, IN, OUT, expand, propagate, score, settle
+from optloc.sites.placement.completions import Asked, exhaust
 
 # Random sets that are exchanged beside the rounded relaxation, and steps of a relaxation: at the root, and of a node.
 _STARTS, _ROOT_STEPS, _STEPS = 15, 60, 40

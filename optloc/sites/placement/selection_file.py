@@ -39,9 +39,17 @@ from optloc.files.table import Table, of_rows, table_of
 from optloc.files.unknowns import settle_frame
 from optloc.files.words import distinct
 from optloc.files.writer import toml_text
-from optloc.placement.areas import convex_parts, corners_in_frame, ground_of, inside, polygons_of, region_of, visible
-from optloc.placement.sites import Group, Name, SiteSelection
 from optloc.problem.problem import Problem
+from optloc.sites.placement.areas import (
+    convex_parts,
+    corners_in_frame,
+    ground_of,
+    inside,
+    polygons_of,
+    region_of,
+    visible,
+)
+from optloc.sites.placement.sites import Group, Name, SiteSelection
 
 # Columns of stations and candidates that a problem file knows.
 _PLACE = (

@@ -14,14 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.calibration.blocks import minima, pulses_alone, stations_alone
-from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
-from optloc.calibration.network import Network
-from optloc.calibration.rounds import Starts, starts_of
 from optloc.linear.evaluate import predict
 from optloc.linear.vectors import vectors
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
+from optloc.sites.calibration.blocks import minima, pulses_alone, stations_alone
+from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.network import Network
+from optloc.sites.calibration.rounds import Starts, starts_of
 
 PRICE = 16.0
 """Cost of a row that is left out: beyond four sigma it is cheaper than what it says, as with suspects of a fix."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optloc.calibration.blocks import MOVED, Block, blocks, elsewhere, moved
-from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
-from optloc.calibration.motions import bent
-from optloc.calibration.network import CLOCKED, Network
-from optloc.calibration.rounds import Ends, joined, rounds, starts_of
 from optloc.problem.chart import tail_probability
+from optloc.sites.calibration.blocks import MOVED, Block, blocks, elsewhere, moved
+from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.motions import bent
+from optloc.sites.calibration.network import CLOCKED, Network
+from optloc.sites.calibration.rounds import Ends, joined, rounds, starts_of
 from optloc.solvers.policy import REFUTED, equal_cost
 
 AGREEING = 3

@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from formulations.low_rank_network import fit_low_rank, random_stations
 from formulations.metric_upgrade import unknowns, upgrade
 from optloc.base.types import Array
-from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
-from optloc.calibration.network import Network
+from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.network import Network
 
 # Starts at a time: a batch of eight costs little more than one.
 _LOW_RANK, _RANDOM = 8, 8

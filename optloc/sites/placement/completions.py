@@ -13,8 +13,8 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, put_rows
-from optloc.placement.branching import IN, OUT, number_left
-from optloc.placement.criteria import TRACE, VOLUME, invert, measure
+from optloc.sites.placement.branching import IN, OUT, number_left
+from optloc.sites.placement.criteria import TRACE, VOLUME, invert, measure
 
 # Rounding of sums of costs, as a share of a limit: a budget that is met exactly is met.
 _EXACT = 1e-9
@@ -39,7 +39,7 @@ class Asked(NamedTuple):
     weight : array (P,)
         Of the places.
     d, kind, worst, fail : int
-        As in `optloc.placement.branching.score`.
+        As in `optloc.sites.placement.branching.score`.
     rules, limits : array (R, n), (R,)
         rules @ w <= limits; the first has no negative entry.
     """

@@ -1,6 +1,6 @@
 """The relaxed choice of a node of the search, as machine code: its least value from below, and what it forbids.
 
-For any weights w and any multipliers the tangent of L at w (`optloc.placement.criteria`) lies below the criterion at
+For any weights w and any multipliers the tangent of L at w (`optloc.sites.placement.criteria`) lies below the criterion at
 every choice, so that its least value over the node is a bound, converged or not. A primal-dual interior-point method
 finds multipliers that make it a good one: those of the places and failures that count, of the rules, and of 0 <= w <=
 1. Nodes that are pruned, or that cannot be, need a few of its steps.
@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, put
 from optloc.kernels.systems import cholesky, solve_factored
-from optloc.placement.criteria import VOLUME, add_square, derive, evaluate
+from optloc.sites.placement.criteria import VOLUME, add_square, derive, evaluate
 
 # Multipliers below this share of the largest are left out: they cost as much as the others, and move the bound by less.
 _SHARE = 1e-3

@@ -6,8 +6,8 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, put_rows
-from optloc.placement.criteria import gather, invert, measure
-from optloc.placement.relaxation import relax
+from optloc.sites.placement.criteria import gather, invert, measure
+from optloc.sites.placement.relaxation import relax
 
 FREE, OUT, IN = -1, 0, 1
 """States of a site."""
@@ -65,7 +65,7 @@ def score(rows: Array, prior: Array, weight: Array, d: int, kind: int, worst: in
     weight : array (P,)
         Of the places.
     d, kind, worst
-        As in `optloc.placement.relaxation.evaluate`.
+        As in `optloc.sites.placement.relaxation.evaluate`.
     fail : int
         Whether the worst loss of one site counts.
     chosen : int array (B, n)

@@ -13,9 +13,9 @@ from formulations.placement import Ground, Region, refine, value
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.models import MODELS, Point
-from optloc.placement.best_set import exchanged, random_sets
-from optloc.placement.chosen import Placement, task_of
-from optloc.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
+from optloc.sites.placement.best_set import exchanged, random_sets
+from optloc.sites.placement.chosen import Placement, task_of
+from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 
 # Random sets whose places are starts beside that of the grid: from these the best was lower by 7, 16 and 1 % in trials.
 _STARTS = 10

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Prior
-from optloc.calibration.likelihood import Estimate, Likelihood, clock_signs, together
-from optloc.calibration.network import Network
 from optloc.kernels.least_squares import refine
 from optloc.linear.vectors import vectors
 from optloc.models import MODELS
@@ -16,6 +14,8 @@ from optloc.problem.build import Measured, assemble, measured
 from optloc.problem.claims import GLOBAL
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.sites.calibration.likelihood import Estimate, Likelihood, clock_signs, together
+from optloc.sites.calibration.network import Network
 from optloc.solvers import solve
 from optloc.solvers.policy import AMBIGUOUS_GAP, equal_cost
 

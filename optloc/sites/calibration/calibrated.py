@@ -9,9 +9,11 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.types import PRECEDENCE, Array, Status
-from optloc.calibration.agreement import AGREEING, Found, frame_size, proven, search
-from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
-from optloc.calibration.gauge import (
+from optloc.engine.shape import STRAIGHT
+from optloc.problem.chart import tail_probability
+from optloc.sites.calibration.agreement import AGREEING, Found, frame_size, proven, search
+from optloc.sites.calibration.blocks import Block, blocks, moved_pulses, place_pulses
+from optloc.sites.calibration.gauge import (
     Determined,
     departure,
     determined,
@@ -21,12 +23,10 @@ from optloc.calibration.gauge import (
     over,
     with_mean_clock,
 )
-from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
-from optloc.calibration.network import Network
-from optloc.calibration.outliers import PRICE, outliers
-from optloc.calibration.rounds import laid
-from optloc.engine.shape import STRAIGHT
-from optloc.problem.chart import tail_probability
+from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.network import Network
+from optloc.sites.calibration.outliers import PRICE, outliers
+from optloc.sites.calibration.rounds import laid
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 from optloc.solvers.verdict.findings import Finding, objections
 
@@ -367,7 +367,7 @@ class _Facts:
     sides : tuple of str
         Sentences on stations, or pulses, in one plane.
     departure : float
-        See `optloc.calibration.gauge.departure`; NaN where a motion is open.
+        See `optloc.sites.calibration.gauge.departure`; NaN where a motion is open.
     blocks : tuple of Block
         Stations and pulses with their proofs.
     elsewhere : tuple of Alternative

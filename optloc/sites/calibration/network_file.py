@@ -13,14 +13,14 @@ from optloc.base.inputs import read_text
 from optloc.base.outputs import claim, write_text
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.calibration.calibrated import Calibration
-from optloc.calibration.network import KINDS, Network, Slot, checked
 from optloc.files.roles import worded
 from optloc.files.schema import Amount, DataTable, ProblemFile, Units, conform, join, name_of, parse_toml
 from optloc.files.table import Table, table_of
 from optloc.files.words import distinct
 from optloc.files.writer import toml_text
 from optloc.models import MODELS, kind_named
+from optloc.sites.calibration.calibrated import Calibration
+from optloc.sites.calibration.network import KINDS, Network, Slot, checked
 
 # Deviation that stations of the frame get in a file, metres: as good as exact.
 _EXACT = 1e-6

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.calibration.gauge import determined, shifted
-from optloc.calibration.likelihood import Estimate, Likelihood
+from optloc.sites.calibration.gauge import determined, shifted
+from optloc.sites.calibration.likelihood import Estimate, Likelihood
 
 # Directions of largest variance, and standard deviations to either side: other minima were 5 to 20 deviations away, in
 # a valley that is curved.

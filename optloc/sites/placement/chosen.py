@@ -15,8 +15,8 @@ from optloc.bounds.bound_map import bound_map, extent, map_coordinates
 from optloc.bounds.crlb import crlb
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.simulate import simulate
-from optloc.placement.best_set import Searched, Task, random_sets, search
-from optloc.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
+from optloc.sites.placement.best_set import Searched, Task, random_sets, search
+from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -414,7 +414,7 @@ def picture(selection: SiteSelection, found: Placement) -> Figure:
     InvalidProblem
         Where rows were chosen, which have no map.
     """
-    from optloc.show.pictures.placement_map import plot_placement
+    from optloc.sites.placement.placement_map import plot_placement
 
     problem, names = selection.problem, np.array(selection.problem.stations.names)
     if selection.by == "row":

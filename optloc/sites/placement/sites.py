@@ -13,11 +13,11 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Prior
 from optloc.linear.normal import Normal, linearise, with_priors
 from optloc.models import MODELS
-from optloc.placement.counts import Group, check_groups
 from optloc.problem.arrivals import as_arrivals
 from optloc.problem.layout import emission_name
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
+from optloc.sites.placement.counts import Group, check_groups
 
 Name = Literal["rms", "volume", "axis"]
 """Criteria: mean-square error, volume and longest axis of the error ellipsoid."""
