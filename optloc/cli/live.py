@@ -34,10 +34,10 @@ from optloc.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from optloc.live.recording import Recorded
-    from optloc.live.site import Site
-    from optloc.live.sources import Adapter
-    from optloc.live.stream import Stream
+    from optloc.service.recording import Recorded
+    from optloc.service.site import Site
+    from optloc.service.sources import Adapter
+    from optloc.service.stream import Stream
 
 # The stream itself is imported inside the commands, so that --help answers at once.
 
@@ -190,9 +190,9 @@ def serve(
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
-    """Return what options say as arguments of `optloc.live.stream.Settings`."""
-    from optloc.live.answers import FORMATS
-    from optloc.live.engine import PHASES
+    """Return what options say as arguments of `optloc.service.stream.Settings`."""
+    from optloc.service.answers import FORMATS
+    from optloc.service.engine import PHASES
 
     return {
         "wait": seconds_of(wait, "--wait"),
@@ -205,11 +205,11 @@ def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str
 
 
 def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, track: bool) -> dict[str, Any]:
-    """Return how tracks are made, as arguments of `optloc.live.stream.Settings`."""
+    """Return how tracks are made, as arguments of `optloc.service.stream.Settings`."""
     if (model, name, noise, gap) == ("cv", "iekf", None, None):
         return {"track": track}
     from optloc.cli.track import Wanted, dynamics_of, rules
-    from optloc.live.tracks import Following
+    from optloc.service.tracks import Following
     from optloc.tracking.entry import Rules
     from optloc.tracking.updates import filter_of
 
@@ -257,10 +257,10 @@ class Asked:
 
 def run_live(file: Path, asked: Asked) -> int:
     """Run a stream until its source ends or a signal comes, and return the exit code."""
-    from optloc.live.recording import read_recording
-    from optloc.live.site import read_site
-    from optloc.live.sources import adapter_of
-    from optloc.live.stream import Settings, Stream
+    from optloc.service.recording import read_recording
+    from optloc.service.site import read_site
+    from optloc.service.sources import adapter_of
+    from optloc.service.stream import Settings, Stream
 
     if not asked.speed > 0.0:
         raise InvalidProblem(f"the speed is {asked.speed:g}", "--speed", "give a positive number")
@@ -291,8 +291,8 @@ def run_live(file: Path, asked: Asked) -> int:
 
 def _open(asked: Asked, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
     """Open the sources that are none of files, and return what is said of them."""
-    from optloc.live import serve as requests
-    from optloc.live.sources import mqtt, zeromq
+    from optloc.service import serve as requests
+    from optloc.service.sources import mqtt, zeromq
 
     said = ""
     if asked.http is not None:
@@ -311,8 +311,8 @@ def _open(asked: Asked, stream: Stream, adapter: Adapter | None, stops: ExitStac
 
 def _read(asked: Asked, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
     """Read a recording or standard input in a thread of its own, if that is wanted."""
-    from optloc.live.recording import replay
-    from optloc.live.stream import read_lines
+    from optloc.service.recording import replay
+    from optloc.service.stream import read_lines
 
     if recording is not None:
         lines = recording if adapter is None else [each._replace(data=adapter(each.data)) for each in recording]
@@ -324,7 +324,7 @@ def _read(asked: Asked, stream: Stream, adapter: Adapter | None, recording: list
 
 def run_check(file: Path, method: str) -> int:
     """Say what a stream of a site takes and answers."""
-    from optloc.live.site import read_site
+    from optloc.service.site import read_site
 
     site = read_site(file, method)
     for line in told(site):

@@ -14,7 +14,7 @@ from data.windows import report
 from live.lines import Answers, arrivals, differences, line, site_in, slowed
 
 from optloc.cli.live import _threads
-from optloc.live.stream import Settings, Stream
+from optloc.service.stream import Settings, Stream
 
 EVENTS = 20_000
 

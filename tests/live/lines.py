@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.live.site import read_site
-from optloc.live.stream import Settings, Stream, read_lines
 from optloc.problem.build import Problem
+from optloc.service.site import read_site
+from optloc.service.stream import Settings, Stream, read_lines
 from optloc.solvers import solve
 
 C = 299_792_458.0

@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from optloc import InvalidProblem
 from optloc.cli import app
-from optloc.live.checkpoint import restore, state_of
-from optloc.live.events import Events, parse
-from optloc.live.metrics import Metrics
-from optloc.live.stream import Settings, Stream
+from optloc.service.checkpoint import restore, state_of
+from optloc.service.events import Events, parse
+from optloc.service.metrics import Metrics
+from optloc.service.stream import Settings, Stream
 
 VALUES = (None, True, 0, -1, 1.5, 1e308, "", "A", "tdoa", "1", "9" * 30, "\ud800", "\x1b[2J", "x" * 300, [], [[]], {})
 VALUES = (*VALUES, {"a": 1}, float("nan"), float("inf"), 10**40, [None] * 5, "optloc live 2")

@@ -9,8 +9,8 @@ import pytest
 from live.lines import EPOCH, SITE, C, arrivals, differences, line, site_in
 
 from optloc.base.errors import InvalidProblem
-from optloc.live.events import LINE, Events, parse, picoseconds, share_of
-from optloc.live.metrics import Metrics
+from optloc.service.events import LINE, Events, parse, picoseconds, share_of
+from optloc.service.metrics import Metrics
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def test_rows_of_open_events_are_bounded(site):
 
 
 def test_closed_events_are_remembered_for_a_while(site, monkeypatch):
-    monkeypatch.setattr("optloc.live.events.REMEMBERED", 3)
+    monkeypatch.setattr("optloc.service.events.REMEMBERED", 3)
     events, notes = events_of(site)
     for i in range(5):
         take(events, 0.0, event=str(i), z=[0.0] * 5)

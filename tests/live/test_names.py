@@ -5,11 +5,11 @@ import json
 import pytest
 from live.lines import EPOCH, Answers, answers, arrivals, line, site_in
 
-from optloc.live.events import Events, parse
-from optloc.live.metrics import Metrics
-from optloc.live.site import FAST, UnknownName
-from optloc.live.sources import ChirpStack
-from optloc.live.stream import Settings, Stream, read_lines, restore, state_of
+from optloc.service.events import Events, parse
+from optloc.service.metrics import Metrics
+from optloc.service.site import FAST, UnknownName
+from optloc.service.sources import ChirpStack
+from optloc.service.stream import Settings, Stream, read_lines, restore, state_of
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 from optloc.base.errors import InvalidProblem  # noqa: E402  (after the libraries that may be missing)
 from optloc.cli.track import runs_of  # noqa: E402
 from optloc.files import read  # noqa: E402
-from optloc.live.serve import serve  # noqa: E402
-from optloc.live.stream import Settings, Stream  # noqa: E402
-from optloc.live.tracks import Following  # noqa: E402
+from optloc.service.serve import serve  # noqa: E402
+from optloc.service.stream import Settings, Stream  # noqa: E402
+from optloc.service.tracks import Following  # noqa: E402
 from optloc.tracking import polynomial, tracked  # noqa: E402
 
 ON_EARTH = SITE.replace("[stations]", '[frame]\nkind = "enu"\norigin = { lat_deg = 47.5, lon_deg = 8.0 }\n\n[stations]')
@@ -245,7 +245,7 @@ def test_a_websocket_takes_lines_and_tells_all_answers(site, served):
 
 def test_a_websocket_that_reads_too_slowly_is_closed(served, monkeypatch):
     stream, port = served
-    monkeypatch.setattr("optloc.live.serve._QUEUE", 4)
+    monkeypatch.setattr("optloc.service.serve._QUEUE", 4)
     with connect(f"ws://127.0.0.1:{port}/ws", open_timeout=10.0) as socket:
         socket.send("{}")
         socket.recv(timeout=10.0)

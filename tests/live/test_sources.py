@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.live.queues import Inbox
-from optloc.live.site import FAST
-from optloc.live.sources import ChirpStack, ModeS, adapter_of, mqtt, zeromq
-from optloc.live.stream import Settings, Stream
+from optloc.service.queues import Inbox
+from optloc.service.site import FAST
+from optloc.service.sources import ChirpStack, ModeS, adapter_of, mqtt, zeromq
+from optloc.service.stream import Settings, Stream
 
 
 @pytest.fixture(scope="module")

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 
 from optloc.cli import app
 from optloc.files import load
-from optloc.live.answers import FORMATS, to_aircraft, to_feature, to_line, to_mark
-from optloc.live.engine import PENDING, Engine
-from optloc.live.events import Events, parse
-from optloc.live.metrics import COUNTS, Metrics
-from optloc.live.queues import WAITING, Ticket
-from optloc.live.site import FAST
-from optloc.live.stream import Settings, Stream, read_lines, state_of
+from optloc.service.answers import FORMATS, to_aircraft, to_feature, to_line, to_mark
+from optloc.service.engine import PENDING, Engine
+from optloc.service.events import Events, parse
+from optloc.service.metrics import COUNTS, Metrics
+from optloc.service.queues import WAITING, Ticket
+from optloc.service.site import FAST
+from optloc.service.stream import Settings, Stream, read_lines, state_of
 from optloc.solvers import solve
 
 
@@ -183,12 +183,12 @@ def test_a_failure_of_optloc_is_an_answer_and_no_end(site, monkeypatch, caplog):
 
     _, lines = whole(site, 2)
     with monkeypatch.context() as patched:
-        patched.setattr("optloc.live.engine.proof_records", fail)
+        patched.setattr("optloc.service.engine.proof_records", fail)
         records, health = answers(site, lines)
     assert [record["phase"] for record in records if "error" not in record] == ["fix", "fix"]
     assert {record["error"] for record in records if "error" in record} == {"ZeroDivisionError: of a solver"}
     assert health["unsolvable"] == 2
-    monkeypatch.setattr("optloc.live.stream.parse", fail)
+    monkeypatch.setattr("optloc.service.stream.parse", fail)
     records, health = answers(site, lines)
     assert [record["error"] for record in records] == ["of a solver"] * 2
     assert "Traceback" in caplog.text

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from threading import Condition, Lock, Thread
 from typing import NamedTuple
 
-from optloc.live.answers import Record, join
-from optloc.live.engine import BATCH
+from optloc.service.answers import Record, join
+from optloc.service.engine import BATCH
 
 WAITING = 4096
 """Lines that may wait to be read, and answers that may wait to be written."""
@@ -72,7 +72,7 @@ class Line(NamedTuple):
     stamp : float
         When it was read, by the clock of the stream.
     when : float
-        The same by the time that events wait, see `optloc.live.stream.read_lines`.
+        The same by the time that events wait, see `optloc.service.stream.read_lines`.
     ticket : Ticket, optional
         Who waits for what it brings.
     track : bool, optional

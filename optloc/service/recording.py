@@ -12,9 +12,9 @@ import numpy as np
 
 from optloc.base.inputs import read_bytes
 from optloc.files.reader import Draft, draft
-from optloc.live.queues import Line
-from optloc.live.stream import Stream
 from optloc.models import MODELS
+from optloc.service.queues import Line
+from optloc.service.stream import Stream
 
 # Lines that are handed on at once where nobody waits for the clock.
 _MANY = 64

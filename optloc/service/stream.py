@@ -17,17 +17,17 @@ from optloc.base.inputs import access
 from optloc.base.outputs import Growing, write_text
 from optloc.kernels.jit import enabled
 from optloc.linear.simulate import simulate
-from optloc.live import events as of_events
-from optloc.live.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
-from optloc.live.checkpoint import restore, state_of
-from optloc.live.engine import BATCH, Engine
-from optloc.live.events import LINE, Events, parse
-from optloc.live.metrics import Metrics
-from optloc.live.queues import Inbox, Line, Outbox, Ticket
-from optloc.live.site import Site, UnknownName, read_site
-from optloc.live.tracks import Following, Tracks
+from optloc.service import events as of_events
+from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
+from optloc.service.checkpoint import restore, state_of
+from optloc.service.engine import BATCH, Engine
+from optloc.service.events import LINE, Events, parse
+from optloc.service.metrics import Metrics
+from optloc.service.queues import Inbox, Line, Outbox, Ticket
+from optloc.service.site import Site, UnknownName, read_site
+from optloc.service.tracks import Following, Tracks
 
-LOG = logging.getLogger("optloc.live")
+LOG = logging.getLogger("optloc.service")
 
 # Lines that are looked at before the clock is: a timer is late by what they take, some milliseconds.
 _LINES = 256
@@ -51,7 +51,7 @@ class Settings:
     revise : bool
         Whether late rows make a new answer.
     phases : "two", "one" or "fix"
-        As `optloc.live.engine.PHASES`.
+        As `optloc.service.engine.PHASES`.
     deadline : float
         Seconds after which a proof is given up.
     shed : bool
@@ -59,7 +59,7 @@ class Settings:
     part : (int, int)
         Which of how many processes this is.
     format : str
-        A key of `optloc.live.answers.FORMATS`.
+        A key of `optloc.service.answers.FORMATS`.
     state : Path, optional
         Checkpoint, read at the start where it is there.
     record : Path, optional

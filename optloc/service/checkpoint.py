@@ -7,10 +7,10 @@ from typing import Any, TypeVar
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import Budget, access, json_of, read_text
-from optloc.live.answers import Record
-from optloc.live.events import Event, Events, name_under, picoseconds, rows_and_arrivals
-from optloc.live.metrics import COUNTS
-from optloc.live.site import Site
+from optloc.service.answers import Record
+from optloc.service.events import Event, Events, name_under, picoseconds, rows_and_arrivals
+from optloc.service.metrics import COUNTS
+from optloc.service.site import Site
 
 _FORMAT = "optloc live 1"
 # Bytes of a checkpoint: as many as the largest state has, 4096 open events of 64 kB and 65 536 ids.
@@ -143,7 +143,7 @@ def _count(found: Any, where: str) -> int:
 
 
 def _counts(found: Any) -> dict[str, int]:
-    """Return what was counted, by the names of `optloc.live.metrics.COUNTS`."""
+    """Return what was counted, by the names of `optloc.service.metrics.COUNTS`."""
     counts = _typed(found, dict, "counts")
     unknown = counts.keys() - COUNTS.keys()
     if unknown:

@@ -13,8 +13,8 @@ from zlib import crc32
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import has_controls
 from optloc.base.units import LARGEST
-from optloc.live.metrics import Metrics
-from optloc.live.site import Row, Site, UnknownName
+from optloc.service.metrics import Metrics
+from optloc.service.site import Row, Site, UnknownName
 
 # One line.
 

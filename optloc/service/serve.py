@@ -12,11 +12,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from optloc.base.errors import InvalidProblem
-from optloc.live.answers import Record, to_line
-from optloc.live.events import LINE
-from optloc.live.queues import WAITING, Ticket
-from optloc.live.site import Site
-from optloc.live.stream import Stream
+from optloc.service.answers import Record, to_line
+from optloc.service.events import LINE
+from optloc.service.queues import WAITING, Ticket
+from optloc.service.site import Site
+from optloc.service.stream import Stream
 
 HOST, PORT = "127.0.0.1", 8200
 """Where requests are taken unless somebody says otherwise: on this machine alone."""

@@ -11,10 +11,10 @@ import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Status
-from optloc.live.events import Event
 from optloc.problem.claims import PROOFS, UNKNOWN
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.service.events import Event
 from optloc.show import formats
 from optloc.show.formats.marks import Mark, Other, mark_of
 from optloc.show.pictures.outlines import earth_points

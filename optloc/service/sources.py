@@ -11,11 +11,11 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.live.events import LINE
-from optloc.live.queues import WAITING
-from optloc.live.stream import Stream
+from optloc.service.events import LINE
+from optloc.service.queues import WAITING
+from optloc.service.stream import Stream
 
-LOG = logging.getLogger("optloc.live")
+LOG = logging.getLogger("optloc.service")
 
 Adapter = Callable[[bytes], bytes]
 """Turns a line of another format into one of a stream; what it does not understand stays, and is refused."""

@@ -14,17 +14,17 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.live.answers import UNNAMED, Record, track_record, unsolved
-from optloc.live.events import Event
-from optloc.live.metrics import Metrics
 from optloc.problem.problem import Problem
+from optloc.service.answers import UNNAMED, Record, track_record, unsolved
+from optloc.service.events import Event
+from optloc.service.metrics import Metrics
 from optloc.tracking.dynamics import Dynamics, polynomial
 from optloc.tracking.entry import Entry, Rules
 from optloc.tracking.run import Follower
 from optloc.tracking.several_targets import alone
 from optloc.tracking.updates import Update
 
-LOG = logging.getLogger("optloc.live")
+LOG = logging.getLogger("optloc.service")
 
 # Events that may wait for their track; beyond, the stream waits, as every scan counts.
 _WAITING = 256

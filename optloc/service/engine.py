@@ -14,13 +14,13 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.live.answers import Record, fix_records, proof_records, unproven, unsolved
-from optloc.live.events import Event
-from optloc.live.metrics import Metrics
-from optloc.live.site import Ready, Row, Site
-from optloc.live.tracks import Following, Scan, Tracks
+from optloc.service.answers import Record, fix_records, proof_records, unproven, unsolved
+from optloc.service.events import Event
+from optloc.service.metrics import Metrics
+from optloc.service.site import Ready, Row, Site
+from optloc.service.tracks import Following, Scan, Tracks
 
-LOG = logging.getLogger("optloc.live")
+LOG = logging.getLogger("optloc.service")
 
 BATCH = 64
 """Events that are solved at once, at most: alone while few come, all that wait under load."""
