@@ -1,7 +1,7 @@
 """Manoeuvring targets by azimuth and elevation with the current statistical model: three simulations.
 
-All trials of a setting run as one batch. The tables and figures are those of `optloc.lab.papers.angles_tables`, the page is
-``angles.md``.
+All trials of a setting run as one batch. `optloc.lab.papers.angles_tables` makes the tables and figures;
+the page is ``angles.md``.
 """
 
 from __future__ import annotations

@@ -159,7 +159,7 @@ def _digest(words: Iterable[str]) -> str:
 
 def shipped() -> dict[str, Traversable]:
     """Return the shipped study files by name."""
-    folder = files("optloc") / "studies"
+    folder = files("optloc.lab") / "studies"
     if not folder.is_dir():
         return {}
     found = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}

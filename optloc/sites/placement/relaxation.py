@@ -1,7 +1,7 @@
 """The relaxed choice of a node of the search, as machine code: its least value from below, and what it forbids.
 
-For any weights w and any multipliers the tangent of L at w (`optloc.sites.placement.criteria`) lies below the criterion at
-every choice, so that its least value over the node is a bound, converged or not. A primal-dual interior-point method
+For any weights w and any multipliers the tangent of L at w (`optloc.sites.placement.criteria`) lies below the criterion
+at every choice, so that its least value over the node is a bound, converged or not. A primal-dual interior-point method
 finds multipliers that make it a good one: those of the places and failures that count, of the rules, and of 0 <= w <=
 1. Nodes that are pruned, or that cannot be, need a few of its steps.
 
