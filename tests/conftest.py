@@ -86,11 +86,11 @@ def data_dir() -> Path:
 def one_form_of_machine_code():
     """Whatever Python hands to machine code is of the types for which `optloc compile` made it: nobody waits twice."""
     yield
-    from optloc.cli.compile import PARTS
+    from optloc.cli.compile import parts
     from optloc.kernels import jit
 
     if not jit.enabled():
         return
-    entries = {name for part in PARTS.values() for name in part.entries}
+    entries = {name for part in parts().values() for name in part.entries}
     twice = {k.name: k.machine.signatures for k in jit._KERNELS if k.name in entries and len(k.machine.signatures) > 1}
     assert not twice, "\n".join(f"{name}: {each}" for name, both in twice.items() for each in both)

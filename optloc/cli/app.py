@@ -7,24 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
-from optloc.cli.calibrate import NETWORKS, calibrate
 from optloc.cli.doctor import doctor
+from optloc.cli.extensions import Asked, extensions
 from optloc.cli.from_table import EXAMPLES as CONVERSIONS
 from optloc.cli.from_table import convert, table_told, takes_table
-from optloc.cli.live import EXAMPLES, SERVED, live, serve
 from optloc.cli.options import (
+    ANSWERS,
     EXIT_CODES,
+    FIRST,
+    MORE,
     AboveGround,
     Allow,
-    AmbiguityDraws,
     Box,
     Budget,
-    Choose,
-    Costs,
-    Criterion,
     EmitterCount,
     Explain,
-    FailOne,
     FalseRows,
     Force,
     Geodetic,
@@ -40,8 +37,6 @@ from optloc.cli.options import (
     NoiseFromData,
     Out,
     Outside,
-    PlacementMap,
-    PlaceOfInterest,
     Plot,
     ProblemPath,
     Quiet,
@@ -61,11 +56,8 @@ from optloc.cli.options import (
     name_in,
     run_process,
 )
-from optloc.cli.study import study
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
-
-FIRST, ANSWERS, MORE = "First steps", "Answers", "More"
 
 app = typer.Typer(
     cls=Group,
@@ -347,44 +339,6 @@ def crlb(
 @app.command(
     rich_help_panel=ANSWERS,
     epilog=example(
-        "optloc place sites.toml -k 6 --worst --fail-one --plot map.png --out chosen.toml",
-        "optloc place site.toml -k 4 --at 1200,800,50",
-    ),
-)
-def place(
-    file: ProblemPath,
-    choose: Choose = None,
-    budget_: Costs = None,
-    criterion: Criterion = None,
-    worst: Annotated[bool | None, typer.Option("--worst/--mean", help="The worst place counts, or the mean.")] = None,
-    fail_one: FailOne = None,
-    gap: Annotated[float | None, typer.Option(metavar="SHARE", help="Stop when the bound is as close.")] = None,
-    time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop after so long.")] = None,
-    at: PlaceOfInterest = None,
-    rows: Annotated[bool, typer.Option("--rows", help="Choose single measurements, not stations.")] = False,
-    draws: AmbiguityDraws = 20,
-    out: Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write the chosen stations.")] = None,
-    plot: PlacementMap = None,
-    as_json: Json = False,
-    outside: Outside = False,
-    budget: Budget = None,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Choose where stations go: which of many sites give the best fixes, with a bound of what any choice can reach.
-
-    FILE is a selection file (choice, candidates, targets), or a problem file, whose stations are the candidates.
-    """
-    from optloc.cli.place import Wanted, run_place
-
-    wanted = Wanted(choose, budget_, criterion, worst, fail_one, gap, time, at, rows, draws)
-    raise typer.Exit(run_place(file, wanted, plot=plot, out=out, as_json=as_json, quiet=quiet))
-
-
-@app.command(
-    rich_help_panel=ANSWERS,
-    epilog=example(
         "optloc check flight.toml --plot health.svg --out health.csv",
         "optloc check toa.csv --stations sites.csv --sigma '20 ns'",
     ),
@@ -455,7 +409,7 @@ def plot(
     where iterations from many starts end. residuals: by station. biases: of a run against time, with 95 %. bound: map
     of the Cramer-Rao bound. track: of a run. accuracy: errors of a study's methods against the bound.
     """
-    from optloc.cli.pictures import Asked, run_plot
+    from optloc.cli.pictures import run_plot
 
     place = Path(f"{what}.png") if out is None else out
     raise typer.Exit(run_plot(what, Asked(file, place, method, epoch), quiet))
@@ -500,37 +454,13 @@ def new(
 
 
 app.command(rich_help_panel=FIRST, epilog=example(*CONVERSIONS))(convert)
-app.command(rich_help_panel=ANSWERS, epilog=example(*NETWORKS))(calibrate)
-
-
-@app.command(
-    rich_help_panel=MORE,
-    epilog=example("optloc reproduce registration", "optloc reproduce registration --size full --out tables"),
-)
-def reproduce(
-    name: Annotated[str, name_in("papers", "Paper")],
-    size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
-        "quick"
-    ),
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-NAME by default.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Make the simulations of a paper again: tables and pictures with printed value, reproduced value and bound."""
-    from optloc.cli.study import run_reproduce
-
-    raise typer.Exit(run_reproduce(name, size, out, seed, quiet))
 
 
 # The names of the lists are known without making one of them.
 def _lists() -> list[str]:
-    from optloc.cli.listing import LISTS
+    from optloc.cli.listing import lists
 
-    return list(LISTS)
+    return list(lists())
 
 
 @app.command(
@@ -589,8 +519,6 @@ def schema(verbose: Verbose = False) -> None:
 
 
 app.command(rich_help_panel=MORE, epilog=example("optloc doctor", "optloc doctor --json"))(doctor)
-app.command(rich_help_panel=ANSWERS, epilog=EXAMPLES)(live)
-app.command(rich_help_panel=ANSWERS, epilog=SERVED)(serve)
 
-# Last, so that help lists it behind the other commands of its panel.
-app.add_typer(study, name="study", rich_help_panel=MORE)
+for one in extensions():
+    one.commands(app)

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,6 +26,7 @@ from rich.table import Table
 
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Motion, Stations
+from optloc.cli.extensions import extensions
 from optloc.cli.output import Screen, dumps, meter
 from optloc.kernels.filter import filter_scan
 from optloc.kernels.jit import REPORTER, compiling, enabled, insist_on, named, names_in, plain
@@ -37,7 +39,6 @@ from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.scope import SHORT
-from optloc.sites.placement import SiteSelection, place
 from optloc.solvers import solve
 from optloc.solvers.certify.admitted import certify
 from optloc.solvers.prepared import prepare
@@ -46,46 +47,47 @@ from optloc.tracking.updates import ekf
 from optloc.uncertainty.region import likelihood_region
 
 _STATIONS = 1e3 * np.array([[0.0, 0, 0], [10, 0, 1], [0, 10, 2], [-9, 1, 0.5], [1, -8, 3], [6, 7, 0]])
-_TARGET = np.array([2e3, 3e3, 4e3])
+TARGET = np.array([2e3, 3e3, 4e3])
 # More problems than plain Python answers, and than the stages of numpy sum the equations of.
 _FEW, _MANY = 40, 500
 
 
-def _problem_of(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+def problem_of(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+    """Return a problem of five rows of one kind, without values."""
     rows = {"b": np.zeros(5, dtype=int)} if kind in ("tdoa", "fdoa", "groa") else {}
     return assemble(stations, measured(kind, a=np.arange(1, 6), sigma=1.0, **rows), **more)
 
 
 def _drawn(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
-    problem = _problem_of(kind, stations, **more)
-    place = np.append(_TARGET, np.zeros(problem.layout.size - 3)) if problem.layout.size > 3 else _TARGET
+    problem = problem_of(kind, stations, **more)
+    place = np.append(TARGET, np.zeros(problem.layout.size - 3)) if problem.layout.size > 3 else TARGET
     return simulate(problem, place, 1, count).flat()
 
 
 def _fix_ranges() -> None:
     problem = _drawn("tdoa", _FEW)
     solve(problem, "gtrs+lsr")
-    prepare(_problem_of("tdoa"), "gtrs+lsr")(problem.z[0])
+    prepare(problem_of("tdoa"), "gtrs+lsr")(problem.z[0])
 
 
 def _fix_tapes() -> None:
     problem = _drawn("groa", _FEW)
     solve(problem, "gtrs+lsr")
-    prepare(_problem_of("groa"), "gtrs+lsr")(problem.z[0])
+    prepare(problem_of("groa"), "gtrs+lsr")(problem.z[0])
 
 
 def _filter() -> None:
     insist_on(filter_scan)
-    scan = simulate(assemble(_STATIONS, measured("range", a=np.arange(6), sigma=1.0)), _TARGET, 1)
-    ekf(scan, _TARGET, np.eye(3))
+    scan = simulate(assemble(_STATIONS, measured("range", a=np.arange(6), sigma=1.0)), TARGET, 1)
+    ekf(scan, TARGET, np.eye(3))
 
 
 def _refine() -> None:
-    solve(_drawn("elevation", _MANY), "lsr", start=np.tile(_TARGET, (_MANY, 1)))
+    solve(_drawn("elevation", _MANY), "lsr", start=np.tile(TARGET, (_MANY, 1)))
     # a run whose emission times are unknowns of its two epochs
     rows = measured("toa", a=np.tile(np.arange(6), 2), epoch=np.repeat([0, 1], 6), sigma=1.0)
     run = assemble(_STATIONS, rows)
-    truth = np.append(_TARGET, np.zeros(run.layout.size - 3))
+    truth = np.append(TARGET, np.zeros(run.layout.size - 3))
     solve(simulate(run, truth, 1, _MANY).flat(), "lsr", start=np.tile(truth, (_MANY, 1)))
 
 
@@ -106,16 +108,16 @@ def _prove_runs() -> None:
     epochs = SHORT // len(_STATIONS) + 1
     place = _STATIONS + 10.0 * np.arange(epochs)[:, None, None] * speed
     rows = measured("tdoa", a=np.tile(np.arange(1, 6), epochs), b=0, epoch=np.repeat(np.arange(epochs), 5), sigma=1.0)
-    problem = simulate(assemble(Stations(place, tuple("ABCDEF")), rows), _TARGET, 1, _FEW).flat()
+    problem = simulate(assemble(Stations(place, tuple("ABCDEF")), rows), TARGET, 1, _FEW).flat()
     certify(problem, _plainly_solved(problem))
     moving = assemble(_STATIONS[:, :2], rows, times=np.arange(float(epochs)), motions=(Motion(1),))
-    problem = simulate(moving, np.append(_TARGET[:2], [30.0, -10.0]), 1).flat()
+    problem = simulate(moving, np.append(TARGET[:2], [30.0, -10.0]), 1).flat()
     certify(problem, _plainly_solved(problem))
 
 
 def _prove_scaled() -> None:
-    problem = with_bias(_problem_of("toa"), "speed", form="scale", per="kind", sigma=0.05)
-    found = simulate(problem, np.append(_TARGET, np.zeros(problem.layout.size - 3)), 1, _FEW).flat()
+    problem = with_bias(problem_of("toa"), "speed", form="scale", per="kind", sigma=0.05)
+    found = simulate(problem, np.append(TARGET, np.zeros(problem.layout.size - 3)), 1, _FEW).flat()
     certify(found, _plainly_solved(found))
 
 
@@ -132,13 +134,8 @@ def _search() -> None:
 def _cover() -> None:
     # of a fix inside, and of one so far outside that infinity is as likely
     for times in (1.0, 1000.0):
-        problem = simulate(_problem_of("tdoa"), times * _TARGET, 1)
+        problem = simulate(problem_of("tdoa"), times * TARGET, 1)
         likelihood_region(problem, _plainly_solved(problem))
-
-
-def _place() -> None:
-    # the criteria differ by numbers, not by types
-    place(SiteSelection(_problem_of("toa"), _TARGET[None], choose=4, gap=0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +154,7 @@ class Part:
 
 # The longest first: there are as many processes as processors, at most two, and memory is a gigabyte each. Those that
 # share what they call do not begin side by side.
-PARTS: Mapping[str, Part] = {
+_PARTS: Mapping[str, Part] = {
     "proofs": Part(
         "proofs of fixes", "optloc.proof", (_prove,), ("optloc.proof.batch._loop", "optloc.proof.batch._evaluate")
     ),
@@ -202,22 +199,19 @@ PARTS: Mapping[str, Part] = {
         tuple(f"optloc.proof.scaled.scaled_proof.{name}" for name in ("prove_scaled", "_evaluate")),
     ),
     "searches": Part("searches for starts", "optloc.proof", (_search,), ("optloc.proof.best_first.search_minima",)),
-    "placements": Part(
-        "placements of stations",
-        "optloc.sites.placement",
-        (_place,),
-        (
-            *(f"optloc.sites.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
-            "optloc.sites.placement.completions.exhaust",
-        ),
-    ),
     "regions": Part("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.cover.cover",)),
 }
 
 
+@cache
+def parts() -> Mapping[str, Part]:
+    """Return all that is compiled, by name; neighbours add theirs."""
+    return {**_PARTS, **{name: part for one in extensions() for name, part in one.kernels().items()}}
+
+
 def missing() -> list[str]:
     """Return the kernels that Python calls of which there is no machine code on disk."""
-    return [name for part in PARTS.values() for name in part.missing()]
+    return [name for part in parts().values() for name in part.missing()]
 
 
 def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[str]:
@@ -233,7 +227,7 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
     list of str
         The kernels that Python calls of which there is no machine code even now; empty if all went well.
     """
-    names = [name for name, part in PARTS.items() if part.missing()]
+    names = [name for name, part in parts().items() if part.missing()]
     known, done, lock = dict[str, set[str]](), set[str](), Lock()
 
     def follow(name: str) -> None:
@@ -278,7 +272,7 @@ def _started(name: str, variables: Mapping[str, str]) -> Iterator[str]:
 
 def _compile(part: Part) -> None:
     """Compile a part in this process, and write what is done to standard output."""
-    for entry in (entry for each in PARTS.values() for entry in each.entries):
+    for entry in (entry for each in parts().values() for entry in each.entries):
         import_module(entry.rpartition(".")[0])  # all kernels are known then
     print("all", *names_in(part.package), flush=True)  # noqa: T201
 
@@ -305,10 +299,10 @@ def run_compile(check: bool, as_json: bool, *, quiet: bool = False) -> int:
     if place is not None and not check:
         with meter("making machine code", quiet) as tell:
             make(tell)
-    found = {name: len(part.missing()) for name, part in PARTS.items()} if place is not None else {}
+    found = {name: len(part.missing()) for name, part in parts().items()} if place is not None else {}
     if as_json:
-        parts = {name: not missing for name, missing in found.items()}
-        typer.echo(dumps({"folder": None if place is None else str(place), "parts": parts}))
+        there = {name: not missing for name, missing in found.items()}
+        typer.echo(dumps({"folder": None if place is None else str(place), "parts": there}))
     else:
         _print(found, None if place is None else str(place))
     return int(place is None or any(found.values()))
@@ -324,7 +318,7 @@ def _print(found: dict[str, int], place: str | None) -> None:
     for title in ("machine code of", "on disk"):
         table.add_column(title)
     for name, missing in found.items():
-        table.add_row(PARTS[name].summary, "no" if missing else "yes")
+        table.add_row(parts()[name].summary, "no" if missing else "yes")
     screen.print(table)
     shipped = installed()
     before = "" if shipped is None else f"installed in {shipped[0]}; what is missing is "
@@ -346,6 +340,6 @@ def _make_alone() -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:]:
-        _compile(PARTS[sys.argv[1]])
+        _compile(parts()[sys.argv[1]])
     else:
         _make_alone()

@@ -14,6 +14,7 @@ from typing import Any
 import typer
 from rich.table import Table
 
+from optloc.cli.extensions import extensions
 from optloc.cli.options import Json, Verbose
 from optloc.cli.output import Screen, dumps, say
 
@@ -96,7 +97,7 @@ def machine_code() -> dict[str, Any]:
 
     if not enabled():
         return {"folder": None, "made_for": None, "installed": False, "parts": {}}
-    from optloc.cli.compile import PARTS
+    from optloc.cli.compile import parts
     from optloc.kernels.kept import kept_in
     from optloc.kernels.manifest import installed, of_this_process
 
@@ -105,7 +106,7 @@ def machine_code() -> dict[str, Any]:
         "folder": None if place is None else str(place),
         "made_for": of_this_process().processor,
         "installed": installed() is not None,
-        "parts": {part.summary: place is not None and not part.missing() for part in PARTS.values()},
+        "parts": {part.summary: place is not None and not part.missing() for part in parts().values()},
     }
 
 
@@ -129,13 +130,6 @@ def advice(found: list[Package], code: dict[str, Any]) -> list[Advice]:
     return told
 
 
-def _datasets() -> dict[str, Any]:
-    from optloc.lab.datasets import available
-
-    folder = os.environ.get("OPTLOC_DATA")
-    return {"folder": folder, "there": list(available()) if folder else []}
-
-
 def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
     """Print versions, machine, where machine code lies and whether it is there, what is missing and what brings it."""
     found, code = packages(), machine_code()
@@ -145,7 +139,7 @@ def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
         "machine": machine(),
         "packages": [asdict(one) | {"state": one.state} for one in found],
         "machine_code": code,
-        "datasets": _datasets(),
+        **{name: fact() for one in extensions() for name, fact in one.facts.items()},
         "advice": [asdict(one) for one in advice(found, code)],
     }
     if as_json:
@@ -170,7 +164,7 @@ def _show(told: dict[str, Any]) -> None:
         say(screen, f"Machine code for {code['made_for']} is kept in {code['folder'] or 'no folder'}")
         for name, there in code["parts"].items():
             say(screen, f"  {'yes' if there else 'no ':3} {name}")
-    if told["datasets"]["folder"]:
+    if told.get("datasets", {}).get("folder"):
         say(screen, f"Data sets in {told['datasets']['folder']}: {', '.join(told['datasets']['there']) or 'none'}")
     say(screen, "Nothing is missing." if not told["advice"] else "Missing:")
     for one in told["advice"]:

@@ -15,10 +15,9 @@ from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.units import UNITS
+from optloc.cli.extensions import Rows, extensions
 from optloc.cli.output import Screen, dumps
 from optloc.models import MODELS
-
-Rows = list[dict[str, str]]
 
 # Widths of the console that a table may wrap over: beyond, entries are easier to read one below the other.
 _WRAPS = 4
@@ -26,9 +25,10 @@ _WRAPS = 4
 
 def run_list(what: str, as_json: bool) -> int:
     """Print one of the tables."""
-    if what not in LISTS:
-        raise InvalidProblem(f"there is no list of {what!r}", "list", nearest(what, LISTS))
-    rows = LISTS[what]()
+    known = lists()
+    if what not in known:
+        raise InvalidProblem(f"there is no list of {what!r}", "list", nearest(what, known))
+    rows = known[what]()
     if as_json:
         typer.echo(dumps(rows))
         return 0
@@ -99,7 +99,7 @@ def _summary(entry: Any) -> str:
     )
 
 
-def _registry(title: str, place: str) -> Callable[[], Rows]:
+def registry(title: str, place: str) -> Callable[[], Rows]:
     """Return what lists a table, or what a function makes of it, by its place: it is imported when it is asked for."""
 
     def rows() -> Rows:
@@ -125,7 +125,7 @@ def _kinds() -> Rows:
 
 
 def _solvers() -> Rows:
-    from optloc.lab.study.methods import backends
+    from optloc.solvers.backends import backends
     from optloc.solvers.methods import SOLVERS
 
     # Back ends of the relaxations are found at run time: those of packages that are installed.
@@ -136,47 +136,21 @@ def _solvers() -> Rows:
     return [*describe("solver", SOLVERS), *found.values()]
 
 
-def _studies() -> Rows:
-    import tomllib
-
-    from optloc.lab.study.design import shipped
-
-    texts = {name: tomllib.loads(entry.read_text(encoding="utf-8")) for name, entry in shipped().items()}
-    return [{"study": name, "summary": data.get("title", data["name"])} for name, data in texts.items()]
-
-
-def _datasets() -> Rows:
-    from optloc.lab.datasets import available
-    from optloc.lab.datasets.catalogue import ENTRIES
-
-    here = available()
-    return [
-        {
-            "dataset": name,
-            "here": "yes" if name in here else "no",
-            "licence": entry.licence,
-            "summary": entry.description,
-        }
-        for name, entry in ENTRIES.items()
-    ]
-
-
-LISTS: dict[str, Callable[[], Rows]] = {
+_LISTS: dict[str, Callable[[], Rows]] = {
     "kinds": _kinds,
-    "formulations": _registry("formulation", "optloc.solvers:FORMULATIONS"),
+    "formulations": registry("formulation", "optloc.solvers:FORMULATIONS"),
     "solvers": _solvers,
-    "methods": _registry("method", "optloc:METHODS"),
-    "losses": _registry("loss", "optloc:LOSSES"),
-    "trackers": _registry("tracker", "optloc.tracking:UPDATES"),
-    "motions": _registry("motion", "optloc.cli.track:MOTIONS"),
-    "baselines": _registry("baseline", "optloc.lab.study.baselines:BASELINES"),
-    "formats": _registry("format", "optloc.show.formats:FORMATS"),
-    "executors": _registry("executor", "optloc.lab.study.execute:EXECUTORS"),
-    "studies": _studies,
-    "papers": _registry("paper", "optloc.lab.papers:PAPERS"),
-    "datasets": _datasets,
-    "pictures": _registry("picture", "optloc.cli.pictures:PICTURES"),
-    "demos": _registry("demo", "optloc.cli.starters:titles"),
-    "starters": _registry("starter", "optloc.cli.starters:starters"),
+    "methods": registry("method", "optloc:METHODS"),
+    "losses": registry("loss", "optloc:LOSSES"),
+    "trackers": registry("tracker", "optloc.tracking:UPDATES"),
+    "motions": registry("motion", "optloc.cli.track:MOTIONS"),
+    "formats": registry("format", "optloc.show.formats:FORMATS"),
+    "pictures": registry("picture", "optloc.cli.pictures:pictures"),
+    "demos": registry("demo", "optloc.cli.starters:titles"),
+    "starters": registry("starter", "optloc.cli.starters:starters"),
 }
-"""What can be listed, by name; `optloc list` and the completion of the shell read it."""
+
+
+def lists() -> dict[str, Callable[[], Rows]]:
+    """Return what can be listed, by name; `optloc list` and the completion of the shell read it."""
+    return {**_LISTS, **{name: rows for one in extensions() for name, rows in one.lists.items()}}

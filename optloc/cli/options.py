@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 BAD_INPUT = 2
 """Exit code of whatever is wrong with the arguments or a file: what shells and typer use for wrong usage."""
 
+FIRST, ANSWERS, MORE = "First steps", "Answers", "More"
+"""Panels of commands in the help."""
+
 STOPPED, READER_GONE = 130, 141
 """Exit codes after Ctrl-C, and where the reader of a pipe has gone: 128 and the signal's number, as shells count."""
 
@@ -281,9 +284,9 @@ def complete(what: str) -> Callable[[str], list[str]]:
 
     def found(incomplete: str) -> list[str]:
         # Completion runs a process for every Tab: nothing is imported before it is known what is asked.
-        from optloc.cli.listing import LISTS
+        from optloc.cli.listing import lists
 
-        return [next(iter(row.values())) for row in LISTS[what]()]
+        return [next(iter(row.values())) for row in lists()[what]()]
 
     return found
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.cli.extensions import Asked, extensions
 from optloc.cli.output import Screen, claim_outputs, say, write_picture
 from optloc.files import Loaded, read
 from optloc.problem.epochs import by_epoch, separable
@@ -20,34 +19,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What is to be drawn.
-
-    Parameters
-    ----------
-    file : Path
-        Problem file, or the folder of a study.
-    out : Path
-        The picture.
-    method : str
-        How fixes are made.
-    epoch : str, optional
-        Label of the epoch, or case of a study; the first by default.
-    """
-
-    file: Path
-    out: Path
-    method: str
-    epoch: str | None
-
-
 def run_plot(what: str, asked: Asked, quiet: bool) -> int:
     """Draw a picture, and return the exit code."""
-    if what not in PICTURES:
-        raise InvalidProblem(f"there is no picture {what!r}", "plot", nearest(what, list(PICTURES)))
+    known = pictures()
+    if what not in known:
+        raise InvalidProblem(f"there is no picture {what!r}", "plot", nearest(what, list(known)))
     claim_outputs(picture=asked.out, inputs=[asked.file])
-    PICTURES[what](asked)
+    known[what](asked)
     say(Screen(quiet=quiet), f"The picture is in {asked.out}.")
     return 0
 
@@ -135,35 +113,7 @@ def _track(asked: Asked) -> None:
     run_track(asked.file, Wanted(), plot=asked.out, quiet=True)
 
 
-def _accuracy(asked: Asked) -> None:
-    """Errors of a study's methods against the bound."""
-    from optloc.lab.study import summary
-    from optloc.lab.study.folder import read_frame
-    from optloc.show.pictures import plot_accuracy
-
-    if not asked.file.is_dir():
-        raise InvalidProblem("the errors of methods are those of a study", str(asked.file), "name its output folder")
-    rows = read_frame(asked.file, [*summary.COLUMNS])
-    if not len(rows):
-        raise InvalidProblem("nothing of the study is finished yet", str(asked.file), "run the study")
-    cells = summary.cells(summary.judged(rows))
-    names = list(dict.fromkeys(str(case) for case in cells["case"]))
-    name = names[0] if asked.epoch is None else asked.epoch
-    if name not in names:
-        raise InvalidProblem(f"there is no case {name!r}", "--epoch", nearest(name, names))
-    case = cells[cells["case"].astype(str) == name]
-    # Methods may lack some noise levels: reindexed, so that all have values (or NaN) at the same ones.
-    noise = np.unique(case["noise"].to_numpy(dtype=float))
-    bound = case.groupby("noise")["bound"].max().reindex(noise).to_numpy(dtype=float)
-    errors = {
-        str(method): part.groupby("noise")["rmse"].first().reindex(noise).to_numpy(dtype=float)
-        for method, part in case.groupby("method", sort=False, observed=True)
-    }
-    unit = str(case["noise_unit"].iloc[0])
-    write_picture(plot_accuracy(noise, errors, bound, name, unit="" if unit == "x" else unit), asked.out)
-
-
-PICTURES: dict[str, Callable[[Asked], None]] = {
+_PICTURES: dict[str, Callable[[Asked], None]] = {
     "fix": _fix,
     "landscape": _landscape,
     "convergence": _convergence,
@@ -171,6 +121,9 @@ PICTURES: dict[str, Callable[[Asked], None]] = {
     "biases": _biases,
     "bound": _bound,
     "track": _track,
-    "accuracy": _accuracy,
 }
-"""Pictures by name."""
+
+
+def pictures() -> dict[str, Callable[[Asked], None]]:
+    """Return the pictures by name, with those of the neighbours."""
+    return {**_PICTURES, **{name: draw for one in extensions() for name, draw in one.pictures.items()}}

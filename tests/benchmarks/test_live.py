@@ -13,7 +13,7 @@ import pytest
 from data.windows import report
 from live.lines import Answers, arrivals, differences, line, site_in, slowed
 
-from optloc.cli.live import _threads
+from optloc.service.command import _threads
 from optloc.service.stream import Settings, Stream
 
 EVENTS = 20_000

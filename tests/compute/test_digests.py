@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import optloc
-from optloc.cli.compile import PARTS
+from optloc.cli.compile import parts
 from optloc.kernels import digests, kept
 from optloc.kernels.jit import _KERNELS, compiled, enabled, inlined, named, replace, with_constants
 from optloc.proof.nodes.dispatch import NODES, text_of
@@ -29,7 +29,7 @@ SHARE = 0.12
 @cache
 def shipped():
     """Return all kernels of optloc by name: those that entries reach."""
-    entries = [named(name) for part in PARTS.values() for name in part.entries]
+    entries = [named(name) for part in parts().values() for name in part.entries]
     return {kernel.name: kernel for entry in entries for kernel in digests.closure(entry)}
 
 
@@ -101,14 +101,14 @@ def test_digests_differ_and_are_the_same_each_time():
 def test_digests_do_not_depend_on_the_order_of_sets(order):
     """Code under a digest that the next process does not compute is compiled by every process."""
     code = """
-from optloc.cli.compile import PARTS
+from optloc.cli.compile import parts
 from optloc.kernels import digests
 from optloc.kernels.jit import named
-print(*(digests.digest_of(named(name)) for part in PARTS.values() for name in part.entries))
+print(*(digests.digest_of(named(name)) for part in parts().values() for name in part.entries))
 """
     command, environment = [sys.executable, "-P", "-c", code], {**os.environ, "PYTHONHASHSEED": order}
     said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
-    assert said == [digests.digest_of(named(name)) for part in PARTS.values() for name in part.entries]
+    assert said == [digests.digest_of(named(name)) for part in parts().values() for name in part.entries]
 
 
 def test_no_kernel_names_a_value_without_a_text_of_its_own():

@@ -217,7 +217,7 @@ def test_a_site_that_no_stream_can_have_is_refused(tmp_path, old, new, said):
 
 
 def test_what_is_told_of_a_site_is_what_it_takes(site):
-    from optloc.cli.live import told
+    from optloc.service.command import told
 
     lines = [text.partition(": ")[2] for text in told(replace(site))]
     for text in lines[1:4]:

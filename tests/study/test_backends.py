@@ -12,11 +12,11 @@ import optloc
 from optloc import Status
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.lab.study import backends as module
-from optloc.lab.study.backends import backend_kind, backends, faults_of, installed, try_apart
 from optloc.lab.study.design import design_of_text
 from optloc.lab.study.folder import progress, read_frame
 from optloc.lab.study.summary import COLUMNS, judged, methods
+from optloc.solvers import backends as module
+from optloc.solvers.backends import backend_kind, backends, faults_of, installed, try_apart
 from optloc.solvers.methods import Choice, using
 
 RUN = CliRunner()

@@ -17,13 +17,13 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Certificate, Status
 from optloc.files.schema import Units, join
-from optloc.lab.study.backends import backend_kind, backends, kind_of, version_of
 from optloc.lab.study.baselines import BASELINES, heard, only_networks, start_of
 from optloc.lab.study.document import MethodTable
 from optloc.lab.study.draws import Drawn
 from optloc.lab.study.minimizers import baseline_of, code_of, load_minimizer
 from optloc.lab.study.networks import CALIBRATE, Found, Networks, calibrated
 from optloc.problem.fix import Fix
+from optloc.solvers.backends import backend_kind, backends, kind_of, version_of
 
 # Back ends stand in a module of their own; studies know them from here.
 __all__ = [

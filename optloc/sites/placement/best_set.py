@@ -1,7 +1,7 @@
 """The search for a set of sites: starts that are exchanged, and a branch and bound that says how good any set can be.
 
-Best first; a node is bounded by its relaxation (`optloc.sites.placement.relaxation`), started from its parent's weights.
-What the reduced costs forbid is fixed at once.
+Best first; a node is bounded by its relaxation (`optloc.sites.placement.relaxation`), started with the weights of its
+parent. What the reduced costs forbid is fixed at once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What ``optloc study`` does (run, status, report, compare), and ``optloc reproduce``: the study of a paper."""
+"""``optloc study``: run, status, report, compare."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from contextlib import contextmanager, nullcontext
 from itertools import groupby
 from math import isinf, isnan, nan
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.outputs import claim, make_folder
+from optloc.base.errors import InvalidProblem
+from optloc.base.outputs import claim
 from optloc.cli.options import (
     STOPPED,
     Budget,
@@ -525,34 +525,3 @@ def _quartiles(values: tuple[float, ...] | None) -> str:
         return "-"
     low, middle, high = ("∞" if isinf(value) else f"{value:g}" for value in values)
     return f"{middle} [{low}, {high}]"
-
-
-# A paper is a study of its own: its trials, tables and pictures are made again.
-
-
-def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
-    """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
-    from optloc.cli.output import bar, say
-    from optloc.lab.papers import Size, paper, reproduction, write
-
-    paper(name)
-    if size not in get_args(Size):
-        raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, get_args(Size)))
-    folder = Path(f"optloc-{name}") if out is None else out
-    # before the work, so that a place that cannot be written is known at once
-    make_folder(folder)
-    claim(folder / "README.md")
-    ready = reproduction(name, cast(Size, size), seed)
-    with bar(name, ready.work, quiet) as advance:
-        report = ready.run(lambda: advance(1))
-    written = write(report, folder)
-    console = Screen(quiet=quiet)
-    for found in report.tables:
-        table = Table(title=found.title, title_justify="left", caption=found.note, caption_justify="left")
-        for i, heading in enumerate(found.header):
-            table.add_column(heading, justify="right" if i else "left", overflow="fold")
-        for row in found.rows:
-            table.add_row(*row)
-        console.print(table)
-    say(console, f"{len(written)} files are in {folder}; begin with README.md.")
-    return 0

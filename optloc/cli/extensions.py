@@ -1,0 +1,80 @@
+"""What neighbours of the core add to the command line: commands, lists, pictures, kernels and facts of the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import typer
+
+    from optloc.cli.compile import Part
+
+Rows = list[dict[str, str]]
+
+NEIGHBOURS = ("optloc.sites", "optloc.service", "optloc.lab")
+"""Packages beside the core. Each has a module ``extension`` with an `Extension`; a missing package adds nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a picture is drawn of.
+
+    Parameters
+    ----------
+    file : Path
+        Problem file, or folder of a study.
+    out : Path
+        Picture to write.
+    method : str
+        Method of the fix.
+    epoch : str, optional
+        Label of the epoch, or the case of a study.
+    """
+
+    file: Path
+    out: Path
+    method: str
+    epoch: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Extension:
+    """What one neighbour adds.
+
+    Parameters
+    ----------
+    commands : callable
+        Adds commands to the application. It must not import heavy libraries.
+    lists : mapping
+        Rows of ``optloc list NAME``.
+    pictures : mapping
+        Drawings of ``optloc plot NAME``.
+    kernels : callable
+        Returns what ``optloc compile`` compiles.
+    facts : mapping
+        Facts of this machine for ``optloc doctor``: a name, and what returns words.
+    """
+
+    commands: Callable[[typer.Typer], None]
+    lists: Mapping[str, Callable[[], Rows]] = field(default_factory=dict)
+    pictures: Mapping[str, Callable[[Asked], None]] = field(default_factory=dict)
+    kernels: Callable[[], Mapping[str, Part]] = dict
+    facts: Mapping[str, Callable[[], dict[str, Any]]] = field(default_factory=dict)
+
+
+@cache
+def extensions() -> tuple[Extension, ...]:
+    """Return what the installed neighbours add."""
+    return tuple(_found())
+
+
+def _found() -> Iterator[Extension]:
+    for name in NEIGHBOURS:
+        if find_spec(name) is not None:
+            yield import_module(f"{name}.extension").EXTENSION

@@ -1,0 +1,61 @@
+"""``optloc reproduce``: the simulations of a paper, made again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import typer
+from rich.table import Table
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.outputs import claim, make_folder
+from optloc.cli.options import Force, Quiet, Verbose, example, name_in
+from optloc.cli.output import Screen
+
+EXAMPLES = example("optloc reproduce registration", "optloc reproduce registration --size full --out tables")
+
+
+def reproduce(
+    name: Annotated[str, name_in("papers", "Paper")],
+    size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
+        "quick"
+    ),
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-NAME by default.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Make the simulations of a paper again: tables and pictures with printed value, reproduced value and bound."""
+    raise typer.Exit(_run(name, size, out, seed, quiet))
+
+
+def _run(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
+    """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
+    from optloc.cli.output import bar, say
+    from optloc.lab.papers import Size, paper, reproduction, write
+
+    paper(name)
+    if size not in get_args(Size):
+        raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, get_args(Size)))
+    folder = Path(f"optloc-{name}") if out is None else out
+    # before the work, so that a place that cannot be written is known at once
+    make_folder(folder)
+    claim(folder / "README.md")
+    ready = reproduction(name, cast(Size, size), seed)
+    with bar(name, ready.work, quiet) as advance:
+        report = ready.run(lambda: advance(1))
+    written = write(report, folder)
+    console = Screen(quiet=quiet)
+    for found in report.tables:
+        table = Table(title=found.title, title_justify="left", caption=found.note, caption_justify="left")
+        for i, heading in enumerate(found.header):
+            table.add_column(heading, justify="right" if i else "left", overflow="fold")
+        for row in found.rows:
+            table.add_row(*row)
+        console.print(table)
+    say(console, f"{len(written)} files are in {folder}; begin with README.md.")
+    return 0

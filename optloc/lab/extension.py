@@ -1,0 +1,97 @@
+"""What the lab adds to the command line: studies, papers, data sets, and their lists and pictures."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import typer
+
+from optloc.cli.extensions import Asked, Extension, Rows
+from optloc.cli.listing import registry
+from optloc.cli.options import MORE
+from optloc.lab.commands.reproduce import EXAMPLES, reproduce
+from optloc.lab.commands.study import study
+
+
+def _commands(app: typer.Typer) -> None:
+    app.command(rich_help_panel=MORE, epilog=EXAMPLES)(reproduce)
+    app.add_typer(study, name="study", rich_help_panel=MORE)
+
+
+def _studies() -> Rows:
+    import tomllib
+
+    from optloc.lab.study.design import shipped
+
+    texts = {name: tomllib.loads(entry.read_text(encoding="utf-8")) for name, entry in shipped().items()}
+    return [{"study": name, "summary": data.get("title", data["name"])} for name, data in texts.items()]
+
+
+def _datasets() -> Rows:
+    from optloc.lab.datasets import available
+    from optloc.lab.datasets.catalogue import ENTRIES
+
+    here = available()
+    return [
+        {
+            "dataset": name,
+            "here": "yes" if name in here else "no",
+            "licence": entry.licence,
+            "summary": entry.description,
+        }
+        for name, entry in ENTRIES.items()
+    ]
+
+
+def _folder() -> dict[str, Any]:
+    from optloc.lab.datasets import available
+
+    folder = os.environ.get("OPTLOC_DATA")
+    return {"folder": folder, "there": list(available()) if folder else []}
+
+
+def _accuracy(asked: Asked) -> None:
+    """Errors of a study's methods against the bound."""
+    import numpy as np
+
+    from optloc.base.errors import InvalidProblem, nearest
+    from optloc.cli.output import write_picture
+    from optloc.lab.study import summary
+    from optloc.lab.study.folder import read_frame
+    from optloc.show.pictures import plot_accuracy
+
+    if not asked.file.is_dir():
+        raise InvalidProblem("the errors of methods are those of a study", str(asked.file), "name its output folder")
+    rows = read_frame(asked.file, [*summary.COLUMNS])
+    if not len(rows):
+        raise InvalidProblem("nothing of the study is finished yet", str(asked.file), "run the study")
+    cells = summary.cells(summary.judged(rows))
+    names = list(dict.fromkeys(str(case) for case in cells["case"]))
+    name = names[0] if asked.epoch is None else asked.epoch
+    if name not in names:
+        raise InvalidProblem(f"there is no case {name!r}", "--epoch", nearest(name, names))
+    case = cells[cells["case"].astype(str) == name]
+    # Methods may lack some noise levels: reindexed, so that all have values (or NaN) at the same ones.
+    noise = np.unique(case["noise"].to_numpy(dtype=float))
+    bound = case.groupby("noise")["bound"].max().reindex(noise).to_numpy(dtype=float)
+    errors = {
+        str(method): part.groupby("noise")["rmse"].first().reindex(noise).to_numpy(dtype=float)
+        for method, part in case.groupby("method", sort=False, observed=True)
+    }
+    unit = str(case["noise_unit"].iloc[0])
+    write_picture(plot_accuracy(noise, errors, bound, name, unit="" if unit == "x" else unit), asked.out)
+
+
+EXTENSION = Extension(
+    _commands,
+    lists={
+        "baselines": registry("baseline", "optloc.lab.study.baselines:BASELINES"),
+        "executors": registry("executor", "optloc.lab.study.execute:EXECUTORS"),
+        "studies": _studies,
+        "papers": registry("paper", "optloc.lab.papers:PAPERS"),
+        "datasets": _datasets,
+    },
+    pictures={"accuracy": _accuracy},
+    facts={"datasets": _folder},
+)

@@ -1,0 +1,17 @@
+"""What the service adds to the command line: `optloc live` and `optloc serve`."""
+
+from __future__ import annotations
+
+import typer
+
+from optloc.cli.extensions import Extension
+from optloc.cli.options import ANSWERS
+from optloc.service.command import EXAMPLES, SERVED, live, serve
+
+
+def _commands(app: typer.Typer) -> None:
+    app.command(rich_help_panel=ANSWERS, epilog=EXAMPLES)(live)
+    app.command(rich_help_panel=ANSWERS, epilog=SERVED)(serve)
+
+
+EXTENSION = Extension(_commands)

@@ -1,0 +1,1 @@
+"""Commands of sites: placement and calibration."""

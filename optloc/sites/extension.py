@@ -1,0 +1,96 @@
+"""What sites add to the command line: `optloc place`, `optloc calibrate` and their kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from optloc.cli.extensions import Extension
+from optloc.cli.options import (
+    ANSWERS,
+    AmbiguityDraws,
+    Budget,
+    Choose,
+    Costs,
+    Criterion,
+    FailOne,
+    Force,
+    Json,
+    Outside,
+    PlacementMap,
+    PlaceOfInterest,
+    ProblemPath,
+    Quiet,
+    Verbose,
+    example,
+)
+from optloc.sites.commands.calibrate import NETWORKS, calibrate
+
+if TYPE_CHECKING:
+    from optloc.cli.compile import Part
+
+_PLACE = example(
+    "optloc place sites.toml -k 6 --worst --fail-one --plot map.png --out chosen.toml",
+    "optloc place site.toml -k 4 --at 1200,800,50",
+)
+
+
+def place(
+    file: ProblemPath,
+    choose: Choose = None,
+    budget_: Costs = None,
+    criterion: Criterion = None,
+    worst: Annotated[bool | None, typer.Option("--worst/--mean", help="The worst place counts, or the mean.")] = None,
+    fail_one: FailOne = None,
+    gap: Annotated[float | None, typer.Option(metavar="SHARE", help="Stop when the bound is as close.")] = None,
+    time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop after so long.")] = None,
+    at: PlaceOfInterest = None,
+    rows: Annotated[bool, typer.Option("--rows", help="Choose single measurements, not stations.")] = False,
+    draws: AmbiguityDraws = 20,
+    out: Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write the chosen stations.")] = None,
+    plot: PlacementMap = None,
+    as_json: Json = False,
+    outside: Outside = False,
+    budget: Budget = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Choose where stations go: which of many sites give the best fixes, with a bound of what any choice can reach.
+
+    FILE is a selection file (choice, candidates, targets), or a problem file, whose stations are the candidates.
+    """
+    from optloc.sites.commands.place import Wanted, run_place
+
+    wanted = Wanted(choose, budget_, criterion, worst, fail_one, gap, time, at, rows, draws)
+    raise typer.Exit(run_place(file, wanted, plot=plot, out=out, as_json=as_json, quiet=quiet))
+
+
+def _commands(app: typer.Typer) -> None:
+    app.command(rich_help_panel=ANSWERS, epilog=_PLACE)(place)
+    app.command(rich_help_panel=ANSWERS, epilog=example(*NETWORKS))(calibrate)
+
+
+def _kernels() -> Mapping[str, Part]:
+    from optloc.cli.compile import Part
+
+    entries = (
+        *(f"optloc.sites.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
+        "optloc.sites.placement.completions.exhaust",
+    )
+    return {"placements": Part("placements of stations", "optloc.sites.placement", (_place,), entries)}
+
+
+def _place() -> None:
+    from optloc.cli.compile import TARGET, problem_of
+    from optloc.sites.placement import SiteSelection
+    from optloc.sites.placement import place as chosen
+
+    # the criteria differ by numbers, not by types
+    chosen(SiteSelection(problem_of("toa"), TARGET[None], choose=4, gap=0.5))
+
+
+EXTENSION = Extension(_commands, kernels=_kernels)
