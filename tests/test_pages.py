@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from doc_pages import DOCS
-from report.browser import Browser, executable
+from show.browser import Browser, executable
 
 # Links that a reader follows are no requests; everything that a browser fetches by itself is.
 FETCHED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "embed": "src"}

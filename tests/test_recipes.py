@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lab.study.texts import design
 from monte_carlo.test_consistency import band
 from recipes import TABLES, files_of_the_page, installed, write_package
-from study.texts import design
 from typer.testing import CliRunner
 from verdicts import alone
 

@@ -11,7 +11,7 @@ import time
 
 import pytest
 from data.windows import report
-from live.lines import Answers, arrivals, differences, line, site_in, slowed
+from service.lines import Answers, arrivals, differences, line, site_in, slowed
 
 from optloc.service.command import _threads
 from optloc.service.stream import Settings, Stream

@@ -4,7 +4,7 @@ import resource
 from time import perf_counter
 
 import pytest
-from study.texts import design
+from lab.study.texts import design
 
 from optloc.lab.study.design import workers
 from optloc.lab.study.execute import executor, run_design

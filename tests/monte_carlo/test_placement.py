@@ -9,7 +9,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from monte_carlo.tables import ledger
-from placement.scenes import every_set, task
+from sites.placement.scenes import every_set, task
 
 from optloc.sites.placement import best_set
 from optloc.sites.placement.best_set import exchanged, random_sets, search

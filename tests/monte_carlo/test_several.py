@@ -7,9 +7,9 @@ from time import perf_counter
 import numpy as np
 import pytest
 from monte_carlo.tables import ledger
+from multi_target.brute import every_set, grown_sets, packed, true_sets
+from multi_target.scenes import EVERY, STAR, drawn
 from often import few
-from several.brute import every_set, grown_sets, packed, true_sets
-from several.scenes import EVERY, STAR, drawn
 
 from optloc import Status
 from optloc.multi_target import separate

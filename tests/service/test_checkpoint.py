@@ -1,0 +1,169 @@
+"""Checkpoints that were damaged: each is refused with one sentence, or goes on as it was."""
+
+import copy
+import json
+import random
+
+import pytest
+from service.lines import EPOCH, Answers, arrivals, line, site_in
+from typer.testing import CliRunner
+
+from optloc import InvalidProblem
+from optloc.cli import app
+from optloc.service.checkpoint import restore, state_of
+from optloc.service.events import Events, parse
+from optloc.service.metrics import Metrics
+from optloc.service.stream import Settings, Stream
+
+VALUES = (None, True, 0, -1, 1.5, 1e308, "", "A", "tdoa", "1", "9" * 30, "\ud800", "\x1b[2J", "x" * 300, [], [[]], {})
+VALUES = (*VALUES, {"a": 1}, float("nan"), float("inf"), 10**40, [None] * 5, "optloc live 2")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    return site_in(tmp_path_factory.mktemp("site"))
+
+
+@pytest.fixture(scope="module")
+def good(site):
+    """Return the state of a stream with open events of every sort."""
+    events = Events(site, Metrics(), lambda record: None, 10.0)
+    for i, times in enumerate(arrivals(site, 3)):
+        for k, time in enumerate(times[: 3 + i]):
+            more = {"target": "T"} if i else {}
+            events.take(parse(line(event=f"e{i}", station="ABCDEF"[k], time_ps=time, **more), site), 1.0, 1.0)
+    more = {"kind": "tdoa", "z": 2.5, "sigma": 2.0, "time": 3.5}
+    events.take(parse(line(event="r", a="C", b="B", **more), site), 1.0, 1.0, track=True)
+    events.remember("done", None)
+    return state_of(events, {})
+
+
+def places(node, path=()):
+    """Yield the paths of all values within a value."""
+    for key in node if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ():
+        yield (*path, key)
+        yield from places(node[key], (*path, key))
+
+
+def damaged(good, seed):
+    """Return a checkpoint with one damage."""
+    rng, text = random.Random(seed), json.dumps(good)
+    kind = rng.choice(["cut", "flip", "value", "value", "value", "drop", "twice", "nest"])
+    if kind == "cut":
+        return text[: rng.randrange(len(text))].encode()
+    if kind == "flip":
+        data = bytearray(text.encode())
+        data[rng.randrange(len(data))] = rng.randrange(256)
+        return bytes(data)
+    made = copy.deepcopy(good)
+    *path, key = rng.choice(list(places(made)))
+    parent = made
+    for each in path:
+        parent = parent[each]
+    if kind == "value":
+        parent[key] = rng.choice(VALUES)
+    elif kind == "drop":
+        del parent[key]
+    elif kind == "nest":
+        parent[key] = [parent[key]]
+    elif isinstance(parent, list):
+        parent.insert(key, copy.deepcopy(parent[key]))
+    else:
+        parent[f"{key}2"] = parent[key]
+    return json.dumps(made).encode()
+
+
+def refusal(path, events):
+    """Return why a checkpoint is refused; empty where it is taken over."""
+    try:
+        restore(path, events, 1.0)
+    except InvalidProblem as error:
+        return str(error)
+    return ""
+
+
+def test_every_damage_is_a_sentence_or_does_not_matter(site, good, tmp_path):
+    path, seen = tmp_path / "s.state", {"refused": 0, "resumed": 0}
+    for seed in range(400):
+        path.write_bytes(damaged(good, seed))
+        events = Events(site, Metrics(), lambda record: None, 10.0)
+        said = refusal(path, events)
+        assert "\n" not in said, seed
+        if said:
+            assert not {**events.open, **events.closed}, seed
+            seen["refused"] += 1
+        else:
+            # what was taken over is a state of its own
+            path.write_text(json.dumps(state_of(events, {})))
+            again = Events(site, Metrics(), lambda record: None, 10.0)
+            restore(path, again, 1.0)
+            assert again.open.keys() == events.open.keys(), seed
+            seen["resumed"] += 1
+    assert min(seen.values()) > 20
+
+
+def test_a_whole_checkpoint_comes_back(site, good, tmp_path):
+    path = tmp_path / "s.state"
+    path.write_text(json.dumps(good))
+    events = Events(site, Metrics(), lambda record: None, 10.0)
+    restore(path, events, 1.0)
+    assert state_of(events, {}) == good
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("counts", [1], r"damaged \(counts"),
+        ("counts", {"lines\n# bad": 1}, "s.state"),
+        ("closed", ["a", 1], r"damaged \(closed"),
+        ("open", {"a": 1}, r"damaged \(open"),
+        ("format", "optloc live 9", "no checkpoint of a stream"),
+    ],
+)
+def test_what_is_wrong_is_named(site, good, tmp_path, key, value, said):
+    path = tmp_path / "s.state"
+    path.write_text(json.dumps(good | {key: value}))
+    with pytest.raises(InvalidProblem, match=said):
+        restore(path, Events(site, Metrics(), lambda record: None, 10.0), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("times", [["A", "1" * 30]]), ("rows", [["tdoa", "B", "A", 1e40, None]]), ("when", 1e300), ("event", "done")],
+)
+def test_an_event_that_no_line_could_make_is_refused(site, good, tmp_path, key, value):
+    path, made = tmp_path / "s.state", copy.deepcopy(good)
+    made["open"][0][key] = value
+    path.write_text(json.dumps(made))
+    with pytest.raises(InvalidProblem, match=r"open event 1|s\.state"):
+        restore(path, Events(site, Metrics(), lambda record: None, 10.0), 1.0)
+
+
+def test_the_command_ends_with_one_sentence_and_leaves_no_recording(tmp_path):
+    site_in(tmp_path)
+    state = tmp_path / "s.state"
+    state.write_text('{"format": "optloc live 1", "closed": [], "open": [], "counts": [3]}')
+    words = ["live", str(tmp_path / "site.toml"), "--state", str(state), "--record", str(tmp_path / "r.ndjson")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2
+    assert "this checkpoint is damaged" in " ".join(done.output.split())
+    assert {path.name for path in tmp_path.iterdir()} == {"site.toml", "s.state"}
+
+
+def test_a_time_that_is_beyond_all_clocks_is_refused_before_it_is_kept(site):
+    with pytest.raises(InvalidProblem, match="beyond all clocks"):
+        parse(line(event="1", kind="tdoa", a="B", b="A", z=1.0, time=1e15), site)
+
+
+def test_a_stream_goes_on_from_its_state(site, good, tmp_path):
+    path, out = tmp_path / "s.state", Answers()
+    path.write_text(json.dumps(good))
+    stream = Stream(site, Settings(state=path, phases="fix", wait=60.0), out)
+    stream.inbox.put(stream.lines([line(event="e2", station="F", time_ps=EPOCH + 10**7)], "test"))
+    stream.close()
+    assert stream.ended.wait(60.0)
+    assert stream.error is None
+    assert {record["event"] for record in out.records} == {"e0", "e1", "e2", "r"}
+    (joined,) = [record for record in out.records if record["event"] == "e2"]
+    assert "error" not in joined, joined
+    assert joined["position"] is not None, joined
