@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from optloc.base.frames import CARTESIAN, ECEF, Frame
     from optloc.base.inputs import Budget
     from optloc.base.types import Bias, Certificate, Motion, Prior, Rows, Stations, Status
-    from optloc.bounds.crlb import Course, crlb, crlb_course
-    from optloc.bounds.observability import Observability, observability
+    from optloc.bounds.cramer_rao import Course, crlb, crlb_course
+    from optloc.bounds.rank import Observability, observability
     from optloc.files import from_table, load
-    from optloc.files.locate import locate
+    from optloc.files.one_call import locate
     from optloc.files.orbits import satellites
     from optloc.linear import constraints
     from optloc.linear.evaluate import predict
@@ -65,13 +65,12 @@ if TYPE_CHECKING:
     from optloc.sites.placement.chosen import Placement, place
     from optloc.sites.placement.sites import SiteSelection
     from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
-    from optloc.solvers.certify.admitted import certify
+    from optloc.solvers.certificates.admitted import certify
     from optloc.solvers.prepared import Prepared, prepare
     from optloc.solvers.robust.stage import rejected
     from optloc.solvers.running import Running
-    from optloc.solvers.status_shares import StatusShares, status_shares
-    from optloc.solvers.suspects.stage import suspects
-    from optloc.station_health.health import Health, health
+    from optloc.solvers.shares import StatusShares, status_shares
+    from optloc.solvers.suspect_rows.stage import suspects
     from optloc.station_health.levels import (
         NoiseLevels,
         common_level,
@@ -79,6 +78,7 @@ if TYPE_CHECKING:
         noise_levels,
         with_noise_levels,
     )
+    from optloc.station_health.stations import Health, health
     from optloc.station_health.structure import NoiseStructure, noise_structure, with_estimated_noise
     from optloc.uncertainty.arc import Arc, trace_arc
     from optloc.uncertainty.posterior import Mixture, Samples, mixture, samples
@@ -215,12 +215,12 @@ _HOMES = {
     "base.frames": "CARTESIAN ECEF Frame",
     "base.inputs": "Budget",
     "base.types": "Bias Certificate Motion Prior Rows Stations Status",
-    "bounds.crlb": "Course crlb crlb_course",
-    "bounds.observability": "Observability observability",
+    "bounds.cramer_rao": "Course crlb crlb_course",
+    "bounds.rank": "Observability observability",
     "sites.calibration.calibrated": "Calibration calibrate",
     "sites.calibration.network": "Network network_of",
     "files": "from_table load",
-    "files.locate": "locate",
+    "files.one_call": "locate",
     "files.orbits": "satellites",
     "linear.evaluate": "predict",
     "linear.gauss_newton": "gauss_newton",
@@ -243,18 +243,18 @@ _HOMES = {
     "problem.noise": "Noise",
     "problem.problem": "Problem",
     "problem.signal": "Signal",
-    "station_health.health": "Health health",
+    "station_health.stations": "Health health",
     "station_health.levels": "NoiseLevels common_level late_signals noise_levels with_noise_levels",
     "station_health.structure": "NoiseStructure noise_structure with_estimated_noise",
     "multi_target": "Emitters separate",
     "solvers": "FORMULATIONS METHODS SOLVERS Formulation solve",
-    "solvers.certify.admitted": "certify",
+    "solvers.certificates.admitted": "certify",
     "solvers.prepared": "Prepared prepare",
     "solvers.robust.stage": "rejected",
     "solvers.running": "Running",
-    "solvers.status_shares": "StatusShares status_shares",
+    "solvers.shares": "StatusShares status_shares",
     "linear.least_squares_ranges": "reduce",
-    "solvers.suspects.stage": "suspects",
+    "solvers.suspect_rows.stage": "suspects",
     "model_checks.coplanar": "distance_from_plane",
     "model_checks.determine": "determined",
     "uncertainty.arc": "Arc trace_arc",

@@ -9,10 +9,10 @@ from verdicts import alone
 
 from optloc import Fix, Motion, Problem, assemble, measured, solve
 from optloc.kernels.least_squares import refine
-from optloc.solvers.certify.admitted import certified
+from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.pool import in_parts
 from optloc.solvers.stages import search_widely
-from optloc.solvers.suspects.stage import suspect
+from optloc.solvers.suspect_rows.stage import suspect
 from optloc.solvers.verdict.judge import verdict
 
 BOX, SIGMA, MILLIRADIANS = np.array([10e3, 10e3, 6e3]), 10.0, 3e-3

@@ -7,8 +7,8 @@ import pytest
 
 from optloc import InvalidProblem, Motion, Prior, Stations, assemble, crlb, measured, with_bias
 from optloc.base.frames import Frame
-from optloc.bounds.crlb import _inverse, crlb_course
-from optloc.bounds.observability import observability
+from optloc.bounds.cramer_rao import _inverse, crlb_course
+from optloc.bounds.rank import observability
 from optloc.lab.papers import registration as scenes
 from optloc.linear.constraints import height
 from optloc.linear.normal import linearise, prior_parts

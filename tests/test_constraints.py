@@ -12,8 +12,8 @@ from optloc import Frame, InvalidProblem, Motion, Status, assemble, measured, si
 from optloc.base.types import Band, Polygon
 from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import box, exact, faces, height, on_face, polygon, speed, visible
-from optloc.solvers.certify.admitted import _is_dear
-from optloc.solvers.certify.position_cost import eliminate_nuisance
+from optloc.solvers.certificates.admitted import _is_dear
+from optloc.solvers.certificates.position_cost import eliminate_nuisance
 
 ENU = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
 PLANE = np.array([[0.0, 0.0], [5e3, 400.0], [300.0, 5e3], [5e3, 5200.0], [2.5e3, -2e3]])

@@ -17,7 +17,7 @@ from optloc import Status, assemble, certify, measured, prepare, simulate, solve
 from optloc.base import linalg
 from optloc.engine import plan
 from optloc.solvers import METHODS, SOLVERS, single
-from optloc.solvers.certify import admitted
+from optloc.solvers.certificates import admitted
 
 STATIONS = np.array([[0.0, 0.0], [1000.0, 0.0], [0.0, 1000.0], [1000.0, 1100.0], [500.0, -300.0]])
 PLACE = np.array([300.0, 400.0])

@@ -13,7 +13,7 @@ from test_constraint_files import rows as inline
 from optloc import Frame, InvalidProblem, Motion, Status, assemble, constraints, measured, simulate, solve
 from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef
 from optloc.base.types import Stations
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.files import read
 from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact, restore, violation

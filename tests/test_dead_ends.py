@@ -15,7 +15,7 @@ from optloc.problem.build import station_array
 from optloc.problem.epochs import by_epoch, states_by_epoch
 from optloc.show.columns import fix_columns
 from optloc.show.fixes import with_sigma
-from optloc.station_health.health import health
+from optloc.station_health.stations import health
 
 FREE = (optloc.Motion(0, span="epoch"),)
 RING = 100.0 * np.array([[np.cos(t), np.sin(t)] for t in np.linspace(0.0, 5.0, 6)])

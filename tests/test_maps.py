@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from optloc.base.errors import InvalidProblem
-from optloc.bounds.bound_map import bound_map, extent
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
+from optloc.bounds.over_area import bound_map, extent
 from optloc.files import from_table, read
 from optloc.show.map import land, rings
 from optloc.show.pictures.bound_map import isolines, levels, map_geojson, plot_bound_map

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from optloc import Motion, Prior, Stations, assemble, crlb, measured, simulate, solve, with_bias
 from optloc.base.frames import Frame
-from optloc.bounds.observability import observability
+from optloc.bounds.rank import observability
 from optloc.lab.papers import registration as scenes
 from optloc.linear.constraints import height
 from optloc.linear.normal import linearise

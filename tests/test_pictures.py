@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc.base.errors import InvalidProblem
-from optloc.bounds.bound_map import bound_map
+from optloc.bounds.over_area import bound_map
 from optloc.cli import app
 from optloc.kernels.sums import equations_at
 from optloc.show import pictures as plot

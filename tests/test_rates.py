@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc import ECEF, MODELS, InvalidProblem, Motion, assemble, measured, simulate, solve, with_bias
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.cli import app
 from optloc.files import load, read
 from optloc.linear.normal import linearise, normal

@@ -12,7 +12,7 @@ import optloc
 from optloc import Bias, Motion, Prior, assemble, measured, simulate
 from optloc.base.records import change
 from optloc.problem.claims import claim
-from optloc.solvers.certify.relaxations import METHODS, reference_bound
+from optloc.solvers.certificates.relaxations import METHODS, reference_bound
 from optloc.solvers.methods import compare_bounds
 from optloc.solvers.outside import accept
 from optloc.solvers.verdict.judge import judge

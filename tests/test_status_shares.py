@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 import optloc
 from optloc import InvalidProblem, Status, assemble, measured, simulate, solve, station_array, status_shares
 from optloc.cli import app
-from optloc.solvers.status_shares import status_map
+from optloc.solvers.shares import status_map
 
 PLACE = np.array([[0.0, 0.0], [40.0, 5.0], [35.0, 45.0], [-5.0, 30.0], [20.0, -15.0]])
 RUN = CliRunner()

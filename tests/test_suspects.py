@@ -19,10 +19,10 @@ from optloc.cli import app
 from optloc.kernels.least_squares import refine
 from optloc.model_checks.evidence import errors, influence, log_tail, reliability, significance
 from optloc.model_checks.groups import groups_of
-from optloc.problem.arrivals import as_arrivals, restore_order
+from optloc.problem.arrival_times import as_arrivals, restore_order
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP
-from optloc.solvers.suspects import subsets
+from optloc.solvers.suspect_rows import subsets
 from optloc.solvers.verdict.judge import judge
 
 RNG = np.random.default_rng(20251121)

@@ -10,7 +10,7 @@ from optloc import InvalidProblem, assemble, constraints, measured
 from optloc.base.cache import key_of
 from optloc.base.types import Bias, Prior, Stations
 from optloc.files import by_station
-from optloc.files import locate as locating
+from optloc.files import one_call as locating
 from optloc.problem import build
 from optloc.problem.problem import Problem
 

@@ -11,7 +11,7 @@ from importlib.resources import files
 import numpy as np
 
 import optloc
-from optloc.bounds.bound_map import bound_map
+from optloc.bounds.over_area import bound_map
 from optloc.show.pictures import plot_bound_map
 
 problem = optloc.load(files("optloc") / "scenarios" / "demo.toml")

@@ -39,7 +39,7 @@ from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, records
 from optloc.show.fixes import with_sigma
 from optloc.solvers import Method
-from optloc.station_health.health import Health, health_of
+from optloc.station_health.stations import Health, health_of
 
 # Members of a bias that are named; the others are counted.
 _MEMBERS = 8

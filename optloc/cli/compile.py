@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -26,11 +25,11 @@ from rich.table import Table
 
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Motion, Stations
-from optloc.cli.extensions import extensions
+from optloc.cli.extensions import Part, extensions
 from optloc.cli.output import Screen, dumps, meter
 from optloc.kernels.filter import filter_scan
-from optloc.kernels.jit import REPORTER, compiling, enabled, insist_on, named, names_in, plain
-from optloc.kernels.kept import CALLEES, alone, is_checkout, is_kept, kept_in
+from optloc.kernels.jit import REPORTER, compiling, enabled, insist_on, names_in, plain
+from optloc.kernels.kept import CALLEES, alone, is_checkout, kept_in
 from optloc.kernels.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
@@ -40,7 +39,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.scope import SHORT
 from optloc.solvers import solve
-from optloc.solvers.certify.admitted import certify
+from optloc.solvers.certificates.admitted import certify
 from optloc.solvers.prepared import prepare
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.tracking.updates import ekf
@@ -136,20 +135,6 @@ def _cover() -> None:
     for times in (1.0, 1000.0):
         problem = simulate(problem_of("tdoa"), times * TARGET, 1)
         likelihood_region(problem, _plainly_solved(problem))
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """What one process compiles: how that is had, and the kernels that Python calls."""
-
-    summary: str
-    package: str
-    works: tuple[Callable[[], None], ...]
-    entries: tuple[str, ...]
-
-    def missing(self) -> list[str]:
-        """Return the kernels of which there is no machine code on disk."""
-        return [name for name in self.entries if not is_kept(named(name))]
 
 
 # The longest first: there are as many processes as processors, at most two, and memory is a gigabyte each. Those that

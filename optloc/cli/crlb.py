@@ -14,8 +14,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import at_most
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
-from optloc.bounds.crlb import Course, crlb_course
+from optloc.bounds.cramer_rao import Course, crlb_course
+from optloc.bounds.over_area import BoundMap, bound_map, extent, map_coordinates
 from optloc.cli.options import coordinates
 from optloc.cli.output import PICTURES, Screen, claim_outputs, dumps, say, write_picture, write_text
 from optloc.files import Loaded, read
@@ -28,7 +28,7 @@ from optloc.problem.layout import Layout, Slot, state_names
 from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from optloc.solvers.status_shares import StatusShares
+    from optloc.solvers.shares import StatusShares
 
 # Lines of the table against time, and of the bounds and of their members: what a screen holds.
 _LINES, _BOUNDS, _MEMBERS = 10, 30, 16
@@ -55,7 +55,7 @@ def run_crlb(
     quiet: bool = False,
 ) -> int:
     """Print the Cramer-Rao bound at a truth or at the fix, draw it against time, and return the exit code."""
-    from optloc.bounds.crlb import crlb
+    from optloc.bounds.cramer_rao import crlb
 
     loaded = read(file, values=False)
     claim_outputs(picture=plot, inputs=[file])
@@ -412,7 +412,7 @@ def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool) -> 
     if wanted.out is not None:
         _map_status(file, loaded, wanted, wanted.out)
         return 0
-    from optloc.solvers.status_shares import status_shares
+    from optloc.solvers.shares import status_shares
 
     problem = _of_one_epoch(loaded.problem)
     truth = vector(problem, wanted.at, wanted.velocity, wanted.geodetic)
@@ -446,7 +446,7 @@ def _show_status(found: StatusShares, title: str) -> None:
 def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> None:
     """Write the map of the share of `ok` fixes of a file."""
     from optloc.show.pictures import plot_status_map, status_geojson
-    from optloc.solvers.status_shares import status_map
+    from optloc.solvers.shares import status_map
 
     ending = out.suffix.lower()
     if ending not in (*PICTURES, ".geojson"):

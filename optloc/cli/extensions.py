@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import typer
 
-    from optloc.cli.compile import Part
-
 Rows = list[dict[str, str]]
 
 NEIGHBOURS = ("optloc.sites", "optloc.service", "optloc.lab")
@@ -41,6 +39,23 @@ class Asked:
     out: Path
     method: str
     epoch: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What one process compiles: how that is had, and the kernels that Python calls."""
+
+    summary: str
+    package: str
+    works: tuple[Callable[[], None], ...]
+    entries: tuple[str, ...]
+
+    def missing(self) -> list[str]:
+        """Return the kernels of which there is no machine code on disk."""
+        from optloc.kernels.jit import named
+        from optloc.kernels.kept import is_kept
+
+        return [name for name in self.entries if not is_kept(named(name))]
 
 
 @dataclass(frozen=True, slots=True)

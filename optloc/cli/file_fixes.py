@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.records import join
 from optloc.base.types import Status
-from optloc.bounds.observability import Observability, observability
+from optloc.bounds.rank import Observability, observability
 from optloc.cli.output import bar
 from optloc.files import Loaded
 from optloc.problem.epoch_groups import EpochGroup, epoch_groups, problem_of

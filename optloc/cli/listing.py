@@ -125,7 +125,7 @@ def _kinds() -> Rows:
 
 
 def _solvers() -> Rows:
-    from optloc.solvers.backends import backends
+    from optloc.solvers.back_ends import backends
     from optloc.solvers.methods import SOLVERS
 
     # Back ends of the relaxations are found at run time: those of packages that are installed.

@@ -70,7 +70,7 @@ from optloc.engine.memory import (
     X,
     make_room,
 )
-from optloc.engine.refine import refine
+from optloc.engine.refinement import refine
 from optloc.engine.shape import STRAIGHT, find_even, measure_shape
 from optloc.engine.start import begin, read, stand
 from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH
@@ -109,7 +109,7 @@ def fixes(
     station : array (N or 1, s, d)
         Stations, metres: those that take part, all of which have rows. Their mean is the centre of the chart.
     tolerance, most : float, int
-        Tolerance and limit of `optloc.engine.refine.refine`.
+        Tolerance and limit of `optloc.engine.refinement.refine`.
     given : bool
         Whether the answer has starts that were found elsewhere, mostly because another position fits the squared ranges
         as well. Every mirror image of them is refined.

@@ -44,7 +44,7 @@ from optloc.engine.memory import (
     Room,
     X,
 )
-from optloc.engine.refine import decide, propose
+from optloc.engine.refinement import decide, propose
 from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES, factor_plain, principal_axes, solve_plain
@@ -144,7 +144,7 @@ def follow(model: Model, rows: Any, room: Room, tolerance: float, fewest: int, e
         Unknowns, damping, steps, and what `keep_fix` wrote in. Lanes that arrived somewhere stay good and are no longer
         alive; those that are given up are not good.
     tolerance : float
-        As of `optloc.engine.refine.refine`.
+        As of `optloc.engine.refinement.refine`.
     fewest : int
         Lanes for which it goes on.
     every : bool

@@ -23,7 +23,7 @@ from optloc.engine.memory import (
     Room,
     X,
 )
-from optloc.engine.refine import refine
+from optloc.engine.refinement import refine
 from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES
 

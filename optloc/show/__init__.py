@@ -3,10 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from optloc.lab.report.study_page import Tell, write_report
     from optloc.show.page import fix_page, live_page, map_page, track_page
 
-__all__ = ["Tell", "fix_page", "live_page", "map_page", "track_page", "write_report"]
+__all__ = ["fix_page", "live_page", "map_page", "track_page"]
 
 
 def __getattr__(name: str) -> Any:

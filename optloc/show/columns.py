@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status, statuses_of
-from optloc.bounds.observability import Observability
+from optloc.bounds.rank import Observability
 from optloc.problem.chart import AXES, CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
 from optloc.problem.fix import Active, Explanation, Fix

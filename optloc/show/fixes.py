@@ -17,7 +17,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import visible
 from optloc.base.types import NOTES, Array, Status
-from optloc.bounds.observability import Observability
+from optloc.bounds.rank import Observability
 from optloc.model_checks.determine import determined, of_fix
 from optloc.problem.bias import estimated_speed
 from optloc.problem.chart import AXES, CARTESIAN, INVERSE_RANGE, NAMES

@@ -18,7 +18,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap
+from optloc.bounds.over_area import BoundMap
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import UNCHECKED

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from optloc.cli.extensions import Extension
+from optloc.cli.extensions import Extension, Part
 from optloc.cli.options import (
     ANSWERS,
     AmbiguityDraws,
@@ -28,9 +28,6 @@ from optloc.cli.options import (
     example,
 )
 from optloc.sites.commands.calibrate import NETWORKS, calibrate
-
-if TYPE_CHECKING:
-    from optloc.cli.compile import Part
 
 _PLACE = example(
     "optloc place sites.toml -k 6 --worst --fail-one --plot map.png --out chosen.toml",
@@ -75,8 +72,6 @@ def _commands(app: typer.Typer) -> None:
 
 
 def _kernels() -> Mapping[str, Part]:
-    from optloc.cli.compile import Part
-
     entries = (
         *(f"optloc.sites.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
         "optloc.sites.placement.completions.exhaust",

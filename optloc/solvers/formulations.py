@@ -13,7 +13,7 @@ from optloc.base.types import Array
 from optloc.linear.mirror import one_position
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers.certify.relaxations import Reference, reference_bound
+from optloc.solvers.certificates.relaxations import Reference, reference_bound
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
 from optloc.solvers.starts.doppler import doppler_starts, dopplered
 from optloc.solvers.starts.position import height_starts, over_ground, registrable, squared_range_starts

@@ -20,8 +20,8 @@ from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, is_scaled, unsupported
 from optloc.solvers import stages
-from optloc.solvers.certify.admitted import certified, value_certified
-from optloc.solvers.certify.branch_and_bound import claims_before, tried_before
+from optloc.solvers.certificates.admitted import certified, value_certified
+from optloc.solvers.certificates.branch_and_bound import claims_before, tried_before
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.planned import Quick
@@ -30,7 +30,7 @@ from optloc.solvers.pool import Pool, offer, pack, where
 from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
-from optloc.solvers.suspects.stage import suspect
+from optloc.solvers.suspect_rows.stage import suspect
 from optloc.solvers.verdict.judge import judge, standing
 
 # The back end that holds for a stretch of code (`formulations.backend`), for layers that know formulations from here.

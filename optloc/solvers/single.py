@@ -41,7 +41,7 @@ from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
 from optloc.proof.scope import is_run, is_scaled, unsupported
 from optloc.proof.search_space import HIDDEN_REACH
 from optloc.proof.surface import UP
-from optloc.solvers.certify.branch_and_bound import (
+from optloc.solvers.certificates.branch_and_bound import (
     ALL_AROUND,
     HIDDEN,
     METHOD,
@@ -50,8 +50,8 @@ from optloc.solvers.certify.branch_and_bound import (
     gaps_below,
     sentence,
 )
-from optloc.solvers.certify.out_of_reach import Edges, Scratch, are_out_of_reach, edges_of, scratch
-from optloc.solvers.certify.position_cost import agrees, surfaces_of
+from optloc.solvers.certificates.out_of_reach import Edges, Scratch, are_out_of_reach, edges_of, scratch
+from optloc.solvers.certificates.position_cost import agrees, surfaces_of
 from optloc.solvers.coplanar import APART
 from optloc.solvers.inequalities import Sight, sights
 from optloc.solvers.methods import Method

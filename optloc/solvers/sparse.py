@@ -18,7 +18,7 @@ from optloc.linear.mirror import one_position
 from optloc.linear.redundancy import present_unknowns
 from optloc.linear.vectors import hold_still, vectors
 from optloc.models import MODELS
-from optloc.problem.arrivals import as_arrivals
+from optloc.problem.arrival_times import as_arrivals
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, begin, offer, pack
@@ -260,7 +260,7 @@ def _starts(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def spread_rows(wrong: Array, origin: Sequence[Array], count: int) -> Array:
-    """Return the rows (N, count) that wrong arrival times (N, m) were made from (`optloc.problem.arrivals`)."""
+    """Return the rows (N, count) that wrong arrival times (N, m) were made from (`optloc.problem.arrival_times`)."""
     out = np.zeros((len(wrong), count), dtype=bool)
     for i, rows in enumerate(origin):
         out[:, rows] |= wrong[:, i, None]

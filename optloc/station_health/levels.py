@@ -21,7 +21,7 @@ from optloc.model_checks.elements import (
 from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.model_checks.overbound import tail_factors
 from optloc.model_checks.variance_components import Fitted, Tested, fit, tested, total, visible, without
-from optloc.problem.arrivals import as_arrivals
+from optloc.problem.arrival_times import as_arrivals
 from optloc.problem.epochs import tied
 from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise, gathered, group, together

@@ -18,7 +18,7 @@ from formulations.squared_range import cone
 from formulations.squared_range_conic import hull, shor
 from optloc import solve
 from optloc.base.threads import mapped
-from optloc.solvers.certify.relaxations import reference_bound
+from optloc.solvers.certificates.relaxations import reference_bound
 
 ROUNDS = 7
 Work = Callable[[int], object]

@@ -7,7 +7,7 @@ from data.windows import report
 from often import few
 
 from optloc import solve, with_bias
-from optloc.bounds.observability import observability
+from optloc.bounds.rank import observability
 from optloc.lab.datasets import adsb
 
 pytestmark = pytest.mark.data

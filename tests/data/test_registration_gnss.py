@@ -9,7 +9,7 @@ from data.windows import report
 from often import few
 
 from optloc import Motion, Status, solve, with_bias
-from optloc.bounds.observability import observability
+from optloc.bounds.rank import observability
 from optloc.lab.datasets import gnss
 
 pytestmark = pytest.mark.data

@@ -6,7 +6,7 @@ from data.registration import calibrating, corrected, fixed, learnt, lines, not_
 from data.windows import report
 
 from optloc import Status, by_epoch, solve, with_bias
-from optloc.bounds.observability import observability
+from optloc.bounds.rank import observability
 from optloc.lab.datasets import plaza
 
 pytestmark = pytest.mark.data

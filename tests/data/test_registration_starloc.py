@@ -8,7 +8,7 @@ from data.registration import fixed, lines, not_beaten
 from data.windows import report
 
 from optloc import Motion, solve, with_bias
-from optloc.bounds.observability import observability
+from optloc.bounds.rank import observability
 from optloc.lab.datasets import starloc
 
 pytestmark = pytest.mark.data

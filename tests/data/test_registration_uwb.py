@@ -11,7 +11,7 @@ from data.windows import report
 from often import few
 
 from optloc import by_epoch, with_bias
-from optloc.bounds.observability import observability
+from optloc.bounds.rank import observability
 from optloc.lab.datasets import uwb
 
 pytestmark = pytest.mark.data

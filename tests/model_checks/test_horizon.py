@@ -8,7 +8,7 @@ from optloc.base.frames import ECEF
 from optloc.base.types import Status
 from optloc.files.convert import understood
 from optloc.files.readings import Told
-from optloc.solvers.certify.branch_and_bound import BARRED, LOST
+from optloc.solvers.certificates.branch_and_bound import BARRED, LOST
 from optloc.solvers.inequalities import is_hidden
 
 UP = np.array([[1.0, 0.2, 0.1], [0.9, -0.3, 0.3], [0.8, 0.5, -0.3], [0.7, -0.4, -0.5], [0.6, 0.1, 0.8]])

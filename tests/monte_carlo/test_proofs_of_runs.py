@@ -18,7 +18,7 @@ from optloc.kernels.jit import enabled
 from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import exact, restore
 from optloc.linear.vectors import vectors
-from optloc.solvers.certify.position_cost import state_columns
+from optloc.solvers.certificates.position_cost import state_columns
 
 Array = np.ndarray
 SEED, STARTS, BATCH = 20261123, 20, 4

@@ -13,7 +13,7 @@ from monte_carlo.trials import automatic, outcome, trials
 
 import optloc
 from optloc import Fix
-from optloc.solvers.certify.relaxations import Reference, reference_bound
+from optloc.solvers.certificates.relaxations import Reference, reference_bound
 
 DEFAULT, FULL = 6, 100
 SLACK = 1e-6

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from verdicts import alone
 
 from optloc import Problem, assemble, measured, solve
-from optloc.problem.arrivals import as_arrivals
+from optloc.problem.arrival_times import as_arrivals
 from optloc.solvers.sparse import sparse_errors
 
 SIGMA, GROSS, LEVEL = 10.0, 50.0, 0.01

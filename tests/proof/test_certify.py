@@ -12,7 +12,7 @@ import optloc
 from optloc import Fix, InvalidProblem, Status, assemble, certify, measured, simulate, solve, with_bias
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
-from optloc.solvers.certify import branch_and_bound
+from optloc.solvers.certificates import branch_and_bound
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 SQUARE = 1e3 * np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0], [0, 2, 0], [1, -3, 0]])

@@ -16,7 +16,7 @@ from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BUDGET
 from optloc.proof.scope import unsupported
-from optloc.solvers.certify import branch_and_bound
+from optloc.solvers.certificates import branch_and_bound
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 TRIALS, FULL, STARTS = 5, 200, 16

@@ -23,7 +23,7 @@ from optloc.proof.runs.search import sum_at, tables_of
 from optloc.proof.search_space import chart_on
 from optloc.proof.space import Space, floor_of, set_curves, set_nodes
 from optloc.proof.surface import SLIP
-from optloc.solvers.certify.position_cost import surfaces_of
+from optloc.solvers.certificates.position_cost import surfaces_of
 
 Array = np.ndarray
 pytestmark = pytest.mark.skipif(not enabled(), reason="runs are proven by machine code")

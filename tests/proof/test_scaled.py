@@ -18,7 +18,7 @@ from optloc.proof.scaled.scaled_proof import costs_at_scaled, scaled_costs
 from optloc.proof.scaled.scaled_search import set_scaled_minimum, tables_of
 from optloc.proof.scope import unsupported
 from optloc.proof.search_space import chart_at
-from optloc.solvers.certify.position_cost import agrees
+from optloc.solvers.certificates.position_cost import agrees
 
 PRIORS = [0.02, 0.1, 0.3, None]
 COUNT = many(60, 3)

@@ -19,7 +19,7 @@ from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scale
 from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_rows, is_positive
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, scaled_costs
 from optloc.proof.scope import unsupported
-from optloc.solvers.certify.position_cost import agrees
+from optloc.solvers.certificates.position_cost import agrees
 
 # Dimension, stations, priors and whether rows are levels.
 KINDS = [

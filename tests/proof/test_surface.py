@@ -10,7 +10,7 @@ from optloc.proof.box import cost_at, least_residual, linearise_rows
 from optloc.proof.nodes.node import PHI, RANGE, SLOPE0
 from optloc.proof.search_space import chart_on, cost_of, empty_box, is_bounded, turned
 from optloc.proof.surface import SAG, SIDES, SLIP
-from optloc.solvers.certify.position_cost import surfaces_of
+from optloc.solvers.certificates.position_cost import surfaces_of
 
 pytestmark = pytest.mark.usefixtures("form")
 EARTH = Frame("ecef")

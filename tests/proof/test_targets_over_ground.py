@@ -33,7 +33,7 @@ from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import has_no_minimum, hessian_of_state, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import Axes, cost_of_state, put, set_bends, set_box, table_of
 from optloc.proof.scope import unsupported
-from optloc.solvers.certify.position_cost import state_columns
+from optloc.solvers.certificates.position_cost import state_columns
 
 Array = np.ndarray
 pytestmark = pytest.mark.skipif(not enabled(), reason="runs are proven by machine code")

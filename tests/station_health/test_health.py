@@ -15,7 +15,7 @@ from optloc.cli import app
 from optloc.files import read
 from optloc.show.pictures import save
 from optloc.show.pictures.residuals import plot_health
-from optloc.station_health.health import _sentences
+from optloc.station_health.stations import _sentences
 
 RUN = CliRunner()
 BIAS = np.array([0.0, 0.0, 60.0, 0.0, -15.0, 0.0, 0.0, 200.0])

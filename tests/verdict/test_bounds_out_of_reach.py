@@ -9,7 +9,7 @@ from optloc.base.types import Band
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
 from optloc.solvers import solve_in_stages
-from optloc.solvers.certify.out_of_reach import edges_of, lay_planes, question
+from optloc.solvers.certificates.out_of_reach import edges_of, lay_planes, question
 from optloc.solvers.methods import Method
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no short way without machine code")

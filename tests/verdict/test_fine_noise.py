@@ -11,8 +11,8 @@ from optloc import ECEF, Frame, Motion, Status, assemble, certify, constraints, 
 from optloc.kernels.jit import enabled
 from optloc.linear.evaluate import predict
 from optloc.proof.near import COARSE
-from optloc.solvers.certify.branch_and_bound import FINE
-from optloc.solvers.certify.position_cost import eliminate_nuisance, prove
+from optloc.solvers.certificates.branch_and_bound import FINE
+from optloc.solvers.certificates.position_cost import eliminate_nuisance, prove
 
 Array = np.ndarray
 needs_code = pytest.mark.skipif(not enabled(), reason="proofs around the Earth take thousands of boxes")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Motion
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.lab.papers.report import Tick
 from optloc.linear.simulate import simulate
 from optloc.problem.build import assemble, measured

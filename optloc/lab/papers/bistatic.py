@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.types import Array, Motion
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.crlb import crlb, crlb_course
+from optloc.bounds.cramer_rao import crlb, crlb_course
 from optloc.lab.papers.report import (
     Ink,
     Report,

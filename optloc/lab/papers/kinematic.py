@@ -13,7 +13,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.types import Array, Motion, Prior
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.linear.normal import linearise, normal, step
 from optloc.linear.simulate import simulate
 from optloc.problem.build import assemble, measured

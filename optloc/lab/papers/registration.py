@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.types import Array, Motion, Stations
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.crlb import crlb, crlb_course
+from optloc.bounds.cramer_rao import crlb, crlb_course
 from optloc.lab.papers.registration_recursion import FIRST, joint_recursion, recursion
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate

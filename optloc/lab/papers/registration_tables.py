@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.types import Array, Status
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.lab.papers.registration import (
     MOVING,
     NANOSECOND,

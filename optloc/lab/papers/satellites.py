@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef
 from optloc.base.types import Array, Motion
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.lab.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, scale, tabulate, typeset
 from optloc.linear.constraints import height as known_height
 from optloc.linear.simulate import simulate

@@ -13,7 +13,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import claim, make_folder, together, write_text, written
 from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap, bound_map, extent, map_coordinates
+from optloc.bounds.over_area import BoundMap, bound_map, extent, map_coordinates
 from optloc.files.writer import harmless_column
 from optloc.lab.report import figures as drawn
 from optloc.lab.report.sheets import latex, sheets

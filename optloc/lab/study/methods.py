@@ -23,7 +23,7 @@ from optloc.lab.study.draws import Drawn
 from optloc.lab.study.minimizers import baseline_of, code_of, load_minimizer
 from optloc.lab.study.networks import CALIBRATE, Found, Networks, calibrated
 from optloc.problem.fix import Fix
-from optloc.solvers.backends import backend_kind, backends, kind_of, version_of
+from optloc.solvers.back_ends import backend_kind, backends, kind_of, version_of
 
 # Back ends stand in a module of their own; studies know them from here.
 __all__ = [

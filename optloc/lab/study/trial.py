@@ -17,7 +17,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Status
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.kernels.sums import equations_at
 from optloc.lab.study.design import Cell, Chunk
 from optloc.lab.study.draws import Case, Drawn

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.bounds.bound_map import BoundMap, Grid
+from optloc.bounds.over_area import BoundMap, Grid
 from optloc.show.pictures.outlines import feature, line_geometry, point_geometry
 from optloc.show.pictures.style import BLACK, GREY, apart, figure_class, literal
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    from optloc.solvers.status_shares import StatusMap
+    from optloc.solvers.shares import StatusMap
 
 COLOURS = "GnBu"
 """Light to dark in one hue: legible in grey and without colour vision, and black lines stay visible."""

@@ -17,7 +17,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 from optloc.show.pictures.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid, literal
-from optloc.station_health.health import Health
+from optloc.station_health.stations import Health
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

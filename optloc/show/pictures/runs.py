@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.bounds.crlb import Course
+from optloc.bounds.cramer_rao import Course
 from optloc.problem.layout import Slot
 from optloc.show.pictures.style import (
     BLACK,

@@ -11,8 +11,8 @@ import numpy as np
 from formulations.placement import covariances
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.bounds.bound_map import bound_map, extent, map_coordinates
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
+from optloc.bounds.over_area import bound_map, extent, map_coordinates
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.simulate import simulate
 from optloc.sites.placement.best_set import Searched, Task, random_sets, search

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.bounds.bound_map import BoundMap
+from optloc.bounds.over_area import BoundMap
 from optloc.show.pictures.bound_map import COLOURS, levels
 from optloc.show.pictures.style import BLACK, GREY, apart, figure_class, literal
 

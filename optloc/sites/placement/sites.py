@@ -13,7 +13,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Prior
 from optloc.linear.normal import Normal, linearise, with_priors
 from optloc.models import MODELS
-from optloc.problem.arrivals import as_arrivals
+from optloc.problem.arrival_times import as_arrivals
 from optloc.problem.layout import emission_name
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem

@@ -13,7 +13,7 @@ from optloc.base.types import Array, Status
 from optloc.linear.constraints import Face, exact
 from optloc.linear.normal import Normal, marginal
 from optloc.linear.redundancy import degrees_of_freedom
-from optloc.problem.arrivals import Arrivals, as_arrivals, restore_order
+from optloc.problem.arrival_times import Arrivals, as_arrivals, restore_order
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem

@@ -17,7 +17,7 @@ from optloc.problem.chart import quantile
 from optloc.problem.fix import Fix
 from optloc.problem.loss import Loss
 from optloc.problem.problem import Problem
-from optloc.solvers.certify.admitted import certified
+from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, NOTICED, REJECTED
 from optloc.solvers.pool import Pool, begin
 from optloc.solvers.robust.reweighting import Doubt, reweight, robust_equations

@@ -12,7 +12,7 @@ from optloc.proof.best_first import Places, find_minima
 from optloc.proof.position_costs import position_costs
 from optloc.proof.runs.run_costs import few_costs
 from optloc.proof.scope import is_run
-from optloc.solvers.certify.position_cost import surfaces_of
+from optloc.solvers.certificates.position_cost import surfaces_of
 from optloc.solvers.policy import LISTED_GAP
 from optloc.solvers.starts.position import spread_of
 

@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from optloc.base.records import join, overwrite, present, take
 from optloc.base.types import Array, Certificate, Status, first_status
-from optloc.bounds.observability import open_sentences
+from optloc.bounds.rank import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.linear.least_squares_ranges import ranges
 from optloc.model_checks.advice import misfit_of

@@ -15,8 +15,8 @@ from optloc.cli import app
 from optloc.lab.study.design import design_of_text
 from optloc.lab.study.folder import progress, read_frame
 from optloc.lab.study.summary import COLUMNS, judged, methods
-from optloc.solvers import backends as module
-from optloc.solvers.backends import backend_kind, backends, faults_of, installed, try_apart
+from optloc.solvers import back_ends as module
+from optloc.solvers.back_ends import backend_kind, backends, faults_of, installed, try_apart
 from optloc.solvers.methods import Choice, using
 
 RUN = CliRunner()

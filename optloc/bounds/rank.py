@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.bounds.crlb import OPEN, free_directions, shared_information, shared_priors, with_local_priors
+from optloc.bounds.cramer_rao import OPEN, free_directions, shared_information, shared_priors, with_local_priors
 from optloc.kernels.sums import summed
 from optloc.problem.layout import Layout, Slot
 from optloc.problem.problem import Problem

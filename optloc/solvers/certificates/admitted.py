@@ -38,7 +38,7 @@ from optloc.proof.batch import Asked
 from optloc.proof.near import BETTER, STATIONARY, VALUE
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.scope import is_run, unsupported
-from optloc.solvers.certify.branch_and_bound import (
+from optloc.solvers.certificates.branch_and_bound import (
     HELD,
     RESTLESS,
     budgets,
@@ -50,8 +50,8 @@ from optloc.solvers.certify.branch_and_bound import (
     to_prove,
     unknown,
 )
-from optloc.solvers.certify.out_of_reach import edges_of, out_of_reach
-from optloc.solvers.certify.position_cost import (
+from optloc.solvers.certificates.out_of_reach import edges_of, out_of_reach
+from optloc.solvers.certificates.position_cost import (
     Costs,
     admitted,
     costs_of,
@@ -448,7 +448,7 @@ def certify(
         Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
         or where that cannot be bounded a box around the stations that the certificate names. Of a target that moves
         (2 d,), velocities in metres per second after the coordinates; None: what its constraints admit, see
-        `optloc.solvers.certify.position_cost.regions_of`.
+        `optloc.solvers.certificates.position_cost.regions_of`.
     margin : float
         Gap between the cost of the fix and that of any other minimum that is tried to prove first; where the proof is
         not finished, 9, the gap of `ambiguous`, and the value alone follow. 0 asks for the value alone: quicker.

@@ -17,20 +17,20 @@ from optloc.model_checks.elements import batch_of
 from optloc.model_checks.evidence import Error, errors, influences
 from optloc.model_checks.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
 from optloc.model_checks.noise_level import SEVERAL, common_level_at
-from optloc.problem.arrivals import Arrivals, as_arrivals, restore_order, shared_places
+from optloc.problem.arrival_times import Arrivals, as_arrivals, restore_order, shared_places
 from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Alternatives, Explanation, Fix, GroupKind, Stage, Suspect
 from optloc.problem.layout import Layout
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
-from optloc.solvers.certify.admitted import certified
+from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED
 from optloc.solvers.pool import Pool, begin, crowd_of, in_parts, offer
 from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
-from optloc.solvers.suspects.subsets import (
+from optloc.solvers.suspect_rows.subsets import (
     Alike,
     Outcome,
     Rest,

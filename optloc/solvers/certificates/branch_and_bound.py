@@ -25,7 +25,7 @@ from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, UNIQUE, VALUE
 from optloc.proof.scaled.scaled_proof import ScaledCosts
 from optloc.proof.scope import unsupported
 from optloc.proof.search_space import HIDDEN_REACH
-from optloc.solvers.certify.position_cost import (
+from optloc.solvers.certificates.position_cost import (
     Costs,
     agrees,
     around,
@@ -486,7 +486,7 @@ def certified_freely(
     pool : Pool
         Refined.
     region : array (2, d), optional
-        As of `optloc.solvers.certify.admitted.certify`.
+        As of `optloc.solvers.certificates.admitted.certify`.
     margin : float
         Gap to prove.
     effort : float

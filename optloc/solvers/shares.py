@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import PRECEDENCE, Array, Prior, Status
-from optloc.bounds.bound_map import Grid, grid_of
+from optloc.bounds.over_area import Grid, grid_of
 from optloc.linear.normal import prior_parts
 from optloc.linear.simulate import samples, simulate
 from optloc.problem.chart import CURVED
@@ -201,7 +201,7 @@ def status_map(
     Parameters
     ----------
     problem, truth, x, y, height, geodetic
-        As of `optloc.bounds.bound_map.bound_map`.
+        As of `optloc.bounds.over_area.bound_map`.
     trials, seed, method
         As of `status_shares`.
     """

@@ -20,7 +20,7 @@ from optloc.problem.claims import GLOBAL
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, is_scaled
-from optloc.solvers.certify.admitted import certified
+from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, NOTICED, REFUTED
 from optloc.solvers.pool import Pool, begin, offer, pack

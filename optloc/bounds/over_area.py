@@ -9,7 +9,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.types import Array
-from optloc.bounds.crlb import crlb
+from optloc.bounds.cramer_rao import crlb
 from optloc.models import MODELS
 from optloc.problem.layout import state_names
 from optloc.problem.noise import variances

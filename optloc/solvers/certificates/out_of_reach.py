@@ -20,8 +20,8 @@ from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, cost_here, costs_at, empty_answer, prove_all, prove_here
 from optloc.proof.near import VALUE
 from optloc.proof.position_costs import Affine, PositionCosts
-from optloc.solvers.certify.branch_and_bound import budgets
-from optloc.solvers.certify.position_cost import admitted, state_columns
+from optloc.solvers.certificates.branch_and_bound import budgets
+from optloc.solvers.certificates.position_cost import admitted, state_columns
 from optloc.solvers.policy import LISTED_GAP, equal_cost
 
 # Share of the distance between fix and plane by which rounding may move a place off the plane.
