@@ -3,8 +3,7 @@
 from decimal import Decimal
 
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from optloc.files.cells import Decimals, numbers
 from optloc.files.table import Table

@@ -7,8 +7,7 @@ import pytest
 from bad_input import write
 from often import few
 from scipy.integrate import solve_ivp
-from test_constraint_files import ENU as HEAD
-from test_constraint_files import rows as inline
+from test_constraint_files import ENU as HEAD, rows as inline
 
 from optloc import Frame, InvalidProblem, Motion, Status, assemble, constraints, measured, simulate, solve
 from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef

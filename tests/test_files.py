@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bad_input import BAD, GEODETIC, HEAD, STATIONS, TDOA, bad_files, inline, tdoa, write
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import ECEF, Frame

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import CASES, STATIONS, TARGET, dense_covariance
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from optloc import MODELS, assemble, crlb, measured, simulate, solve
 from optloc.problem.noise import Block, Noise

@@ -22,8 +22,7 @@ from optloc import (
     solve,
 )
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.models import layers as rays
-from optloc.models import medium as media
+from optloc.models import layers as rays, medium as media
 from optloc.models.layers import first_arrival
 from optloc.models.primitives import Jet, Point
 from optloc.show.pictures import plot_fixes

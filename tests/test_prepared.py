@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import CASES, ENU, STATIONS, TARGET, pairs
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from optloc import (
     InvalidProblem,
@@ -27,9 +26,9 @@ from optloc.base.types import Band
 from optloc.engine.plan import plan_of
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
-from optloc.solvers import solve_in_stages
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import in_parts
+from optloc.solvers.solution import solve_in_stages
 from optloc.solvers.stages import gtrs, lsr_with_mirror
 from optloc.solvers.verdict.judge import verdict
 

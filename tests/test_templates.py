@@ -9,8 +9,7 @@ import optloc
 from optloc import InvalidProblem, assemble, constraints, measured
 from optloc.base.cache import key_of
 from optloc.base.types import Bias, Prior, Stations
-from optloc.files import by_station
-from optloc.files import one_call as locating
+from optloc.files import by_station, one_call as locating
 from optloc.problem import build
 from optloc.problem.problem import Problem
 

@@ -2,8 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.units import SI_UNIT, SPEED_OF_LIGHT, UNITS, conversion, sigma_to_si, to_si

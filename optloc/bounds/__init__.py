@@ -1,1 +1,17 @@
 """How good a fix can be: the bound, what is observable, maps of both."""
+
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.bounds.cramer_rao import Course as Course, crlb as crlb, crlb_course as crlb_course
+    from optloc.bounds.over_area import (
+        BoundMap as BoundMap,
+        bound_map as bound_map,
+        extent as extent,
+        map_coordinates as map_coordinates,
+    )
+    from optloc.bounds.rank import Observability as Observability, observability as observability
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

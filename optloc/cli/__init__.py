@@ -1,5 +1,52 @@
 """The command line: ``optloc fix``, ``check``, ``track`` and so on; ``optloc --help`` lists them."""
 
-from optloc.cli.app import app, main
+from typing import TYPE_CHECKING
 
-__all__ = ["app", "main"]
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.cli.app import app as app, main as main
+    from optloc.cli.compile import TARGET as TARGET, problem_of as problem_of
+    from optloc.cli.crlb import vector as vector
+    from optloc.cli.extensions import Asked as Asked, Extension as Extension, Part as Part, Rows as Rows
+    from optloc.cli.listing import registry as registry
+    from optloc.cli.options import (
+        ANSWERS as ANSWERS,
+        MORE as MORE,
+        READER_GONE as READER_GONE,
+        STOPPED as STOPPED,
+        AmbiguityDraws as AmbiguityDraws,
+        Budget as Budget,
+        Choose as Choose,
+        Costs as Costs,
+        Criterion as Criterion,
+        FailOne as FailOne,
+        Force as Force,
+        Group as Group,
+        Json as Json,
+        Method as Method,
+        Outside as Outside,
+        PlacementMap as PlacementMap,
+        PlaceOfInterest as PlaceOfInterest,
+        ProblemPath as ProblemPath,
+        Quiet as Quiet,
+        Verbose as Verbose,
+        complete as complete,
+        example as example,
+        find_problem as find_problem,
+        name_in as name_in,
+    )
+    from optloc.cli.output import (
+        Screen as Screen,
+        bar as bar,
+        claim_outputs as claim_outputs,
+        dumps as dumps,
+        line as line,
+        say as say,
+        write_picture as write_picture,
+        write_table as write_table,
+        write_text as write_text,
+    )
+    from optloc.cli.track import Wanted as Wanted, dynamics_of as dynamics_of, rules as rules
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

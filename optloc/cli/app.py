@@ -9,8 +9,7 @@ import typer
 
 from optloc.cli.doctor import doctor
 from optloc.cli.extensions import Asked, extensions
-from optloc.cli.from_table import EXAMPLES as CONVERSIONS
-from optloc.cli.from_table import convert, table_told, takes_table
+from optloc.cli.from_table import EXAMPLES as CONVERSIONS, convert, table_told, takes_table
 from optloc.cli.options import (
     ANSWERS,
     EXIT_CODES,

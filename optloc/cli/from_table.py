@@ -184,8 +184,7 @@ def columns_of(pairs: Sequence[str] | None) -> dict[str, str]:
 def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, quiet: bool) -> int:
     """Convert a file, say what is understood before it is written, and return the exit code."""
     from optloc.cli.output import Screen, dumps, write_text
-    from optloc.files.convert import convert as written
-    from optloc.files.convert import understood
+    from optloc.files.convert import convert as written, understood
     from optloc.files.readings import Told
 
     told, console = Told(**given), Screen(quiet=quiet or as_json)

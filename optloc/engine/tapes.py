@@ -35,8 +35,7 @@ from optloc.engine.memory import (
 from optloc.engine.start import NEAR
 from optloc.kernels.gtrs import minimise
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import Cells, arrange, blur_of, gather, memory, price
-from optloc.kernels.lanes import load as load_lane
+from optloc.kernels.lanes import Cells, arrange, blur_of, gather, load as load_lane, memory, price
 from optloc.kernels.pack import Numbers
 from optloc.kernels.polynomial import DEGREE
 from optloc.kernels.systems import LANES, eliminate_last, factor_plain, solve_plain

@@ -1,17 +1,65 @@
 """Problem files: stations and measurements in TOML, CSV and Parquet, in the units of their writers."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
 
 if TYPE_CHECKING:
-    from optloc.files.reader import Loaded, from_table, load, read
+    from optloc.base.inputs import (
+        Budget as Budget,
+        access as access,
+        has_controls as has_controls,
+        json_of as json_of,
+        read_bytes as read_bytes,
+        read_text as read_text,
+        within as within,
+    )
+    from optloc.base.outputs import (
+        Growing as Growing,
+        claim as claim,
+        is_stream as is_stream,
+        make_folder as make_folder,
+        together as together,
+        visible as visible,
+        write_text as write_text,
+        written as written,
+    )
+    from optloc.files.one_call import locate as locate
+    from optloc.files.orbits import satellites as satellites
+    from optloc.files.propagation import speed_of as speed_of
+    from optloc.files.reader import (
+        Draft as Draft,
+        Loaded as Loaded,
+        assemble as assemble,
+        draft as draft,
+        from_table as from_table,
+        load as load,
+        read as read,
+    )
+    from optloc.files.roles import worded as worded
+    from optloc.files.schema import (
+        Amount as Amount,
+        DataTable as DataTable,
+        FrameTable as FrameTable,
+        MeasurementsTable as MeasurementsTable,
+        PriorTable as PriorTable,
+        ProblemFile as ProblemFile,
+        SoundTable as SoundTable,
+        SpeedTable as SpeedTable,
+        StationsTable as StationsTable,
+        Units as Units,
+        conform as conform,
+        join as join,
+        kind_model as kind_model,
+        name_of as name_of,
+        parse_toml as parse_toml,
+        read_document as read_document,
+        validate as validate,
+    )
+    from optloc.files.stations import survey as survey
+    from optloc.files.table import Table as Table, of_rows as of_rows, table_of as table_of
+    from optloc.files.unknowns import FREE as FREE, places_of as places_of, settle_frame as settle_frame
+    from optloc.files.words import distinct as distinct
+    from optloc.files.writer import harmless_column as harmless_column, toml_text as toml_text
 
-__all__ = ["Loaded", "from_table", "load", "read"]
-
-
-def __getattr__(name: str) -> Any:
-    # The schema takes a quarter of a second: who only writes a table, or shows the help, does not wait for it.
-    from importlib import import_module
-
-    if name in __all__:
-        return getattr(import_module("optloc.files.reader"), name)
-    raise AttributeError(f"module 'optloc.files' has no attribute {name!r}")
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from csv import Error as CSVError
-from csv import reader as lines_of
+from csv import Error as CSVError, reader as lines_of
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast

@@ -7,9 +7,7 @@ from typing import Any
 
 import typer
 
-from optloc.cli.extensions import Asked, Extension, Rows
-from optloc.cli.listing import registry
-from optloc.cli.options import MORE
+from optloc.cli import MORE, Asked, Extension, Rows, registry
 from optloc.lab.commands.reproduce import EXAMPLES, reproduce
 from optloc.lab.commands.study import study
 
@@ -55,10 +53,10 @@ def _accuracy(asked: Asked) -> None:
     """Errors of a study's methods against the bound."""
     import numpy as np
 
-    from optloc.base.errors import InvalidProblem, nearest
-    from optloc.cli.output import write_picture
+    from optloc.cli import write_picture
     from optloc.lab.study import summary
     from optloc.lab.study.folder import read_frame
+    from optloc.problem import InvalidProblem, nearest
     from optloc.show.pictures import plot_accuracy
 
     if not asked.file.is_dir():

@@ -1,1 +1,15 @@
 """Whether what is assumed holds: of a covariance that it covers, of a model that it fits."""
+
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.model_checks.advice import advise as advise, explained as explained
+    from optloc.model_checks.coplanar import distance_from_plane as distance_from_plane
+    from optloc.model_checks.determine import determined as determined
+    from optloc.model_checks.evidence import Reliability as Reliability, reliability as reliability
+    from optloc.model_checks.geometry import Advice as Advice
+    from optloc.model_checks.noise_level import CommonLevel as CommonLevel, LateSignals as LateSignals
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -16,7 +16,7 @@ from typing import Any
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Table
 from optloc.base.units import UNITS
-from optloc.models.medium import arrival, path, path_rate
+from optloc.models.medium import Atmosphere as Atmosphere, Layers as Layers, arrival, path, path_rate
 from optloc.models.primitives import (
     Components,
     Point,

@@ -1,7 +1,12 @@
 """Several emitters at once: which rows of an epoch are whose, how many emitters there are, and where each is."""
 
-from optloc.multi_target.answer import Emitters, Ghost, evenly
-from optloc.multi_target.assign import separate
-from optloc.tracking.associate import Clutter
+from typing import TYPE_CHECKING
 
-__all__ = ["Clutter", "Emitters", "Ghost", "evenly", "separate"]
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.multi_target.answer import Emitters as Emitters, Ghost as Ghost, evenly as evenly
+    from optloc.multi_target.assign import separate as separate
+    from optloc.tracking.associate import Clutter as Clutter
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -1,1 +1,85 @@
 """One estimation problem and its answer as values."""
+
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.base.errors import (
+        InvalidProblem as InvalidProblem,
+        NoSolution as NoSolution,
+        OptlocError as OptlocError,
+        nearest as nearest,
+    )
+    from optloc.base.frames import (
+        CARTESIAN as CARTESIAN,
+        ECEF as ECEF,
+        Frame as Frame,
+        ecef_to_geodetic as ecef_to_geodetic,
+        geodetic_to_ecef as geodetic_to_ecef,
+    )
+    from optloc.base.registry import (
+        Table as Table,
+        load_plugin as load_plugin,
+        plugin_module as plugin_module,
+        plugins as plugins,
+    )
+    from optloc.base.types import (
+        ANSWERED as ANSWERED,
+        PRECEDENCE as PRECEDENCE,
+        Array as Array,
+        Bias as Bias,
+        Certificate as Certificate,
+        Motion as Motion,
+        Prior as Prior,
+        Rows as Rows,
+        Stations as Stations,
+        Status as Status,
+    )
+    from optloc.base.units import (
+        LARGEST as LARGEST,
+        SI_UNIT as SI_UNIT,
+        SPEED_OF_LIGHT as SPEED_OF_LIGHT,
+        Conversion as Conversion,
+    )
+    from optloc.problem.arrival_times import as_arrivals as as_arrivals
+    from optloc.problem.bias import with_bias as with_bias, with_known_bias as with_known_bias
+    from optloc.problem.build import (
+        Measured as Measured,
+        assemble as assemble,
+        measured as measured,
+        station_array as station_array,
+    )
+    from optloc.problem.chart import Chart as Chart, quantile as quantile, tail_probability as tail_probability
+    from optloc.problem.claims import GLOBAL as GLOBAL, PROOFS as PROOFS, UNKNOWN as UNKNOWN
+    from optloc.problem.clocks import clock_densities as clock_densities
+    from optloc.problem.determined import Determined as Determined, Direction as Direction, Quantity as Quantity
+    from optloc.problem.epochs import (
+        by_epoch as by_epoch,
+        cut as cut,
+        separable as separable,
+        tied as tied,
+        window as window,
+    )
+    from optloc.problem.fix import (
+        Alternatives as Alternatives,
+        Explanation as Explanation,
+        Fix as Fix,
+        Stage as Stage,
+        Suspect as Suspect,
+    )
+    from optloc.problem.forms import form_of as form_of
+    from optloc.problem.layout import Layout as Layout, emission_name as emission_name, state_names as state_names
+    from optloc.problem.loss import LOSSES as LOSSES, Loss as Loss
+    from optloc.problem.noise import (
+        Block as Block,
+        Noise as Noise,
+        arrivals as arrivals,
+        group as group,
+        variances as variances,
+        whiten as whiten,
+    )
+    from optloc.problem.problem import Problem as Problem
+    from optloc.problem.signal import Signal as Signal
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

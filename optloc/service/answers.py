@@ -9,16 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.frames import Frame
-from optloc.base.types import Array, Status
-from optloc.problem.claims import PROOFS, UNKNOWN
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
+from optloc.problem import PROOFS, UNKNOWN, Array, Fix, Frame, Problem, Status
 from optloc.service.events import Event
-from optloc.show import formats
-from optloc.show.formats.marks import Mark, Other, mark_of
-from optloc.show.pictures.outlines import earth_points
-from optloc.tracking.entry import Entry
+from optloc.show import Mark, Other, earth_points, formats, mark_of
+from optloc.tracking import Entry
 
 Record = dict[str, Any]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TypeVar
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import Budget, access, json_of, read_text
+from optloc.files import Budget, access, json_of, read_text
+from optloc.problem import InvalidProblem
 from optloc.service.answers import Record
 from optloc.service.events import Event, Events, name_under, picoseconds, rows_and_arrivals
 from optloc.service.metrics import COUNTS

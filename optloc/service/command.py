@@ -18,20 +18,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.outputs import claim, visible
-from optloc.cli.options import (
-    READER_GONE,
-    STOPPED,
-    Budget,
-    Force,
-    Method,
-    Outside,
-    ProblemPath,
-    Quiet,
-    Verbose,
-    example,
-)
+from optloc.cli import READER_GONE, STOPPED, Budget, Force, Method, Outside, ProblemPath, Quiet, Verbose, example
+from optloc.files import claim, visible
+from optloc.problem import InvalidProblem, nearest
 
 if TYPE_CHECKING:
     from optloc.service.recording import Recorded
@@ -208,10 +197,9 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
     """Return how tracks are made, as arguments of `optloc.service.stream.Settings`."""
     if (model, name, noise, gap) == ("cv", "iekf", None, None):
         return {"track": track}
-    from optloc.cli.track import Wanted, dynamics_of, rules
+    from optloc.cli import Wanted, dynamics_of, rules
     from optloc.service.tracks import Following
-    from optloc.tracking.entry import Rules
-    from optloc.tracking.updates import filter_of
+    from optloc.tracking import Rules, filter_of
 
     dynamics = dynamics_of(Wanted(model, noise=noise))
     return {"track": track, "following": Following(dynamics, filter_of(name), rules(Rules().gate, gap))}
@@ -475,7 +463,7 @@ def part_of(text: str) -> tuple[int, int]:
 
 def seconds_of(text: str, where: str) -> float:
     """Return a time such as "50 ms" in seconds; a bare number is seconds."""
-    from optloc.files.schema import Units
+    from optloc.files import Units
 
     value = Units("time").plain(text, None, where)
     if not value >= 0.0:

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Status
+from optloc.problem import Array, InvalidProblem, Status
 from optloc.service.answers import Record, fix_records, proof_records, unproven, unsolved
 from optloc.service.events import Event
 from optloc.service.metrics import Metrics

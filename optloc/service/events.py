@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 from zlib import crc32
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.inputs import has_controls
-from optloc.base.units import LARGEST
+from optloc.files import has_controls
+from optloc.problem import LARGEST, InvalidProblem, nearest
 from optloc.service.metrics import Metrics
 from optloc.service.site import Row, Site, UnknownName
 

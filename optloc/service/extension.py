@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from optloc.cli.extensions import Extension
-from optloc.cli.options import ANSWERS
+from optloc.cli import ANSWERS, Extension
 from optloc.service.command import EXAMPLES, SERVED, live, serve
 
 

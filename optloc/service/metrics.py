@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.types import Array
+from optloc.problem import Array
 
 # Latencies that are kept, of each phase: percentiles of the last seconds under load, of the last minute at 64 a second.
 _LATENCIES = 4096

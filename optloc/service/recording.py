@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.inputs import read_bytes
-from optloc.files.reader import Draft, draft
+from optloc.files import Draft, draft, read_bytes
 from optloc.models import MODELS
 from optloc.service.queues import Line
 from optloc.service.stream import Stream

@@ -11,7 +11,7 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
-from optloc.base.errors import InvalidProblem
+from optloc.problem import InvalidProblem
 from optloc.service.answers import Record, to_line
 from optloc.service.events import LINE
 from optloc.service.queues import WAITING, Ticket

@@ -13,18 +13,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.cache import Cache
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.frames import Frame
-from optloc.base.types import Array
-from optloc.base.units import Conversion
-from optloc.files.propagation import speed_of
-from optloc.files.reader import Draft, assemble
-from optloc.files.schema import ProblemFile, join, name_of, read_document
-from optloc.files.table import Table, table_of
-from optloc.files.unknowns import FREE, places_of
+from optloc.engine import Cache
+from optloc.files import (
+    FREE,
+    Draft,
+    ProblemFile,
+    Table,
+    assemble,
+    join,
+    name_of,
+    places_of,
+    read_document,
+    speed_of,
+    table_of,
+)
 from optloc.models import MODELS
-from optloc.solvers.prepared import Prepared, prepare
+from optloc.problem import Array, Conversion, Frame, InvalidProblem, nearest
+from optloc.solvers import Prepared, prepare
 
 FAST = "gtrs+lsr"
 """The method of the first phase: no proof, some ten microseconds a fix."""

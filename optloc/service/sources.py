@@ -10,7 +10,7 @@ from threading import Thread
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.problem import InvalidProblem, nearest
 from optloc.service.events import LINE
 from optloc.service.queues import WAITING
 from optloc.service.stream import Stream

@@ -12,11 +12,9 @@ from time import monotonic
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import access
-from optloc.base.outputs import Growing, write_text
-from optloc.kernels.jit import enabled
-from optloc.linear.simulate import simulate
+from optloc.engine import enabled, simulate
+from optloc.files import Growing, access, write_text
+from optloc.problem import InvalidProblem
 from optloc.service import events as of_events
 from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
 from optloc.service.checkpoint import restore, state_of

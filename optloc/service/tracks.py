@@ -12,17 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
-from optloc.problem.problem import Problem
+from optloc.problem import Array, InvalidProblem, Problem
 from optloc.service.answers import UNNAMED, Record, track_record, unsolved
 from optloc.service.events import Event
 from optloc.service.metrics import Metrics
-from optloc.tracking.dynamics import Dynamics, polynomial
-from optloc.tracking.entry import Entry, Rules
-from optloc.tracking.run import Follower
-from optloc.tracking.several_targets import alone
-from optloc.tracking.updates import Update
+from optloc.tracking import Dynamics, Entry, Follower, Rules, Update, alone, polynomial
 
 LOG = logging.getLogger("optloc.service")
 

@@ -1,18 +1,64 @@
 """Pages that need no network, and what a fix says: reports of studies, maps of bounds, fixes and tracks, words."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
 
 if TYPE_CHECKING:
-    from optloc.show.page import fix_page, live_page, map_page, track_page
+    from optloc.show.drawing import (
+        SIZE as SIZE,
+        Drawing as Drawing,
+        Looks as Looks,
+        Picture as Picture,
+        inline as inline,
+        marks as marks,
+        panel as panel,
+        panels as panels,
+        svg_text as svg_text,
+        with_legend as with_legend,
+    )
+    from optloc.show.formats import FORMATS as FORMATS, write_fixes as write_fixes
+    from optloc.show.formats.marks import Mark as Mark, Other as Other, mark_of as mark_of
+    from optloc.show.map import Canvas as Canvas
+    from optloc.show.page import (
+        Part as Part,
+        fix_page as fix_page,
+        live_page as live_page,
+        map_element as map_element,
+        map_page as map_page,
+        track_page as track_page,
+        write_page as write_page,
+    )
+    from optloc.show.pictures.bound_map import (
+        COLOURS as COLOURS,
+        levels as levels,
+        map_geojson as map_geojson,
+        plot_bound_map as plot_bound_map,
+        plot_status_map as plot_status_map,
+        status_geojson as status_geojson,
+    )
+    from optloc.show.pictures.fixes import plot_fixes as plot_fixes
+    from optloc.show.pictures.landscape import plot_convergence as plot_convergence, plot_landscape as plot_landscape
+    from optloc.show.pictures.outlines import earth_points as earth_points
+    from optloc.show.pictures.residuals import plot_health as plot_health, plot_residuals as plot_residuals
+    from optloc.show.pictures.runs import (
+        plot_accuracy as plot_accuracy,
+        plot_biases as plot_biases,
+        plot_course as plot_course,
+    )
+    from optloc.show.pictures.style import (
+        BLACK as BLACK,
+        BLUE as BLUE,
+        GREEN as GREEN,
+        GREY as GREY,
+        ORANGE as ORANGE,
+        PURPLE as PURPLE,
+        apart as apart,
+        figure_class as figure_class,
+        literal as literal,
+        save as save,
+    )
+    from optloc.show.pictures.track import plot_tracks as plot_tracks
+    from optloc.show.sheet import ABSENT as ABSENT, Sheet as Sheet, TextTable as TextTable
 
-__all__ = ["fix_page", "live_page", "map_page", "track_page"]
-
-
-def __getattr__(name: str) -> Any:
-    # Pages bring templates and drawings with them; words of a fix need neither.
-    from importlib import import_module
-
-    for place in ("page", "study_page"):
-        if name in __all__ and hasattr(module := import_module(f"optloc.show.{place}"), name):
-            return getattr(module, name)
-    raise AttributeError(f"module 'optloc.show' has no attribute {name!r}")
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -25,7 +25,7 @@ _DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class Look:
     """The look of a method.
 
     Parameters
@@ -57,15 +57,15 @@ class Mark:
         return f"method-{self.number}"
 
 
-def marks(methods: list[str]) -> dict[str, Mark]:
+def marks(methods: list[str]) -> dict[str, Look]:
     """Return the look of every method."""
     return {
-        name: Mark(i, name, _COLOURS[i % len(_COLOURS)], _MARKS[i % len(_MARKS)], _DASHES[(i // 2 + i // 8) % 4])
+        name: Look(i, name, _COLOURS[i % len(_COLOURS)], _MARKS[i % len(_MARKS)], _DASHES[(i // 2 + i // 8) % 4])
         for i, name in enumerate(methods)
     }
 
 
-Looks = dict[str, Mark]
+Looks = dict[str, Look]
 
 # Inches, with texts of 8 to 10 points: two panels beside each other on a desk, one on a phone, and both can be read.
 SIZE = (5.2, 3.5)

@@ -22,7 +22,7 @@ from optloc.bounds.over_area import BoundMap
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import UNCHECKED
-from optloc.show.drawing import Drawing, Mark
+from optloc.show.drawing import Drawing, Look
 from optloc.show.map import (
     Canvas,
     Curve,
@@ -100,7 +100,7 @@ def write_page(
     *,
     opening: Sequence[str] = (),
     facts: str = "",
-    methods: Iterable[Mark] = (),
+    methods: Iterable[Look] = (),
     live: bool = False,
 ) -> str:
     """Return a page.
@@ -115,7 +115,7 @@ def write_page(
         Paragraphs above them.
     facts : str
         The same in small print.
-    methods : iterable of Mark
+    methods : iterable of Look
         Looks of methods for a legend that stays in view.
     live : bool
         Whether the map asks its server for fixes, once a second.

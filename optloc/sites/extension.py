@@ -8,18 +8,19 @@ from typing import Annotated
 
 import typer
 
-from optloc.cli.extensions import Extension, Part
-from optloc.cli.options import (
+from optloc.cli import (
     ANSWERS,
     AmbiguityDraws,
     Budget,
     Choose,
     Costs,
     Criterion,
+    Extension,
     FailOne,
     Force,
     Json,
     Outside,
+    Part,
     PlacementMap,
     PlaceOfInterest,
     ProblemPath,
@@ -80,9 +81,8 @@ def _kernels() -> Mapping[str, Part]:
 
 
 def _place() -> None:
-    from optloc.cli.compile import TARGET, problem_of
-    from optloc.sites.placement import SiteSelection
-    from optloc.sites.placement import place as chosen
+    from optloc.cli import TARGET, problem_of
+    from optloc.sites.placement import SiteSelection, place as chosen
 
     # the criteria differ by numbers, not by types
     chosen(SiteSelection(problem_of("toa"), TARGET[None], choose=4, gap=0.5))

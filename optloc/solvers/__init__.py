@@ -1,94 +1,48 @@
-"""Solve: from a problem to a fix, without a guess."""
+"""Methods from a problem to a fix, without a guess; proofs, robust losses and suspects."""
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from typing import Any
+from optloc.base.faces import exported
 
-import numpy as np
+if TYPE_CHECKING:
+    from optloc.linear.vectors import vectors as vectors
+    from optloc.solvers.back_ends import (
+        Backend as Backend,
+        backend_kind as backend_kind,
+        backends as backends,
+        kind_of as kind_of,
+        version_of as version_of,
+    )
+    from optloc.solvers.certificates.admitted import certify as certify
+    from optloc.solvers.methods import (
+        FORMULATIONS as FORMULATIONS,
+        METHODS as METHODS,
+        SOLVERS as SOLVERS,
+        Choice as Choice,
+        Entry as Entry,
+        Formulation as Formulation,
+        Method as Method,
+        counting as counting,
+        shortcut as shortcut,
+        using as using,
+    )
+    from optloc.solvers.outside import given as given, judge_points as judge_points
+    from optloc.solvers.policy import (
+        AMBIGUOUS_GAP as AMBIGUOUS_GAP,
+        LISTED_GAP as LISTED_GAP,
+        REFUTED as REFUTED,
+        equal_cost as equal_cost,
+    )
+    from optloc.solvers.pool import Pool as Pool, begin as begin, offer as offer
+    from optloc.solvers.prepared import Prepared as Prepared, prepare as prepare
+    from optloc.solvers.robust.stage import rejected as rejected
+    from optloc.solvers.running import Running as Running
+    from optloc.solvers.shares import StatusShares as StatusShares, status_shares as status_shares
+    from optloc.solvers.solution import solve as solve
+    from optloc.solvers.starts.angles import course_starts as course_starts, courses as courses
+    from optloc.solvers.starts.position import spread_of as spread_of
+    from optloc.solvers.suspect_rows.stage import suspects as suspects
+    from optloc.solvers.verdict.findings import Finding as Finding, objections as objections
+    from optloc.solvers.verdict.judge import judge as judge
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
-from optloc.linear.vectors import vectors
-from optloc.problem.determined import with_sources
-from optloc.problem.epochs import by_epoch, separable
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
-from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, Entry, Formulation, Method, shortcut
-from optloc.solvers.outside import given
-from optloc.solvers.pool import PART, begin, in_parts, where
-from optloc.solvers.single import at_once
-from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
-
-__all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Method", "given", "solve", "vectors"]
-
-
-def solve(problem: Problem, method: str = "auto", *, start: Any = None, refine: bool = True) -> Fix:
-    """Return the fix of every problem of a batch, without a first guess.
-
-    Parameters
-    ----------
-    problem : Problem
-        Batch axes (...). Where its epochs share no unknown they are solved as one more batch axis, (..., k).
-    method : str
-        "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``. One that only starts,
-        such as "sdp" or "minimax", is followed by "lsr+certify".
-    start : array (..., size), optional
-        Starting vector: all that a method has which begins with a refinement, such as "lsr", and one more candidate
-        of every other.
-    refine : bool
-        False: a method that only starts returns its estimate as it is, with the status `unrefined`: for those who
-        compare starts.
-
-    Returns
-    -------
-    Fix
-        With the problem's batch axes. Failure is a status, never an exception: where a stage fails numerically for one
-        problem of a batch it is `numerical` with the cause, and the others are fixed.
-
-    Raises
-    ------
-    InvalidProblem
-        For an unknown method, or where nothing is unknown.
-    """
-    run = Method.parse(method)
-    fix = at_once(problem, run) if start is None else None
-    fix = solve_in_stages(problem, run, start, refine=refine) if fix is None else fix
-    return with_sources(problem, fix)
-
-
-def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:
-    """Return what `solve` returns, by the stages of a method: a batch is what they are made for."""
-    if problem.layout.size == 0:
-        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
-    if separable(problem):
-        problem = by_epoch(problem)
-    shape, flat = problem.batch_shape, problem.flat()
-    vector = None if start is None else _broadcast_start(problem, start).reshape(-1, problem.layout.size)
-
-    def work(some: Problem, part: slice) -> Fix:
-        pool = run(some, None if vector is None else begin(some, vector[part]))
-        if refine and pool.curvature is None:
-            pool = _FINISH(some, pool)
-        with where("the verdict"):
-            return hide_open_epochs(verdict(some, pool))
-
-    # the shortcut divides its work itself, and shares it among threads
-    most = flat.batch_shape[0] if shortcut(run) and vector is None else PART
-    with np.errstate(all="ignore"):  # what overflows is judged: a status says so, once
-        fix = in_parts(flat, work, most, failed)
-    return fix.reshape(shape) if shape != (len(fix),) else fix
-
-
-# What refines and judges the starts of a method that has nothing behind them.
-_FINISH = Method(("lsr", "certify"))
-
-
-def _broadcast_start(problem: Problem, start: Any) -> Array:
-    """Return a starting vector for every problem, (..., size)."""
-    vector, wanted = np.asarray(start, dtype=float), (*problem.batch_shape, problem.layout.size)
-    try:
-        return np.broadcast_to(vector, wanted)
-    except ValueError:
-        raise InvalidProblem(
-            f"start has shape {vector.shape}, not {wanted}", "start", "order it by the layout"
-        ) from None
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

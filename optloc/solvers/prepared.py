@@ -15,10 +15,10 @@ from optloc.engine.plan import Plan, plan_of
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers import solve, solve_in_stages
 from optloc.solvers.methods import Method, shortcut
 from optloc.solvers.planned import settle_directly
 from optloc.solvers.single import Single, is_few, single
+from optloc.solvers.solution import solve, solve_in_stages
 from optloc.solvers.verdict.judge import verdict
 
 

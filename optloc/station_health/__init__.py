@@ -1,1 +1,22 @@
 """What the residuals of many fixes say of the measurements: noise levels, station biases, gross errors."""
+
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.station_health.levels import (
+        NoiseLevels as NoiseLevels,
+        common_level as common_level,
+        late_signals as late_signals,
+        noise_levels as noise_levels,
+        with_noise_levels as with_noise_levels,
+    )
+    from optloc.station_health.stations import Health as Health, health as health
+    from optloc.station_health.structure import (
+        NoiseStructure as NoiseStructure,
+        noise_structure as noise_structure,
+        with_estimated_noise as with_estimated_noise,
+    )
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

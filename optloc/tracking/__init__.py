@@ -1,42 +1,59 @@
 """Trackers: fixes in time, started by the fixes of `optloc.solve`."""
 
-from optloc.tracking.constants import begun_with_constants, followed_with_constants
-from optloc.tracking.dynamics import Dynamics, current_statistical, polynomial, singer
-from optloc.tracking.entry import Entry, Rules
-from optloc.tracking.measurement_space import lines, simplified
-from optloc.tracking.run import collected, tracked
-from optloc.tracking.start import begun, two_point
-from optloc.tracking.track import State, Track, followed, predicted
-from optloc.tracking.updates import UPDATES, Filter, Updated, ekf, gated, reweighted, whitened
-from optloc.tracking.whole_run import fitted, posterior_bound, smoothed
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "UPDATES",
-    "Dynamics",
-    "Entry",
-    "Filter",
-    "Rules",
-    "State",
-    "Track",
-    "Updated",
-    "begun",
-    "begun_with_constants",
-    "collected",
-    "current_statistical",
-    "ekf",
-    "fitted",
-    "followed",
-    "followed_with_constants",
-    "gated",
-    "lines",
-    "polynomial",
-    "posterior_bound",
-    "predicted",
-    "reweighted",
-    "simplified",
-    "singer",
-    "smoothed",
-    "tracked",
-    "two_point",
-    "whitened",
-]
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.tracking.associate import (
+        Associate as Associate,
+        Clutter as Clutter,
+        assigned as assigned,
+        joint as joint,
+        nearest as nearest,
+    )
+    from optloc.tracking.constants import (
+        begun_with_constants as begun_with_constants,
+        followed_with_constants as followed_with_constants,
+    )
+    from optloc.tracking.dynamics import (
+        Dynamics as Dynamics,
+        correlated as correlated,
+        current_statistical as current_statistical,
+        polynomial as polynomial,
+        singer as singer,
+    )
+    from optloc.tracking.entry import Entry as Entry, Rules as Rules
+    from optloc.tracking.measurement_space import lines as lines, simplified as simplified
+    from optloc.tracking.run import Follower as Follower, collected as collected, tracked as tracked
+    from optloc.tracking.several_models import imm as imm, parallel as parallel, resized as resized
+    from optloc.tracking.several_targets import (
+        Candidates as Candidates,
+        Missing as Missing,
+        alone as alone,
+        associated as associated,
+    )
+    from optloc.tracking.start import (
+        begun as begun,
+        first_fix as first_fix,
+        is_one_gaussian as is_one_gaussian,
+        state_of as state_of,
+        two_point as two_point,
+        with_height_rows as with_height_rows,
+    )
+    from optloc.tracking.track import State as State, Track as Track, followed as followed, predicted as predicted
+    from optloc.tracking.updates import (
+        UPDATES as UPDATES,
+        Filter as Filter,
+        Update as Update,
+        Updated as Updated,
+        ekf as ekf,
+        filter_of as filter_of,
+        gated as gated,
+        joseph as joseph,
+        reweighted as reweighted,
+        whitened as whitened,
+    )
+    from optloc.tracking.whole_run import fitted as fitted, posterior_bound as posterior_bound, smoothed as smoothed
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

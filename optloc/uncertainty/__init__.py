@@ -1,1 +1,18 @@
 """What the data say beyond a covariance: regions, arcs, samples, mixtures and the radii of data sheets."""
+
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.uncertainty.arc import Arc as Arc, trace_arc as trace_arc
+    from optloc.uncertainty.posterior import (
+        Mixture as Mixture,
+        Samples as Samples,
+        mixture as mixture,
+        samples as samples,
+    )
+    from optloc.uncertainty.radii import Accuracy as Accuracy, accuracy as accuracy
+    from optloc.uncertainty.region import Region as Region, likelihood_region as likelihood_region
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -8,8 +8,7 @@ from data.reference import Reference, centred, descend, ecef, horizontal
 from optloc.lab.datasets.adsb import ARRIVAL, HEIGHT, Heard
 from optloc.lab.datasets.gnss import SIGMA, Receptions
 from optloc.lab.datasets.mrclam import Sightings, sigmas
-from optloc.lab.datasets.starloc import SIGMA as BEARING
-from optloc.lab.datasets.starloc import Groups
+from optloc.lab.datasets.starloc import SIGMA as BEARING, Groups
 
 RADIUS = 6.4e6
 

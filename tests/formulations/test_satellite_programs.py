@@ -12,8 +12,7 @@ from formulations.range_height import ellipsoid, locate, three_stations, visible
 from formulations.range_height_conic import _reach, lift
 from optloc import solve
 from optloc.base.frames import ECEF
-from optloc.linear.constraints import height
-from optloc.linear.constraints import visible as sight
+from optloc.linear.constraints import height, visible as sight
 from optloc.problem.build import assemble, measured, station_array
 
 EARTH = 6378137.0

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from monte_carlo.tables import ledger
 from proof.doppler import registration
-from proof.test_moving_targets import drawn as moving_target
-from proof.test_moving_targets import limits
+from proof.test_moving_targets import drawn as moving_target, limits
 from proof.test_targets_over_ground import drawn as over_ground
 
 from optloc import Problem, Status, simulate, solve

@@ -11,8 +11,7 @@ from monte_carlo.test_consistency import band
 from runs import run, truth
 
 from optloc import Status
-from optloc.lab.papers.registration import PRINTED, Setting, rms, wander
-from optloc.lab.papers.registration import truth as printed_truth
+from optloc.lab.papers.registration import PRINTED, Setting, rms, truth as printed_truth, wander
 
 FULL, JOINT, GAUSSIAN = 2000, 2000, 500
 PRIOR, WIDTH = 200.0, 20.0

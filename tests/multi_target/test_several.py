@@ -12,8 +12,7 @@ from optloc import InvalidProblem, Status
 from optloc.multi_target import Clutter, evenly, separate
 from optloc.multi_target.pricing_search import TOLERANCE, Region, search
 from optloc.multi_target.set_packing import Prices, cheapest_sets, price_rows
-from optloc.multi_target.sets import Tuples, around, changes, of_picks, scenes
-from optloc.multi_target.sets import refine_sets as refined
+from optloc.multi_target.sets import Tuples, around, changes, of_picks, refine_sets as refined, scenes
 
 AZIMUTHS = {"kind": "azimuth", "channels": [0, 1, 2, 3, 4]}
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 from data.windows import report
-from service.lines import arrivals as drawn
-from service.lines import differences, line, site_in
+from service.lines import arrivals as drawn, differences, line, site_in
 
 pytestmark = pytest.mark.full
 

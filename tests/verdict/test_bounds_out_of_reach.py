@@ -8,9 +8,9 @@ from optloc import Status, assemble, measured, prepare, solve
 from optloc.base.types import Band
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
-from optloc.solvers import solve_in_stages
 from optloc.solvers.certificates.out_of_reach import edges_of, lay_planes, question
 from optloc.solvers.methods import Method
+from optloc.solvers.solution import solve_in_stages
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no short way without machine code")
 SIGMA, TRIALS, STARTS = 10.0, 40, 30

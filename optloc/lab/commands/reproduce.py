@@ -8,10 +8,9 @@ from typing import Annotated, cast, get_args
 import typer
 from rich.table import Table
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.outputs import claim, make_folder
-from optloc.cli.options import Force, Quiet, Verbose, example, name_in
-from optloc.cli.output import Screen
+from optloc.cli import Force, Quiet, Screen, Verbose, example, name_in
+from optloc.files import claim, make_folder
+from optloc.problem import InvalidProblem, nearest
 
 EXAMPLES = example("optloc reproduce registration", "optloc reproduce registration --size full --out tables")
 
@@ -35,7 +34,7 @@ def reproduce(
 
 def _run(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
     """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
-    from optloc.cli.output import bar, say
+    from optloc.cli import bar, say
     from optloc.lab.papers import Size, paper, reproduction, write
 
     paper(name)

@@ -14,9 +14,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import claim
-from optloc.cli.options import (
+from optloc.cli import (
     STOPPED,
     Budget,
     Force,
@@ -24,12 +22,14 @@ from optloc.cli.options import (
     Json,
     Outside,
     Quiet,
+    Screen,
     Verbose,
     complete,
     example,
     find_problem,
 )
-from optloc.cli.output import Screen
+from optloc.files import claim
+from optloc.problem import InvalidProblem
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
@@ -102,11 +102,10 @@ def run(
     verbose: Verbose = False,
 ) -> None:
     """Run a study, or go on with one that was stopped: finished parts are kept, and new methods run alone."""
-    from optloc.base.registry import load_plugin
     from optloc.lab.study.design import design_of
-    from optloc.lab.study.execute import executor as chosen
-    from optloc.lab.study.execute import run_design
+    from optloc.lab.study.execute import executor as chosen, run_design
     from optloc.lab.study.methods import added
+    from optloc.problem import load_plugin
 
     for name in plugin or ():
         load_plugin(name)
@@ -205,13 +204,12 @@ def bench(
     verbose: Verbose = False,
 ) -> None:
     """Solve the public test set by a few methods and yours, and write who is right how often as a page."""
-    from optloc.base.registry import load_plugin
-    from optloc.cli.output import write_text
+    from optloc.cli import write_text
     from optloc.lab.study.design import design_of
     from optloc.lab.study.execute import executor, run_design
-    from optloc.lab.study.leaderboard import SET
-    from optloc.lab.study.leaderboard import page as made
+    from optloc.lab.study.leaderboard import SET, page as made
     from optloc.lab.study.methods import added
+    from optloc.problem import load_plugin
 
     claim(page)
     for name in plugin or ():
@@ -271,7 +269,7 @@ def profiles(
     verbose: Verbose = False,
 ) -> None:
     """Say which share of the trials each method solves, within how much work: data and performance profiles."""
-    from optloc.cli.output import claim_outputs, write_picture
+    from optloc.cli import claim_outputs, write_picture
     from optloc.lab.study import summary
     from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest, references
     from optloc.lab.study.profiles import profiles as profiled
@@ -284,7 +282,7 @@ def profiles(
     found = profiled(frame, tau=tau, work=work, out=known)
     if plot is not None:
         from optloc.lab.report.figures import profile_picture
-        from optloc.show.drawing import marks
+        from optloc.show import marks
 
         write_picture(profile_picture(found, marks(list(found.methods))), plot)
     if as_json:
@@ -327,10 +325,9 @@ def histories(
     verbose: Verbose = False,
 ) -> None:
     """Follow methods on their way down: the cost against evaluations of it and against iterations."""
-    from optloc.base.registry import load_plugin
-    from optloc.cli.output import claim_outputs, write_picture, write_table
-    from optloc.lab.study.histories import histories as followed
-    from optloc.lab.study.histories import question, reach
+    from optloc.cli import claim_outputs, write_picture, write_table
+    from optloc.lab.study.histories import histories as followed, question, reach
+    from optloc.problem import load_plugin
 
     claim_outputs(table=out, picture=plot, inputs=[] if place.is_dir() else [place])
     for name in plugin or ():
@@ -341,7 +338,7 @@ def histories(
         write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})
     if plot is not None:
         from optloc.lab.report.figures import history_picture
-        from optloc.show.drawing import marks
+        from optloc.show import marks
 
         write_picture(history_picture(found, marks(list(found.methods))), plot)
     if as_json:
@@ -362,13 +359,13 @@ def schema(verbose: Verbose = False) -> None:
 
 
 def _print_json(value: Any) -> None:
-    from optloc.cli.output import dumps
+    from optloc.cli import dumps
 
     typer.echo(dumps(value))
 
 
 def _say(line: str) -> None:
-    from optloc.cli.output import say
+    from optloc.cli import say
 
     say(Screen(), line)
 

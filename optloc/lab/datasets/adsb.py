@@ -17,13 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.base.frames import ECEF
-from optloc.base.types import Array, Motion
-from optloc.base.units import SPEED_OF_LIGHT
+from optloc.engine import height
 from optloc.lab.datasets.reading import choose, places, table
-from optloc.linear.constraints import height
-from optloc.problem.build import assemble, measured, station_array
-from optloc.problem.problem import Problem
+from optloc.problem import ECEF, SPEED_OF_LIGHT, Array, Motion, Problem, assemble, measured, station_array
 
 ARRIVAL = 30.0  # metres: the robust spread of the residuals at the truth that comes with the set
 HEIGHT = 30.0  # metres: four times the quantum of the reports, 25 ft

@@ -10,10 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
 from optloc.lab.datasets.reading import check_files, root
-from optloc.problem.problem import Problem
+from optloc.problem import Array, InvalidProblem, Problem, nearest
 
 
 @dataclass(frozen=True, slots=True)

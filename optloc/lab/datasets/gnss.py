@@ -14,12 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.frames import ECEF
-from optloc.base.types import Array, Bias, Motion
+from optloc.engine import height, visible
 from optloc.lab.datasets.reading import choose, places, table
-from optloc.linear.constraints import height, visible
-from optloc.problem.build import assemble, measured, station_array
-from optloc.problem.problem import Problem
+from optloc.problem import ECEF, Array, Bias, Motion, Problem, assemble, measured, station_array
 
 if TYPE_CHECKING:
     import pandas as pd

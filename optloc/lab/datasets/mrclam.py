@@ -12,10 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.base.types import Array, Motion
 from optloc.lab.datasets.reading import choose, places, table
-from optloc.problem.build import assemble, measured
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Motion, Problem, assemble, measured
 
 # Radians and metres. Four times the robust spread of azimuths, for one in a hundred is beyond 5 degrees.
 SIGMA = {"azimuth": np.deg2rad(2.0), "range": 0.1}

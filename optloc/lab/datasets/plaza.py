@@ -16,10 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.base.types import Array, Motion
 from optloc.lab.datasets.reading import Window, Windows, along, choose, cut_windows, places, table
-from optloc.problem.build import assemble, measured
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Motion, Problem, assemble, measured
 
 # Metres: the rms of the residuals at the truth after each calibration, see above.
 SIGMA = {"raw": 3.0, "offset": 1.15, "affine": 0.53, "scaled": 0.53}

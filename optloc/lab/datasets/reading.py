@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.inputs import read_bytes
-from optloc.base.types import Array
-from optloc.problem.problem import Problem
+from optloc.files import read_bytes
+from optloc.problem import Array, InvalidProblem, Problem, nearest
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.types import Array, Motion
 from optloc.lab.datasets.reading import choose, places, table
-from optloc.problem.build import assemble, measured, station_array
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Motion, Problem, assemble, measured, station_array
 
 if TYPE_CHECKING:
     import pandas as pd

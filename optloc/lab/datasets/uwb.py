@@ -30,12 +30,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Motion
 from optloc.lab.datasets.reading import Window, Windows, along, choose, cut_windows, places, table
-from optloc.problem.build import assemble, measured
-from optloc.problem.noise import Block, Noise, group
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Block, InvalidProblem, Motion, Noise, Problem, assemble, group, measured
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib import import_module
 
-from optloc.base.errors import InvalidProblem, nearest
 from optloc.lab.papers.report import Report, Reproduction, Size, write
-from optloc.show.sheet import TextTable
+from optloc.problem import InvalidProblem, nearest
+from optloc.show import TextTable
 
 __all__ = ["PAPERS", "Paper", "Report", "Reproduction", "Size", "TextTable", "paper", "reproduction", "write"]
 

@@ -11,18 +11,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.types import Array, Motion
-from optloc.bounds.cramer_rao import crlb
+from optloc.bounds import crlb
+from optloc.engine import simulate
 from optloc.lab.papers.report import Tick
-from optloc.linear.simulate import simulate
-from optloc.problem.build import assemble, measured
-from optloc.problem.epochs import by_epoch, cut
-from optloc.problem.problem import Problem
-from optloc.solvers import solve
-from optloc.solvers.starts.angles import courses
-from optloc.tracking import Dynamics, State, Track, current_statistical, followed, singer
-from optloc.tracking.dynamics import correlated
-from optloc.tracking.whole_run import fitted, posterior_bound
+from optloc.problem import Array, Motion, Problem, assemble, by_epoch, cut, measured
+from optloc.solvers import courses, solve
+from optloc.tracking import (
+    Dynamics,
+    State,
+    Track,
+    correlated,
+    current_statistical,
+    fitted,
+    followed,
+    posterior_bound,
+    singer,
+)
 
 # The three simulations of the paper, as printed where they can be and repaired where not.
 

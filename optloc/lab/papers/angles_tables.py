@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.types import Array
 from optloc.lab.papers.angles import (
     CIRCLE_START,
     LOST,
@@ -57,7 +56,8 @@ from optloc.lab.papers.report import (
     tabulate,
     typeset,
 )
-from optloc.show.sheet import ABSENT, TextTable
+from optloc.problem import Array
+from optloc.show import ABSENT, TextTable
 from optloc.tracking import Dynamics, State, current_statistical, polynomial
 
 if TYPE_CHECKING:

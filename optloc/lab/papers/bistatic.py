@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.types import Array, Motion
-from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.cramer_rao import crlb, crlb_course
+from optloc.bounds import crlb, crlb_course
+from optloc.engine import box, predict, simulate
 from optloc.lab.papers.report import (
     Ink,
     Report,
@@ -28,19 +27,10 @@ from optloc.lab.papers.report import (
     tabulate,
     typeset,
 )
-from optloc.linear.constraints import box
-from optloc.linear.evaluate import predict
-from optloc.linear.simulate import simulate
-from optloc.problem.build import assemble, measured
-from optloc.problem.epochs import cut
-from optloc.problem.problem import Problem
-from optloc.show.sheet import ABSENT, TextTable
-from optloc.solvers import solve
-from optloc.solvers.starts.angles import course_starts
-from optloc.tracking.dynamics import polynomial
-from optloc.tracking.measurement_space import lines, simplified
-from optloc.tracking.start import first_fix, state_of
-from optloc.tracking.track import Track, followed
+from optloc.problem import SPEED_OF_LIGHT, Array, Motion, Problem, assemble, cut, measured
+from optloc.show import ABSENT, TextTable
+from optloc.solvers import course_starts, solve
+from optloc.tracking import Track, first_fix, followed, lines, polynomial, simplified, state_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,21 +11,33 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array, Motion, Prior
-from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.cramer_rao import crlb
-from optloc.linear.normal import linearise, normal, step
-from optloc.linear.simulate import simulate
-from optloc.problem.build import assemble, measured
-from optloc.problem.epochs import cut
-from optloc.problem.problem import Problem
+from optloc.bounds import crlb
+from optloc.engine import linearise, normal, simulate, step
+from optloc.problem import SPEED_OF_LIGHT, Array, Motion, Prior, Problem, assemble, cut, measured
 from optloc.solvers import solve
-from optloc.tracking import Dynamics, State, Track, followed, polynomial
-from optloc.tracking.associate import Associate, Clutter, assigned, joint, nearest
-from optloc.tracking.several_models import imm, parallel, resized
-from optloc.tracking.several_targets import Candidates, Missing, associated
-from optloc.tracking.updates import Update, Updated, joseph, whitened
-from optloc.tracking.whole_run import posterior_bound
+from optloc.tracking import (
+    Associate,
+    Candidates,
+    Clutter,
+    Dynamics,
+    Missing,
+    State,
+    Track,
+    Update,
+    Updated,
+    assigned,
+    associated,
+    followed,
+    imm,
+    joint,
+    joseph,
+    nearest,
+    parallel,
+    polynomial,
+    posterior_bound,
+    resized,
+    whitened,
+)
 
 # The scene of the paper: three targets, four stations, twenty updates behind one fix.
 

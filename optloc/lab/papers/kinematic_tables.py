@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from optloc.base.types import Array, Motion
 from optloc.lab.papers.kinematic import (
     FILTERS,
     LOST,
@@ -34,10 +33,10 @@ from optloc.lab.papers.kinematic import (
     weighting,
 )
 from optloc.lab.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, percent, tabulate, typeset
-from optloc.problem.epochs import cut
-from optloc.show.sheet import ABSENT, TextTable
+from optloc.problem import Array, Motion, cut
+from optloc.show import ABSENT, TextTable
 from optloc.solvers import solve
-from optloc.tracking.several_models import parallel
+from optloc.tracking import parallel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

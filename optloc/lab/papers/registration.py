@@ -13,17 +13,22 @@ from typing import Literal
 
 import numpy as np
 
-from optloc.base.types import Array, Motion, Stations
-from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.cramer_rao import crlb, crlb_course
+from optloc.bounds import crlb, crlb_course
+from optloc.engine import predict, simulate
 from optloc.lab.papers.registration_recursion import FIRST, joint_recursion, recursion
-from optloc.linear.evaluate import predict
-from optloc.linear.simulate import simulate
-from optloc.problem.bias import with_bias
-from optloc.problem.build import assemble, measured
-from optloc.problem.fix import Fix
-from optloc.problem.noise import Block, Noise
-from optloc.problem.problem import Problem
+from optloc.problem import (
+    SPEED_OF_LIGHT,
+    Array,
+    Block,
+    Fix,
+    Motion,
+    Noise,
+    Problem,
+    Stations,
+    assemble,
+    measured,
+    with_bias,
+)
 from optloc.solvers import solve
 
 # The scenes of the paper, as printed, and one more whose stations span space and never meet.

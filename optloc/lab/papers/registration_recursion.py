@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array
+from optloc.problem import Array
 
 FIRST = 40
 """Epochs that are collected before the first estimate, as printed."""

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.types import Array, Status
-from optloc.bounds.cramer_rao import crlb
+from optloc.bounds import crlb
 from optloc.lab.papers.registration import (
     MOVING,
     NANOSECOND,
@@ -44,7 +43,8 @@ from optloc.lab.papers.report import (
     tabulate,
     typeset,
 )
-from optloc.show.sheet import ABSENT, TextTable
+from optloc.problem import Array, Status
+from optloc.show import ABSENT, TextTable
 from optloc.solvers import solve
 
 if TYPE_CHECKING:

@@ -26,10 +26,9 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import make_folder, together, write_text, written
-from optloc.show.drawing import Picture
-from optloc.show.sheet import ABSENT, TextTable
+from optloc.files import make_folder, together, write_text, written
+from optloc.problem import InvalidProblem
+from optloc.show import ABSENT, Picture, TextTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

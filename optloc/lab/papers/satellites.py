@@ -12,24 +12,37 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef
-from optloc.base.types import Array, Motion
-from optloc.base.units import SPEED_OF_LIGHT
-from optloc.bounds.cramer_rao import crlb
+from optloc.bounds import crlb
+from optloc.engine import height as known_height, simulate
 from optloc.lab.papers.report import Ink, Report, Size, Study, Tick, canvas, explain, label, scale, tabulate, typeset
-from optloc.linear.constraints import height as known_height
-from optloc.linear.simulate import simulate
-from optloc.problem.bias import with_bias
-from optloc.problem.build import assemble, measured, station_array
-from optloc.problem.epochs import cut
-from optloc.problem.problem import Problem
-from optloc.show.sheet import ABSENT, TextTable
+from optloc.problem import (
+    ECEF,
+    SPEED_OF_LIGHT,
+    Array,
+    Motion,
+    Problem,
+    assemble,
+    cut,
+    ecef_to_geodetic,
+    geodetic_to_ecef,
+    measured,
+    station_array,
+    with_bias,
+)
+from optloc.show import ABSENT, TextTable
 from optloc.solvers import solve
-from optloc.tracking.constants import begun_with_constants, followed_with_constants
-from optloc.tracking.dynamics import Dynamics, polynomial
-from optloc.tracking.start import two_point, with_height_rows
-from optloc.tracking.track import State, Track, followed
-from optloc.tracking.whole_run import posterior_bound
+from optloc.tracking import (
+    Dynamics,
+    State,
+    Track,
+    begun_with_constants,
+    followed,
+    followed_with_constants,
+    polynomial,
+    posterior_bound,
+    two_point,
+    with_height_rows,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

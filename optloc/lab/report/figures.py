@@ -7,12 +7,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.base.types import Array
 from optloc.lab.study.histories import COUNTS, Histories, band
 from optloc.lab.study.profiles import WORK, Profiles
 from optloc.lab.study.summary import accuracy_rows, distribution, noise_text, wilson
-from optloc.show.drawing import SIZE, Looks, Mark, Picture, panel, panels, with_legend
-from optloc.show.pictures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, literal
+from optloc.problem import Array
+from optloc.show import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SIZE,
+    Looks,
+    Picture,
+    literal,
+    panel,
+    panels,
+    with_legend,
+)
+from optloc.show.drawing import Look
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,7 +137,7 @@ def _log(axis: Any, scale: Any, low: float, high: float) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bool = False, width: float = 1.5) -> None:
+def _line(axes: Axes, mark: Look, x: Array, y: Array, *, marker: bool, steps: bool = False, width: float = 1.5) -> None:
     (line,) = axes.plot(
         x,
         y,

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.lab.study.profiles import RATIOS, Profiles, shares
 from optloc.lab.study.summary import PROVEN, by_status, clopper_pearson, noise_text, ranking, wilson
-from optloc.show.sheet import Sheet, TextTable
+from optloc.show import Sheet, TextTable
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import claim, make_folder, together, write_text, written
-from optloc.base.types import Array
-from optloc.bounds.over_area import BoundMap, bound_map, extent, map_coordinates
-from optloc.files.writer import harmless_column
+from optloc.bounds import BoundMap, bound_map, extent, map_coordinates
+from optloc.files import claim, harmless_column, make_folder, together, write_text, written
 from optloc.lab.report import figures as drawn
 from optloc.lab.report.sheets import latex, sheets
 from optloc.lab.study import summary
@@ -24,12 +21,23 @@ from optloc.lab.study.folder import Manifest, design_of_manifest, read_frame, re
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import Profiles, profiles
 from optloc.lab.study.summary import case_label, noise_text
-from optloc.show.drawing import Drawing, Mark, Picture, inline, marks, svg_text, with_legend
-from optloc.show.map import Canvas
-from optloc.show.page import Part, map_element, write_page
-from optloc.show.pictures.bound_map import plot_bound_map
-from optloc.show.pictures.style import figure_class
-from optloc.show.sheet import Sheet
+from optloc.problem import Array, InvalidProblem
+from optloc.show import (
+    Canvas,
+    Drawing,
+    Part,
+    Picture,
+    Sheet,
+    figure_class,
+    inline,
+    map_element,
+    marks,
+    plot_bound_map,
+    svg_text,
+    with_legend,
+    write_page,
+)
+from optloc.show.drawing import Look
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -122,7 +130,7 @@ class _Found:
     manifest: Manifest
     frame: pd.DataFrame
     cells: pd.DataFrame
-    looks: dict[str, Mark]
+    looks: dict[str, Look]
     sheets: dict[str, Sheet]
     places: list[Place]
     profiles: Profiles | None

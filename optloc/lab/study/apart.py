@@ -19,10 +19,9 @@ from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from typing import IO, Any, NoReturn
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.registry import load_plugin, plugins
 from optloc.lab.study.design import Chunk
 from optloc.lab.study.trial import DIED, LATE, Lost, Part, compute
+from optloc.problem import InvalidProblem, load_plugin, plugins
 
 # Seconds: to begin, half of one where a processor is free; without a task, after which it ends, as nobody tells a
 # cluster that a study is over; between the end of its pipe and its own, which says how it ended.

@@ -14,31 +14,28 @@ from time import perf_counter
 import numpy as np
 
 from formulations.backend import count
-from optloc.base.errors import InvalidProblem
-from optloc.base.linalg import centre_and_spread
-from optloc.base.registry import Table
-from optloc.base.threads import WORTH, mapped
-from optloc.base.types import Array, Status
-from optloc.kernels.least_squares import WEIGHINGS
-from optloc.kernels.sums import equations_at
+from optloc.engine import (
+    WEIGHINGS,
+    WORTH,
+    centre_and_spread,
+    depends_on_place,
+    differentiate,
+    equations_at,
+    mapped,
+    one_position,
+    prior_parts,
+    step,
+    vectors,
+    weighed,
+)
 from optloc.lab.study.draws import Drawn
 from optloc.lab.study.networks import Found, Networks, each, from_truth, refined
-from optloc.linear.evaluate import differentiate
-from optloc.linear.mirror import one_position
-from optloc.linear.normal import depends_on_place, prior_parts, step, weighed
-from optloc.linear.vectors import vectors
 from optloc.models import MODELS
-from optloc.problem.epochs import tied, window
-from optloc.problem.fix import Fix, Stage
-from optloc.problem.noise import whiten
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Fix, InvalidProblem, Problem, Stage, Status, Table, tied, whiten, window
 from optloc.sites.calibration.likelihood import Estimate, likelihood
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.rounds import starts_of
-from optloc.solvers.outside import given, judge_points
-from optloc.solvers.pool import offer
-from optloc.solvers.starts.position import spread_of
-from optloc.solvers.verdict.judge import judge
+from optloc.solvers import given, judge, judge_points, offer, spread_of
 
 _ASIDE = 0.2
 """Width of the box of guesses in the middle, in radii of the array: off every station by chance, near to all alike."""

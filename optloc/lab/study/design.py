@@ -20,21 +20,26 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.inputs import read_text, within
-from optloc.base.types import Array, Stations
-from optloc.base.units import SI_UNIT
-from optloc.files import read
-from optloc.files.schema import conform, join, kind_model, parse_toml
+from optloc.files import conform, join, kind_model, parse_toml, read, read_text, within
 from optloc.lab.study.document import Level, NetworkTable, ScenarioTable, StudyFile, sigma_of
 from optloc.lab.study.draws import Case, add_flaws, check_truth, metres, place_stations
 from optloc.lab.study.methods import Method, methods_of
 from optloc.lab.study.networks import NetworkCase, check_network, noise_of
 from optloc.models import MODELS
-from optloc.problem.build import assemble, measured
-from optloc.problem.epochs import separable
-from optloc.problem.noise import Block, Noise, variances
-from optloc.problem.problem import Problem
+from optloc.problem import (
+    SI_UNIT,
+    Array,
+    Block,
+    InvalidProblem,
+    Noise,
+    Problem,
+    Stations,
+    assemble,
+    measured,
+    nearest,
+    separable,
+    variances,
+)
 
 # Trials of a chunk, whose part should take seconds: less, and files and tasks cost as much as fixes; more, and a run
 # that is stopped loses minutes. A fast fix takes about 0.1 ms with everything beside it (a million in two minutes is

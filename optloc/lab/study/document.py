@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from optloc.base.errors import InvalidProblem
-from optloc.files.schema import Units
+from optloc.files import Units
 from optloc.models import MODELS
+from optloc.problem import InvalidProblem
 
 Amount = float | str
 """A number in the SI unit, or text such as "30 ns"."""

@@ -14,17 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.base import arrays
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.frames import Frame
-from optloc.base.types import Array, Bias
-from optloc.files.schema import Units, join
+from optloc.engine import simulate, walks, wander
+from optloc.files import Units, join
 from optloc.lab.study.document import Amount, LayoutTable, ScenarioTable, TruthTable, sigma_of
-from optloc.linear.simulate import simulate
-from optloc.linear.walks import walks, wander
-from optloc.problem.bias import with_bias
-from optloc.problem.forms import form_of
-from optloc.problem.layout import state_names
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Bias, Frame, InvalidProblem, Problem, form_of, nearest, state_names, with_bias
 
 Rng = np.random.Generator
 

@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, filterwarnings, warn
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.registry import plugins
 from optloc.lab.study.apart import Pool
 from optloc.lab.study.design import Chunk, StudyDesign, workers
 from optloc.lab.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
 from optloc.lab.study.trial import DIED, LATE, Lost, Part, join_parts, part_of_lost
+from optloc.problem import InvalidProblem, nearest, plugins
 
 CONNECT = 10.0
 """Seconds to wait for a scheduler: one on the same network answers in less than one; people wait for no more."""

@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import json_of, read_bytes
-from optloc.base.outputs import written
-from optloc.base.types import Status
+from optloc.files import json_of, read_bytes, written
 from optloc.lab.study.baselines import BASELINES
 from optloc.lab.study.design import StudyDesign, design_of_text
 from optloc.lab.study.methods import version_of
 from optloc.lab.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
+from optloc.problem import InvalidProblem, Status
 
 if TYPE_CHECKING:
     import pandas as pd

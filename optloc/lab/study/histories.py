@@ -16,11 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
+from optloc.engine import depends_on_place, equations_at, refine
 from optloc.files import read
-from optloc.kernels.least_squares import refine
-from optloc.kernels.sums import equations_at
 from optloc.lab.study.baselines import Baseline, heard, start_of
 from optloc.lab.study.draws import Case, Drawn, draw
 from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest
@@ -29,13 +26,19 @@ from optloc.lab.study.minimizers import baseline_of
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import check_accuracy
 from optloc.lab.study.summary import case_label, noise_text
-from optloc.linear.normal import depends_on_place
-from optloc.problem.epochs import by_epoch, separable
-from optloc.problem.problem import Problem
-from optloc.solvers import FORMULATIONS, SOLVERS, solve
-from optloc.solvers import Method as Pipeline
-from optloc.solvers.methods import Choice, counting, shortcut, using
-from optloc.solvers.pool import Pool, begin
+from optloc.problem import Array, InvalidProblem, Problem, by_epoch, nearest, separable
+from optloc.solvers import (
+    FORMULATIONS,
+    SOLVERS,
+    Choice,
+    Method as Pipeline,
+    Pool,
+    begin,
+    counting,
+    shortcut,
+    solve,
+    using,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

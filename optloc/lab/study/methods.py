@@ -14,16 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import ANSWERED, Array, Certificate, Status
-from optloc.files.schema import Units, join
+from optloc.files import Units, join
 from optloc.lab.study.baselines import BASELINES, heard, only_networks, start_of
 from optloc.lab.study.document import MethodTable
 from optloc.lab.study.draws import Drawn
 from optloc.lab.study.minimizers import baseline_of, code_of, load_minimizer
 from optloc.lab.study.networks import CALIBRATE, Found, Networks, calibrated
-from optloc.problem.fix import Fix
-from optloc.solvers.back_ends import backend_kind, backends, kind_of, version_of
+from optloc.problem import ANSWERED, Array, Certificate, Fix, InvalidProblem, Status, nearest
+from optloc.solvers import backend_kind, backends, kind_of, version_of
 
 # Back ends stand in a module of their own; studies know them from here.
 __all__ = [
@@ -251,7 +249,7 @@ def run(method: Method, drawn: Drawn | Networks) -> Run:
     Nonsense
         Where what the method returned is no fix of these trials.
     """
-    from optloc.solvers.methods import Choice, counting, using
+    from optloc.solvers import Choice, counting, using
 
     choice = None
     if method.solver:

@@ -14,19 +14,10 @@ from types import ModuleType
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.registry import load_plugin, plugin_module
-from optloc.base.types import Array
-from optloc.kernels.jit import FEW, usable
-from optloc.kernels.pack import pack
-from optloc.kernels.sums import equations_at
+from optloc.engine import FEW, Normal, equations_at, pack, usable, walks
 from optloc.lab.study.baselines import BASELINES, Baseline, claim, teller, weighed_at, weighings
 from optloc.lab.study.draws import Drawn
-from optloc.linear.normal import Normal
-from optloc.linear.walks import walks
-from optloc.problem.fix import Fix
-from optloc.problem.noise import whiten
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Fix, InvalidProblem, Problem, load_plugin, nearest, plugin_module, whiten
 
 Cost = Callable[[Array], tuple[float, Array]]
 """Returns the maximum-likelihood cost at a vector (size,) and its gradient (size,); SI units."""
@@ -73,7 +64,7 @@ def _equations(one: Problem) -> Callable[[Array], Normal]:
 
     By machine code, for what is timed is the minimizer: one evaluation after the other takes numpy six times as long.
     """
-    from optloc.kernels.equations import normal_at, normal_block
+    from optloc.engine import normal_at, normal_block
 
     white, alone = whiten(one.noise, one.weight), np.zeros(1, dtype=np.int64)
     # A minimizer asks many times: that is worth waiting for.

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import ANSWERED, Array, Status
-from optloc.files.schema import Units, join
+from optloc.files import Units, join
 from optloc.lab.study.document import Amount, NetworkTable
+from optloc.problem import ANSWERED, Array, InvalidProblem, Status
 from optloc.sites.calibration.calibrated import Calibration, calibrate
 from optloc.sites.calibration.gauge import determined
 from optloc.sites.calibration.likelihood import Estimate, likelihood, together

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
+from optloc.problem import Array, InvalidProblem, nearest
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
 from optloc.lab.study.summary import above_least, instances, performance_profile
+from optloc.problem import Array, InvalidProblem, nearest
 
 if TYPE_CHECKING:
     import pandas as pd

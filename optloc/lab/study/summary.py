@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
 from optloc.lab.study.folder import read_frame
 from optloc.lab.study.trial import FAILED, VALUES
+from optloc.problem import Array, InvalidProblem
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,9 +16,8 @@ from typing import Any, Literal
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array, Status
-from optloc.bounds.cramer_rao import crlb
-from optloc.kernels.sums import equations_at
+from optloc.bounds import crlb
+from optloc.engine import TOLERANCE, covariance, eliminated, equations_at, exact, violation
 from optloc.lab.study.design import Cell, Chunk
 from optloc.lab.study.draws import Case, Drawn
 from optloc.lab.study.methods import Nonsense, require_program, run, version_of
@@ -31,11 +30,7 @@ from optloc.lab.study.networks import (
     known_networks,
     true_columns,
 )
-from optloc.linear.constraints import TOLERANCE, exact, violation
-from optloc.linear.normal import covariance, eliminated
-from optloc.problem.claims import PROOFS
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
+from optloc.problem import PROOFS, Array, Fix, Problem, Status
 
 # The long table of a study, one row for each trial of each method: columns, units and meaning in one place.
 

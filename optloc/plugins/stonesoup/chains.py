@@ -15,16 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from optloc.base.types import Array, Motion, Prior, Status
-from optloc.kernels.least_squares import Refined, refine
-from optloc.linear.normal import covariance, linearise
-from optloc.linear.redundancy import degrees_of_freedom
+from optloc.engine import Refined, covariance, degrees_of_freedom, linearise, refine
 from optloc.plugins.stonesoup.models import problem_of, rows_by_kind, values_of
-from optloc.problem.chart import tail_probability
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
-from optloc.solvers import solve
-from optloc.solvers.prepared import prepare
+from optloc.problem import Array, Fix, Motion, Prior, Problem, Status, tail_probability
+from optloc.solvers import prepare, solve
 
 # A fix is trusted as a Gaussian where no other minimum costs less than this more: five standard deviations.
 GAP = 25.0

@@ -18,14 +18,12 @@ from stonesoup.types.state import GaussianState, WeightedGaussianState
 from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
-from optloc.base.errors import InvalidProblem
 from optloc.plugins.stonesoup.chains import GAP, LONG, Chain, Terms, Work, alone, grown, is_flat, near, posed
 from optloc.plugins.stonesoup.models import StationMeasurement, values_of
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
+from optloc.problem import Fix, InvalidProblem, Problem
 from optloc.solvers import solve
-from optloc.tracking.start import is_one_gaussian
-from optloc.uncertainty.posterior import mixture
+from optloc.tracking import is_one_gaussian
+from optloc.uncertainty import mixture
 
 # Chains that wait for more scans: of those that no detection has continued for long the oldest are forgotten.
 _REMEMBERED = 40

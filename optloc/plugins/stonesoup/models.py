@@ -22,14 +22,21 @@ from stonesoup.types.angle import Bearing, Elevation
 from stonesoup.types.array import StateVector, StateVectors
 from stonesoup.types.detection import Detection
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Motion, Status
-from optloc.linear.evaluate import predict
-from optloc.linear.normal import linearise
+from optloc.engine import linearise, predict
 from optloc.models import MODELS, kind_named
-from optloc.problem.build import assemble, measured, station_array
-from optloc.problem.noise import Block, arrivals, group
-from optloc.problem.problem import Problem
+from optloc.problem import (
+    Array,
+    Block,
+    InvalidProblem,
+    Motion,
+    Problem,
+    Status,
+    arrivals,
+    assemble,
+    group,
+    measured,
+    station_array,
+)
 from optloc.solvers import solve
 
 # A detection with one of these has no position of its own.

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optloc.problem.chart import tail_probability
+from optloc.problem import tail_probability
 from optloc.sites.calibration.blocks import MOVED, Block, blocks, elsewhere, moved
 from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.sites.calibration.motions import bent
 from optloc.sites.calibration.network import CLOCKED, Network
 from optloc.sites.calibration.rounds import Ends, joined, rounds, starts_of
-from optloc.solvers.policy import REFUTED, equal_cost
+from optloc.solvers import REFUTED, equal_cost
 
 AGREEING = 3
 """Starts that must arrive at the least cost: with fewer, one network in ten was found in another minimum."""

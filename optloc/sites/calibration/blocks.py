@@ -6,18 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.types import Array, Prior
-from optloc.kernels.least_squares import refine
-from optloc.linear.vectors import vectors
+from optloc.engine import refine, vectors
 from optloc.models import MODELS
-from optloc.problem.build import Measured, assemble, measured
-from optloc.problem.claims import GLOBAL
-from optloc.problem.fix import Fix
-from optloc.problem.problem import Problem
+from optloc.problem import GLOBAL, Array, Fix, Measured, Prior, Problem, assemble, measured
 from optloc.sites.calibration.likelihood import Estimate, Likelihood, clock_signs, together
 from optloc.sites.calibration.network import Network
-from optloc.solvers import solve
-from optloc.solvers.policy import AMBIGUOUS_GAP, equal_cost
+from optloc.solvers import AMBIGUOUS_GAP, equal_cost, solve
 
 MOVED = 16.0
 """Cost that a block's other place may have beyond its present one for all to be refined from there: what is dearer by

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, NoSolution, nearest
-from optloc.base.types import PRECEDENCE, Array, Status
-from optloc.engine.shape import STRAIGHT
-from optloc.problem.chart import tail_probability
+from optloc.engine import STRAIGHT
+from optloc.problem import PRECEDENCE, Array, InvalidProblem, NoSolution, Status, nearest, tail_probability
 from optloc.sites.calibration.agreement import AGREEING, Found, frame_size, proven, search
 from optloc.sites.calibration.blocks import Block, blocks, moved_pulses, place_pulses
 from optloc.sites.calibration.gauge import (
@@ -27,8 +25,7 @@ from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.outliers import PRICE, outliers
 from optloc.sites.calibration.rounds import laid
-from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
-from optloc.solvers.verdict.findings import Finding, objections
+from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, REFUTED, Finding, objections
 
 # Pulses that starts are made from: those with most rows. More find nothing that so many do not.
 _CORE = 60

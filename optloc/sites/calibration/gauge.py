@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from optloc.base.types import Array
-from optloc.problem.chart import quantile
+from optloc.problem import Array, quantile
 from optloc.sites.calibration.blocks import settled
 from optloc.sites.calibration.likelihood import Estimate, Likelihood, together
 from optloc.sites.calibration.network import Network
-from optloc.solvers.policy import AMBIGUOUS_GAP
+from optloc.solvers import AMBIGUOUS_GAP
 
 # Singular values of scaled derivatives below this share of the largest are zeros: exact ones come out at 1e-15.
 _ZERO = 1e-9

@@ -6,13 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.types import Array, Bias, Motion, Stations
-from optloc.kernels.least_squares import refine
-from optloc.linear.evaluate import differentiate, predict
+from optloc.engine import differentiate, predict, refine
 from optloc.models import BETWEEN
-from optloc.problem.build import Measured, assemble, measured
-from optloc.problem.noise import variances
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Bias, Measured, Motion, Problem, Stations, assemble, measured, variances
 from optloc.sites.calibration.network import CLOCKED, Network
 
 # Steps of a refinement, and the length in deviations below which a step is the last: costs are then off by 1e-6.

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.base.types import Array
+from optloc.problem import Array
 from optloc.sites.calibration.gauge import determined, shifted
 from optloc.sites.calibration.likelihood import Estimate, Likelihood
 

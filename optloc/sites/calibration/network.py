@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.arrays import numbers
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
+from optloc.engine import numbers
 from optloc.models import MODELS, kind_named
+from optloc.problem import Array, InvalidProblem, nearest
 
 CLOCKED = ("toa", "tdoa")
 """Kinds that a station's clock enters; a two-way range has none."""

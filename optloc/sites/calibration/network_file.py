@@ -8,17 +8,26 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.inputs import read_text
-from optloc.base.outputs import claim, write_text
-from optloc.base.types import Array
-from optloc.base.units import SPEED_OF_LIGHT
-from optloc.files.roles import worded
-from optloc.files.schema import Amount, DataTable, ProblemFile, Units, conform, join, name_of, parse_toml
-from optloc.files.table import Table, table_of
-from optloc.files.words import distinct
-from optloc.files.writer import toml_text
+from optloc.files import (
+    Amount,
+    DataTable,
+    ProblemFile,
+    Table,
+    Units,
+    claim,
+    conform,
+    distinct,
+    join,
+    name_of,
+    parse_toml,
+    read_text,
+    table_of,
+    toml_text,
+    worded,
+    write_text,
+)
 from optloc.models import MODELS, kind_named
+from optloc.problem import SPEED_OF_LIGHT, Array, InvalidProblem, nearest
 from optloc.sites.calibration.calibrated import Calibration
 from optloc.sites.calibration.network import KINDS, Network, Slot, checked
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.show.pictures.style import BLACK, GREY, figure_class, literal
+from optloc.problem import Array
+from optloc.show import BLACK, GREY, figure_class, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

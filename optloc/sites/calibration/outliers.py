@@ -13,11 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.linear.evaluate import predict
-from optloc.linear.vectors import vectors
-from optloc.problem.noise import variances
-from optloc.problem.problem import Problem
+from optloc.engine import predict, vectors
+from optloc.problem import Array, Problem, variances
 from optloc.sites.calibration.blocks import minima, pulses_alone, stations_alone
 from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.sites.calibration.network import Network

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from formulations.low_rank_network import fit_low_rank, random_stations
 from formulations.metric_upgrade import unknowns, upgrade
-from optloc.base.types import Array
+from optloc.problem import Array
 from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.sites.calibration.network import Network
 

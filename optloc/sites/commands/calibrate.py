@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from optloc.cli.options import Budget, Force, Json, Outside, ProblemPath, Quiet, Verbose
+from optloc.cli import Budget, Force, Json, Outside, ProblemPath, Quiet, Verbose
 
 if TYPE_CHECKING:
     from optloc.sites.calibration import Calibration
@@ -59,8 +59,8 @@ def _run(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    from optloc.base.types import Status
-    from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
+    from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
+    from optloc.problem import Status
     from optloc.sites.calibration import calibrate as find
     from optloc.sites.calibration.network_file import check_name, read_network, write_calibrated
 
@@ -88,7 +88,7 @@ def _run(
 def _show(found: Calibration) -> None:
     from rich.table import Table
 
-    from optloc.cli.output import Screen, say
+    from optloc.cli import Screen, say
 
     console, net = Screen(), found.network
     say(console, f"status {found.status.label}, proof {found.proof}; frame of {found.gauge}")

@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import is_stream
-from optloc.cli.crlb import vector
-from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
-from optloc.files import read
-from optloc.problem.epochs import by_epoch, separable
+from optloc.cli import Screen, claim_outputs, dumps, line, say, vector, write_picture, write_text
+from optloc.files import is_stream, read
+from optloc.problem import InvalidProblem, by_epoch, separable
 from optloc.sites.placement import Placement, SiteSelection, picture, place
 from optloc.sites.placement.chosen import PRIOR
 from optloc.sites.placement.refinement import refined

@@ -7,12 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from formulations.placement import Ground, Region
-from optloc.base.errors import InvalidProblem
-from optloc.base.frames import Frame
-from optloc.base.inputs import json_of, read_text
-from optloc.base.types import Array
-from optloc.files.schema import DataTable
-from optloc.files.table import table_of
+from optloc.files import DataTable, json_of, read_text, table_of
+from optloc.problem import Array, Frame, InvalidProblem
 
 # Points between a site and a place at which the ground is looked at, and nodes of a side that a spline needs.
 _SAMPLES, _NODES = 200, 4

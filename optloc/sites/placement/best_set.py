@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from formulations.placement import Criterion, Design
-from optloc.base.types import Array
+from optloc.problem import Array
 from optloc.sites.placement.branching import FREE, IN, OUT, expand, propagate, score, settle
 from optloc.sites.placement.completions import Asked, exhaust
 

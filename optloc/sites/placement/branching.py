@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.kernels.jit import compiled, put_rows
+from optloc.engine import compiled, put_rows
+from optloc.problem import Array
 from optloc.sites.placement.criteria import gather, invert, measure
 from optloc.sites.placement.relaxation import relax
 

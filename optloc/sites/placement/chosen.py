@@ -9,12 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from formulations.placement import covariances
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Status
-from optloc.bounds.cramer_rao import crlb
-from optloc.bounds.over_area import bound_map, extent, map_coordinates
-from optloc.linear.redundancy import degrees_of_freedom
-from optloc.linear.simulate import simulate
+from optloc.bounds import bound_map, crlb, extent, map_coordinates
+from optloc.engine import degrees_of_freedom, simulate
+from optloc.problem import Array, InvalidProblem, Status
 from optloc.sites.placement.best_set import Searched, Task, random_sets, search
 from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 

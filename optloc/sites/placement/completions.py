@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.kernels.jit import compiled, put_rows
+from optloc.engine import compiled, put_rows
+from optloc.problem import Array
 from optloc.sites.placement.branching import IN, OUT, number_left
 from optloc.sites.placement.criteria import TRACE, VOLUME, invert, measure
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
+from optloc.problem import Array, InvalidProblem
 
 # Members of a group, and groups, that are named; the others are counted.
 _NAMED, _GROUPS = 8, 3

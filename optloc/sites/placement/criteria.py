@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.kernels.jit import compiled
+from optloc.engine import compiled
+from optloc.problem import Array
 
 TRACE, VOLUME, AXIS = 0, 1, 2
 """Criteria: tr Cov, log det Cov, and the largest eigenvalue of Cov."""

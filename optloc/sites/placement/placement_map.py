@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.bounds.over_area import BoundMap
-from optloc.show.pictures.bound_map import COLOURS, levels
-from optloc.show.pictures.style import BLACK, GREY, apart, figure_class, literal
+from optloc.bounds import BoundMap
+from optloc.problem import Array
+from optloc.show import BLACK, COLOURS, GREY, apart, figure_class, levels, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,8 @@ import numpy as np
 
 from formulations.backend import SolverError
 from formulations.placement import Ground, Region, refine, value
-from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
 from optloc.models import MODELS, Point
+from optloc.problem import Array, InvalidProblem
 from optloc.sites.placement.best_set import exchanged, random_sets
 from optloc.sites.placement.chosen import Placement, task_of
 from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
@@ -189,7 +188,7 @@ class _Row:
 
 def _numbers(candidates: Candidates) -> list[_Row]:
     """Return the rows of all sites."""
-    from optloc.linear.normal import linearise
+    from optloc.engine import linearise
 
     linear, d = linearise(candidates.problem, candidates.vectors), candidates.design.dimension
     jacobian = np.concatenate([linear.shared, linear.local], axis=-1)

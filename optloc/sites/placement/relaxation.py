@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.kernels.jit import compiled, put
-from optloc.kernels.systems import cholesky, solve_factored
+from optloc.engine import cholesky, compiled, put, solve_factored
+from optloc.problem import Array
 from optloc.sites.placement.criteria import VOLUME, add_square, derive, evaluate
 
 # Multipliers below this share of the largest are left out: they cost as much as the others, and move the bound by less.

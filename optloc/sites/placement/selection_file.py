@@ -11,13 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from formulations.placement import Ground, Region
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.frames import Frame
-from optloc.base.inputs import read_text, within
-from optloc.base.outputs import claim, write_text
-from optloc.base.types import Array
-from optloc.files.reader import assemble
-from optloc.files.schema import (
+from optloc.files import (
     Amount,
     DataTable,
     FrameTable,
@@ -26,20 +20,27 @@ from optloc.files.schema import (
     SoundTable,
     SpeedTable,
     StationsTable,
+    Table,
     Units,
+    assemble,
+    claim,
     conform,
+    distinct,
     join,
     kind_model,
     name_of,
+    of_rows,
     parse_toml,
+    read_text,
+    settle_frame,
+    survey,
+    table_of,
+    toml_text,
     validate,
+    within,
+    write_text,
 )
-from optloc.files.stations import survey
-from optloc.files.table import Table, of_rows, table_of
-from optloc.files.unknowns import settle_frame
-from optloc.files.words import distinct
-from optloc.files.writer import toml_text
-from optloc.problem.problem import Problem
+from optloc.problem import Array, Frame, InvalidProblem, Problem, nearest
 from optloc.sites.placement.areas import (
     convex_parts,
     corners_in_frame,

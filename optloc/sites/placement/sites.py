@@ -9,14 +9,9 @@ from typing import Literal
 import numpy as np
 
 from formulations.placement import Criterion, Design
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array, Prior
-from optloc.linear.normal import Normal, linearise, with_priors
+from optloc.engine import Normal, linearise, with_priors
 from optloc.models import MODELS
-from optloc.problem.arrival_times import as_arrivals
-from optloc.problem.layout import emission_name
-from optloc.problem.noise import variances
-from optloc.problem.problem import Problem
+from optloc.problem import Array, InvalidProblem, Prior, Problem, as_arrivals, emission_name, nearest, variances
 from optloc.sites.placement.counts import Group, check_groups
 
 Name = Literal["rms", "volume", "axis"]

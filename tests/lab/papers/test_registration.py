@@ -33,8 +33,7 @@ from optloc.lab.papers.registration_recursion import FIRST, joint_recursion, joi
 from optloc.lab.papers.registration_tables import accuracy, flatness, metres, separation
 from optloc.lab.papers.report import Study
 from optloc.linear.evaluate import predict
-from optloc.linear.normal import normal
-from optloc.linear.normal import step as house_step
+from optloc.linear.normal import normal, step as house_step
 
 RUN = CliRunner()
 

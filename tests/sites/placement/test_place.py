@@ -10,8 +10,7 @@ from sites.placement.scenes import drawn, hall
 import optloc
 from formulations.placement import Ground, Region
 from optloc import InvalidProblem, SiteSelection, assemble, crlb, measured, place
-from optloc.sites.placement import Draws, Group
-from optloc.sites.placement import chosen as chosen_module
+from optloc.sites.placement import Draws, Group, chosen as chosen_module
 from optloc.sites.placement.chosen import drawn as simulated
 from optloc.sites.placement.refinement import refined
 from optloc.sites.placement.sites import candidates_of

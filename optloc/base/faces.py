@@ -1,0 +1,50 @@
+"""Public names of a package, which load when they are first used.
+
+The ``__init__`` of a package lists what it exports once, as imports for type checkers. Python reads the list from
+there, so that ``import optloc`` loads neither solvers nor tables.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+Exported = tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]
+
+
+def exported(package: str, file: str, own: tuple[str, ...] = ()) -> Exported:
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
+
+    Parameters
+    ----------
+    package, file : str
+        Its ``__name__`` and ``__file__``. All imports under ``if TYPE_CHECKING:`` of the file are exported.
+    own : tuple of str
+        Names that the file defines itself.
+    """
+    homes = dict(_imports(ast.parse(Path(file).read_text(encoding="utf-8"))))
+    names = sorted({*homes, *own})
+
+    def find(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module, original = homes[name]
+        found = getattr(import_module(module), original)
+        setattr(sys.modules[package], name, found)
+        return found
+
+    return find, lambda: names, names
+
+
+def _imports(tree: ast.Module) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield name, module and original name of the imports for type checkers."""
+    for block in tree.body:
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+            for line in block.body:
+                if isinstance(line, ast.ImportFrom) and line.module:
+                    for alias in line.names:
+                        yield alias.asname or alias.name, (line.module, alias.name)

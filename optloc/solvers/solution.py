@@ -1,0 +1,90 @@
+"""Solve: from a problem to a fix, without a guess."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.problem.determined import with_sources
+from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.solvers.methods import Method, shortcut
+from optloc.solvers.pool import PART, begin, in_parts, where
+from optloc.solvers.single import at_once
+from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
+
+
+def solve(problem: Problem, method: str = "auto", *, start: Any = None, refine: bool = True) -> Fix:
+    """Return the fix of every problem of a batch, without a first guess.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch axes (...). Where its epochs share no unknown they are solved as one more batch axis, (..., k).
+    method : str
+        "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``. One that only starts,
+        such as "sdp" or "minimax", is followed by "lsr+certify".
+    start : array (..., size), optional
+        Starting vector: all that a method has which begins with a refinement, such as "lsr", and one more candidate
+        of every other.
+    refine : bool
+        False: a method that only starts returns its estimate as it is, with the status `unrefined`: for those who
+        compare starts.
+
+    Returns
+    -------
+    Fix
+        With the problem's batch axes. Failure is a status, never an exception: where a stage fails numerically for one
+        problem of a batch it is `numerical` with the cause, and the others are fixed.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown method, or where nothing is unknown.
+    """
+    run = Method.parse(method)
+    fix = at_once(problem, run) if start is None else None
+    fix = solve_in_stages(problem, run, start, refine=refine) if fix is None else fix
+    return with_sources(problem, fix)
+
+
+def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:
+    """Return what `solve` returns, by the stages of a method: a batch is what they are made for."""
+    if problem.layout.size == 0:
+        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
+    if separable(problem):
+        problem = by_epoch(problem)
+    shape, flat = problem.batch_shape, problem.flat()
+    vector = None if start is None else _broadcast_start(problem, start).reshape(-1, problem.layout.size)
+
+    def work(some: Problem, part: slice) -> Fix:
+        pool = run(some, None if vector is None else begin(some, vector[part]))
+        if refine and pool.curvature is None:
+            pool = _FINISH(some, pool)
+        with where("the verdict"):
+            return hide_open_epochs(verdict(some, pool))
+
+    # the shortcut divides its work itself, and shares it among threads
+    most = flat.batch_shape[0] if shortcut(run) and vector is None else PART
+    with np.errstate(all="ignore"):  # what overflows is judged: a status says so, once
+        fix = in_parts(flat, work, most, failed)
+    return fix.reshape(shape) if shape != (len(fix),) else fix
+
+
+# What refines and judges the starts of a method that has nothing behind them.
+_FINISH = Method(("lsr", "certify"))
+
+
+def _broadcast_start(problem: Problem, start: Any) -> Array:
+    """Return a starting vector for every problem, (..., size)."""
+    vector, wanted = np.asarray(start, dtype=float), (*problem.batch_shape, problem.layout.size)
+    try:
+        return np.broadcast_to(vector, wanted)
+    except ValueError:
+        raise InvalidProblem(
+            f"start has shape {vector.shape}, not {wanted}", "start", "order it by the layout"
+        ) from None
