@@ -88,6 +88,19 @@ def wrong_arrows(root: Path) -> list[str]:
     return out
 
 
+def past_faces(root: Path) -> list[str]:
+    """Return a sentence for each import of a neighbour that enters a package of the core past its face."""
+    out = []
+    for name, path in modules(root).items():
+        if room(name) in NEIGHBOURS:
+            for node in nodes(path):
+                sources = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                sources += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                inner = [source for source in sources if source.startswith("optloc.") and source.count(".") > 1]
+                out += [f"{name}:{node.lineno} imports {source}" for source in inner if room(source) not in NEIGHBOURS]
+    return out
+
+
 def circle(graph: Mapping[str, set[str]]) -> list[str]:
     """Return a circle of a graph, empty if there is none."""
     done: set[str] = set()
@@ -120,6 +133,19 @@ def test_every_folder_has_a_layer():
 def test_imports_go_down_and_in_no_circle():
     assert not wrong_arrows(ROOT)
     assert not circle(graph_of(ROOT))
+
+
+def test_neighbours_import_the_faces_of_the_core_only():
+    assert not past_faces(ROOT)
+
+
+def test_an_import_past_a_face_is_seen(tmp_path):
+    lines = "from optloc.problem import Fix\nfrom optloc.lab.study import trial\n"
+    root = house(
+        tmp_path,
+        {"optloc/lab/a.py": f"{lines}def f():\n    from optloc.problem.fix import Fix\n    import optloc.base.types\n"},
+    )
+    assert past_faces(root) == ["optloc.lab.a:4 imports optloc.problem.fix", "optloc.lab.a:5 imports optloc.base.types"]
 
 
 def test_no_loose_module():

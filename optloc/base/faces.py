@@ -33,7 +33,10 @@ def exported(package: str, file: str, own: tuple[str, ...] = ()) -> Exported:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, original = homes[name]
-        found = getattr(import_module(module), original)
+        try:
+            found = getattr(import_module(module), original)
+        except AttributeError:
+            found = import_module(f"{module}.{original}")
         setattr(sys.modules[package], name, found)
         return found
 

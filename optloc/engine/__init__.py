@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from optloc.base.faces import exported
 
 if TYPE_CHECKING:
+    from optloc.base import arrays as arrays, linalg as linalg
     from optloc.base.arrays import numbers as numbers
     from optloc.base.cache import Cache as Cache
     from optloc.base.linalg import centre_and_spread as centre_and_spread

@@ -57,7 +57,7 @@ def _accuracy(asked: Asked) -> None:
     from optloc.lab.study import summary
     from optloc.lab.study.folder import read_frame
     from optloc.problem import InvalidProblem, nearest
-    from optloc.show.pictures import plot_accuracy
+    from optloc.show import plot_accuracy
 
     if not asked.file.is_dir():
         raise InvalidProblem("the errors of methods are those of a study", str(asked.file), "name its output folder")

@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.problem import PROOFS, UNKNOWN, Array, Fix, Frame, Problem, Status
 from optloc.service.events import Event
-from optloc.show import Mark, Other, earth_points, formats, mark_of
+from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, mark_of
 from optloc.tracking import Entry
 
 Record = dict[str, Any]
@@ -300,7 +300,7 @@ FORMATS: Mapping[str, Callable[[Record, Frame], bytes | None]] = {
     "ndjson": lambda record, _: to_line(record),
     "geojson": lambda record, _: to_line(to_feature(record)),
     "aircraft": lambda record, _: to_line(to_aircraft(record)) if record.get("lat_deg") is not None else None,
-    **{name: _of_file(one.each) for name, one in formats.FORMATS.items() if one.each is not None},
+    **{name: _of_file(one.each) for name, one in FILE_FORMATS.items() if one.each is not None},
 }
 """What lines of the output are, by name: a function of a record and the frame of its site."""
 

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from optloc.show.drawing import (
         SIZE as SIZE,
         Drawing as Drawing,
+        Look as Look,
         Looks as Looks,
         Picture as Picture,
         inline as inline,

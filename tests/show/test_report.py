@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.lab.report.sheets import duration, latex, number, percent
+from optloc.lab.report.study_page import write_report
 from optloc.lab.study.design import design_of
 from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import begin, read_frame
-from optloc.show import write_report
 from optloc.show.drawing import marks as looks_of, panel, svg_text
 from optloc.show.map import Canvas, Curve, Label
 from optloc.show.page import Part, write_page

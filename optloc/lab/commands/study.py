@@ -154,7 +154,7 @@ def report(
 
     A study that is not finished has a report too: of what is there.
     """
-    from optloc.show import write_report
+    from optloc.lab.report.study_page import write_report
 
     console = Screen(stderr=True)
     shown = console.is_terminal and not quiet

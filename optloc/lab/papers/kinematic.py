@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from optloc.base import linalg
 from optloc.bounds import crlb
-from optloc.engine import linearise, normal, simulate, step
+from optloc.engine import linalg, linearise, normal, simulate, step
 from optloc.problem import SPEED_OF_LIGHT, Array, Motion, Prior, Problem, assemble, cut, measured
 from optloc.solvers import solve
 from optloc.tracking import (

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.base import linalg
+from optloc.engine import linalg
 from optloc.problem import Array
 
 FIRST = 40

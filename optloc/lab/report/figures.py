@@ -19,6 +19,7 @@ from optloc.show import (
     ORANGE,
     PURPLE,
     SIZE,
+    Look,
     Looks,
     Picture,
     literal,
@@ -26,7 +27,6 @@ from optloc.show import (
     panels,
     with_legend,
 )
-from optloc.show.drawing import Look
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -25,6 +25,7 @@ from optloc.problem import Array, InvalidProblem
 from optloc.show import (
     Canvas,
     Drawing,
+    Look,
     Part,
     Picture,
     Sheet,
@@ -37,7 +38,6 @@ from optloc.show import (
     with_legend,
     write_page,
 )
-from optloc.show.drawing import Look
 
 if TYPE_CHECKING:
     import pandas as pd

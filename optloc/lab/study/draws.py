@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.base import arrays
-from optloc.engine import simulate, walks, wander
+from optloc.engine import arrays, simulate, walks, wander
 from optloc.files import Units, join
 from optloc.lab.study.document import Amount, LayoutTable, ScenarioTable, TruthTable, sigma_of
 from optloc.problem import Array, Bias, Frame, InvalidProblem, Problem, form_of, nearest, state_names, with_bias

@@ -15,9 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from optloc.base import linalg
 from optloc.bounds import crlb
-from optloc.engine import TOLERANCE, covariance, eliminated, equations_at, exact, violation
+from optloc.engine import TOLERANCE, covariance, eliminated, equations_at, exact, linalg, violation
 from optloc.lab.study.design import Cell, Chunk
 from optloc.lab.study.draws import Case, Drawn
 from optloc.lab.study.methods import Nonsense, require_program, run, version_of
