@@ -152,37 +152,8 @@ def test_no_loose_module():
     assert [path.name for path in sorted((ROOT / "optloc").glob("*.py"))] == ["__init__.py"]
 
 
-# A file is a concept that a stranger can hold in mind; these are the limits of the contributing guide.
-# 280 and courses that follow the Earth: their formula, and where targets are along them; noise that follows from
-# signals; the recursion of a paper apart from its scenes; and walks of clocks: what they are, what they say as
-# information, and how tied epochs are solved; bounds over boxes of states of a target that moves, and their search; the
-# front door: one call to a fix, and what a fix says of itself, as columns and in words (both were parts of the command
-# line); tables of strangers: their cells with all digits, files of other programs, sorts of readings, long and wide,
-# and the options that say the rest; places over ground with bounds of how they bend, and bounds over boxes of states;
-# what inequalities admit, and the edges of it; media, and rays through them; which of many sites to take: selections
-# as numbers and as files, criteria, relaxation, branching and completions as machine code, the search, what became of
-# it, refinement, areas, its command and its map; files of navigation and of receivers, and satellites by what they
-# say; formats in which others take fixes: their table, marks, what is XML, and what is lines; what an installation
-# lacks; minimizers of others in studies, methods on the same trials, and the leaderboard; networks of unknown places:
-# fits of low rank and their upgrade, the network, its likelihood, starts, blocks, search, frame and verdict, its
-# files,
-# its command and its map; chains of Stone Soup's detections; what methods of a study solve within how much work, and
-# their way down; the nuclear norm of a network, and studies of networks; their random places as machine code; convex
-# boxes around known minima (parts of two searches before); squared rows over a box, kernels that only borrow arrays;
-# names of columns of foreign tables, nested records as rows, and the report of how a table was read; degrees
-# of freedom; columns that are named like those of receivers; the speed that a file states, magnetic declination, and
-# headings of vehicles;
-# back ends of studies (a part of methods before) and their trial, contours and the regions that they draw;
-# the digest of a kernel, and how numba is asked to compile; the engine: what its steps ask of rows, rows of ranges and
-# of tapes, linear rows beside squared ranges, what is admitted, plans, and parameter vectors; bounds out of reach; runs
-# whose epochs are lanes; the forms of biases; the rows of the scans of a run as arrays; logarithms of ranges, groups of
-# nodes, and the space of a branch and bound (a part of the search of runs before); mirror images in the plane of the
-# stations, the distance from it, and both sides of it as one region;
-# starts of unknown headings; layers; repeats of a measurement; rows with unknown scales, and
-# proofs with an unknown factor: a box, its curvature, the search and the proof; knowledge in every status, and the
-# directions that data allow, in words and on maps; normal laws that bounds cut off; shares of statuses; boxes that
-# scales share with other proofs, and the loop of both.
-MODULES, LINES, BODY, RECURRING = 423, 600, 60, 20
+# Limits of the contributing guide. A commit that adds a file raises the number of modules, so that each is a decision.
+MODULES, LINES, BODY, RECURRING = 437, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

@@ -1,6 +1,6 @@
 """The command line as ``python -m optloc.cli``."""
 
-from optloc.cli import main
+from optloc.cli.app import main
 
 if __name__ == "__main__":
     main()

@@ -27,7 +27,7 @@ from optloc.cli.output import (
     write_table,
     write_text,
 )
-from optloc.files import Loaded
+from optloc.files.reader import Loaded
 from optloc.files.readings import Told
 from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
 from optloc.model_checks.elements import By, batch_of
@@ -38,7 +38,7 @@ from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, records
 from optloc.show.fixes import with_sigma
-from optloc.solvers import Method
+from optloc.solvers.methods import Method
 from optloc.station_health.stations import Health, health_of
 
 # Members of a bias that are named; the others are counted.
@@ -114,7 +114,7 @@ def _advice(loaded: Loaded, checked: Checked | None) -> tuple[Advice, ...]:
         # the file was only to be read: what it says of values is not looked at
         problem = problem.with_rows(z=np.full_like(problem.z, np.nan))
     elif problem.epochs == 1 and np.isfinite(problem.z[problem.weight > 0.0]).all():
-        from optloc.solvers import solve
+        from optloc.solvers.solution import solve
 
         vectors = solve(problem).x
     return advice_for_vectors(problem, vectors)
@@ -279,7 +279,7 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
 
 
 def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     batch = batch_of(loaded.problem)
     count = batch.batch_shape[0]

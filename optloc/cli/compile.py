@@ -38,9 +38,9 @@ from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.scope import SHORT
-from optloc.solvers import solve
 from optloc.solvers.certificates.admitted import certify
 from optloc.solvers.prepared import prepare
+from optloc.solvers.solution import solve
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.tracking.updates import ekf
 from optloc.uncertainty.region import likelihood_region

@@ -18,7 +18,7 @@ from optloc.bounds.cramer_rao import Course, crlb_course
 from optloc.bounds.over_area import BoundMap, bound_map, extent, map_coordinates
 from optloc.cli.options import coordinates
 from optloc.cli.output import PICTURES, Screen, claim_outputs, dumps, say, write_picture, write_text
-from optloc.files import Loaded, read
+from optloc.files.reader import Loaded, read
 from optloc.files.schema import Units
 from optloc.model_checks.evidence import Reliability, reliability
 from optloc.models import MODELS
@@ -97,7 +97,7 @@ def _sought(problem: Problem) -> bool:
 
 def _solve(file: Path) -> Array:
     """Return the fix of a file that has measured values."""
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     problem = read(file).problem
     return solve(problem).x
@@ -339,7 +339,7 @@ def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed
         return np.asarray(truth[None, names[0].start : names[0].start + names[0].size])
     if not needed:
         return None
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     fix = solve(read(file).problem)
     place = fix.position.reshape(-1, problem.dimension)
@@ -385,7 +385,7 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
     if ending == ".geojson":
         write_text(out, dumps(map_geojson(found)))
         return
-    from optloc.show import map_page
+    from optloc.show.page import map_page
 
     write_text(out, map_page(found, title))
 

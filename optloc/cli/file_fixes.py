@@ -15,7 +15,7 @@ from optloc.base.records import join
 from optloc.base.types import Status
 from optloc.bounds.rank import Observability, observability
 from optloc.cli.output import bar
-from optloc.files import Loaded
+from optloc.files.reader import Loaded
 from optloc.problem.epoch_groups import EpochGroup, epoch_groups, problem_of
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
@@ -75,7 +75,7 @@ class FileFixes:
 
 def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
     """Return the fixes of a file; a bar moves on a terminal's standard error."""
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     if separable(loaded.problem):
         fix, reweighted = _fix_epochs(loaded, method, quiet)
@@ -88,8 +88,8 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
 
 def _fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
     """Return the fixes of epochs that share nothing, in their order, and whether weights of rows are not as stated."""
-    from optloc.solvers import solve
     from optloc.solvers.methods import is_quick
+    from optloc.solvers.solution import solve
 
     reweighted, order, stages = False, [], {}
 

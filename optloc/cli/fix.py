@@ -32,7 +32,7 @@ from optloc.cli.output import (
     write_results,
     write_text,
 )
-from optloc.files import Loaded
+from optloc.files.reader import Loaded
 from optloc.files.readings import Told
 from optloc.files.schema import ConstraintTable
 from optloc.model_checks.advice import advise, advise_at, explained_at
@@ -142,7 +142,7 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
         if plot is not None:
             draw(found, plot)
         if html is not None:
-            from optloc.show import fix_page
+            from optloc.show.page import fix_page
 
             labels = [str(label) for label in found.columns["epoch"]]
             write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels))

@@ -279,7 +279,7 @@ def read_problem(
     quiet, on_error : bool
         Whether nothing is said of a table, and whether it is said on standard error.
     """
-    from optloc.files import read
+    from optloc.files.reader import read
 
     if told is None:
         return read(file, values=values, more=more)

@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.cli.extensions import Asked, extensions
 from optloc.cli.output import Screen, claim_outputs, say, write_picture
-from optloc.files import Loaded, read
+from optloc.files.reader import Loaded, read
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -32,7 +32,7 @@ def run_plot(what: str, asked: Asked, quiet: bool) -> int:
 
 def _solve_all(asked: Asked) -> tuple[Loaded, Problem, Fix]:
     """Return a file, its problem (epochs that share nothing as a batch) and its fixes."""
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     loaded = read(asked.file)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
@@ -41,7 +41,7 @@ def _solve_all(asked: Asked) -> tuple[Loaded, Problem, Fix]:
 
 def _solve_one(asked: Asked) -> tuple[Problem, Fix, str]:
     """Return the problem of one epoch, or of a run, with its fix and a title."""
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     loaded = read(asked.file)
     if not separable(loaded.problem):

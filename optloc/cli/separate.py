@@ -13,8 +13,9 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Status
 from optloc.cli.crlb import vector
 from optloc.cli.output import Screen, dumps, write_text
-from optloc.files import Loaded, read
-from optloc.multi_target import Emitters, evenly, separate
+from optloc.files.reader import Loaded, read
+from optloc.multi_target.answer import Emitters, evenly
+from optloc.multi_target.assign import separate
 from optloc.problem.problem import Problem
 
 # Digits of a number of rows: no file holds more.

@@ -18,7 +18,7 @@ from optloc.cli.file_fixes import FileFixes, fix_file, fixes_json
 from optloc.cli.fix import draw, show
 from optloc.cli.options import shipped_problems
 from optloc.cli.output import Screen, claim_outputs, dumps, say, write_text
-from optloc.files import read
+from optloc.files.reader import read
 from optloc.models import MODELS, Model
 
 _FIX = """

@@ -32,7 +32,7 @@ from optloc.cli.output import (
     write_results,
     write_text,
 )
-from optloc.files import Loaded
+from optloc.files.reader import Loaded
 from optloc.files.readings import Told
 from optloc.files.writer import GrowingTable
 from optloc.linear.least_squares_ranges import reduce
@@ -41,10 +41,11 @@ from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.show.formats.marks import Results
-from optloc.tracking import Dynamics, State, current_statistical, polynomial, singer
+from optloc.tracking.dynamics import Dynamics, current_statistical, polynomial, singer
 from optloc.tracking.entry import Entry, Rules
 from optloc.tracking.run import tracked
 from optloc.tracking.several_targets import alone
+from optloc.tracking.track import State
 from optloc.tracking.updates import filter_of, reweighted
 
 
@@ -345,8 +346,8 @@ def track_columns(one: TargetTrack) -> Columns:
 
 def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
     """Return the page with the map of all tracks."""
-    from optloc.show import track_page
     from optloc.show.map import degrees, sentence, spots
+    from optloc.show.page import track_page
 
     problem, d = loaded.problem, loaded.problem.dimension
     entries = [(one.name, label, e) for one in ones for label, e in zip(one.labels, one.entries, strict=False)]

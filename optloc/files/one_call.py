@@ -33,7 +33,7 @@ from optloc.problem.bias import scale_of
 from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers import solve
+from optloc.solvers.solution import solve
 
 # Nothing is nearer to the centre of the Earth than its poles, metres.
 _SURFACE = 6.3e6

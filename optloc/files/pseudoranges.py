@@ -190,7 +190,7 @@ def _first_pass(source: Path, epoch: Array, place: Array, z: Array, count: int, 
     On the ground (`level`) three satellites are enough.
     """
     from optloc.linear.constraints import height
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     slot = np.arange(len(epoch)) - np.searchsorted(epoch, epoch)  # epochs stand in order
     width = int(slot.max()) + 1

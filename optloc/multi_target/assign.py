@@ -31,8 +31,8 @@ from optloc.multi_target.sets import (
 )
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers import solve
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
+from optloc.solvers.solution import solve
 from optloc.tracking.associate import Clutter
 
 # Fixes of few rows that are tried, and those that are followed: one batch. What they miss the

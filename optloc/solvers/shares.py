@@ -17,7 +17,7 @@ from optloc.problem.chart import CURVED
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers import solve
+from optloc.solvers.solution import solve
 
 # Fixes at a time: their rows take some tens of megabytes.
 _PART = 2**14

@@ -153,7 +153,7 @@ def noise_levels(
     K. R. Koch, "Maximum likelihood estimate of variance components" (1986), equation 4.
     Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters" (2013), section 3.
     """
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     batch = batch_of(problem)
     if fix is None and batch.layout.size:
@@ -239,7 +239,7 @@ def common_level(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     InvalidProblem
         Where no epoch has a fix.
     """
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     batch = batch_of(problem)
     if fix is None and batch.layout.size:
@@ -411,7 +411,7 @@ def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     ----------
     A. P. Dempster, N. M. Laird, D. B. Rubin, "Maximum likelihood from incomplete data via the EM algorithm" (1977).
     """
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     batch = batch_of(problem)
     if fix is not None or not batch.layout.size:

@@ -131,7 +131,7 @@ def health(problem: Problem, by: By = "station", *, method: str = "auto", fix: F
     InvalidProblem
         Where no epoch has a fix, or none has redundancy.
     """
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     batch = batch_of(problem)
     if fix is None and batch.layout.size:

@@ -126,7 +126,7 @@ def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None =
     D. A. Harville, "Maximum likelihood approaches to variance component estimation" (1977), section 3.
     G. Schwarz, "Estimating the dimension of a model", Annals of Statistics 6 (1978).
     """
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     batch = batch_of(problem)
     if fix is None and batch.layout.size:
@@ -366,7 +366,7 @@ def _agree(
     problem: Problem, batch: Problem, by: By, common: By | None, method: str, before: _Learnt | None = None
 ) -> _Learnt:
     """Return fixes whose noise agrees with their residuals, from earlier fixes or from none."""
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     if before is None:
         before_kept, x = usable(batch, solve(batch, method) if batch.layout.size else None)
@@ -392,7 +392,7 @@ def _agree(
 
 def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array, Array]:
     """Return fixes with other noise: by descent from the earlier fixes, for least squares without bounds."""
-    from optloc.solvers import solve
+    from optloc.solvers.solution import solve
 
     if not now.layout.size:
         return kept, x

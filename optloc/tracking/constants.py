@@ -11,7 +11,7 @@ from optloc.base.types import Array, Motion
 from optloc.problem.epochs import cut
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
-from optloc.solvers import solve
+from optloc.solvers.solution import solve
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.track import State, Track, check_state, check_trackable, follow
 from optloc.tracking.updates import Update, filter_of

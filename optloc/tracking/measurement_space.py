@@ -15,7 +15,7 @@ from optloc.problem import noise as noises
 from optloc.problem.epochs import by_epoch, cut
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
-from optloc.solvers import solve
+from optloc.solvers.solution import solve
 from optloc.solvers.starts.angles import course_starts, pair
 from optloc.tracking.track import Track, check_trackable, status_of_scans
 

@@ -15,7 +15,7 @@ from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
-from optloc.solvers import solve
+from optloc.solvers.solution import solve
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.rivals import Rival

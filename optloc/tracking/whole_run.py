@@ -11,7 +11,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion, Status
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers import solve
+from optloc.solvers.solution import solve
 from optloc.tracking.dynamics import Dynamics, polynomial
 from optloc.tracking.track import State, Track, check_trackable, collect, scans, status_of_scans
 from optloc.tracking.updates import Updated, joseph, whitened
