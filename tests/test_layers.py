@@ -24,7 +24,7 @@ LAYERS = (
     "solvers uncertainty",
     "tracking station_health",
     "files multi_target",
-    "show",
+    "show advice",
     "cli",
     # neighbours, which import the faces of the core only
     "sites plugins",
@@ -153,7 +153,7 @@ def test_no_loose_module():
 
 
 # Limits of the contributing guide. A commit that adds a file raises the number of modules, so that each is a decision.
-MODULES, LINES, BODY, RECURRING = 437, 600, 60, 20
+MODULES, LINES, BODY, RECURRING = 442, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

@@ -26,8 +26,10 @@ from optloc.problem.epochs import cut, joined
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.tracking.condition import Condition
+from optloc.tracking.differences import differences
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.motions import motion_named
 from optloc.tracking.rivals import Rival, remaining
 from optloc.tracking.scan_rows import Scans
 from optloc.tracking.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
@@ -47,6 +49,46 @@ from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovati
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
 Screen = tuple[float, float, float]
+
+
+def track(
+    problem: Problem,
+    model: Dynamics | str = "cv",
+    update: Update | str = "iekf",
+    *,
+    start: State | None = None,
+    rules: Rules | None = None,
+) -> Track:
+    """Return the track of one target through a run, without a first guess.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run of one target: epochs with times.
+    model : Dynamics or str
+        Model of motion, or its name: "cv", "ca", "static", "singer", "csm"; see ``optloc list motions``.
+    update : callable or str
+        A filter, or its name; see ``optloc list trackers``.
+    start : State, optional
+        Known state at or before the first scan.
+    rules : Rules, optional
+        When rows are left out and tracks begin anew.
+
+    Returns
+    -------
+    Track
+        State [p, v, a] after each scan, its covariance and status. `Track.states` returns another order.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown model or filter, times that do not increase, a run of several targets, and a start that does not
+        fit. Several targets are separated by `optloc.tracking.alone`.
+    """
+    dynamics = motion_named(model) if isinstance(model, str) else model
+    run = differences(problem) if problem.emitting else problem
+    entries = list(tracked(run, dynamics, update, start=start, rules=rules))
+    return collected(entries, problem.dimension)
 
 
 def tracked(
