@@ -8,8 +8,9 @@ from often import few
 from scipy.stats import chi2
 
 import optloc
-from optloc import InvalidProblem, Status, calibrate, network_of
+from optloc import InvalidProblem, Status, calibrate
 from optloc.kernels.jit import plain
+from optloc.sites.calibration import network_of
 from optloc.sites.calibration.blocks import settled
 from optloc.sites.calibration.calibrated import refuted_blocks
 from optloc.sites.calibration.gauge import departure, determined

@@ -9,11 +9,12 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from optloc import MODELS, InvalidProblem, solve
+from optloc import InvalidProblem, solve
 from optloc.cli import app
 from optloc.files.columns import any_unit, role_of, roles, sigma_kind, stem
 from optloc.files.convert import understood
 from optloc.files.readings import Told
+from optloc.models import MODELS
 
 RUN = CliRunner()
 SITES = {

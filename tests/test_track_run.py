@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from often import few
 
-from optloc import ECEF, InvalidProblem, Motion, Status, assemble, measured, station_array
+from optloc import InvalidProblem, Motion, Status, assemble, measured, station_array
 from optloc.linear.constraints import box, height
+from optloc.problem import ECEF
 from optloc.tracking import Rules, State, collected, current_statistical, followed, polynomial, singer, tracked
 from optloc.tracking.several_targets import alone
 

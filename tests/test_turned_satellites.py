@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, by_epoch, solve
+from optloc import InvalidProblem, solve
 from optloc.base.frames import ECEF
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.cli import app
 from optloc.files import load
 from optloc.files.convert import convert, understood
 from optloc.files.readings import Told
+from optloc.problem import by_epoch
 
 RUN = CliRunner()
 RATE = 7.2921151467e-5

@@ -112,7 +112,7 @@ def plugins() -> tuple[str, ...]:
 
 
 def load_plugin(name: str) -> None:
-    """Run a Python file or module that adds to the tables, such as ``optloc.MODELS["mine"] = ...``, once.
+    """Run a Python file or module that adds to the tables, such as ``optloc.models.MODELS["mine"] = ...``, once.
 
     Parameters
     ----------

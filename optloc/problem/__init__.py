@@ -75,7 +75,9 @@ if TYPE_CHECKING:
         Block as Block,
         Noise as Noise,
         arrivals as arrivals,
+        dense as dense,
         group as group,
+        independent as independent,
         variances as variances,
         whiten as whiten,
     )

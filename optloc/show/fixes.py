@@ -206,7 +206,7 @@ def _extents(fix: Fix) -> list[tuple[str, str]]:
     if fix.chart.kind == CARTESIAN:
         return _coordinates(fix) if fix.chart.cut_off else []
     if fix.chart.kind != INVERSE_RANGE:
-        return [("95 % region", "curved: the numbers behind ± do not cover; optloc.likelihood_region does")]
+        return [("95 % region", "curved: the numbers behind ± do not cover; optloc.uncertainty.likelihood_region does")]
     low, high = (float(end) for end in fix.interval("range"))
     far = f"to {high:.4g} m" if np.isfinite(high) else "or more, to infinity"
     told = [("95 % range", f"{low:.4g} m {far}, from the middle of the stations")]

@@ -357,7 +357,7 @@ def check_trackable(problem: Problem) -> None:
         advice = "learn it first, then `with_known_bias`"
         raise InvalidProblem(f"the bias {problem.biases[0].name!r} is unknown", "track", advice)
     if problem.emitting:
-        raise InvalidProblem("emission times are unknown", "track", "use differences: `optloc.reduce` makes them")
+        raise InvalidProblem("emission times are unknown", "track", "take differences with `optloc.engine.reduce`")
     if problem.stations.unknown_for:
         raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
 

@@ -195,7 +195,7 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     update : callable or str
         A filter, or its name in `UPDATES`.
     loss : Loss or str
-        A loss, or its name in `optloc.LOSSES`.
+        A loss, or its name in `optloc.problem.LOSSES`.
 
     Raises
     ------

@@ -108,7 +108,7 @@ def samples(
     problem : Problem
         The problem of the fix: one static position.
     fix : Fix
-        A single fix; its alternatives are left out, see `optloc.mixture`.
+        A single fix; its alternatives are left out, see `optloc.uncertainty.mixture`.
     n : int
         How many samples; powers of two are spread most evenly.
     seed : int

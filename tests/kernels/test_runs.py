@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from runs import drawn, estimated, run, truth
 
-from optloc import Motion, Prior, Status, assemble, measured, solve, with_bias
+from optloc import Motion, Status, assemble, measured, solve, with_bias
 from optloc.base import linalg
 from optloc.kernels.jit import enabled
 from optloc.kernels.least_squares import refine
 from optloc.kernels.pack import fold, folding, pack_runs
 from optloc.linear.normal import linearise, local_covariance, marginal, normal, whitener_at, with_priors
+from optloc.problem import Prior
 from optloc.solvers import planned
 
 SENSORS = 1e3 * np.array([[0.0, 0.0], [10.0, 1.0], [9.0, 9.0], [1.0, 10.0], [5.0, 4.0]])

@@ -10,8 +10,9 @@ from descent import levenberg
 from often import few
 from proof.sampling import many
 
-from optloc import Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
+from optloc import Motion, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
 from optloc.kernels.jit import enabled
+from optloc.problem import Prior
 from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import (

@@ -8,10 +8,11 @@ from descent import levenberg
 from often import few
 from proof.sampling import many
 
-from optloc import Frame, Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve
+from optloc import Frame, Motion, Status, assemble, certify, constraints, measured, simulate, solve
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import exact, levels, restore
 from optloc.models.course import carry
+from optloc.problem import Prior
 from optloc.proof.runs.ground import (
     Ground,
     axes_at,

@@ -74,7 +74,7 @@ def test_the_outline_in_the_plane_is_the_contour_of_the_cost(name, item):
     (outline,) = found
     # a cost of its own
     S, z = problem.stations.position.reshape(-1, 2), problem.z
-    inverse = np.linalg.inv(optloc.noise.dense(problem.noise, np.arange(problem.count)).reshape((problem.count,) * 2))
+    inverse = np.linalg.inv(optloc.problem.dense(problem.noise, np.arange(problem.count)).reshape((problem.count,) * 2))
 
     def cost(points):
         away = points[:, None] - S
@@ -109,7 +109,7 @@ def test_an_ambiguous_fix_has_two_parts_of_their_own_sizes():
     assert len(outline.polygons) == 2
     assert not outline.cut
     S, z = problem.stations.position.reshape(-1, 2), problem.rows[0].z
-    inverse = np.linalg.inv(optloc.noise.dense(problem.noise, np.arange(2)))
+    inverse = np.linalg.inv(optloc.problem.dense(problem.noise, np.arange(2)))
 
     def value(points):
         r = np.linalg.norm(points[:, None] + fix.position - S, axis=-1)

@@ -6,8 +6,9 @@ from often import few
 from uncertainty.scenes import CASES, fixed
 
 import optloc
-from optloc import InvalidProblem, assemble, likelihood_region, measured
+from optloc import InvalidProblem, assemble, measured
 from optloc.problem.chart import INVERSE_RANGE, jacobian, quantile
+from optloc.uncertainty import likelihood_region
 from optloc.uncertainty.arc import trace_from
 from optloc.uncertainty.region import Surface
 
@@ -128,7 +129,9 @@ def test_where_infinity_is_within_the_region_is_a_cone():
 
 
 def test_of_a_gaussian_it_is_the_ellipse():
-    prior = optloc.Prior("position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]]))
+    prior = optloc.problem.Prior(
+        "position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]])
+    )
     stations = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3]])
     weak = assemble(stations, measured("range", np.full(3, 5e3), a=np.arange(3), sigma=1e7), priors=(prior,))
     fix = optloc.solve(weak)

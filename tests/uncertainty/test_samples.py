@@ -5,14 +5,17 @@ import pytest
 from uncertainty.scenes import fixed
 
 import optloc
-from optloc import InvalidProblem, assemble, measured, mixture, samples, trace_arc
+from optloc import InvalidProblem, assemble, measured
 from optloc.problem.chart import CURVED, INVERSE_RANGE
+from optloc.uncertainty import mixture, samples, trace_arc
 from optloc.uncertainty.region import Surface
 
 
 def gaussian():
     """Return a problem whose rows say nothing beside a prior."""
-    prior = optloc.Prior("position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]]))
+    prior = optloc.problem.Prior(
+        "position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]])
+    )
     stations = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3]])
     problem = assemble(stations, measured("range", np.full(3, 5e3), a=np.arange(3), sigma=1e7), priors=(prior,))
     return problem, prior

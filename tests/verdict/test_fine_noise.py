@@ -7,9 +7,10 @@ import pytest
 from often import few
 from verdict.exact import COUNT, draw
 
-from optloc import ECEF, Frame, Motion, Status, assemble, certify, constraints, measured, solve
+from optloc import Frame, Motion, Status, assemble, certify, constraints, measured, solve
 from optloc.kernels.jit import enabled
 from optloc.linear.evaluate import predict
+from optloc.problem import ECEF
 from optloc.proof.near import COARSE
 from optloc.solvers.certificates.branch_and_bound import FINE
 from optloc.solvers.certificates.position_cost import eliminate_nuisance, prove

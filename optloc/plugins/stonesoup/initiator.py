@@ -37,7 +37,7 @@ def mixture_state(
     Parameters
     ----------
     problem, fix : Problem, Fix
-        One static position and its single fix, as `optloc.mixture` takes them.
+        One static position and its single fix, as `optloc.uncertainty.mixture` takes them.
     mapping : sequence of int
         Places of the position in the state.
     prior_state : GaussianState

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from optloc import by_epoch, simulate, solve
+from optloc import simulate, solve
 from optloc.lab.papers import angles, bistatic, kinematic, registration, satellites
+from optloc.problem import by_epoch
 
 METHODS = ("sdp+lsr", "socp+lsr", "gtrs+nlp+lsr")
 TRIALS = {"registration": 1, "registration, prior": 1}

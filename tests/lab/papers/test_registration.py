@@ -9,8 +9,9 @@ from often import few
 from typer.testing import CliRunner
 from verdicts import alone
 
-from optloc import crlb, linearise, simulate, solve
+from optloc import crlb, simulate, solve
 from optloc.cli import app
+from optloc.engine import linearise
 from optloc.files import read
 from optloc.lab.papers import registration, registration_tables
 from optloc.lab.papers.registration import (

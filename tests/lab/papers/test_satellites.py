@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import ECEF, crlb, predict
+from optloc import crlb
 from optloc.cli import app
+from optloc.engine import predict
 from optloc.lab.papers import satellites
 from optloc.lab.papers.report import Study
 from optloc.lab.papers.satellites import (
@@ -24,6 +25,7 @@ from optloc.lab.papers.satellites import (
     surface_course,
     truth,
 )
+from optloc.problem import ECEF
 
 RUN = CliRunner()
 

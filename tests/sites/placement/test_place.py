@@ -9,8 +9,8 @@ from sites.placement.scenes import drawn, hall
 
 import optloc
 from formulations.placement import Ground, Region
-from optloc import InvalidProblem, SiteSelection, assemble, crlb, measured, place
-from optloc.sites.placement import Draws, Group, chosen as chosen_module
+from optloc import InvalidProblem, assemble, crlb, measured, place
+from optloc.sites.placement import Draws, Group, SiteSelection, chosen as chosen_module
 from optloc.sites.placement.chosen import drawn as simulated
 from optloc.sites.placement.refinement import refined
 from optloc.sites.placement.sites import candidates_of
