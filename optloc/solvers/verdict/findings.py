@@ -43,7 +43,8 @@ BENT_SENTENCE = {
 BOTH_SIDES = (
     "the stations lie in a plane, and the target is on either side or in it: "
     "`optloc.model_checks.distance_from_plane` says how far"
-)"""Sentence on a fix whose two mirror images are one region."""
+)
+"""Sentence on a fix whose two mirror images are one region."""
 _ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
 # Share of the distance of two mirror images by which a minimum may be off one of them and be the same.
 _SAME_END = 1e-3
