@@ -8,7 +8,7 @@ import pytest
 from recipes import installed, write_package
 
 from optloc import InvalidProblem
-from optloc.base.registry import Table
+from optloc.base.registry import Registry
 from optloc.models import MODELS, Model
 from optloc.tracking import UPDATES
 
@@ -70,7 +70,7 @@ def test_a_package_may_look_at_the_table_while_it_is_loaded(tmp_path, monkeypatc
 
 
 def test_a_table_is_a_dictionary_that_grows():
-    table = Table("optloc.none", callable, {"abs": abs})
+    table = Registry("optloc.none", callable, {"abs": abs})
     table["max"] = max
     assert list(table) == ["abs", "max"]
     assert len(table) == 2

@@ -19,7 +19,7 @@ from optloc import Frame, Status, crlb, simulate, solve
 from optloc.base.types import Motion, Stations
 from optloc.bounds import observability
 from optloc.kernels.least_squares import refine
-from optloc.lab.papers.registration import PRINTED, Setting, rms, wander
+from optloc.lab.papers.registration import PRINTED, RegistrationSetting, rms, wander
 from optloc.linear.constraints import box, height, speed
 from optloc.solvers.starts.registration import turn_courses
 
@@ -365,7 +365,7 @@ def test_other_routes_reach_the_same_optimum(method, prior):
 
 
 def test_a_recursion_from_a_guess_diverges_where_no_guess_is_needed():
-    setting = Setting(PRINTED, 30, SEED, 1)
+    setting = RegistrationSetting(PRINTED, 30, SEED, 1)
     many, bound = setting.draw(600), setting.bound(600)
     (plain,) = wander(setting, many, (600,), (bound,), width=20.0)
     assert 1 <= plain.lost.sum() <= 5

@@ -32,7 +32,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.reader import Loaded
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
@@ -40,7 +40,7 @@ from optloc.show.formats.marks import Results
 from optloc.tracking.differences import differences
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.entry import Entry, Rules
-from optloc.tracking.motions import motion_named
+from optloc.tracking.named_models import motion_named
 from optloc.tracking.run import tracked
 from optloc.tracking.several_targets import alone
 from optloc.tracking.track import State
@@ -54,7 +54,7 @@ _REASONS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class TrackOptions:
     """How a file is to be tracked; see the help of the command.
 
     Parameters
@@ -111,14 +111,14 @@ class TargetTrack:
 
 def run_track(
     file: Path,
-    wanted: Wanted,
+    wanted: TrackOptions,
     *,
     out: Path | None = None,
     as_json: bool = False,
     plot: Path | None = None,
     html: Path | None = None,
     quiet: bool = False,
-    table: Told | None = None,
+    table: ColumnHints | None = None,
 ) -> int:
     """Track the targets of a file or a table, write what was asked for, and return the exit code.
 
@@ -174,7 +174,7 @@ def _json(loaded: Loaded, columns: Columns) -> dict[str, Any]:
     return about | {"scans": records(columns)}
 
 
-def dynamics_of(wanted: Wanted) -> Dynamics:
+def dynamics_of(wanted: TrackOptions) -> Dynamics:
     """Return the model of motion; raise InvalidProblem for an unknown one."""
     return motion_named(wanted.model, wanted.noise, wanted.memory, "--model")
 
@@ -224,7 +224,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         yield name, run, tuple(loaded.epochs[k] for k in epochs)
 
 
-def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:
+def _start(problem: Problem, dynamics: Dynamics, wanted: TrackOptions) -> State | None:
     """Return the initial state that options give."""
     if (wanted.start is None) != (wanted.sigma is None):
         lacking = "--start" if wanted.start is None else "--start-sigma"
@@ -305,9 +305,9 @@ def _write(
         if table is not None:
             table.file.discard()
     if plot is not None:
-        from optloc.show.pictures.track import Drawn, plot_tracks
+        from optloc.show.pictures.track import PlottedTrack, plot_tracks
 
-        drawn = [Drawn(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
+        drawn = [PlottedTrack(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
         write_picture(plot_tracks(drawn, title=loaded.title), plot)
     if html is not None:
         write_text(html, _map(loaded, ones))

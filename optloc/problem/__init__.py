@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         geodetic_to_ecef as geodetic_to_ecef,
     )
     from optloc.base.registry import (
-        Table as Table,
+        Registry as Registry,
         load_plugin as load_plugin,
         plugin_module as plugin_module,
         plugins as plugins,

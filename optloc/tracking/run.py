@@ -29,7 +29,7 @@ from optloc.tracking.condition import Condition
 from optloc.tracking.differences import differences
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.entry import Entry, Rules
-from optloc.tracking.motions import motion_named
+from optloc.tracking.named_models import motion_named
 from optloc.tracking.rivals import Rival, remaining
 from optloc.tracking.scan_rows import Scans
 from optloc.tracking.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
@@ -133,7 +133,7 @@ def tracked(
     rules = rules or Rules()
     course = Condition.of(start, float(problem.times[0]) if start is None else start.time, rules)
     course.fresh = start is not None
-    return _Run.of(cleaned, broken, dynamics, rule, rules).entries(course)
+    return _TrackRun.of(cleaned, broken, dynamics, rule, rules).entries(course)
 
 
 def collected(entries: Sequence[Entry], dimension: int) -> Track:
@@ -151,7 +151,7 @@ def collected(entries: Sequence[Entry], dimension: int) -> Track:
 
 
 @dataclass(frozen=True, slots=True)
-class _Run:
+class _TrackRun:
     """One run, or a stretch of it, with its rules.
 
     Parameters
@@ -180,7 +180,7 @@ class _Run:
     near: float
 
     @classmethod
-    def of(cls, problem: Problem, broken: Array, dynamics: Dynamics, rule: Update, rules: Rules) -> _Run:
+    def of(cls, problem: Problem, broken: Array, dynamics: Dynamics, rule: Update, rules: Rules) -> _TrackRun:
         """Return a run whose rows (m,) are `broken` where they are not finite."""
         bad = np.bincount(problem.epoch[broken], minlength=problem.epochs).tolist()
         problem = with_height_rows(problem)
@@ -402,7 +402,7 @@ class Follower:
             self._waiting, self.last = run, time
             return []
         cleaned, broken = _clean(reduce(joined, run))
-        stretch = _Run.of(cleaned, broken, self._dynamics, self._rule, self._rules)
+        stretch = _TrackRun.of(cleaned, broken, self._dynamics, self._rule, self._rules)
         course = self._course or Condition.of(None, float(run[0].times[0]), self._rules)
         done: list[Entry] = []
         self._needed = 1

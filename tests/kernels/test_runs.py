@@ -97,13 +97,13 @@ def test_answers_are_those_of_numpy(name, monkeypatch):
 
 
 def test_covariances_are_those_of_the_normal_equations():
-    from optloc.kernels.damping import Rules
+    from optloc.kernels.damping import StopRules
     from optloc.kernels.runs import fixed_runs, sums_of_runs
 
     problem = free(70, trials=2)[0].flat()
     x, item = solve(problem, "gtrs+lsr").x, np.arange(2)
     runs = pack_runs(problem, whitener_at(problem, x))
-    done, found = fixed_runs(runs, item, x, Rules(), 2)
+    done, found = fixed_runs(runs, item, x, StopRules(), 2)
     equations = sums_of_runs(runs, done.x, item, priors=True)
     shared, _ = linalg.inverse(marginal(equations)[0])
     assert found.regular.all()

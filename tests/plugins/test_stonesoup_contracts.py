@@ -273,7 +273,7 @@ def test_two_targets_in_clutter_are_two_tracks_by_bounded_work(clutter, seed, mo
     solve = initiator.solve
 
     def counted(left):
-        calls.append(chains.Work(left))
+        calls.append(chains.ChainWork(left))
         return calls[-1]
 
     monkeypatch.setattr(initiator, "Work", counted)

@@ -17,7 +17,7 @@ from optloc.show.map import fixed_spots
 from optloc.show.pictures import plot_fixes
 from optloc.show.pictures.outlines import outlines_of
 from optloc.uncertainty.contour import holds
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty.region import RegionSurface
 
 DEMOS = Path(optloc.__file__).parent / "scenarios"
 
@@ -130,7 +130,7 @@ def test_in_space_the_coordinate_that_is_not_seen_is_at_its_best(name, view):
     problem, _, fix = fixed(name, 0)
     plane = np.eye(3)[list(view)]
     (outline,) = regions(problem, fix, plane)
-    surface, hidden = Surface.of(problem, fix), np.cross(*plane)
+    surface, hidden = RegionSurface.of(problem, fix), np.cross(*plane)
     rng = np.random.default_rng(3)
     around = np.concatenate(outline.lines)
     spread = np.sqrt(hidden @ fix.covariance() @ hidden)

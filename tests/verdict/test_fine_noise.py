@@ -162,10 +162,10 @@ def test_a_question_that_rounding_cannot_answer_has_a_verdict_of_its_own():
         ),
         np.array([3e6, 4e6]),
     ).flat()
-    from optloc.proof.batch import Asked
+    from optloc.proof.batch import ProofRequest
 
     one, none = np.zeros(1, dtype=np.int64), np.full((1, 2, 2), np.nan)
-    asked = Asked(
+    asked = ProofRequest(
         x=np.array([[3e6, 4e6]]),
         others=np.zeros((1, 0, 2)),
         known=one,

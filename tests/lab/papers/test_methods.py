@@ -46,7 +46,7 @@ def test_every_way_ends_at_the_minimum_of_auto(name):
 
 def test_every_way_ends_at_the_minimum_of_auto_along_a_course():
     """The kinematic paper: a target that stands anew at each epoch."""
-    scene = kinematic.Scenario()
+    scene = kinematic.KinematicScenario()
     drawn = by_epoch(kinematic.draw(scene, scene.course(1), 1, (5,)).runs).flat().take(np.arange(0, 60, 15))
     best = solve(drawn, "auto")
     for method in METHODS:

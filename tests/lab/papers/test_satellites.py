@@ -114,7 +114,7 @@ def test_orbits_keep_the_formation_and_its_height():
     assert np.arctan2(step @ east, step @ north) == pytest.approx(0.7, abs=1e-2)
 
 
-TINY = satellites.Sample(4, 4, (100e3,), steps=20, far=12)
+TINY = satellites.SatellitesSample(4, 4, (100e3,), steps=20, far=12)
 
 
 @pytest.fixture(scope="module")
