@@ -80,7 +80,7 @@ from optloc.proof.search_space import (
     Box,
     Cost,
     KnownMinima,
-    LocalCoordinates,
+    LocalAxes,
     chart_at,
     empty_box,
     equal_within,
@@ -161,7 +161,7 @@ def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: floa
 
 
 @inlined
-def _take(stack: Array, row: int, atlas: Atlas, chart: LocalCoordinates, corners: Array, box: Box, piece: int) -> bool:
+def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array, box: Box, piece: int) -> bool:
     """Take a box off the stack and set its centre; return False where nothing of it is to be looked at.
 
     What lies beyond the corners, if they are known, is left out.
@@ -221,7 +221,7 @@ def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float
 
 
 @compiled
-def _descend_near(work: GlobalWorkspace, chart: LocalCoordinates) -> float:
+def _descend_near(work: GlobalWorkspace, chart: LocalAxes) -> float:
     return descend(work.cost, chart, work.near)
 
 
@@ -229,7 +229,7 @@ def _descend_near(work: GlobalWorkspace, chart: LocalCoordinates) -> float:
 def _set_rival(
     work: GlobalWorkspace,
     atlas: Atlas,
-    _chart: LocalCoordinates,
+    _chart: LocalAxes,
     i: int,
     x: Array,
     value: float,

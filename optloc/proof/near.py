@@ -46,7 +46,7 @@ from optloc.proof.search_space import (
     Box,
     Cost,
     KnownMinima,
-    LocalCoordinates,
+    LocalAxes,
     blur_at,
     chart_on,
     curve_along,
@@ -70,7 +70,7 @@ CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 _CAPACITY = 512
 
 
-class LocalSearchGoal(NamedTuple):
+class BoxGoal(NamedTuple):
     """What is to be shown of every box.
 
     Parameters
@@ -101,11 +101,11 @@ class LocalSearchGoal(NamedTuple):
 @compiled
 def branch(
     cost: Cost,
-    chart: LocalCoordinates,
+    chart: LocalAxes,
     box: Box,
     minima: Array,
     sides: Array,
-    aim: LocalSearchGoal,
+    aim: BoxGoal,
     budget: int,
     stack: Array,
     size: int,
@@ -114,13 +114,13 @@ def branch(
 
     Parameters
     ----------
-    cost, chart : Cost, LocalCoordinates
+    cost, chart : Cost, LocalAxes
         The cost and its search coordinates.
     box : Box
         Tables; holds the point of the outcomes CHEAPER and ANOTHER in the end.
     minima, sides : array (P, 3)
         Known minima, and half-widths of boxes around them where the cost is convex.
-    aim : LocalSearchGoal
+    aim : BoxGoal
         What is to be shown.
     budget : int
         How many boxes may be looked at.
@@ -197,7 +197,7 @@ def branch(
 
 
 @inlined
-def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: LocalSearchGoal, enough: bool) -> bool:
+def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: BoxGoal, enough: bool) -> bool:
     """Return whether a box lies where nothing is left to show.
 
     In the convex box of a known minimum there is no second, but a lower point there may be: `enough` says where any of
@@ -210,7 +210,7 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: LocalSear
 
 
 @compiled
-def _follow(cost: Cost, chart: LocalCoordinates, box: Box, minima: Array, sides: Array, aim: LocalSearchGoal) -> int:
+def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: BoxGoal) -> int:
     """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER if it is not known, or CLEAR.
 
     The box is the minimum afterwards, or where all is clear what it was, but for its tables.
@@ -259,7 +259,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
 
 
 @compiled
-def lay_or_halve(cost: Cost, chart: LocalCoordinates, box: Box, stack: Array, size: int) -> int:
+def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int) -> int:
     """Lay a box on a surface, and bound its nodes; return -1, or the size of the stack where that is another box's.
 
     A box of another piece of the surface is dropped, one over which it is no graph is halved across its longer side.
@@ -385,7 +385,7 @@ def prove(
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     better, whole = _refuting(least, eps, noise), (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
-    aim, stack = LocalSearchGoal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
+    aim, stack = BoxGoal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, hole, 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
     if outcome == CLEAR and not alone:
@@ -438,7 +438,7 @@ def steepness(slope: tuple[float, float, float], noise: float) -> float:
 
 
 @compiled
-def _laid(cost: Cost, chart: LocalCoordinates, box: Box) -> tuple[float, float]:
+def _laid(cost: Cost, chart: LocalAxes, box: Box) -> tuple[float, float]:
     """Return the cost of a fix on its surface, infinite off it, and the rounding of its residual; fill the sums."""
     box.at[:], box.half[:] = 0.0, 0.0
     there, noise = value_at(cost, chart, box), 0.0
@@ -451,10 +451,10 @@ def _laid(cost: Cost, chart: LocalCoordinates, box: Box) -> tuple[float, float]:
 @compiled
 def _search_sides(
     cost: Cost,
-    around: LocalCoordinates,
+    around: LocalAxes,
     box: Box,
     known: KnownMinima,
-    aim: LocalSearchGoal,
+    aim: BoxGoal,
     budget: int,
     boxes: int,
     stack: Array,
@@ -469,7 +469,7 @@ def _search_sides(
         minima, sides, count, free = known_minima(cost, chart, box, known, low, high, 0.0, aim.value, False)
         if not aim.level > aim.value:
             count = free
-        own = LocalSearchGoal(aim.level, aim.value, aim.better, aim.whole, free, own=0)
+        own = BoxGoal(aim.level, aim.value, aim.better, aim.whole, free, own=0)
         # No hole: the origin of a piece is no minimum.
         size = push_around(stack, 0, low, high, np.zeros(3), 0)
         outcome, more, _ = branch(cost, chart, box, minima[:count], sides[:count], own, budget - boxes, stack, size)
@@ -481,7 +481,7 @@ def _search_sides(
 
 @inlined
 def region_of(
-    cost: Cost, chart: LocalCoordinates, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array
+    cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array
 ) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
     if isnan(lower[0]):

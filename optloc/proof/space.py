@@ -18,7 +18,7 @@ from optloc.proof.search_space import (
     LINES,
     Box,
     Cost,
-    LocalCoordinates,
+    LocalAxes,
     accuracy_floor,
     curve_at,
     is_bounded,
@@ -36,7 +36,7 @@ class Space(NamedTuple):
         Whether it is the atlas.
     atlas : Atlas
         The pieces, with known minima.
-    chart : LocalCoordinates
+    chart : LocalAxes
         The search coordinates, along planes or on a piece of a surface.
     minima, sides : array (P, 3)
         Known minima in these, and half-widths of boxes around them on which the cost is convex.
@@ -44,13 +44,13 @@ class Space(NamedTuple):
 
     far: bool
     atlas: Atlas
-    chart: LocalCoordinates
+    chart: LocalAxes
     minima: Array
     sides: Array
 
 
 @compiled
-def in_atlas(atlas: Atlas, chart: LocalCoordinates) -> Space:
+def in_atlas(atlas: Atlas, chart: LocalAxes) -> Space:
     """Return an atlas as the space of a search."""
     none = np.empty((0, 3))
     return Space(True, atlas, chart, none, none)

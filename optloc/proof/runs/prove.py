@@ -35,7 +35,7 @@ from optloc.proof.near import (
     STATIONARY,
     UNIQUE,
     VALUE,
-    LocalSearchGoal,
+    BoxGoal,
     region_of,
 )
 from optloc.proof.nodes.dispatch import infinity_of
@@ -67,7 +67,7 @@ from optloc.proof.search_space import (
     HIDDEN_REACH,
     LINES,
     KnownMinima,
-    LocalCoordinates,
+    LocalAxes,
     accuracy_floor,
     chart_on,
     equal_within,
@@ -218,7 +218,7 @@ class ProofTask(NamedTuple):
         The fix.
     beside : KnownMinima
         What else is known.
-    aim : LocalSearchGoal
+    aim : BoxGoal
         What is to be shown of every box.
     eps : float
         How far below the cost of the fix still counts as equal.
@@ -230,7 +230,7 @@ class ProofTask(NamedTuple):
 
     x: Array
     beside: KnownMinima
-    aim: LocalSearchGoal
+    aim: BoxGoal
     eps: float
     budget: int
     found: Array
@@ -264,7 +264,7 @@ def prove_run(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
-    aim = LocalSearchGoal(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
+    aim = BoxGoal(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
     task = ProofTask(x, beside, aim, eps, budget, found)
     if far:
         return _prove_far(run, task, atlas_of(middle, radius, D, 1 + beside.points.shape[0]), chart, tables)
@@ -274,7 +274,7 @@ def prove_run(
 
 
 @compiled
-def _blur(run: RunCost, chart: LocalCoordinates, x: Array, far: bool, tables: RunTables) -> float:
+def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables) -> float:
     """Return a bound of the rounding errors of a residual (its length) at a fix, and in the atlas of all positions."""
     middle, radius = cube(run.cost.kinds, run.cost.data, x)
     atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
@@ -286,7 +286,7 @@ def _blur(run: RunCost, chart: LocalCoordinates, x: Array, far: bool, tables: Ru
 
 @compiled
 def _prove_far(
-    run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalCoordinates, tables: RunTables
+    run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables
 ) -> tuple[int, int, float]:
     """Prove over all space."""
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
@@ -308,7 +308,7 @@ def _prove_far(
 
 
 @compiled
-def _verdict(outcome: int, aim: LocalSearchGoal) -> int:
+def _verdict(outcome: int, aim: BoxGoal) -> int:
     """Return the verdict of a proof by the outcome of its search."""
     if outcome == CLEAR:
         return UNIQUE if aim.level > aim.value else VALUE
@@ -321,7 +321,7 @@ def _verdict(outcome: int, aim: LocalSearchGoal) -> int:
 
 @compiled
 def _prove_near(
-    run: RunCost, task: ProofTask, atlas: Atlas, around: LocalCoordinates, tables: RunTables, lower: Array, upper: Array
+    run: RunCost, task: ProofTask, atlas: Atlas, around: LocalAxes, tables: RunTables, lower: Array, upper: Array
 ) -> tuple[int, int, float]:
     """Prove in search coordinates around a fix: a region, what few rows enclose, or all pieces of a surface."""
     corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
@@ -353,7 +353,7 @@ def _prove_near(
 
 @compiled
 def _beside(
-    run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalCoordinates, tables: RunTables, corners: Array, own: bool
+    run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables, corners: Array, own: bool
 ) -> Space:
     """Return search coordinates with their known minima, that of the fix (`own`) first; none where it is none."""
     others, known, place = task.beside.points, zero(), np.empty(task.x.shape[0])

@@ -44,7 +44,7 @@ from optloc.proof.scaled.reduction import (
     reduce_rows,
     sheet_of,
 )
-from optloc.proof.search_space import Box, Cost, LocalCoordinates, curve_at, empty_box, place, widen
+from optloc.proof.search_space import Box, Cost, LocalAxes, curve_at, empty_box, place, widen
 from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, set_nodes, set_place
 
 
@@ -70,7 +70,7 @@ def tables_of(scaled: Scaled) -> ScaledTables:
 
 
 @compiled
-def cost_near(scaled: Scaled, chart: LocalCoordinates, tables: ScaledTables) -> float:
+def cost_near(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
     """Return the least cost over the factors at the centre of the box around a position; its sums are filled."""
     near, cost = tables.near, scaled.cost
     near.half[:] = 0.0
@@ -89,7 +89,7 @@ _SAME_COST = 1e-13
 
 
 @compiled
-def descend_scaled(scaled: Scaled, chart: LocalCoordinates, tables: ScaledTables) -> float:
+def descend_scaled(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
     """Move the box around a position to a minimum; return its cost, or infinity where none is reached."""
     near = tables.near
     now, damping, start = cost_near(scaled, chart, tables), _DAMPING, near.at.copy()
@@ -150,7 +150,7 @@ def set_scaled_minimum(
     scaled: Scaled,
     tables: ScaledTables,
     atlas: Atlas,
-    chart: LocalCoordinates,
+    chart: LocalAxes,
     i: int,
     x: Array,
     value: float,
@@ -163,7 +163,7 @@ def set_scaled_minimum(
     ----------
     scaled, tables : Scaled, ScaledTables
         The cost, and working memory.
-    chart : LocalCoordinates
+    chart : LocalAxes
         Search coordinates around the fix.
     atlas, i, x, value, eps
         As of `optloc.proof.convex_boxes.set_minimum`.
@@ -307,7 +307,7 @@ def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho
 
 
 @compiled
-def _descend_near(work: ScaledSearchWorkspace, chart: LocalCoordinates) -> float:
+def _descend_near(work: ScaledSearchWorkspace, chart: LocalAxes) -> float:
     return descend_scaled(work.scaled, chart, work.tables)
 
 
@@ -315,7 +315,7 @@ def _descend_near(work: ScaledSearchWorkspace, chart: LocalCoordinates) -> float
 def _set_rival(
     work: ScaledSearchWorkspace,
     atlas: Atlas,
-    chart: LocalCoordinates,
+    chart: LocalAxes,
     i: int,
     x: Array,
     value: float,
