@@ -70,7 +70,7 @@ CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 _CAPACITY = 512
 
 
-class BoxGoal(NamedTuple):
+class Goal(NamedTuple):
     """What is to be shown of every box.
 
     Parameters
@@ -100,15 +100,7 @@ class BoxGoal(NamedTuple):
 
 @compiled
 def branch(
-    cost: Cost,
-    chart: LocalAxes,
-    box: Box,
-    minima: Array,
-    sides: Array,
-    aim: BoxGoal,
-    budget: int,
-    stack: Array,
-    size: int,
+    cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal, budget: int, stack: Array, size: int
 ) -> tuple[int, int, float]:
     """Look at the boxes of a stack until none is left.
 
@@ -120,7 +112,7 @@ def branch(
         Tables; holds the point of the outcomes CHEAPER and ANOTHER in the end.
     minima, sides : array (P, 3)
         Known minima, and half-widths of boxes around them where the cost is convex.
-    aim : BoxGoal
+    aim : Goal
         What is to be shown.
     budget : int
         How many boxes may be looked at.
@@ -197,7 +189,7 @@ def branch(
 
 
 @inlined
-def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: BoxGoal, enough: bool) -> bool:
+def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, enough: bool) -> bool:
     """Return whether a box lies where nothing is left to show.
 
     In the convex box of a known minimum there is no second, but a lower point there may be: `enough` says where any of
@@ -210,7 +202,7 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: BoxGoal, 
 
 
 @compiled
-def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: BoxGoal) -> int:
+def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal) -> int:
     """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER if it is not known, or CLEAR.
 
     The box is the minimum afterwards, or where all is clear what it was, but for its tables.
@@ -385,7 +377,7 @@ def prove(
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     better, whole = _refuting(least, eps, noise), (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
-    aim, stack = BoxGoal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
+    aim, stack = Goal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, hole, 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
     if outcome == CLEAR and not alone:
@@ -454,7 +446,7 @@ def _search_sides(
     around: LocalAxes,
     box: Box,
     known: KnownMinima,
-    aim: BoxGoal,
+    aim: Goal,
     budget: int,
     boxes: int,
     stack: Array,
@@ -469,7 +461,7 @@ def _search_sides(
         minima, sides, count, free = known_minima(cost, chart, box, known, low, high, 0.0, aim.value, False)
         if not aim.level > aim.value:
             count = free
-        own = BoxGoal(aim.level, aim.value, aim.better, aim.whole, free, own=0)
+        own = Goal(aim.level, aim.value, aim.better, aim.whole, free, own=0)
         # No hole: the origin of a piece is no minimum.
         size = push_around(stack, 0, low, high, np.zeros(3), 0)
         outcome, more, _ = branch(cost, chart, box, minima[:count], sides[:count], own, budget - boxes, stack, size)

@@ -35,7 +35,7 @@ from optloc.proof.near import (
     STATIONARY,
     UNIQUE,
     VALUE,
-    BoxGoal,
+    Goal,
     region_of,
 )
 from optloc.proof.nodes.dispatch import infinity_of
@@ -218,7 +218,7 @@ class ProofTask(NamedTuple):
         The fix.
     beside : KnownMinima
         What else is known.
-    aim : BoxGoal
+    aim : Goal
         What is to be shown of every box.
     eps : float
         How far below the cost of the fix still counts as equal.
@@ -230,7 +230,7 @@ class ProofTask(NamedTuple):
 
     x: Array
     beside: KnownMinima
-    aim: BoxGoal
+    aim: Goal
     eps: float
     budget: int
     found: Array
@@ -264,7 +264,7 @@ def prove_run(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
-    aim = BoxGoal(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
+    aim = Goal(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
     task = ProofTask(x, beside, aim, eps, budget, found)
     if far:
         return _prove_far(run, task, atlas_of(middle, radius, D, 1 + beside.points.shape[0]), chart, tables)
@@ -308,7 +308,7 @@ def _prove_far(
 
 
 @compiled
-def _verdict(outcome: int, aim: BoxGoal) -> int:
+def _verdict(outcome: int, aim: Goal) -> int:
     """Return the verdict of a proof by the outcome of its search."""
     if outcome == CLEAR:
         return UNIQUE if aim.level > aim.value else VALUE

@@ -30,7 +30,7 @@ from optloc.proof.box import (
 from optloc.proof.convex_boxes import is_known
 from optloc.proof.curvature import has_no_infimum
 from optloc.proof.descents import damped_step
-from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, BoxGoal
+from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, Goal
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
 from optloc.proof.pieces import is_listed
@@ -105,7 +105,7 @@ def search_run(
     tables: RunTables,
     stack: Array,
     size: int,
-    aim: BoxGoal,
+    aim: Goal,
     budget: int,
     found: Array,
 ) -> tuple[int, int, float]:
@@ -121,7 +121,7 @@ def search_run(
         Working memory.
     stack, size : array (capacity, DEPTH), int
         The boxes.
-    aim : BoxGoal
+    aim : Goal
         What is to be shown of each.
     budget : int
         How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
@@ -180,7 +180,7 @@ def _is_done(
     run: RunCost,
     space: Space,
     tables: RunTables,
-    aim: BoxGoal,
+    aim: Goal,
     here: float,
     low: float,
     touching: bool,

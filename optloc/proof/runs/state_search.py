@@ -23,7 +23,7 @@ from optloc.proof.near import (
     STATIONARY,
     UNIQUE,
     VALUE,
-    BoxGoal,
+    Goal,
 )
 from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.runs.state_bounds import has_no_minimum, is_convex, least_length, set_lines, sum_up
@@ -78,7 +78,7 @@ class Search(NamedTuple):
 
 
 @compiled
-def search_courses(search: Search, stack: Array, size: int, aim: BoxGoal, budget: int, found: Array) -> tuple[int, int]:
+def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: int, found: Array) -> tuple[int, int]:
     """Search boxes for minima that cost less than a level; return the outcome and how many boxes were looked at.
 
     Parameters
@@ -87,7 +87,7 @@ def search_courses(search: Search, stack: Array, size: int, aim: BoxGoal, budget
         Where.
     stack, size : array (capacity, 2 n), int
         The boxes: centres, half-widths.
-    aim : BoxGoal
+    aim : Goal
         What is to be shown of each.
     budget : int
         How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
@@ -393,7 +393,7 @@ def prove_course(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
-    aim = BoxGoal(level, least - eps, least - 0.5 * eps, False, 0, 0)
+    aim = Goal(level, least - eps, least - 0.5 * eps, False, 0, 0)
     known, place = zero(), x.copy()
     for p in range(1 + (others.shape[0] if kappa > 0.0 else 0)):
         for m in range(n if p > 0 else 0):
