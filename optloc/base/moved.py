@@ -39,7 +39,10 @@ _NAMES = {
 }
 # Modules that were attributes of optloc.
 _MODULES = {"epochs": "optloc.problem.epochs", "frames": "optloc.base.frames", "noise": "optloc.problem.noise"}
-_PLACES = {name: f"{package}.{name}" for package, names in _NAMES.items() for name in names.split()} | _MODULES
+_RENAMED = {"Plan": "optloc.sites.placement.SiteSelection"}
+_PLACES = (
+    {name: f"{package}.{name}" for package, names in _NAMES.items() for name in names.split()} | _MODULES | _RENAMED
+)
 
 MOVED = frozenset(_PLACES)
 """All names that have moved."""
