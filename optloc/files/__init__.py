@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     )
     from optloc.files.roles import worded as worded
     from optloc.files.schema import (
-        Amount as Amount,
         DataTable as DataTable,
         FrameTable as FrameTable,
         MeasurementsTable as MeasurementsTable,

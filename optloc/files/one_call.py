@@ -8,15 +8,16 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import Any, NamedTuple, cast, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast, get_args, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Array, Band, Stations
-from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
+from optloc.base.types import Amount, Array, Band, Stations
+from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
 from optloc.files.columns import stem
 from optloc.files.declination import angle_of, date_of, declinations
@@ -34,6 +35,16 @@ from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.solution import solve
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Places: TypeAlias = "Mapping[str, Sequence[float]] | ArrayLike | pd.DataFrame"
+"""Coordinates by name, as an array (s, 2 or 3), or as a table."""
+Values: TypeAlias = (
+    "Mapping[str, ArrayLike] | Mapping[tuple[str, str], ArrayLike] | ArrayLike | pd.Series | pd.DataFrame"
+)
+"""Measurements by station or by pair of stations, in the order of the stations, or as a table."""
 
 # Nothing is nearer to the centre of the Earth than its poles, metres.
 _SURFACE = 6.3e6
@@ -66,24 +77,66 @@ class _North(NamedTuple):
     declination: Any
 
 
+@overload
 def locate(
-    stations: Any = None,
+    stations: Places,
     *,
-    latlon: Any = None,
-    toa: Any = None,
-    tdoa: Any = None,
-    ranges: Any = None,
-    pseudoranges: Any = None,
-    bearings: Any = None,
-    elevations: Any = None,
-    sigma: Any = None,
-    unit: Any = None,
+    latlon: None = None,
+    toa: Values | None = None,
+    tdoa: Values | None = None,
+    ranges: Values | None = None,
+    pseudoranges: Values | None = None,
+    bearings: Values | None = None,
+    elevations: Values | None = None,
+    sigma: Amount | Mapping[str, Amount] | None = None,
+    unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Any = None,
+    height: Amount | Sequence[Amount] | None = None,
     azimuth: str = COMPASS,
-    declination: Any = None,
+    declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: float | tuple[float, float] | Medium = SPEED_OF_LIGHT,
+    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    method: str = "auto",
+) -> Fix: ...
+@overload
+def locate(
+    stations: None = None,
+    *,
+    latlon: Places,
+    toa: Values | None = None,
+    tdoa: Values | None = None,
+    ranges: Values | None = None,
+    pseudoranges: Values | None = None,
+    bearings: Values | None = None,
+    elevations: Values | None = None,
+    sigma: Amount | Mapping[str, Amount] | None = None,
+    unit: str | Mapping[str, str] | None = None,
+    reference: str | None = None,
+    height: Amount | Sequence[Amount] | None = None,
+    azimuth: str = COMPASS,
+    declination: Amount | date | None = None,
+    frame: str = "cartesian",
+    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    method: str = "auto",
+) -> Fix: ...
+def locate(
+    stations: Places | None = None,
+    *,
+    latlon: Places | None = None,
+    toa: Values | None = None,
+    tdoa: Values | None = None,
+    ranges: Values | None = None,
+    pseudoranges: Values | None = None,
+    bearings: Values | None = None,
+    elevations: Values | None = None,
+    sigma: Amount | Mapping[str, Amount] | None = None,
+    unit: str | Mapping[str, str] | None = None,
+    reference: str | None = None,
+    height: Amount | Sequence[Amount] | None = None,
+    azimuth: str = COMPASS,
+    declination: Amount | date | None = None,
+    frame: str = "cartesian",
+    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
     method: str = "auto",
 ) -> Fix:
     """Return where something is from what receivers measured of it, in one call.
@@ -122,8 +175,9 @@ def locate(
         Unit of the values: "ns", "km", "rad" and so on.
     reference : str, optional
         Station that time differences are taken to; the first by default.
-    height : float, or (least, greatest), optional
-        Known height of the target: metres above the WGS 84 ellipsoid, or along z where there is no Earth.
+    height : float, str, or (least, greatest), optional
+        Known height of the target, metres or text such as "1640 ft": above the WGS 84 ellipsoid, or along z where
+        there is no Earth.
     azimuth : "north-clockwise", "north-counterclockwise" or "east-counterclockwise"
         Where bearings are counted from, and which way.
     declination : float, str or date, optional
@@ -132,10 +186,10 @@ def locate(
         compass bearings.
     frame : "cartesian" or "ecef"
         What x, y, z of stations mean.
-    speed : float, (float, float), Layers or Atmosphere
-        Propagation speed, m/s: light, or `optloc.units.sound_in_air` and `sound_in_water`; or `optloc.models.Layers`
-        and `optloc.models.Atmosphere`, through which rays bend. A pair is a speed and its standard deviation: the speed
-        is then estimated with the position, from all measurements that are times.
+    speed : float, str, (float, float), Layers or Atmosphere
+        Propagation speed, m/s or text such as "1480 m/s": light, `optloc.units.sound_in_air` or `sound_in_water`. Rays
+        bend through `optloc.models.Layers` and `optloc.models.Atmosphere`. A pair is a speed and its standard deviation:
+        the speed is then estimated with the position, from all measurements that are times.
     method : str
         As of `optloc.solve`.
 
@@ -188,7 +242,7 @@ def _check_north(north: _North, given: Mapping[str, Any]) -> None:
 
 def _speed_sigma(given: Any) -> float | None:
     """Return the standard deviation of a speed that is a pair."""
-    return float(given[1]) if isinstance(given, tuple | list) else None
+    return float(in_si(given[1], "speed", "speed")) if isinstance(given, tuple | list) else None
 
 
 def _speed(given: Any) -> float | Medium:
@@ -201,6 +255,7 @@ def _speed(given: Any) -> float | Medium:
             )
         _speed(given[1])  # as positive as the speed
         return _speed(given[0])
+    given = in_si(given, "speed", "speed")
     if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
         advice = "give metres per second, optloc.models.Layers or optloc.models.Atmosphere"
         raise InvalidProblem("the speed is no positive number", "speed", advice)
@@ -329,12 +384,14 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
             raise InvalidProblem("bearings alone do not tell how high the target is", "bearings", advice)
         return ()
     try:
-        low, high = (float(end) for end in (height if np.ndim(height) else (height, height)))
+        ends = (height, height) if isinstance(height, str) or not np.ndim(height) else height
+        low, high = (float(in_si(end, "length", "height")) for end in ends)
+    except InvalidProblem:
+        raise
     except (TypeError, ValueError):
         low = high = np.nan
     if not low <= high:
-        what = f"{height!r} is no height" if isinstance(height, str) else "this is no height"
-        raise InvalidProblem(what, "height", "give metres, or the least and the greatest")
+        raise InvalidProblem("this is no height", "height", "give metres, or the least and the greatest")
     if places.frame.geodetic:
         return constraints.height(low, high)
     if d == 2:

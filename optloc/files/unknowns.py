@@ -11,10 +11,9 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Amount, Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT, Conversion, Quantity
 from optloc.files.schema import (
-    Amount,
     BiasTable,
     ConstraintTable,
     FrameTable,

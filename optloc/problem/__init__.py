@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from optloc.base.types import (
         ANSWERED as ANSWERED,
         PRECEDENCE as PRECEDENCE,
+        Amount as Amount,
         Array as Array,
         Bias as Bias,
         Certificate as Certificate,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
@@ -18,7 +19,7 @@ from optloc.solvers.single import at_once
 from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
 
 
-def solve(problem: Problem, method: str = "auto", *, start: Any = None, refine: bool = True) -> Fix:
+def solve(problem: Problem, method: str = "auto", *, start: ArrayLike | None = None, refine: bool = True) -> Fix:
     """Return the fix of every problem of a batch, without a first guess.
 
     Parameters

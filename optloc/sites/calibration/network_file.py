@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from optloc.files import (
-    Amount,
     DataTable,
     ProblemFile,
     Table,
@@ -27,7 +26,7 @@ from optloc.files import (
     write_text,
 )
 from optloc.models import MODELS, kind_named
-from optloc.problem import SPEED_OF_LIGHT, Array, InvalidProblem, nearest
+from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, nearest
 from optloc.sites.calibration.calibrated import Calibration
 from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked
 

@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from formulations.placement import PlacementGround, PlacementRegion
 from optloc.files import (
-    Amount,
     DataTable,
     FrameTable,
     MeasurementsTable,
@@ -40,7 +39,7 @@ from optloc.files import (
     within,
     write_text,
 )
-from optloc.problem import Array, Frame, InvalidProblem, Problem, nearest
+from optloc.problem import Amount, Array, Frame, InvalidProblem, Problem, nearest
 from optloc.sites.placement.areas import (
     convex_parts,
     corners_in_frame,
