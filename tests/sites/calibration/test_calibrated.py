@@ -3,9 +3,9 @@
 import casadi
 import numpy as np
 import pytest
-from calibration_scenes import HALL, degenerate, hall, reflected, thin
 from often import few
 from scipy.stats import chi2
+from sites.calibration.scenes import HALL, degenerate, hall, reflected, thin
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate, network_of
