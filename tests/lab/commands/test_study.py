@@ -1,11 +1,15 @@
 """optloc study: bad commands are one sentence; a study runs, tells its state and is compared."""
 
+from collections import Counter
+from math import inf
+
 import pytest
 from lab.study.test_design import sentence
 from lab.study.texts import QUICK
 from typer.testing import CliRunner
 
 from optloc.cli import app
+from optloc.lab.commands.study import _in_words, _quartiles
 
 RUN = CliRunner()
 
@@ -42,3 +46,13 @@ def test_run_status_and_compare(tmp_path):
     assert "identical" in both.stdout
     next((tmp_path / "out" / "parts").glob("*.parquet")).unlink()
     assert RUN.invoke(app, ["study", "status", out]).exit_code == 1
+
+
+def test_counts_are_told_by_the_most_common():
+    assert _in_words(Counter(ok=7, misfit=2)) == "ok 7, misfit 2"
+    assert _in_words(Counter(ok=7, misfit=4, ambiguous=3, stalled=2, died=1)) == "ok 7, misfit 4, ambiguous 3, other 3"
+
+
+def test_quartiles_stand_around_the_median():
+    assert _quartiles((2.0, 3.5, inf)) == "3.5 [2, ∞]"
+    assert _quartiles(None) == "-"

@@ -43,7 +43,7 @@ def test_windows_in_the_air_have_the_differences_of_their_place(folder):
 
 def test_the_noise_of_a_problem_is_shared_within_a_window_alone(folder):
     problem, _ = dataset(folder, flight="F1")
-    noise, epoch = dense(problem.noise, problem.count), problem.rows[0].epoch
+    noise, epoch = dense(problem.noise, np.arange(problem.count)), problem.rows[0].epoch
     assert (noise[epoch[:, None] != epoch] == 0.0).all()
     assert (np.linalg.eigvalsh(noise) > 0.0).all()
     assert noise[0, 0] == pytest.approx(ROW**2 + 2.0 * ARRIVAL**2)

@@ -271,21 +271,3 @@ def test_draws_depend_on_seed_and_key_alone():
     assert (one == same).all()
     assert abs(one - seed).max() > 1.0
     assert abs(one - key).max() > 1.0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["registratoin"], "did you mean 'registration'"),
-        (["registration", "--size", "huge"], "quick, full"),
-        (["registration", "--out", "taken"], "choose another place"),
-    ],
-)
-def test_bad_requests_are_one_sentence(arguments, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken").write_text("a file")
-    result = RUN.invoke(app, ["reproduce", *arguments])
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert words in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
