@@ -1,9 +1,11 @@
 """The engine of a stream: fixes of events are those of solve, and proofs are given up in time."""
 
 from math import inf
+from threading import Event as Flag
 
 import numpy as np
 import pytest
+from service import lines
 from service.lines import arrivals, differences, site_in, slowed, solved
 
 from optloc.service.engine import Engine, _order, _since_first
@@ -49,8 +51,9 @@ def test_events_with_too_few_rows_and_refused_ones_are_answered_at_once(site):
     assert (second, few["status"]) == ("none", "too few rows")
 
 
-def test_a_proof_that_is_not_there_in_time_is_given_up(site):
-    out, now = Answers(), [0.0]
+def test_a_proof_that_is_not_there_in_time_is_given_up(site, monkeypatch):
+    out, now, gate = Answers(), [0.0], Flag()
+    monkeypatch.setattr(lines, "Slow", lambda prepared, busy: lambda z: gate.wait(30.0) and prepared(z))
     engine = Engine(slowed(site), Metrics(), out, lambda: now[0], deadline=0.5)
     engine.settle(events(differences(site, arrivals(site, 1))))
     assert engine.next_due == 0.5
@@ -59,6 +62,7 @@ def test_a_proof_that_is_not_there_in_time_is_given_up(site):
     assert [(record["phase"], last) for _, record, last in out.all] == [("fix", False), ("proof", True)]
     assert out.all[1][1]["why"] == "deadline"
     assert engine.next_due == inf
+    gate.set()
     engine.stop()
     assert len(out.all) == 2
 
