@@ -34,8 +34,8 @@ def test_arrivals_make_the_rows_of_the_stations_that_are_there(site):
 
 def test_arrivals_and_values_become_metres(site):
     ready = site.ready((0, 1, 2), site.rows[3:])
-    arrivals = np.array([[0.0, 1e6, 3e6]])  # picoseconds: 1 and 3 microseconds after A
-    assert ready.si(arrivals, np.array([[10.0, 20.0]]))[0] == pytest.approx([1e-6 * C, 3e-6 * C, 10.0, 20.0])
+    arrivals = np.array([[1e6, 0.0, 3e6]])  # picoseconds: B is a microsecond before A, C is two after it
+    assert ready.si(arrivals, np.array([[10.0, 20.0]]))[0] == pytest.approx([-1e-6 * C, 2e-6 * C, 10.0, 20.0])
     assert site.ready((), ()) is None
 
 

@@ -52,14 +52,17 @@ def test_the_covariance_is_the_inverse_of_the_information_off_the_frame():
     np.testing.assert_allclose(found @ told.free, 0.0, atol=1e-9)
 
 
-def test_named_stations_are_at_zero_on_an_axis_and_in_a_plane():
-    truth, z = hall(3, 6, 8, 0.0, clocks=True)
+@pytest.mark.parametrize("draw", [3, 4, 5, 6])
+def test_named_stations_are_at_zero_on_an_axis_and_in_a_plane(draw):
+    truth, z = hall(draw, 6, 8, 0.0, clocks=True)
     net = network_of(z, 0.1, synchronised=False)
     found = in_frame(net, truth, (1, 4, 2))
     held = fixed_by(net, (1, 4, 2))
     values = np.concatenate([found.stations[0].ravel(), found.clocks[0]])
     assert held @ values == pytest.approx([0.0] * 7, abs=1e-9)
     assert found.stations[0, 4, 0] > 0.0
+    height = found.stations[0, :, 2]
+    assert height[np.abs(height).argmax()] > 0.0  # of two mirror images
     np.testing.assert_allclose(distances(found.pulses[0]), distances(truth.pulses[0]))
     np.testing.assert_allclose(likelihood(net).residual(found), 0.0, atol=1e-6)
 
