@@ -188,8 +188,8 @@ def locate(
         What x, y, z of stations mean.
     speed : float, str, (float, float), Layers or Atmosphere
         Propagation speed, m/s or text such as "1480 m/s": light, `optloc.units.sound_in_air` or `sound_in_water`. Rays
-        bend through `optloc.models.Layers` and `optloc.models.Atmosphere`. A pair is a speed and its standard deviation:
-        the speed is then estimated with the position, from all measurements that are times.
+        bend through `optloc.models.Layers` and `optloc.models.Atmosphere`. A pair is a speed and its standard
+        deviation: the speed is then estimated with the position, from all measurements that are times.
     method : str
         As of `optloc.solve`.
 

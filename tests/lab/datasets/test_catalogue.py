@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import optloc
-from optloc import InvalidProblem, datasets
+from optloc import InvalidProblem
+from optloc.lab import datasets
 from optloc.lab.datasets.catalogue import ENTRIES
 from optloc.lab.datasets.reading import VARIABLE
 from optloc.problem.noise import variances
@@ -34,7 +35,7 @@ def test_names_and_options_are_checked(tmp_path):
 
 
 def test_the_page_names_every_set_with_its_options_licence_and_source():
-    text = (Path(__file__).parents[1] / "docs" / "datasets.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "datasets.md").read_text(encoding="utf-8")
     lines = {
         name: next(line for line in text.splitlines() if line.startswith(f"| `{name}`")) for name in datasets.NAMES
     }

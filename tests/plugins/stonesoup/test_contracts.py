@@ -13,7 +13,7 @@ from monte_carlo.tables import write
 
 pytest.importorskip("stonesoup", reason="Stone Soup is not installed: pip install 'optloc[stonesoup]'")
 
-from plugins.test_stonesoup import MODELS, PAIRS, PLACE, RATE, SIGMA, STATIONS, TRANSITION, TRUTH, ZERO, tdoa
+from plugins.stonesoup.test_stonesoup import MODELS, PAIRS, PLACE, RATE, SIGMA, STATIONS, TRANSITION, TRUTH, ZERO, tdoa
 from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
 from stonesoup.deleter.time import UpdateTimeStepsDeleter
 from stonesoup.hypothesiser.distance import DistanceHypothesiser

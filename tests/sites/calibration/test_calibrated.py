@@ -1,21 +1,18 @@
 """Networks from nothing: known answers, what no frame changes, named refusals, and single blocks refuted."""
 
-import casadi
 import numpy as np
 import pytest
-from calibration_scenes import HALL, degenerate, hall, reflected, thin
 from often import few
 from scipy.stats import chi2
+from sites.calibration.scenes import HALL, degenerate, hall, reflected, thin
 
 import optloc
 from optloc import InvalidProblem, Status, calibrate
-from optloc.kernels.jit import plain
 from optloc.sites.calibration import network_of
 from optloc.sites.calibration.blocks import settled
 from optloc.sites.calibration.calibrated import refuted_blocks
-from optloc.sites.calibration.gauge import departure, determined
+from optloc.sites.calibration.gauge import determined
 from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood
-from optloc.sites.calibration.rounds import starts_of
 
 EXACT = 1e-6
 
@@ -56,50 +53,6 @@ def test_noisy_networks_are_as_cheap_as_from_the_truth_and_ok():
     assert np.mean(shares) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 240))
 
 
-def test_derivatives_are_those_of_automatic_differentiation():
-    truth, z = hall(5, 5, 6, 0.1, clocks=True)
-    near = calibrated_near(truth)
-    net = network_of(z, 0.1, synchronised=False, distances=[(0, 2, 7.0, 0.2)], place=truth.stations[0], place_sigma=0.5)
-    lik = likelihood(net)
-    a, b, y, o = (casadi.SX.sym(n, *s) for n, s in (("a", (5, 3)), ("b", (5, 1)), ("y", (6, 3)), ("o", (6, 1))))
-    rows = [(z[j, i] - casadi.norm_2(a[i, :] - y[j, :]) - o[j] - b[i]) / 0.1 for j in range(6) for i in range(5)]
-    rows.append((7.0 - casadi.norm_2(a[0, :] - a[2, :])) / 0.2)
-    rows.append(casadi.vec(net.place - a) / 0.5)
-    cost = casadi.sumsqr(casadi.vertcat(*rows))
-    unknowns = casadi.vertcat(casadi.vec(a.T), b, casadi.vec(y.T), o)
-    both = casadi.Function("f", [a, b, y, o], [cost, casadi.gradient(cost, unknowns)])
-    value, gradient = both(near.stations[0], near.clocks[0], near.pulses[0], near.emission[0])
-    assert lik.cost(near)[0] == pytest.approx(float(value))
-    by_station, by_pulse, known = lik.jacobian(near)
-    residual, line = lik.residual(near)[0], near.stations[0, 0] - near.stations[0, 2]
-    extra = [(7.0 - np.linalg.norm(line)) / 0.2, *((net.place - near.stations[0]) / 0.5).ravel()]
-    stations = -2.0 * (np.einsum("nrp,nr->p", by_station, residual) + known.T @ extra)
-    pulses = -2.0 * np.einsum("nrq,nr->nq", by_pulse, residual)
-    ours = np.concatenate([stations, pulses[:, :3].ravel(), pulses[:, 3]])
-    assert ours == pytest.approx(np.asarray(gradient).ravel(), rel=1e-9, abs=1e-7)
-
-
-def test_machine_code_finds_the_minima_of_numpy():
-    truth, z = hall(5, 7, 12, 0.1, clocks=True)
-    z[2, 3] = np.nan
-    distances = [(0, 2, float(np.linalg.norm(truth.stations[0, 0] - truth.stations[0, 2])), 0.2)]
-    lik = likelihood(
-        network_of(z, 0.1, synchronised=False, distances=distances, place=truth.stations[0], place_sigma=0.5)
-    )
-    with plain():
-        one, first = lik.refine(truth)
-    two, second = lik.refine(truth)
-    assert first == pytest.approx(second, abs=1e-5)
-    assert one.stations == pytest.approx(two.stations, abs=1e-3)
-
-
-def test_random_places_lead_to_the_minimum():
-    truth, z = hall(3, 12, 20, 0.03)
-    lik = likelihood(network_of(z, 0.03))
-    cost = lik.refine(starts_of(lik, 0).random(8))[1]
-    assert cost.min() == pytest.approx(lik.refine(truth)[1][0], abs=0.01)
-
-
 def test_a_covariance_that_only_the_cost_refutes_is_not_ok():
     # the truth, its pulses wherever they fit best, costs no more than noise does, and is beyond the 99.99 % ellipsoid
     truth, z = hall(500096, 6, 20, 0.03)
@@ -113,17 +66,6 @@ def test_a_covariance_that_only_the_cost_refutes_is_not_ok():
     assert dearer[0] - found.cost < chi2.ppf(0.95, told.sum())
     assert (((axes.T @ error)[told]) ** 2 / width[told]).sum() > chi2.ppf(0.9999, told.sum())
     assert found.status is Status.CURVED
-
-
-def test_the_cost_is_that_of_a_gaussian_where_noise_is_small():
-    far = []
-    for sigma in (1e-4, 0.03):
-        truth, z = hall(500096, 6, 20, sigma)
-        lik = likelihood(network_of(z, sigma))
-        at = lik.refine(truth)[0]
-        far.append(departure(lik, at, determined(lik, at)))
-    assert far[0] < 0.02
-    assert far[1] > 0.3
 
 
 def test_gross_rows_are_named_and_the_network_is_unproven_at_best():
@@ -146,11 +88,6 @@ def test_a_pulse_at_two_places_has_none_and_leaves_the_stations_as_they_are():
     assert found.status is not Status.AMBIGUOUS
     assert np.isnan(found.pulses[6]).all()
     assert np.isfinite(found.pulses).all(axis=1).sum() >= 18
-
-
-def calibrated_near(truth):
-    rng = np.random.default_rng(1)
-    return type(truth)(*(v + 0.3 * rng.standard_normal(v.shape) for v in (getattr(truth, n) for n in truth.__slots__)))
 
 
 def test_distances_and_their_deviations_do_not_depend_on_the_frame():

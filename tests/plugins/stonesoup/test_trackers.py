@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("stonesoup", reason="Stone Soup is not installed: pip install 'optloc[stonesoup]'")
 
-from plugins.test_stonesoup import PLACE, RATE, STATIONS, TRANSITION, TRUTH
-from plugins.test_stonesoup_contracts import prior, scans
+from plugins.stonesoup.test_contracts import prior, scans
+from plugins.stonesoup.test_stonesoup import PLACE, RATE, STATIONS, TRANSITION, TRUTH
 from scipy.special import chdtri
 from stonesoup.dataassociator.neighbour import GlobalNearestNeighbour, GNNWith2DAssignment
 from stonesoup.dataassociator.probability import JPDA
@@ -186,8 +186,8 @@ def test_point_processes_of_gaussian_mixtures(kind, seed):
 @pytest.mark.skipif(find_spec("ortools") is None, reason="multi-frame assignment needs ortools, which is not installed")
 def test_several_frames_of_hypotheses(seed):
     """In a process of its own: ortools has a HiGHS of its own, and is not loaded after CasADi's."""
-    code = "import sys; sys.path.insert(0, sys.argv[1]); from plugins import test_stonesoup_trackers as own; "
-    tests = str(Path(__file__).parents[1])
+    code = "import sys; sys.path.insert(0, sys.argv[1]); from plugins.stonesoup import test_trackers as own; "
+    tests = str(Path(__file__).parents[2])
     subprocess.run([sys.executable, "-c", f"{code} own.several_frames({seed})", tests], check=True, timeout=120)
 
 

@@ -1,6 +1,6 @@
 """The pages of the papers: filled from their tables alone, and the committed ones are what their tables give.
 
-``OPTLOC_WRITE_DOCS=1 pytest tests/lab/papers/test_pages.py`` writes the committed pages from the tables beside them.
+``OPTLOC_WRITE_DOCS=1 pytest tests/lab/papers/test_report.py`` writes the committed pages from the tables beside them.
 """
 
 import csv

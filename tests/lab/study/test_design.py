@@ -104,40 +104,6 @@ def test_every_setting_of_the_table_is_one_that_its_back_end_knows(solver):
     assert solver in {name for name, _ in tally}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["run", "divergense"], "did you mean 'divergence'"),
-        (["run", "nowhere.toml"], "no such file"),
-        (["run", "groa", "--executor", "procesess"], "did you mean 'processes'"),
-        (["run", "groa", "--executor", "in-process"], "unknown executor 'in-process'"),
-        (["run", "groa", "--task-limit", "0"], "a task cannot take 0 s"),
-        (["run", "groa", "--task-limit", "nan"], "a task cannot take nan s"),
-        (["status", "."], "holds no study"),
-        (["compare", ".", "."], "holds no study"),
-    ],
-)
-def test_bad_commands_are_one_sentence(arguments, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert words in sentence(RUN.invoke(app, ["study", *arguments]))
-
-
-def test_run_status_and_compare(tmp_path):
-    (tmp_path / "s.toml").write_text(QUICK)
-    out = str(tmp_path / "out")
-    made = RUN.invoke(app, ["study", "run", str(tmp_path / "s.toml"), "--out", out, "-j", "1"])
-    assert made.exit_code == 0, made.output
-    assert "complete, 180 of 180 rows" in made.stdout
-    state = RUN.invoke(app, ["study", "status", out, "--json"])
-    assert state.exit_code == 0
-    assert '"rows": 180' in state.stdout
-    both = RUN.invoke(app, ["study", "compare", out, out], env={"COLUMNS": "200"})
-    assert both.exit_code == 0
-    assert "identical" in both.stdout
-    next((tmp_path / "out" / "parts").glob("*.parquet")).unlink()
-    assert RUN.invoke(app, ["study", "status", out]).exit_code == 1
-
-
 def test_lists_show_what_studies_are_made_of():
     for what, words in {
         "solvers": ("CLARABEL", "ipopt", "sqpmethod", "scipy", "lsr", "version"),

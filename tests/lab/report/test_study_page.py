@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.lab.report.sheets import duration, latex, number, percent
 from optloc.lab.report.study_page import write_report
 from optloc.lab.study.design import design_of
 from optloc.lab.study.execute import executor, run_design
@@ -278,27 +277,3 @@ def test_bad_places_are_sentences(site, tmp_path):
     found = RUN.invoke(app, ["study", "report", str(tmp_path / "none")])
     assert found.exit_code == 2
     assert "there is no such folder" in found.output
-
-
-def test_numbers_are_short_and_honest():
-    assert [number(v) for v in (1.0, 0.123456, 1234.5, 2.5e-7, 123456.0, 0.0, np.nan)] == [
-        "1.00", "0.123", "1234", "2.50·10⁻⁷", "1.23·10⁵", "0", "–"
-    ]  # fmt: skip
-    assert [duration(v) for v in (2.0, 1.5e-3, 3e-6, 4e-10, np.nan)] == [
-        "2.00 s",
-        "1.50 ms",
-        "3.00 µs",
-        "0.400 ns",
-        "–",
-    ]
-    assert [percent(v) for v in (1.0, 0.99999, 0.5, 0.0001, 0.0)] == ["100", "> 99.9", "50.0", "< 0.1", "0"]
-
-
-def test_latex_escapes_and_has_all_columns():
-    table = TextTable("t", "A & B", ("method", "time"), (("a_b <c>", "2·10⁻⁷ s"), ("50 %", "3 µs")), "≤ 5 %")
-    text = latex(table)
-    assert r"a\_b \ensuremath{<}c\ensuremath{>} & 2\ensuremath{\cdot}10\ensuremath{^{-7}} s \\" in text
-    assert r"50 \% & 3 \ensuremath{\mu}s \\" in text
-    assert r"\begin{longtable}{lr}" in text
-    assert text.count(r"\begin") == text.count(r"\end{longtable}") == 1
-    text.encode("ascii")

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from calibration_scenes import hall
+from sites.calibration.scenes import hall
 from typer.testing import CliRunner
 
 from optloc.cli import app
