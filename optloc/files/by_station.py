@@ -39,11 +39,12 @@ _ENDS = Cache[list[tuple[int, int]]](256)
 
 
 class StationValues(NamedTuple):
-    """Values (..., m) as they are given, what each belongs to, and the unit that their column names."""
+    """Values (..., m) as they are given, what each belongs to, the unit that their column names, and row labels."""
 
     values: Array
     keys: list[Any]
     unit: str | None = None
+    labels: list[Any] | None = None
 
 
 def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
@@ -79,7 +80,7 @@ def station_values(word: str, given: Any, names: Sequence[str], reference: str |
     kept = [i for i, (a, b) in enumerate(ends) if a != b]  # the reference against itself says nothing
     if not kept:
         raise InvalidProblem("there is nothing but the reference", word, "give the other stations")
-    return StationValues(found.values[..., kept], [ends[i] for i in kept], found.unit)
+    return found._replace(values=found.values[..., kept], keys=[ends[i] for i in kept])
 
 
 def _with_names(given: Any) -> Any:
@@ -137,7 +138,7 @@ def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> Statio
             raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
     # By number: two columns may have one name.
     values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
-    return StationValues(np.stack(values, axis=-1), columns)
+    return StationValues(np.stack(values, axis=-1), columns, labels=list(frame.index))
 
 
 def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
@@ -187,7 +188,9 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
         seen.add(place)
         grid[place] = value
     named = unit_of(str(chosen["z"]), ("s", "ms", "us", "ns", "ps", "m", "km", "cm", "mm", "ft", "deg", "rad"))
-    return StationValues(grid if epochs is not None else grid[0], list(keys), named)
+    return StationValues(
+        grid if epochs is not None else grid[0], list(keys), named, None if epochs is None else list(rows)
+    )
 
 
 def _no_dates(word: str, values: Array) -> Array:

@@ -223,8 +223,17 @@ def locate(
     north = _North(azimuth, declination)
     _check_north(north, given)
     own, spread = _speed(speed), _speed_sigma(speed)
-    problem = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, own, spread, north)
-    return solve(problem, method=method)
+    problem, labels = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, own, spread, north)
+    return _labelled(solve(problem, method=method), labels)
+
+
+def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
+    """Return fixes with the index of the data frame that their values come from."""
+    if labels is None or fix.shape != (len(labels),):
+        return fix
+    own = np.empty(len(labels), dtype=object)
+    own[:] = labels
+    return replace(fix, labels=own)
 
 
 def _check_north(north: _North, given: Mapping[str, Any]) -> None:
@@ -279,13 +288,14 @@ def _problem_of(
     through: float | Medium,
     spread: float | None,
     north: _North,
-) -> Problem:
-    """Return the problem of the arguments of `locate`."""
+) -> tuple[Problem, list[Any] | None]:
+    """Return the problem of the arguments of `locate`, and the labels of its rows."""
     medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
     places = _PLACES.call(_receivers, stations, latlon, frame)
-    rows, timed = [], []
+    rows, timed, labels = [], [], None
     for word, values in given.items():
         found = station_values(word, values, places.names, reference)
+        labels = found.labels if labels is None else labels
         own = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
         step, own_sigma = _SCALES.call(_scale, word, own, sigma, list(given), speed, convention)
@@ -294,7 +304,7 @@ def _problem_of(
         rows.append(_from_north(made, north, own, places) if word == "bearings" else made)
     at = _heights(height, places, given)
     problem = assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
-    return problem if spread is None else _with_speed(problem, speed, spread, timed)
+    return (problem if spread is None else _with_speed(problem, speed, spread, timed)), labels
 
 
 def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bool]) -> Problem:

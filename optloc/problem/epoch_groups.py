@@ -11,7 +11,8 @@ import numpy as np
 from optloc.base.arrays import first_rows
 from optloc.base.types import Array, Rows, Stations
 from optloc.problem.epochs import by_epoch, separable, states_by_epoch
-from optloc.problem.fix import Explanation, Fix
+from optloc.problem.explanations import Explanation
+from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise, gathered, group
 from optloc.problem.problem import Problem, map_numbers
 

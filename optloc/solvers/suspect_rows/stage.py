@@ -20,7 +20,8 @@ from optloc.model_checks.noise_level import SEVERAL, common_level_at
 from optloc.problem.arrival_times import Arrivals, as_arrivals, restore_order, shared_places
 from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
-from optloc.problem.fix import Alternatives, Explanation, Fix, GroupKind, Stage, Suspect
+from optloc.problem.explanations import Explanation, GroupKind, Suspect
+from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.layout import Layout
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
