@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optloc import InvalidProblem, Motion, Prior, assemble, measured
+from optloc import InvalidProblem, Motion, Prior, assemble, measured, with_bias
 from optloc.base.types import Band, Polygon, Stations
 from optloc.linear.constraints import box, speed
 from optloc.problem.noise import Block, Noise
@@ -61,8 +61,6 @@ def test_a_value_that_is_missing_passes_and_an_infinite_one_does_not():
 
 
 def test_two_unknowns_of_one_name_are_refused():
-    from optloc import with_bias
-
     clock = with_bias(GOOD, "clock").biases[0]
     with pytest.raises(InvalidProblem, match="the name 'position' is taken twice"):
         check_unknowns(replace(GOOD, biases=(replace(clock, name="position"),)))
@@ -88,4 +86,4 @@ def test_bands_on_one_quantity_are_together():
     other = Band("plane", np.array(0.0), np.array(1.0), np.array([1.0, 0.0]), "x", target=1)
     region = Polygon(np.array([[0, 0], [1, 0], [0, 1.0]]))
     groups = like([*first, region, *second, other])
-    assert [[band.lower.item() for band in group] for group in groups] == [[0.0, -1.0], [1.0], [0.0]]
+    assert [[band.lower.item() for band in group] for group in groups] == [[0.0, -1.0], [1.0, -np.inf], [0.0]]
