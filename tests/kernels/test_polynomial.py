@@ -22,15 +22,25 @@ def test_the_roots_of_a_product_are_its_zeros_in_order(places):
     np.testing.assert_allclose(roots(c, -1.5, 2.0), inside, rtol=1e-10)
 
 
-def test_random_polynomials_have_the_real_roots_of_their_companion_matrices():
+def test_roots_are_those_of_eigenvalues():
     rng = np.random.default_rng(1)
-    for c in rng.standard_normal((50, DEGREE + 1)):
-        expected = np.polynomial.polynomial.polyroots(c)
-        real = np.sort(expected.real[np.abs(expected.imag) < 1e-9])
-        real = real[np.abs(real) < 5.0]
-        np.testing.assert_allclose(roots(c, -5.0, 5.0), real, rtol=1e-7, atol=1e-9)
+    work, out = np.zeros((2, DEGREE + 2)), np.zeros(DEGREE)
+    for trial in range(200):
+        roots = rng.uniform(-2.0, 2.0, 4)
+        pair = rng.uniform(-1.0, 1.0) + 1j * rng.uniform(0.1, 1.0)
+        if trial % 2:
+            roots = np.array([*roots[:2], pair, np.conj(pair)])
+        c = np.poly(roots).real[::-1] * rng.uniform(0.1, 10.0)
+        real = np.sort(roots[np.abs(roots.imag) == 0.0].real)
+        real = real[np.abs(real) < 1.5]
+        count = real_roots(c, -1.5, 1.5, work, out)
+        assert count == len(real)
+        apart = np.diff(real).min(initial=1.0)
+        np.testing.assert_allclose(out[:count], real, atol=1e-13 / apart**2)
 
 
-def test_polynomials_of_lower_degree_and_without_real_roots():
-    np.testing.assert_allclose(roots([-6.0, 2.0, 0.0, 0.0, 0.0], -9.0, 9.0), [3.0])
-    assert len(roots([1.0, 0.0, 1.0, 0.0, 0.0], -9.0, 9.0)) == 0
+def test_roots_of_lower_degree():
+    work, out = np.zeros((2, DEGREE + 2)), np.zeros(DEGREE)
+    assert real_roots(np.array([-6.0, 3.0, 0.0, 0.0, 0.0]), -9.0, 9.0, work, out) == 1
+    assert out[0] == pytest.approx(2.0)
+    assert real_roots(np.array([1.0, 0.0, 1.0, 0.0, 0.0]), -9.0, 9.0, work, out) == 0

@@ -1,5 +1,7 @@
 """The structure of problems as tables of whole numbers."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from optloc import Motion, assemble, measured, with_bias
@@ -54,9 +56,7 @@ def test_tables_hold_each_row_once_and_the_unknowns_of_each_group():
     row = found.table[found.row : found.row + 6]
     assert sorted(row[:, 0]) == list(range(6))
     at = found.table[found.group : found.group + 7, GROUP_COLUMN]
-    columns = [
-        found.table[found.column + a : found.column + b, 0].tolist() for a, b in zip(at[:-1], at[1:], strict=True)
-    ]
+    columns = [found.table[found.column + a : found.column + b, 0].tolist() for a, b in pairwise(at)]
     # epoch 0 first: differences of stations 1, 2 and 3, of which the last has no clock
     assert columns == [[0, 1, 2], [0, 1, 3], [0, 1]] * 2
 
