@@ -243,7 +243,7 @@ def test_a_batch_is_the_same_in_one_part_and_in_many_on_any_threads(monkeypatch)
     found = []
     for threads, most in (("1", 1000), ("3", 1000), ("1", 16), ("3", 16)):
         monkeypatch.setenv("OPTLOC_THREADS", threads)
-        monkeypatch.setattr("optloc.solvers.PART", most)
+        monkeypatch.setattr("optloc.solvers.solution.PART", most)
         found.append(solve(problem))
     for fix in found[1:]:
         assert np.array_equal(fix.x, found[0].x)
