@@ -52,6 +52,13 @@ def test_joined_records_have_as_many_slots_as_the_widest_and_empty_entries_elsew
     assert found.name == "first"
 
 
+def test_an_array_that_all_entries_share_stays_one_row():
+    shared, other = np.broadcast_to(np.array([1.0, 2.0]), (3, 2)), np.array([[1.0, 3.0]])
+    assert join([Whole(shared), Whole(shared)], 6).x.strides[0] == 0
+    mixed = join([Whole(shared), Whole(other)], 4).x
+    assert mixed.tolist() == [[1.0, 2.0]] * 3 + [[1.0, 3.0]]
+
+
 def test_entries_are_replaced_and_the_record_itself_stays_as_it_was():
     record = whole(0, 3, 2, code=np.array([1, 2, 3]))
     found = overwrite(record, np.array([1]), whole(9, 1, 3))

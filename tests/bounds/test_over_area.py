@@ -27,6 +27,16 @@ def test_the_columns_of_a_grid_go_along_x():
     assert grid.places.tolist() == [[0, 10], [1, 10], [2, 10], [0, 20], [1, 20], [2, 20]]
 
 
+def test_a_grid_in_degrees_is_at_its_height_on_earth_unless_metres_are_asked_for():
+    places = ECEF.from_geodetic(np.radians([47.0, 47.1, 47.0]), np.radians([11.0, 11.0, 11.1]), np.zeros(3))
+    problem = assemble(places, measured("range", a=[0, 1, 2], sigma=1.0), frame=ECEF)
+    grid = grid_of(problem, [11.05], [47.05], 2000.0)
+    assert grid.geodetic
+    assert map_coordinates(ECEF, grid.places, True)[0] == pytest.approx([11.05, 47.05, 2000.0])
+    assert grid.stations[2] == pytest.approx([11.1, 47.0])
+    assert grid_of(problem, [1.0], [2.0], 3.0, geodetic=False).places.tolist() == [[1.0, 2.0, 3.0]]
+
+
 def test_an_extent_holds_stations_and_places_with_a_margin_of_the_larger_side():
     assert extent(ranges(), np.array([[3e3, 0.0], [np.nan, 1.0]]), widen=0.5) == (-3e3, 5e3, -3e3, 3e3)
 

@@ -1,10 +1,13 @@
 """Mirror images in the plane of the stations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from optloc import Motion, assemble, measured
 from optloc.linear.mirror import Folded, is_of_ranges, mirror, one_position, plane_of_stations, rows_of_stations
+from optloc.linear.normal import Normal
 
 LEVEL = np.array([[0.0, 0.0, 2.0], [9.0, 1.0, 2.0], [10.0, 9.0, 2.0], [1.0, 7.0, 2.0]])
 
@@ -55,6 +58,19 @@ def test_one_position_is_a_target_at_rest():
         "groa",
         "range_sum",
     ]
+
+
+def test_on_the_plane_no_step_leads_across_it_unless_it_is_downhill():
+    folded = Folded(2, np.full(2, 1e-3))
+    info = np.broadcast_to(np.diag([2.0, 4.0, 5.0]), (2, 3, 3))
+    vector = np.array([[1.0, 1.0, -3.0], [1.0, 1.0, 3.0]])
+    none = np.zeros((2, 1, 0, 0)), np.zeros((2, 1, 3, 0)), vector, np.zeros((2, 1, 0)), np.zeros(2)
+    x = np.array([[4.0, 5.0, 1e-3], [4.0, 5.0, 1e-3]])
+    move, ok = folded.step(Normal(info, *none), np.zeros(2), x)
+    assert ok.all()
+    np.testing.assert_allclose(move, [[0.5, 0.25, 0.0], [0.5, 0.25, 0.6]], atol=1e-12)
+    held, _ = replace(folded, held=True).step(Normal(info, *none), np.zeros(2), x)
+    assert held[:, 2].tolist() == [0.0, 0.0]
 
 
 def test_a_step_in_the_squared_distance_ends_on_the_plane_and_not_beyond():

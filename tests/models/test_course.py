@@ -21,12 +21,21 @@ def test_a_level_way_keeps_the_height_and_climb_and_rise_add_to_it(climb, rise):
     assert carried(5e4 * EAST + climb * UP, rise)[2] == pytest.approx(3000.0 + climb + rise, abs=1e-7)
 
 
-def test_a_way_of_100_km_has_the_length_and_the_direction_of_the_geodesic():
-    lat, lon, _ = carried(1e5 * EAST)
+@pytest.mark.parametrize(("way", "within"), [(1e5, 0.03), (5e5, 2.0)])
+def test_a_way_on_the_ground_has_the_length_and_the_direction_of_the_geodesic(way, within):
+    ground = START - 3000.0 * UP
+    lat, lon, height = pymap3d.ecef2geodetic(*carry(tuple(ground), tuple(ground + way * EAST), 0.0))
     length, azimuth = vdist(47.0, 11.0, lat, lon)
-    # the way is at 3 000 m above the ellipsoid: on the ground it is shorter by height over radius of curvature
-    assert length == pytest.approx(1e5 * (1.0 - 3000.0 / (6.39e6 + 3000.0)), abs=0.2)
-    assert azimuth == pytest.approx(90.0, abs=1e-4)
+    assert length == pytest.approx(way, abs=within)
+    assert azimuth == pytest.approx(90.0, abs=1e-3)
+    assert height == pytest.approx(0.0, abs=1e-7)
+
+
+def test_a_way_high_above_the_ground_is_shorter_there_by_height_over_radius():
+    high = START + 1e5 * UP
+    lat, lon, _ = pymap3d.ecef2geodetic(*carry(tuple(high), tuple(high + 1e4 * EAST), 0.0))
+    radius = 6.3896e6  # of curvature towards east at 47 degrees
+    assert vdist(47.0, 11.0, lat, lon)[0] == pytest.approx(1e4 * radius / (radius + 1.03e5), abs=0.5)
 
 
 def test_a_target_at_rest_stays():

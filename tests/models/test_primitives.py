@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
+import pymap3d
 import pytest
+from cases import turn_matrix
 
 from optloc.models.primitives import (
     Jet,
@@ -12,6 +14,7 @@ from optloc.models.primitives import (
     differential,
     distance,
     geodetic_height,
+    geodetic_normal,
     hypot,
     local,
     namespace,
@@ -46,6 +49,25 @@ def test_a_wrapped_angle_has_the_same_direction_within_half_a_turn(angle):
     found = wrap(angle)
     assert abs(found) <= math.pi
     assert (math.cos(found), math.sin(found)) == pytest.approx((math.cos(angle), math.sin(angle)), abs=1e-15)
+
+
+@pytest.mark.parametrize("place", [(47.0, 11.0, 900.0), (-80.0, 170.0, -3e3), (2.0, -60.0, 4e5)])
+def test_heights_and_normals_of_the_ellipsoid_are_those_of_another_library(place):
+    lat, lon = np.radians(place[:2])
+    ecef = pymap3d.geodetic2ecef(*place)
+    assert geodetic_height(ecef) == pytest.approx(place[2], abs=1e-6)
+    normal = (np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat))
+    assert geodetic_normal(ecef) == pytest.approx(normal, abs=1e-12)
+    for i, found in enumerate(geodetic_normal(tuple(jets(*ecef)))):
+        for j in range(3):
+            ahead, behind = (geodetic_normal(tuple(np.array(ecef) + sign * 10.0 * np.eye(3)[j])) for sign in (1, -1))
+            assert found.partials[j] == pytest.approx((ahead[i] - behind[i]) / 20.0, abs=1e-13)
+
+
+def test_a_turn_is_the_rotation_of_half_of_its_tangent():
+    for turn in (np.array([0.7, -0.4, 1.1]), np.array([0.6])):
+        axes = tuple(map(tuple, np.eye(max(len(turn), 2))))
+        np.testing.assert_allclose(rotate(axes, tuple(turn)), turn_matrix(turn), atol=1e-14)
 
 
 def test_axes_turn_by_a_small_vector_as_its_cross_product_does():
