@@ -9,7 +9,7 @@ from cases import CASES, STATIONS, TARGET, plain_cost, plain_predict
 from optloc import ECEF, Prior, assemble, measured, with_bias
 from optloc.engine.admission import admission_of
 from optloc.engine.draw import _is_bounded, draw_ranges, draw_tapes
-from optloc.engine.memory import BY_HEIGHT, BY_SQUARES, RANGED, SIGN
+from optloc.engine.memory import BY_HEIGHT, BY_SQUARES, HEARD, RANGED, SEEN, SIGN
 from optloc.engine.plan import _bare
 from optloc.linear.constraints import height
 
@@ -71,3 +71,11 @@ def test_costs_grow_without_bound_where_ranges_add_up_or_a_position_has_a_prior(
     assert not _is_bounded(with_bias(ranges, "offset", per="kind"))
     assert _is_bounded(with_bias(ranges, "offset", per="kind", sigma=3.0))
     assert not _is_bounded(with_bias(ranges, "gain", per="kind", form="scale", sigma=0.1))
+
+
+def test_stations_of_angles_are_marked_beside_those_with_any_row():
+    one = _bare(CASES["range+azimuth-2d"].problem)  # ranges to stations 0 and 4, azimuths of 1 and 2
+    found = draw_tapes(one, admission_of(one), 2)
+    station = found.node[1]
+    assert sorted(station[found.model.station[HEARD] == 1.0]) == [0, 1, 2, 4]
+    assert sorted(station[found.model.station[SEEN] == 1.0]) == [1, 2]
