@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from linear.test_constraints import ENU, PLANE, SPACE, above, moving
 from often import few
 from scipy.optimize import minimize
-from test_constraints import ENU, PLANE, SPACE, above, moving
 
 from optloc import Frame, Status, assemble, measured, solve
 from optloc.linear.constraints import box, height, polygon, speed

@@ -1,4 +1,4 @@
-"""Samples, arcs and mixtures: exact where the posterior can be integrated, and as good at the truth as was measured."""
+"""Samples and mixtures: exact where the posterior can be integrated, and as good at the truth as was measured."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,10 @@ from uncertainty.scenes import fixed
 
 import optloc
 from optloc import InvalidProblem, assemble, measured
-from optloc.problem.chart import CURVED, INVERSE_RANGE
-from optloc.uncertainty import mixture, samples, trace_arc
-from optloc.uncertainty.region import RegionSurface
+from optloc.problem.chart import INVERSE_RANGE
+from optloc.uncertainty import mixture, samples
+from optloc.uncertainty.posterior import moments, weighed
+from optloc.uncertainty.region import Surface
 
 
 def gaussian():
@@ -35,7 +36,7 @@ def test_samples_of_a_gaussian_have_its_moments():
 def test_samples_of_a_far_emitter_are_those_of_the_integral(prior):
     """Against a sum over a grid in the chart: the share of the probability nearer than some ranges."""
     problem, _, fix = fixed("tdoa 2 5 100", 0)
-    surface, reach = RegionSurface.of(problem, fix), 400e3
+    surface, reach = Surface.of(problem, fix), 400e3
     assert surface.kind == INVERSE_RANGE
     sigma = np.sqrt(np.diag(surface.chart.spread))
     p = np.linspace(-6, 6, 201) * sigma[0]
@@ -63,6 +64,18 @@ def test_effective_numbers_are_those_measured():
     # Medians of 811 to 899 of 1024 were measured, and 70 at least.
     assert 780 <= np.median(effective) <= 930
     assert min(effective) > 70
+
+
+def test_weights_are_normalised_and_samples_outside_are_left_out():
+    position = np.arange(8.0).reshape(4, 2)
+    found = weighed(position, np.array([1000.0, -np.inf, 1000.0 + np.log(2.0), 1000.0]), "flat", 9.0, True)
+    assert found.position.tolist() == position[[0, 2, 3]].tolist()
+    assert found.weight == pytest.approx([0.25, 0.5, 0.25])
+    assert found.effective == pytest.approx(1.0 / (0.0625 + 0.25 + 0.0625))
+    assert found.mean == pytest.approx(0.25 * position[0] + 0.5 * position[2] + 0.25 * position[3])
+    assert found.covariance == pytest.approx(moments(position[[0, 2, 2, 3]], np.ones(4))[1])
+    assert found.covariance == pytest.approx(np.cov(position[[0, 2, 2, 3]].T, ddof=0))
+    assert found.drawn(400, 1)[:, 0].tolist().count(4.0) in (199, 200, 201)
 
 
 def test_moments_that_do_not_exist_are_refused():
@@ -95,67 +108,6 @@ def test_equal_weights_keep_the_distribution():
     drawn = found.drawn(20000, 3)
     assert drawn.mean(0) == pytest.approx(found.mean, rel=1e-3)
     assert np.cov(drawn.T) == pytest.approx(found.covariance, rel=0.02)
-
-
-def test_an_arc_around_a_line_closes():
-    problem, truth, fix = fixed("line", 1)
-    arc = trace_arc(problem, fix)
-    assert arc.closed
-    assert (arc.node[0] == arc.node[-1]).all()
-    # A circle around the line of the stations, all of it as far off as the target.
-    assert np.linalg.norm(arc.position[:, 1:], axis=1) == pytest.approx(np.linalg.norm(truth[1:]), rel=0.01)
-    assert 100 < len(arc.node) < 500
-    share, beside = arc.locate(arc.position[[5, 40]])
-    assert beside == pytest.approx(0.0, abs=1e-6)
-    assert 0 < share[0] < share[1] < 1
-    assert arc.mass.sum() == pytest.approx(1)
-
-
-def test_an_arc_goes_through_the_mirror_image():
-    """Stations in a plane but for 50 m: the other side of it costs little more, and the arc leads there."""
-    problem, _, fix = fixed("plane 50 400", 0)
-    arc = trace_arc(problem, fix)
-    assert not arc.closed
-    assert not arc.far
-    assert arc.position[:, 2].min() < -300
-    assert arc.position[:, 2].max() > 300
-    assert (arc.cost[[0, -1]] - fix.cost > 25).all()
-    assert 30 < len(arc.node) < 90
-
-
-def along_arcs(name, n):
-    share, beside = [], []
-    for item in range(n):
-        problem, truth, fix = fixed(name, item)
-        if RegionSurface.of(problem, fix).kind == CURVED:
-            found = trace_arc(problem, fix).locate(truth[None])
-            share.append(found[0][0])
-            beside.append(found[1][0])
-    return np.array(share), np.array(beside)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(("name", "n"), [("plane 50 400", 120), ("plane 200 1000", 400), ("line", 60)])
-def test_the_truth_lies_along_the_arc_as_promised(name, n):
-    share, beside = along_arcs(name, n)
-    assert len(share) > 40
-    width = 3 * np.sqrt(0.95 * 0.05 / len(share))
-    # Measured: 92.5 to 98.3 % within the central 95 %, across 94.0 to 97.2 %.
-    assert abs(((share > 0.025) & (share < 0.975)).mean() - 0.95) < width
-    # Two numbers across the arc: chi-square with two degrees of freedom.
-    assert abs((beside**2 < 5.99).mean() - 0.95) < width
-
-
-@pytest.mark.parametrize("name", ["plane 50 400", "line"])
-def test_samples_along_an_arc_are_the_likelihood(name):
-    """Shares along the curve, by samples with weights and by the curve's own mass."""
-    problem, _, fix = fixed(name, 0)
-    arc, found = trace_arc(problem, fix), samples(problem, fix, 4096, 1)
-    assert found.prior == "arc"
-    assert found.effective > 0.5 * 4096
-    share = arc.locate(found.position)[0]
-    for edge in (0.1, 0.5, 0.9):
-        assert found.weight[share < edge].sum() == pytest.approx(edge, abs=0.03)
 
 
 def compared(names, n):

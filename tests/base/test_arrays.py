@@ -95,7 +95,7 @@ CHOSEN = {name for setting in SETTINGS for name in setting}
 
 def begun(setting):
     here = {name: value for name, value in os.environ.items() if name not in CHOSEN}
-    command = [sys.executable, "-W", "ignore", "-c", DIGESTS, str(Path(__file__).parent)]
+    command = [sys.executable, "-W", "ignore", "-c", DIGESTS, str(Path(__file__).parents[1])]
     return subprocess.Popen(command, env=here | setting, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

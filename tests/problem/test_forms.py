@@ -19,7 +19,7 @@ from optloc.proof.scope import unsupported
 from optloc.tracking.constants import begun_with_constants
 from optloc.tracking.dynamics import polynomial
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OWNER = ROOT / "optloc/problem/forms.py"
 
 
