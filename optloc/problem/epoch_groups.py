@@ -226,7 +226,10 @@ def _stations_of(stations: Stations, own: Array) -> Stations:
     position = pick(stations.position)
     assert position is not None
     names = tuple(f"\ue000{i}\ue001" for i in range(own.shape[1]))
-    return replace(stations, position=position, velocity=pick(stations.velocity), names=names)
+    # Errors that are noise belong to their stations, as places do.
+    both = (stations.covariance, stations.velocity_covariance)
+    errors = [None if each is None else _once(each[own]) for each in both]
+    return Stations(position, names, pick(stations.velocity), None, errors[0], stations.span, errors[1])
 
 
 def _rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:
