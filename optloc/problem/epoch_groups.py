@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.arrays import first_rows
 from optloc.base.types import Array, Rows, Stations
-from optloc.problem.epochs import by_epoch, separable, states_by_epoch
+from optloc.problem.epochs import by_epoch, rows_by_epoch, separable, states_by_epoch
 from optloc.problem.fix import Explanation, Fix
 from optloc.problem.noise import Block, Noise, gathered, group
 from optloc.problem.problem import Problem, map_numbers
@@ -128,6 +128,21 @@ def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
             names = tuple(one.label(name, item) for name in problem.stations.names)
             return replace(problem, stations=replace(problem.stations, names=names))
     raise LookupError(epoch)
+
+
+def explanations_by_epoch(problem: Problem, explanations: Array) -> Array:
+    """Return explanations (k,) of fixes by `epoch_groups` with their rows numbered as in the batch of `by_epoch`."""
+    out, place = explanations.copy(), rows_by_epoch(problem)
+    for one in epoch_groups(problem):
+        if one.rows is not None:
+            for epoch, rows in zip(one.epochs, place[one.rows], strict=True):
+                out[epoch] = tuple(_renumbered(each, rows) for each in out[epoch])
+    return out
+
+
+def _renumbered(one: Explanation, rows: Array) -> Explanation:
+    suspects = (replace(s, rows=tuple(rows[np.array(s.rows, dtype=int)].tolist())) for s in one.suspects)
+    return replace(one, suspects=tuple(suspects))
 
 
 @dataclass(frozen=True, slots=True)
