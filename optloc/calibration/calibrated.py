@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, NoSolution, nearest
+from optloc.base.errors import InvalidProblem, NoSolution, no_station
 from optloc.base.types import PRECEDENCE, Array, Status
 from optloc.calibration.agreement import AGREEING, Found, frame_size, proven, search
 from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
@@ -535,7 +535,7 @@ def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
         raise InvalidProblem(f"a frame needs {network.dimension} stations", "gauge", "name so many, each once")
     for name in gauge:
         if name not in network.names:
-            raise InvalidProblem(f"there is no station {name!r}", "gauge", nearest(name, list(network.names)))
+            raise no_station(name, "gauge", network.names)
     return tuple(network.names.index(name) for name in gauge)
 
 

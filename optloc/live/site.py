@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.cache import Cache
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest, no_station
 from optloc.base.frames import Frame
 from optloc.base.types import Array
 from optloc.base.units import Conversion
@@ -211,7 +211,7 @@ class Site:
                 what = "the station is missing" if needed else "there is a station too many"
                 raise InvalidProblem(what, key, f"{kind} rows name {count} of them")
             if needed and name not in self.number:
-                raise UnknownName(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
+                raise no_station(name[:40], key, self.stations, UnknownName)
         if a == b and count > 1:
             raise InvalidProblem(f"{kind} names station {a!r} twice", "b", "name two stations")
         return Row(alike[0].section, -1, kind, a, b)
