@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.base.cache import Cache
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, no_station
 from optloc.base.types import Array
 from optloc.files.columns import stem, unit_of
 from optloc.files.roles import WORDS
@@ -50,7 +50,7 @@ class StationValues(NamedTuple):
 def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
     """Return values by what they belong to: a station, or of time differences a pair of them."""
     if reference is not None and reference not in names:
-        raise InvalidProblem(f"there is no station {reference!r}", "reference", nearest(str(reference), names))
+        raise no_station(reference, "reference", names)
     first = names[0] if reference is None else reference
     given = _with_names(given)
     if hasattr(given, "columns") and hasattr(given, "index"):
@@ -110,7 +110,7 @@ def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[in
         raise InvalidProblem(f"{key!r} does not name what was measured", word, "use the name of a station")
     unknown = [str(name) for name in pair if str(name) not in names]
     if unknown:
-        raise InvalidProblem(f"there is no station {unknown[0]!r}", word, nearest(unknown[0], names))
+        raise no_station(unknown[0], word, names)
     one, *other = (names.index(str(name)) for name in pair)
     return one, other[0] if other else -1
 

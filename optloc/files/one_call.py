@@ -19,14 +19,12 @@ from optloc.base.frames import Frame
 from optloc.base.types import Amount, Array, Band, Stations
 from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
-from optloc.files.columns import stem
-from optloc.files.declination import angle_of, date_of, declinations
+from optloc.files.declination import declination_of, declinations
 from optloc.files.propagation import is_time
 from optloc.files.readings import CARTESIAN, COMPASS
-from optloc.files.roles import WORDS, worded
+from optloc.files.roles import worded
 from optloc.files.schema import FrameTable, StationsTable, Units
-from optloc.files.stations import survey
-from optloc.files.table import Table, of_frame
+from optloc.files.stations import station_table, survey
 from optloc.linear import constraints
 from optloc.models import MODELS
 from optloc.models.medium import Medium
@@ -241,12 +239,8 @@ def _check_north(north: _North, given: Mapping[str, Any]) -> None:
     known = get_args(AzimuthConvention)
     if north.azimuth not in known:
         raise InvalidProblem(f"there is no convention {north.azimuth!r}", "azimuth", nearest(north.azimuth, known))
-    if north.declination is None:
-        return
-    if "bearings" not in given:
+    if north.declination is not None and "bearings" not in given:
         raise InvalidProblem("there are no bearings", "declination", "leave it out")
-    if north.azimuth == CARTESIAN:
-        raise InvalidProblem("angles from the x axis have no declination", "declination", "leave it out")
 
 
 def _speed_sigma(given: Any) -> float | None:
@@ -335,10 +329,8 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
         raise InvalidProblem(what, "stations", "give stations= in metres, or latlon= in degrees")
     if frame not in ("cartesian", "ecef"):
         raise InvalidProblem(f"there is no frame {frame!r}", "frame", 'use "cartesian" or "ecef", or latlon=')
-    if isinstance(stations, Stations):
-        stations = dict(zip(stations.names, stations.position[..., 0, :, :], strict=True))
     where, axes = ("stations", "xyz") if latlon is None else ("latlon", ("lat_deg", "lon_deg", "height"))
-    table = worded(_station_table(stations if latlon is None else latlon, where, axes), "m")
+    table = worded(station_table(stations if latlon is None else latlon, where, axes), "m")
     globe = table.has("lat_deg") or table.has("lon_deg")
     if latlon is not None and not globe:
         raise InvalidProblem("there are no latitudes", "latlon", "call the columns lat and lon, or use stations=")
@@ -351,36 +343,6 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     made = station_array(found.position[order], found.names, axes=axes_of)
     extent = float(np.ptp(made.position, axis=-2).max())
     return _Receivers(made, own, globe and not table.has("height"), extent)
-
-
-def _station_table(given: Any, where: str, axes: Sequence[str]) -> Table:
-    """Return stations as a table, whatever they are given as."""
-    if hasattr(given, "columns") and hasattr(given, "index"):
-        table = of_frame(given, where, {})
-        stems = {stem(name) for name in table.columns}
-        if stems & set(WORDS["name"].split()):
-            return table
-        return of_frame({"name": np.array([str(label) for label in given.index], dtype=object)} | {
-            name: table.columns[name] for name in table.columns
-        }, where, {})  # fmt: skip
-    if isinstance(given, Mapping) and {stem(str(key)) for key in given} & {"x", *WORDS["lat_deg"].split(), "latdeg"}:
-        return of_frame(given, where, {})
-    names = [str(name) for name in given] if isinstance(given, Mapping) else None
-    rows = list(given.values()) if isinstance(given, Mapping) else given
-    if isinstance(given, Mapping) and rows and all(isinstance(row, Mapping) for row in rows):
-        keys = dict.fromkeys(key for row in rows for key in row)
-        columns = {key: np.array([row.get(key) for row in rows], dtype=object) for key in keys}
-        return of_frame({"name": np.array(names, dtype=object)} | columns, where, {})
-    try:
-        place = np.array([np.asarray(row, dtype=float) for row in rows])
-    except (TypeError, ValueError):
-        place = np.zeros(0)
-    if place.ndim != 2 or place.shape[1] not in (2, 3):
-        what = "these are no positions of 2 or 3 coordinates each"
-        raise InvalidProblem(what, where, "give name: (x, y, z), or an array with a row for each station")
-    labels = names or [f"S{i}" for i in range(len(place))]
-    named = {"name": np.array(labels, dtype=object)}
-    return of_frame(named | dict(zip(axes, place.T, strict=False)), where, {})
 
 
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
@@ -480,12 +442,10 @@ def _from_north(made: Measured, north: _North, unit: str, places: _Receivers) ->
     if isinstance(east, bool) or not isinstance(east, str | date | float | int | np.number):
         what = f"{type(east).__name__} is no declination"
         raise InvalidProblem(what, "declination", 'give a number, "4 deg", or a date such as "2026-06-01"')
-    day = date_of(east, "declination")
-    if day is None:
-        amount = angle_of(str(east), unit, "declination")
-        return replace(made, rows=replace(rows, correction=rows.correction + amount))
-    each = declinations(places.stations.position[0], places.frame, day, "declination")
-    return replace(made, rows=replace(rows, correction=rows.correction + each[rows.a]))
+    angle, day = declination_of(east, north.azimuth, unit, "declination")
+    at = places.stations.position[0]
+    more = angle if day is None else declinations(at, places.frame, day, "declination")[rows.a]
+    return replace(made, rows=replace(rows, correction=rows.correction + more))
 
 
 def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:

@@ -9,7 +9,9 @@ if TYPE_CHECKING:
         InvalidProblem as InvalidProblem,
         NoSolution as NoSolution,
         OptlocError as OptlocError,
+        check_once as check_once,
         nearest as nearest,
+        no_station as no_station,
     )
     from optloc.base.frames import (
         CARTESIAN as CARTESIAN,

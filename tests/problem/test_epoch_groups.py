@@ -54,6 +54,19 @@ def test_fixes_are_those_of_the_union_of_all_rows(kind, noise):
         assert fix.dof.tolist() == union.dof[one.epochs].tolist()
 
 
+@pytest.mark.parametrize("kind", ["toa", "tdoa"])
+def test_errors_of_stations_that_are_noise_stay_with_their_stations(kind):
+    """Each station has an error of its own size: that of another one would be seen in the covariance."""
+    problem, _ = run(kind, **({"sigma": 1.0} if kind == "toa" else {"arrival_sigma": 1.0}))
+    covariance = np.geomspace(1.0, 1e4, 12)[:, None, None] * np.eye(3)
+    problem = replace(problem, stations=replace(problem.stations, covariance=covariance, span="noise"))
+    union = optloc.solve(by_epoch(problem), "gtrs+lsr")
+    for one in epoch_groups(problem):
+        fix = optloc.solve(one.problem, "gtrs+lsr")
+        np.testing.assert_allclose(fix.cov, union.cov[one.epochs], rtol=1e-3)
+        np.testing.assert_allclose(fix.p_value, union.p_value[one.epochs], atol=1e-3)
+
+
 def test_one_plan_serves_all_sets_of_stations():
     problem, _ = run("toa", sigma=1.0)
     for one in epoch_groups(problem):

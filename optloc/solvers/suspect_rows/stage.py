@@ -214,9 +214,11 @@ def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
     if problem.epochs > 1 or len(fix.x) < SEVERAL:
         return None
     with np.errstate(invalid="ignore", divide="ignore"):
-        each = fix.cost / fix.dof
-        # a liar has a large cost relative to the other fixes, for noise of any size
-        kept = np.flatnonzero((fix.dof > 0) & (each <= _GROSS * np.median(each[np.isfinite(each) & (fix.dof > 0)])))
+        each = np.where(fix.dof > 0, fix.cost / fix.dof, np.inf)
+    if np.isfinite(each).sum() < SEVERAL:
+        return None
+    # a liar has a large cost relative to the other fixes, for noise of any size
+    kept = np.flatnonzero(each <= _GROSS * np.median(each[np.isfinite(each)]))
     if len(kept) < SEVERAL:
         return None
     batch = batch_of(problem.take(kept))
