@@ -59,7 +59,7 @@ class Diagnosis:
 
 
 def diagnose(problem: Problem, fix: Fix) -> Diagnosis:
-    """Return why a fix is not ``ok``, what its data determine, and which errors it would not notice.
+    """Return the causes of a status, the unknowns that the data determine, and the errors that go unnoticed.
 
     Parameters
     ----------
