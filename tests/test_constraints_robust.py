@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from files.test_constraint_files import ranges, ranging, run
 from often import few
 from scipy.optimize import minimize
-from test_constraint_files import ranges, ranging, run
 from test_constraints import ENU, PLANE, SPACE, above, drawn, moving
 from verdicts import alone
 
