@@ -59,7 +59,7 @@ def budgets() -> str:
     """Return how much a file may hold as a table."""
     from dataclasses import asdict
 
-    from optloc import Budget
+    from optloc.files import Budget
 
     what = {
         "bytes": "bytes of a table: as it is stored, and as Parquet declares itself unpacked",
@@ -76,7 +76,7 @@ def budgets() -> str:
 
 def words() -> str:
     """Return the words that a method is made of as a table."""
-    from optloc import SOLVERS
+    from optloc.solvers import SOLVERS
 
     lines = [f"| `{name}` | {entry.role} | {entry.summary} |" for name, entry in SOLVERS.items()]
     return "\n".join(["| word | role | what the stage does |", "|---|---|---|", *lines])
@@ -99,8 +99,8 @@ def formats() -> str:
 
 def kinds() -> str:
     """Return the measurement kinds as a table."""
-    from optloc import MODELS
     from optloc.base.units import UNITS
+    from optloc.models import MODELS
 
     head = ["| kind | stations | dimensions | what is measured | units of a file |", "|---|---|---|---|---|"]
     lines = []

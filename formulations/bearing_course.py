@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array, Mask, dot, span, uncentre
-from formulations.bearing_ls import Rays, lengths, look, rays
+from formulations.bearing_ls import BearingRays, lengths, look, rays
 
 # Singular value, over the largest one, of scaled rows that counts as zero: five decades above their rounding errors.
 _RANK = 1e-10
@@ -36,7 +36,7 @@ _NEAR = 1e-6  # shortest range, over the size of the array, that a weight is com
 
 
 @dataclass(frozen=True, slots=True)
-class Courses:
+class BearingCourses:
     """Pseudo-linear courses of a batch.
 
     Parameters
@@ -57,7 +57,7 @@ class Courses:
 
 
 @dataclass(frozen=True, slots=True)
-class _Run:
+class _CourseRun:
     """What was seen: stations (N, m, d), axes, times as powers (N, m, order + 1), rows and right sides."""
 
     station: Array
@@ -93,7 +93,7 @@ def sight_courses(
     axes: Array | None = None,
     order: int = 1,
     passes: int = 2,
-) -> Courses:
+) -> BearingCourses:
     """Fit a polynomial course to bearings without a guess.
 
     Parameters
@@ -116,7 +116,7 @@ def sight_courses(
 
     Returns
     -------
-    Courses
+    BearingCourses
         Three courses per item and whether they exist.
 
     Notes
@@ -149,15 +149,15 @@ def sight_courses(
         front = dot(run.line(final), seen.ahead) > 0.0
         ok = np.asarray(np.isfinite(final).all(axis=(-2, -1)))
         three = [uncentre(each, middle, half) for each in (plain, c, final)]
-    return Courses(three[0], three[1], three[2], ok, ok & (front | ~use).all(axis=-1))
+    return BearingCourses(three[0], three[1], three[2], ok, ok & (front | ~use).all(axis=-1))
 
 
-def _run(S: Array, axes: Array | None, powers: Array, seen: Rays, both: bool) -> _Run:
+def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
     normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
     size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)
     # one station at the origin has no size: any positive length will do
-    return _Run(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
+    return _CourseRun(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:

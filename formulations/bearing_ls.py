@@ -36,7 +36,7 @@ _PARALLEL = 1e13  # condition number from which lines are parallel: less than th
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
+class BearingRays:
     """Directions of sight and the two tangents along which the angles grow, in the frame of the stations.
 
     Parameters
@@ -80,7 +80,7 @@ class Sighted:
     ahead: Mask
 
 
-def rays(azimuth: ArrayLike, elevation: ArrayLike | None = None, axes: ArrayLike | None = None) -> Rays:
+def rays(azimuth: ArrayLike, elevation: ArrayLike | None = None, axes: ArrayLike | None = None) -> BearingRays:
     """Turn angles into directions.
 
     Parameters
@@ -94,7 +94,7 @@ def rays(azimuth: ArrayLike, elevation: ArrayLike | None = None, axes: ArrayLike
 
     Returns
     -------
-    Rays
+    BearingRays
         Unit vectors.
 
     Notes
@@ -115,7 +115,7 @@ def rays(azimuth: ArrayLike, elevation: ArrayLike | None = None, axes: ArrayLike
     if axes is not None:
         turn = np.asarray(axes, dtype=np.float64)
         local = [np.einsum("...ij,...i->...j", turn, vector) for vector in local]
-    return Rays(local[0], local[1], local[2] if elevation is not None else None)
+    return BearingRays(local[0], local[1], local[2] if elevation is not None else None)
 
 
 def sight(
@@ -242,7 +242,7 @@ def meeting(direction: Array, station: Array) -> Array:
     return point
 
 
-def look(line: Array, axes: ArrayLike | None = None) -> Rays:
+def look(line: Array, axes: ArrayLike | None = None) -> BearingRays:
     """Turn lines of sight into directions.
 
     Parameters
@@ -254,7 +254,7 @@ def look(line: Array, axes: ArrayLike | None = None) -> Rays:
 
     Returns
     -------
-    Rays
+    BearingRays
         Unit vectors in the frame.
     """
     azimuth = np.arctan2(line[..., 1], line[..., 0])

@@ -34,7 +34,7 @@ _RANK = 1e-11  # singular value of the whitened rows, over the largest one, that
 
 
 @dataclass(frozen=True, slots=True)
-class Ranges:
+class BistaticRanges:
     """Ranges from the receiver.
 
     Parameters
@@ -75,7 +75,7 @@ class Ranges:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class BistaticCourse:
     """A polynomial course.
 
     Parameters
@@ -109,7 +109,7 @@ def triad(azimuth: ArrayLike, elevation: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: float = 1e-6) -> Ranges:
+def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: float = 1e-6) -> BistaticRanges:
     """Range from excess path and direction, in closed form.
 
     Parameters
@@ -125,7 +125,7 @@ def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: 
 
     Returns
     -------
-    Ranges
+    BistaticRanges
         With the partials that bound its error.
 
     Notes
@@ -146,10 +146,12 @@ def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: 
         slope = np.where(along > r, aside / (reach + (along - r)), reach + (r - along)) / reach
         turn = -off * (r / reach)[..., None]
         valid = (l > 0.0) & np.isfinite(r) & np.isfinite(slope) & (slope >= least)
-    return Ranges(np.where(valid, r, np.nan), slope, turn, valid)
+    return BistaticRanges(np.where(valid, r, np.nan), slope, turn, valid)
 
 
-def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: Array, *, order: int = 1) -> Course:
+def course(
+    excess: Array, axes: Array, illuminator: Array, time: Array, sigma: Array, *, order: int = 1
+) -> BistaticCourse:
     """Fit a polynomial course to several epochs by weighted linear least squares.
 
     Parameters
@@ -169,7 +171,7 @@ def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: A
 
     Returns
     -------
-    Course
+    BistaticCourse
         A start for the maximum-likelihood fit; without noise, the truth.
 
     Notes
@@ -206,7 +208,7 @@ def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: A
             far, across = np.sqrt(dot(p, p)), np.sqrt(dot(p - A[:, None], p - A[:, None]))
         ok &= ((dot(p, e[:, :, 2]) > 0.0) | ~heard).all(axis=-1)
         c = np.where(ok[:, None, None], uncentre(c, middle, spread), np.nan)
-    return Course(c.reshape(*lead, order + 1, 3), ok.reshape(lead))
+    return BistaticCourse(c.reshape(*lead, order + 1, 3), ok.reshape(lead))
 
 
 def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:

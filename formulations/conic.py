@@ -50,7 +50,7 @@ _KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ConicAnswer:
     """What one conic solve gave.
 
     Parameters
@@ -126,7 +126,7 @@ class Relaxation:
         own: Data = self._own.data
         return own
 
-    def solve(self, values: Mapping[str, Array], *, bound: bool = True, reach: float | None = None) -> Answer:
+    def solve(self, values: Mapping[str, Array], *, bound: bool = True, reach: float | None = None) -> ConicAnswer:
         """Solve with new parameter values.
 
         Parameters
@@ -141,7 +141,7 @@ class Relaxation:
 
         Returns
         -------
-        Answer
+        ConicAnswer
             Point, value, bound and status; failure is reported, not raised.
         """
         if values.keys() != self.parameters.keys():
@@ -165,7 +165,7 @@ class Relaxation:
         *,
         bound: bool,
         reach: float | None,
-    ) -> Answer:
+    ) -> ConicAnswer:
         data.feed(values)
         try:
             solution = _solver(data, settings).solve()
@@ -184,9 +184,9 @@ class Relaxation:
         at = x if status in _MET else np.full(len(x), np.nan)
         quadratic = float(at @ data.square(at))
         primal = 0.5 * quadratic + float(data.q @ at) + data.d
-        return Answer(data.recover(at), primal, low, status, status == "Solved", int(solution.iterations))
+        return ConicAnswer(data.recover(at), primal, low, status, status == "Solved", int(solution.iterations))
 
-    def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> Answer:
+    def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> ConicAnswer:
         import cvxpy
 
         for name, value in values.items():
@@ -214,7 +214,7 @@ class Relaxation:
             for v in self.problem.variables()
         }
         primal = float(self.problem.value) if good else np.nan
-        return Answer(point, primal, -np.inf, status, good and status == cvxpy.OPTIMAL, iterations, message)
+        return ConicAnswer(point, primal, -np.inf, status, good and status == cvxpy.OPTIMAL, iterations, message)
 
 
 # How Clarabel ends with an answer: its tolerances are met, or its reduced ones (5e-5 of the gap, 1e-4 of feasibility),

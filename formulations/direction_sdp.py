@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
 from formulations.bearing_ls import meeting, predict, rays
-from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
+from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 
 # Least cosine by which an azimuth is weighed: within 0.06 degrees of the zenith it says next to nothing.
 _LEVEL = 1e-3
@@ -55,7 +55,7 @@ class Directed:
         (`directions`) or of the angular ML cost (`angle_bound`).
     rank_ratio : float
         Second over first eigenvalue of the lift in terms of v; near zero where tight.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -64,7 +64,7 @@ class Directed:
     value: float
     bound: float
     rank_ratio: float
-    answer: Answer
+    answer: ConicAnswer
 
 
 def directions(

@@ -62,7 +62,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array, Index, Mask
-from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
+from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.range_height import Ellipsoid
 
 SIZE = 24
@@ -133,7 +133,7 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class DopplerScene:
     """The rows in units of their own size, see the module's text.
 
     Parameters
@@ -182,7 +182,7 @@ class Scene:
         rates: Array,
         design: Array,
         surface: Ellipsoid | None,
-    ) -> Scene:
+    ) -> DopplerScene:
         """Scale, and choose what is lifted; arguments as in `doppler`."""
         origin = place.mean(axis=0) if surface is None else surface.centre
         # of an ellipsoid its mean radius, else the farthest node
@@ -250,7 +250,7 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
+class DopplerStart:
     """A start from the relaxation.
 
     Parameters
@@ -265,7 +265,7 @@ class Started:
         Optimum, and a lower bound of the weighted cost within the reach, recomputed from the dual.
     rank_ratio : float
         Second over first eigenvalue of the lift.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -275,7 +275,7 @@ class Started:
     value: float
     bound: float
     rank_ratio: float
-    answer: Answer | None
+    answer: ConicAnswer | None
 
 
 def doppler(
@@ -290,7 +290,7 @@ def doppler(
     surface: Ellipsoid | None = None,
     reach: float = 10.0,
     backend: str = "CLARABEL",
-) -> Started:
+) -> DopplerStart:
     """Start a source at rest from Doppler shifts, and range differences beside them.
 
     Parameters
@@ -315,7 +315,7 @@ def doppler(
 
     Returns
     -------
-    Started
+    DopplerStart
         Points and bound; see the module's text for what they are worth. NaN where the data or the answer are.
 
     Raises
@@ -331,7 +331,7 @@ def doppler(
     A = np.zeros((len(values), 0)) if design is None else np.asarray(design, dtype=np.float64)
     if not all(np.isfinite(part).all() for part in (S, V, values, W, A)):
         return _nothing(S.shape[1], A.shape, None)
-    scene = Scene.of(S, V, values, W, R, Q, A, surface)
+    scene = DopplerScene.of(S, V, values, W, R, Q, A, surface)
     relaxation, far = _relaxation(scene.shape, backend), np.ones(len(values))
     for _ in range(_PASSES):
         given, size = scene.parameters(far, reach)
@@ -345,7 +345,7 @@ def doppler(
     return _read_off(scene, weighted, size, answer)
 
 
-def _read_off(scene: Scene, far: Array, size: float, answer: Answer) -> Started:
+def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer) -> DopplerStart:
     lift, d = answer.values["lift"], scene.shape.dimension
     point, beta = lift[0, 1 : 1 + d], scene.shape.places[0]
     spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
@@ -355,7 +355,7 @@ def _read_off(scene: Scene, far: Array, size: float, answer: Answer) -> Started:
         # a mean of places on a surface lies below it: they are brought back along the line to its centre
         points = points / np.sqrt(np.einsum("ij,jk,ik->i", points, scene.surface.shape, points))[:, None]
     unknown = scene.mean + scene.unit * lift[0, beta : beta + scene.shape.unknowns]
-    return Started(
+    return DopplerStart(
         scene.origin + scene.length * points,
         unknown,
         np.where(scene.pivot < 0, 1.0, scene.length * far),
@@ -366,10 +366,10 @@ def _read_off(scene: Scene, far: Array, size: float, answer: Answer) -> Started:
     )
 
 
-def _nothing(dimension: int, design: tuple[int, ...], answer: Answer | None) -> Started:
+def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
     rows, unknowns = design
     point, none = np.full((1 + 2 * dimension, dimension), np.nan), np.full(unknowns, np.nan)
-    return Started(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
+    return DopplerStart(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
 
 
 def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
@@ -453,7 +453,7 @@ def doppler_problem(shape: Shape) -> Any:
     Returns
     -------
     cvxpy.Problem
-        Variable ``lift`` of shape (n, n), ordered (1, x, beta, r, w); parameters as `Scene.parameters` gives them.
+        Variable ``lift`` of shape (n, n), ordered (1, x, beta, r, w); parameters of `DopplerScene.parameters`.
 
     Notes
     -----

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
-from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
+from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.nls import Local, Program
 
 
@@ -48,7 +48,7 @@ class Lifted:
         Optimum, and a lower bound of the ML cost ``|K r(x) - z|^2`` recomputed from the dual.
     rank_ratio : float
         Second over first eigenvalue of the lift.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -57,7 +57,7 @@ class Lifted:
     value: float
     bound: float
     rank_ratio: float
-    answer: Answer
+    answer: ConicAnswer
 
 
 def lifted_problem(count: int, dim: int) -> Any:

@@ -46,7 +46,7 @@ _LEAST, _MOST = 1e-12, 1e8
 
 
 @dataclass(frozen=True, slots=True)
-class Stations:
+class StationFactors:
     """What is sought of the stations: S fits of M stations.
 
     Parameters
@@ -87,7 +87,7 @@ class Pulses:
 class LowRank:
     """A fit of small rank: stations, pulses and the weighted sum of squares (S,)."""
 
-    stations: Stations
+    stations: StationFactors
     pulses: Pulses
     cost: Array
 
@@ -95,13 +95,13 @@ class LowRank:
         """Return some of the fits."""
         s, p = self.stations, self.pulses
         return LowRank(
-            Stations(s.alpha[which], s.u[which], s.b[which]),
+            StationFactors(s.alpha[which], s.u[which], s.b[which]),
             Pulses(p.beta[which], p.v[which], p.o[which]),
             self.cost[which],
         )
 
 
-def random_stations(rng: np.random.Generator, count: int, m: int, d: int) -> Stations:
+def random_stations(rng: np.random.Generator, count: int, m: int, d: int) -> StationFactors:
     """Return random stations in a cube, half of them flattened, from which fits begin.
 
     Parameters
@@ -113,15 +113,15 @@ def random_stations(rng: np.random.Generator, count: int, m: int, d: int) -> Sta
 
     Returns
     -------
-    Stations
+    StationFactors
         Of spread one.
     """
     u = rng.uniform(-0.5, 0.5, (count, m, d))
     u[::2, :, -1] *= 0.3  # halls and networks are wider than high
-    return Stations(np.sum(u * u, axis=-1), u, np.zeros((count, m)))
+    return StationFactors(np.sum(u * u, axis=-1), u, np.zeros((count, m)))
 
 
-def fit_low_rank(z: Array, weight: Array, emission: Array, start: Stations, *, clocks: bool = False) -> LowRank:
+def fit_low_rank(z: Array, weight: Array, emission: Array, start: StationFactors, *, clocks: bool = False) -> LowRank:
     """Fit stations and pulses to arrivals from each of several starts.
 
     Parameters
@@ -132,7 +132,7 @@ def fit_low_rank(z: Array, weight: Array, emission: Array, start: Stations, *, c
         Relative inverse standard deviation of each; zero where there is none.
     emission : bool array (N,)
         Whether the time of emission of a pulse is unknown; else it is zero.
-    start : Stations
+    start : StationFactors
         Where to begin, S starts.
     clocks : bool
         Whether offsets of the stations' clocks are sought.
@@ -154,7 +154,7 @@ class _Fit:
     emission: Array
     clocks: bool
 
-    def run(self, at: Stations) -> LowRank:
+    def run(self, at: StationFactors) -> LowRank:
         count = at.alpha.shape[0]
         scale = np.broadcast_to(self.weight, (count, *self.z.shape))
         damping = np.full(count, _DAMPING)
@@ -176,13 +176,13 @@ class _Fit:
                     break
         return LowRank(at, here.pulses, here.cost)
 
-    def distance(self, at: Stations, pulses: Pulses) -> Array:
+    def distance(self, at: StationFactors, pulses: Pulses) -> Array:
         """Return distances (S, N, M): the mean of what the arrival and what the fit say, kept off zero."""
         by_time = np.abs(self.z - at.b[:, None] - pulses.o[:, :, None])
         square = at.alpha[:, None] + (pulses.beta + pulses.o**2)[:, :, None] + pulses.v @ np.swapaxes(at.u, 1, 2)
         return np.maximum(0.5 * (by_time + np.sqrt(np.maximum(square, 0.0))), _NEAR)
 
-    def project(self, at: Stations, scale: Array) -> _Projected:
+    def project(self, at: StationFactors, scale: Array) -> _Projected:
         """Return the residuals that no choice of the pulses can take away."""
         shifted = self.z - at.b[:, None]
         u = np.broadcast_to(at.u[:, None], (*scale.shape, at.u.shape[-1]))
@@ -199,7 +199,7 @@ class _Fit:
         pulses = Pulses(found[..., 0], found[..., 1 : 1 + d], found[..., 1 + d])
         return _Projected(pulses, q, residual, scale, np.sum(residual**2, axis=(1, 2)))
 
-    def moved(self, at: Stations, here: _Projected, damping: Array) -> Stations:
+    def moved(self, at: StationFactors, here: _Projected, damping: Array) -> StationFactors:
         """Return stations after one damped step of Gauss and Newton."""
         count, n, m = here.scale.shape
         d = at.u.shape[-1]
@@ -219,7 +219,7 @@ class _Fit:
         diagonal += damping[:, None] * (diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-300)
         step = np.linalg.solve(normal, gradient).reshape(count, m, p)
         b = at.b + step[..., -1] if self.clocks else at.b
-        return Stations(at.alpha + step[..., 0], at.u + step[..., 1 : 1 + d], b)
+        return StationFactors(at.alpha + step[..., 0], at.u + step[..., 1 : 1 + d], b)
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,8 +249,10 @@ def _where(mask: Mask, one: Array, other: Array) -> Array:
     return np.where(mask.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
-def _chosen(mask: Mask, one: Stations, other: Stations) -> Stations:
-    return Stations(_where(mask, one.alpha, other.alpha), _where(mask, one.u, other.u), _where(mask, one.b, other.b))
+def _chosen(mask: Mask, one: StationFactors, other: StationFactors) -> StationFactors:
+    return StationFactors(
+        _where(mask, one.alpha, other.alpha), _where(mask, one.u, other.u), _where(mask, one.b, other.b)
+    )
 
 
 def orthonormal(a: Array) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
-from formulations.conic import Answer, Relaxation, keep, tight
+from formulations.conic import ConicAnswer, Relaxation, keep, tight
 
 # Largest half-angle that is handled as a cone, radians: at pi/2 the cone is a half-space; here its tangent is 100.
 _WIDEST = 0.5 * np.pi - 0.01
@@ -54,7 +54,7 @@ class Common:
     meet : bool or None
         True where `point` was checked to lie in every cone; False where `most` is negative, a proof that no point
         does; None where neither could be shown.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -62,7 +62,7 @@ class Common:
     margin: float
     most: float
     meet: bool | None
-    answer: Answer
+    answer: ConicAnswer
 
 
 @dataclass(frozen=True, slots=True)

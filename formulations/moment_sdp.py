@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 from formulations.algebra import Array, Index
-from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
-from formulations.range_enclosure import Box, Ranged
+from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
+from formulations.range_enclosure import EnclosingBox, Ranged
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class Bounded:
         No point of the box costs less: recomputed from the dual, and at most the `cost` that was given.
     rank_ratio : float
         Second over first eigenvalue of the moments of (1, s, t); near zero where tight.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -119,7 +119,7 @@ class Bounded:
     value: float
     bound: float
     rank_ratio: float
-    answer: Answer
+    answer: ConicAnswer
 
 
 def moment_problem(stations: int, dimension: int) -> Any:
@@ -167,14 +167,14 @@ def _relaxation(stations: int, dimension: int, backend: str) -> Relaxation:
     return Relaxation(moment_problem(stations, dimension), backend=backend, settings=settings)
 
 
-def moment_bound(ranged: Ranged, box: Box, cost: float, *, backend: str = "CLARABEL") -> Bounded:
+def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str = "CLARABEL") -> Bounded:
     """Bound the maximum-likelihood cost from below over a box.
 
     Parameters
     ----------
     ranged : Ranged
         The measurements, numbers of order one.
-    box : Box
+    box : EnclosingBox
         Where to look; best `formulations.range_enclosure.enclosure` with the same cost.
     cost : float
         Costs above this need no bound: that of a fix, and a little more.
@@ -208,7 +208,7 @@ def moment_bound(ranged: Ranged, box: Box, cost: float, *, backend: str = "CLARA
     return Bounded(point, answer.primal * size, min(answer.bound * size, cost), rank_ratio(place), answer)
 
 
-def _forms(ranged: Ranged, box: Box, unit: Array) -> tuple[Array, Array, Array]:
+def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array, Array]:
     """Quadratic form of the first equality, coefficients of the others, and the cost in terms of (1, t, w)."""
     from_first, other = box.centre - ranged.station[0], ranged.station[1:] - ranged.station[0]
     middle, half = 0.5 * (box.low + box.high), 0.5 * (box.high - box.low)

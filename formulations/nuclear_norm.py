@@ -35,8 +35,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
-from formulations.conic import Answer, Relaxation, keep
-from formulations.low_rank_network import LowRank, Pulses, Stations
+from formulations.conic import ConicAnswer, Relaxation, keep
+from formulations.low_rank_network import LowRank, Pulses, StationFactors
 
 # Change of the times of emission, in units of the spread, below which passes have settled: far below any noise.
 _SETTLED = 1e-7
@@ -58,7 +58,7 @@ class NuclearNorm:
         Share of the nuclear norm that the singular values beyond the first d have: zero for a network without noise.
     passes : int
         How many were made.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report on the last.
     """
 
@@ -67,7 +67,7 @@ class NuclearNorm:
     bound: float
     beyond: float
     passes: int
-    answer: Answer
+    answer: ConicAnswer
 
 
 def nuclear_problem(stations: int, pulses: int) -> Any:
@@ -175,5 +175,5 @@ def affine_network(z: ArrayLike, offset: ArrayLike, d: int) -> LowRank:
     X = Z * Z - 2.0 * Z * o
     middle, alpha, beta = X.mean(), X.mean(axis=1), X.mean(axis=0)
     u, s, v = np.linalg.svd(X - alpha[:, None] - beta + middle, full_matrices=False)
-    stations = Stations((alpha - middle)[None], (u[:, :d] * s[:d])[None], np.zeros((1, len(Z))))
+    stations = StationFactors((alpha - middle)[None], (u[:, :d] * s[:d])[None], np.zeros((1, len(Z))))
     return LowRank(stations, Pulses(beta[None], v[:d].T[None], o[None]), np.array([np.sum(s[d:] ** 2)]))

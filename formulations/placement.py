@@ -258,7 +258,7 @@ def outer_approximation(
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class PlacementGround:
     """Height of the ground on a grid, between its nodes a cubic spline; level beyond the outermost nodes.
 
     Parameters
@@ -287,7 +287,7 @@ class Ground:
 
 
 @dataclass(frozen=True, slots=True)
-class Region:
+class PlacementRegion:
     """A convex part of where sites may stand: edges @ x <= offsets in the plan, and low <= height above ground <= high.
 
     Parameters
@@ -303,7 +303,7 @@ class Region:
     low: float = 0.0
     high: float = 0.0
 
-    def excess(self, place: Array, ground: Ground | None) -> Array:
+    def excess(self, place: Array, ground: PlacementGround | None) -> Array:
         """Return by how much a place (d,) breaks each rule; none is positive inside."""
         plan = self.edges @ place[:2] - self.offsets
         if len(place) == 2:
@@ -311,7 +311,7 @@ class Region:
         up = place[2] - (0.0 if ground is None else float(ground.at(place[None, :2])[0]))
         return np.concatenate([plan, [self.low - up, up - self.high]])
 
-    def nearest(self, place: Array, ground: Ground | None) -> Array:
+    def nearest(self, place: Array, ground: PlacementGround | None) -> Array:
         """Return the place in the region that is nearest in the plan, at the nearest height."""
         flat = place[:2].copy()
         if (self.edges @ flat > self.offsets).any():
@@ -329,14 +329,14 @@ class Region:
 def refine(
     information: Callable[[Sequence[Any]], Sequence[Any]],
     start: Array,
-    regions: Sequence[Region],
+    regions: Sequence[PlacementRegion],
     weight: Array,
     dimension: int,
     criterion: Criterion,
     *,
     worst: bool = False,
     fail: bool = False,
-    ground: Ground | None = None,
+    ground: PlacementGround | None = None,
 ) -> Array:
     """Return positions (k, d) of sites that are locally optimal, by IPOPT from a start (k, d).
 
@@ -348,13 +348,13 @@ def refine(
         From a list of k symbols (d, 1), or None for a site that fails, to the matrices (m, m) of all places.
     start : Array, shape (k, d)
         Where it begins.
-    regions : sequence of k Region
+    regions : sequence of k PlacementRegion
         Where each site may stand.
     weight : Array, shape (P,)
         Of the places.
     dimension, criterion, worst, fail
         As in `value`.
-    ground : Ground, optional
+    ground : PlacementGround, optional
         What heights are above.
 
     Raises

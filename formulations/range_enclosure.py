@@ -96,7 +96,7 @@ class Ranged:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class EnclosingBox:
     """A parallelepiped of positions and an interval of the reference range.
 
     Parameters
@@ -115,7 +115,7 @@ class Box:
     high: float
 
 
-def enclosure(ranged: Ranged, point: Array, cost: float) -> Box | None:
+def enclosure(ranged: Ranged, point: Array, cost: float) -> EnclosingBox | None:
     """Find a box that holds every position with at most a given cost.
 
     Parameters
@@ -129,7 +129,7 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> Box | None:
 
     Returns
     -------
-    Box or None
+    EnclosingBox or None
         None where the rows do not enclose: too few of them, or the errors too large for the geometry.
 
     Notes
@@ -148,13 +148,13 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> Box | None:
         slack = rho * float(np.sqrt(ranged.covariance[0, 0]))
         reach = max(0.0, ranged.offset[0] - slack), ranged.offset[0] + slack
         if left is None:
-            return Box(ranged.station[0], reach[1] * np.eye(a.shape[1]), *reach)
+            return EnclosingBox(ranged.station[0], reach[1] * np.eye(a.shape[1]), *reach)
         return _box(ranged, point, left, right - side * d * sum(reach), error, reach)
     found = None if left is None else error.reference(left[-1], float(left[-1] @ right))
     return None if left is None or found is None else _box(ranged, point, left[:-1], right, error, found)
 
 
-def ball(ranged: Ranged, centre: Array, radius: float) -> Box:
+def ball(ranged: Ranged, centre: Array, radius: float) -> EnclosingBox:
     """Return the box around a ball of positions.
 
     Parameters
@@ -168,11 +168,11 @@ def ball(ranged: Ranged, centre: Array, radius: float) -> Box:
 
     Returns
     -------
-    Box
+    EnclosingBox
         A cube, and the ranges that points of the ball have.
     """
     away = float(np.linalg.norm(centre - ranged.station[0]))
-    return Box(centre, radius * np.eye(len(centre)), max(0.0, away - radius), away + radius)
+    return EnclosingBox(centre, radius * np.eye(len(centre)), max(0.0, away - radius), away + radius)
 
 
 def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
@@ -222,7 +222,9 @@ class _Error:
         return self.rho**2 * float(np.abs(row) @ self.variance)
 
 
-def _box(ranged: Ranged, point: Array, left: Array, right: Array, error: _Error, reach: tuple[float, float]) -> Box:
+def _box(
+    ranged: Ranged, point: Array, left: Array, right: Array, error: _Error, reach: tuple[float, float]
+) -> EnclosingBox:
     """Box of ``x' = left (right - phi)``, in principal axes; a measured reference range is an unknown of its own."""
     low, high = reach
     axes = _principal(ranged, point)
@@ -230,7 +232,7 @@ def _box(ranged: Ranged, point: Array, left: Array, right: Array, error: _Error,
     half = np.array([error.position(row, low, high) for row in rows])
     if not ranged.free:
         half += np.abs(rows @ (error.side * error.excess)) * (high - low)
-    return Box(ranged.station[0] + left @ right, axes * (half * _ROUND), low / _ROUND, high * _ROUND)
+    return EnclosingBox(ranged.station[0] + left @ right, axes * (half * _ROUND), low / _ROUND, high * _ROUND)
 
 
 def _principal(ranged: Ranged, point: Array) -> Array:

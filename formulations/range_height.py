@@ -136,7 +136,7 @@ def visible(x: Array, surface: Ellipsoid, s: Array) -> Mask:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class HeightCandidates:
     """Points that fit, in no particular order.
 
     Parameters
@@ -154,7 +154,9 @@ class Candidates:
     valid: Mask
 
 
-def locate(stations: Array, sign: ArrayLike, offset: Array, surface: Ellipsoid, *, positive: bool = True) -> Candidates:
+def locate(
+    stations: Array, sign: ArrayLike, offset: Array, surface: Ellipsoid, *, positive: bool = True
+) -> HeightCandidates:
     """All points of the ellipsoid whose ranges to three stations are known up to one unknown.
 
     Parameters
@@ -172,7 +174,7 @@ def locate(stations: Array, sign: ArrayLike, offset: Array, surface: Ellipsoid, 
 
     Returns
     -------
-    Candidates
+    HeightCandidates
         None where the stations lie on a line, the input is not finite or nothing real fits.
 
     Notes
@@ -194,7 +196,7 @@ def locate(stations: Array, sign: ArrayLike, offset: Array, surface: Ellipsoid, 
     return _reshape(_meet(curve, flat, A, centre, positive=positive), lead)
 
 
-def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Candidates:
+def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> HeightCandidates:
     """All points of the ellipsoid with known ranges to two stations.
 
     Parameters
@@ -208,7 +210,7 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Cand
 
     Returns
     -------
-    Candidates
+    HeightCandidates
         None where the spheres do not meet, the input is not finite or nothing real fits.
 
     Notes
@@ -228,13 +230,13 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Cand
     return _reshape(_meet(curve, flat, A, centre, positive=True), lead)
 
 
-def _reshape(found: Candidates, lead: tuple[int, ...]) -> Candidates:
+def _reshape(found: HeightCandidates, lead: tuple[int, ...]) -> HeightCandidates:
     """Give the batch axis its shape back."""
     x, ranges = (v.reshape(*lead, *v.shape[1:]) for v in (found.x, found.ranges))
-    return Candidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
+    return HeightCandidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
 
 
-def _meet(curve: Curve, stations: Array, A: Array, centre: Array, *, positive: bool) -> Candidates:
+def _meet(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
     """All points common to N curves and their ellipsoids."""
     with np.errstate(all="ignore"):
         E, L, alpha = curve.on_ellipsoid(A, centre)
@@ -258,14 +260,14 @@ def _meet(curve: Curve, stations: Array, A: Array, centre: Array, *, positive: b
     valid = np.take_along_axis(valid, order, axis=1)
     x, ranges = (np.take_along_axis(v, order[..., None], axis=1) for v in (x, ranges))
     x[~valid], ranges[~valid] = np.nan, np.nan
-    return Candidates(x, ranges, valid)
+    return HeightCandidates(x, ranges, valid)
 
 
 # Curves on which a point has measured ranges.
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class HeightCurve:
     """A batch of N curves.
 
     Parameters
@@ -331,7 +333,7 @@ class Curve:
         return E, L, dot(self.across, An)
 
 
-def three_stations(stations: Array, sign: Array, offset: Array) -> Curve:
+def three_stations(stations: Array, sign: Array, offset: Array) -> HeightCurve:
     """Curve of the points whose ranges to three stations are known up to one unknown.
 
     Parameters
@@ -343,7 +345,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> Curve:
 
     Returns
     -------
-    Curve
+    HeightCurve
         Not ok where the stations lie on a line.
 
     Notes
@@ -371,7 +373,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> Curve:
     shift = -dot(start, p) / long
     start, scale = start + p * shift[:, None], 1.0 / np.sqrt(long)
     square = [shift**2 - dot(start, start), 2.0 * scale * (shift - dot(start, p)), (1.0 - dot(p, p)) / long]
-    return Curve(
+    return HeightCurve(
         np.where(ok[:, None], stations[:, 0], 0.0) + start,
         p * scale[:, None],
         normal / np.sqrt(size)[:, None],
@@ -382,7 +384,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> Curve:
     )
 
 
-def two_stations(stations: Array, ranges: Array, towards: Array) -> Curve:
+def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
     """Circle of the points with known ranges to two stations.
 
     Parameters
@@ -396,7 +398,7 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> Curve:
 
     Returns
     -------
-    Curve
+    HeightCurve
         The parameters (t, mu) lie on the unit circle. Not ok where the spheres do not meet.
     """
     a = stations[:, 1] - stations[:, 0]
@@ -412,7 +414,7 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> Curve:
     up = _perpendicular(axis, np.where(usable[:, None], towards, 0.0) - base)
     square = np.broadcast_to([1.0, 0.0, -1.0], base.shape)
     along = np.cross(axis, up) * radius[:, None]
-    return Curve(base, along, up * radius[:, None], square, np.zeros_like(ranges), ranges, ok)
+    return HeightCurve(base, along, up * radius[:, None], square, np.zeros_like(ranges), ranges, ok)
 
 
 def _perpendicular(axis: Array, hint: Array) -> Array:

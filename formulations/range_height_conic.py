@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from formulations.algebra import Array
-from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
-from formulations.range_height import Curve, Ellipsoid, three_stations
+from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
+from formulations.range_height import Ellipsoid, HeightCurve, three_stations
 
 
 @dataclass(frozen=True, slots=True)
-class Lifted:
+class LiftedHeights:
     """A lifted fix.
 
     Parameters
@@ -40,7 +40,7 @@ class Lifted:
         Lower bound of the objective over all points that fit, recomputed from the dual. It bounds no likelihood.
     rank_ratio : float
         Second over first eigenvalue of the lift; near zero means exact.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -48,7 +48,7 @@ class Lifted:
     ranges: Array
     bound: float
     rank_ratio: float
-    answer: Answer
+    answer: ConicAnswer
 
 
 def lifted_problem() -> Any:
@@ -79,7 +79,7 @@ def _relaxation(backend: str) -> Relaxation:
 
 def lift(
     stations: Array, sign: Array, offset: Array, surface: Ellipsoid, near: Array, *, backend: str = "CLARABEL"
-) -> Lifted:
+) -> LiftedHeights:
     """Solve the relaxation.
 
     Parameters
@@ -97,7 +97,7 @@ def lift(
 
     Returns
     -------
-    Lifted
+    LiftedHeights
         The fix where `rank_ratio` is small. The problem is built once per back end in each process.
 
     Notes
@@ -108,8 +108,8 @@ def lift(
     guess = float(np.linalg.norm(near - stations[0]))
     forms, change = _forms(curve, surface, near, guess)
     if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
-        nothing = Answer({}, np.nan, -np.inf, "not formulated", solved=False, iterations=0)
-        return Lifted(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
+        nothing = ConicAnswer({}, np.nan, -np.inf, "not formulated", solved=False, iterations=0)
+        return LiftedHeights(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
     # each form divided by its largest entry: an equality may be, and the bound is multiplied back
     scale = float(np.abs(forms["objective"]).max())
     data = {name: form / np.abs(form).max() for name, form in forms.items()}
@@ -117,10 +117,10 @@ def lift(
     lift = answer.values["lift"]
     _, t, mu = change @ lift[:, 0]
     x = curve.points(np.array([[t]]), np.array([[mu]]))[0, 0]
-    return Lifted(x, curve.rate[0] * t + curve.offset[0], answer.bound * scale, rank_ratio(lift), answer)
+    return LiftedHeights(x, curve.rate[0] * t + curve.offset[0], answer.bound * scale, rank_ratio(lift), answer)
 
 
-def _forms(curve: Curve, surface: Ellipsoid, near: Array, guess: float) -> tuple[dict[str, Array], Array]:
+def _forms(curve: HeightCurve, surface: Ellipsoid, near: Array, guess: float) -> tuple[dict[str, Array], Array]:
     """Quadratic forms in (1, t, mu), referred to the guess and in units of it, and what undoes that."""
     E, L, alpha = (v[0] for v in curve.on_ellipsoid(surface.shape[None], surface.centre[None]))
     q, rate, offset = curve.square[0], curve.rate[0, 0], curve.offset[0, 0]
@@ -135,7 +135,7 @@ def _forms(curve: Curve, surface: Ellipsoid, near: Array, guess: float) -> tuple
     return {name: change.T @ form @ change for name, form in forms.items()}, change
 
 
-def _reach(curve: Curve, station: Array, surface: Ellipsoid, guess: float) -> float:
+def _reach(curve: HeightCurve, station: Array, surface: Ellipsoid, guess: float) -> float:
     """Length that the lift of no point of the ellipsoid exceeds: what makes the bound rigorous."""
     size = 1.0 / float(np.sqrt(np.linalg.eigvalsh(surface.shape)[0]))
     t = (float(np.linalg.norm(station - surface.centre)) + size) / guess + 1.0

@@ -55,7 +55,7 @@ _NEAREST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class RegistrationCourse:
     """Range offsets of a batch of N problems at B times.
 
     Parameters
@@ -94,12 +94,12 @@ class _Guess:
     reference: Array
 
 
-def candidates(course: Course, order: int = 0) -> tuple[Array, Array]:
+def candidates(course: RegistrationCourse, order: int = 0) -> tuple[Array, Array]:
     """Return starting points of a registration.
 
     Parameters
     ----------
-    course : Course
+    course : RegistrationCourse
         N problems.
     order : 0, 1 or 2
         Fixed target, constant velocity, constant acceleration.
@@ -120,12 +120,12 @@ def candidates(course: Course, order: int = 0) -> tuple[Array, Array]:
     return np.concatenate([state, branches], axis=1), guess.bias
 
 
-def _powers(course: Course, count: int) -> Array:
+def _powers(course: RegistrationCourse, count: int) -> Array:
     """Return the powers t^j / j! (B, count)."""
     return np.stack([course.time**j / factorial(j) for j in range(count)], axis=-1)
 
 
-def _rows(course: Course, guess: _Guess) -> tuple[Array, Array, Array, Array]:
+def _rows(course: RegistrationCourse, guess: _Guess) -> tuple[Array, Array, Array, Array]:
     """Return ranges r, and of the rows over r the columns of x and of r_0 and the right side, each (N, B, S, ...)."""
     m = course.offset - (course.bias @ guess.bias[:, None, :, None])[..., 0]
     r = np.maximum(m + course.sign * guess.reference[..., None], _NEAREST)
@@ -134,14 +134,14 @@ def _rows(course: Course, guess: _Guess) -> tuple[Array, Array, Array, Array]:
     return r, (others - first) / r[..., None], course.sign * m / r, right
 
 
-def _course_columns(course: Course, columns: Array, order: int) -> Array:
+def _course_columns(course: RegistrationCourse, columns: Array, order: int) -> Array:
     """Return columns (N, B, S, d) of a place as columns (N, B, S, (order + 1) d) of a course."""
     powers = _powers(course, order + 1)
     spread = powers[:, None, :, None] * columns[..., None, :]
     return spread.reshape(*spread.shape[:-2], -1)
 
 
-def _free_ranges(course: Course, order: int) -> _Guess:
+def _free_ranges(course: RegistrationCourse, order: int) -> _Guess:
     """Return biases and smoothed reference ranges of stage 0."""
     size, q = len(course.offset), course.bias.shape[-1]
     guess = _Guess(np.zeros((size, q)) + course.mean, np.ones(course.offset.shape[:2]))
@@ -167,7 +167,7 @@ def _free_ranges(course: Course, order: int) -> _Guess:
     return guess
 
 
-def _least_squares(rows: Array, course: Course, bias: Array | None, cut: float) -> Array:
+def _least_squares(rows: Array, course: RegistrationCourse, bias: Array | None, cut: float) -> Array:
     """Return the least-squares solution (N, n) of rows [A | b] (N, B, S, n + 1); undetermined directions stay zero."""
     flat = rows.reshape(len(rows), -1, rows.shape[-1])
     gram = np.swapaxes(flat, -1, -2) @ flat
@@ -192,7 +192,7 @@ def _solve(matrix: Array, vector: Array, cut: float) -> Array:
     return np.where(good[:, None], y, np.nan)
 
 
-def _smooth(course: Course, reference: Array, order: int) -> Array:
+def _smooth(course: RegistrationCourse, reference: Array, order: int) -> Array:
     """Return reference ranges whose squares are those of some course: r^2 - |s|^2 = lifts(t) - 2 s' x(t)."""
     first = course.station[..., 0, :]
     lifts = _powers(course, 2 * order + 1)
@@ -205,7 +205,7 @@ def _smooth(course: Course, reference: Array, order: int) -> Array:
     return np.asarray(np.sqrt(np.maximum(fitted[..., 0] + known, _NEAREST**2)))
 
 
-def _tie_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Guess]:
+def _tie_ranges(course: RegistrationCourse, guess: _Guess, order: int) -> tuple[Array, _Guess]:
     """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best."""
     q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
     _, place, gain, right = _rows(course, guess)
@@ -232,7 +232,7 @@ def _tie_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Gues
     return state, _Guess(guess.bias + y[:, :q], np.sqrt(distance))
 
 
-def _add_prior(rows: Array, course: Course, bias: Array) -> Array:
+def _add_prior(rows: Array, course: RegistrationCourse, bias: Array) -> Array:
     """Return rows (N, R, q + n + 1) with those of the prior of the biases, whose columns are the first."""
     q = bias.shape[1]
     prior = np.zeros((len(rows), q, rows.shape[-1]))
@@ -261,7 +261,7 @@ def _solve_constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
     return np.concatenate([bias, points[:, 0]], axis=-1), points[..., :d]
 
 
-def _reference(course: Course, theta: Array, lifts: Array, order: int) -> Array:
+def _reference(course: RegistrationCourse, theta: Array, lifts: Array, order: int) -> Array:
     """Return the squared ranges (N, B) of the reference station."""
     first = course.station[..., 0, :]
     along = _course_columns(course, first[..., None, :], order)[..., 0, :]
@@ -269,7 +269,7 @@ def _reference(course: Course, theta: Array, lifts: Array, order: int) -> Array:
     return np.asarray(lifts @ _powers(course, 2 * order + 1).T - 2.0 * inner + (first**2).sum(-1))
 
 
-def _branches(course: Course, state: Array, reference: Array) -> Array:
+def _branches(course: RegistrationCourse, state: Array, reference: Array) -> Array:
     """Return two courses (N, 2, order + 1, d) on either side of the plane that the stations spread in most."""
     first = course.station[..., 0, :]
     # the normal is the direction in which the stations spread least; beside it the distance from the plane follows

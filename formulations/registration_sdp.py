@@ -53,7 +53,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
-from formulations.conic import Answer, Relaxation, keep, rank_ratio
+from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio
 
 # Two to a decade. In random plane arrays the best one (median of twelve) is 30 for targets within one extent, 3 at two
 # extents, 0.3 at three, 0.1 at five and 0.03 at ten.
@@ -62,7 +62,7 @@ PRICES = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
+class RegistrationStart:
     """One answer of the relaxation.
 
     Parameters
@@ -81,7 +81,7 @@ class Started:
         Mean over the windows of the lifted ``|p_k|^2`` less its value at the target, length squared.
     rank_ratio : float
         Second over first eigenvalue in its own units, of the block in which it is largest; near zero would mean tight.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -92,7 +92,7 @@ class Started:
     misfit: float
     slack: float
     rank_ratio: float
-    answer: Answer
+    answer: ConicAnswer
 
 
 def registration(
@@ -106,7 +106,7 @@ def registration(
     time: ArrayLike | None = None,
     prices: tuple[float, ...] = PRICES,
     backend: str = "CLARABEL",
-) -> tuple[Started, ...]:
+) -> tuple[RegistrationStart, ...]:
     """Solve the relaxation for a ladder of prices.
 
     Parameters
@@ -132,7 +132,7 @@ def registration(
 
     Returns
     -------
-    tuple of Started
+    tuple of RegistrationStart
         One for each price that was solved, lowest cost first: starts to be refined. Of a moving target refine all:
         it has several minima, and the order says little about which of them a start leads to. Empty where the data
         are not finite, a moving target is seen at one time only, or the solver gave none.
@@ -147,7 +147,7 @@ def registration(
     The module's text. Shifted and scaled inside, so the answer does not depend on origin or unit. Built once per
     shape and back end in each process.
     """
-    run = Windows.of(station, z, whiten, sigma, design, mean, time)
+    run = RegistrationWindows.of(station, z, whiten, sigma, design, mean, time)
     if not run.finite:
         return ()
     # the price of the mean of |p_k|^2 over the windows
@@ -163,7 +163,7 @@ def registration(
 
 
 @dataclass(frozen=True, slots=True)
-class Windows:
+class RegistrationWindows:
     """Data of K windows about the stations' mean, in units of the stations' extent.
 
     Parameters
@@ -210,7 +210,7 @@ class Windows:
         design: ArrayLike | None,
         mean: ArrayLike,
         time: ArrayLike | None,
-    ) -> Windows:
+    ) -> RegistrationWindows:
         """Shift and scale; arguments as in `formulations.registration_sdp.registration`."""
         s, rows, W, spread = (np.asarray(a, dtype=np.float64) for a in (station, z, whiten, sigma))
         if not (np.isfinite(spread) & (spread > 0)).all():
@@ -321,7 +321,7 @@ def _relaxation(windows: int, stations: int, dimension: int, order: int, biases:
     return Relaxation(registration_problem(windows, stations, dimension, order, biases), backend=backend)
 
 
-def _parameters(run: Windows) -> dict[str, Array]:
+def _parameters(run: RegistrationWindows) -> dict[str, Array]:
     """Coefficients of the lifted equalities, those of the second kind divided by the unit of the leftovers."""
     K, S, _ = run.station.shape
     power, first, other = run.power, run.station[:, 0], run.station[:, 1:]
@@ -343,13 +343,13 @@ def _parameters(run: Windows) -> dict[str, Array]:
     }
 
 
-def _read_off(run: Windows, weight: Array, price: float, answer: Answer) -> Started:
+def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: ConicAnswer) -> RegistrationStart:
     shared, inside = answer.values["shared"], slice(1, 1 + len(weight))
     target = shared[0, inside]
     cost, shift = run.cost(target)
     # what the lift says |p|^2 is: more than the square of what it says p is, by the slack
     square = float((weight * shared[inside, inside]).sum())
-    return Started(
+    return RegistrationStart(
         run.place(target),
         run.mean + run.unit * run.scale * shift,
         cost,
@@ -361,6 +361,6 @@ def _read_off(run: Windows, weight: Array, price: float, answer: Answer) -> Star
     )
 
 
-def _block(answer: Answer, window: int) -> Array:
+def _block(answer: ConicAnswer, window: int) -> Array:
     across = answer.values[f"across {window}"]
     return np.block([[answer.values["shared"], across], [across.T, answer.values[f"own {window}"]]])

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri, erfc
 
 from formulations.algebra import Array
-from formulations.conic import Answer, Relaxation, keep, tight
+from formulations.conic import ConicAnswer, Relaxation, keep, tight
 
 Groups = NDArray[np.intp]
 
@@ -56,7 +56,7 @@ class SparseFit:
         Cost at `y` and `errors`.
     bound : float
         Lower bound of the cost, recomputed from the dual; minus infinity where none was asked for.
-    answer : Answer, optional
+    answer : ConicAnswer, optional
         The solver's report; None where the rows leave a direction open.
     """
 
@@ -64,7 +64,7 @@ class SparseFit:
     errors: Array
     value: float
     bound: float
-    answer: Answer | None
+    answer: ConicAnswer | None
 
 
 def thresholds(sizes: Groups) -> Array:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from formulations.algebra import Array
-from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
+from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.squared_range import Quadric
 
 
@@ -45,7 +45,7 @@ class Relaxed:
     rank_ratio : float
         Second over first eigenvalue of the lifted matrix (Shor); relative distance from the quadric (second order).
         Near zero means tight.
-    answer : Answer
+    answer : ConicAnswer
         The solver's report.
     """
 
@@ -54,7 +54,7 @@ class Relaxed:
     value: float
     bound: float
     rank_ratio: float
-    answer: Answer
+    answer: ConicAnswer
 
 
 def shor_problem(quadric: Quadric) -> Any:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.sites.calibration.likelihood import Estimate
+from optloc.sites.calibration.likelihood import NetworkEstimate
 
 HALL = np.array([20.0, 20.0, 6.0])
 
@@ -18,7 +18,7 @@ def hall(seed, m, n, sigma, *, clocks=False, box=HALL):
     offsets = rng.uniform(-5.0, 5.0, m) if clocks else np.zeros(m)
     apart = np.linalg.norm(pulses[:, None] - stations, axis=-1)
     z = apart + sent[:, None] + offsets + sigma * rng.standard_normal((n, m))
-    return Estimate(stations[None], offsets[None], pulses[None], sent[None]), z
+    return NetworkEstimate(stations[None], offsets[None], pulses[None], sent[None]), z
 
 
 def distances(points):
@@ -60,4 +60,4 @@ def reflected(truth):
     normal = np.linalg.svd(truth.pulses[0] - centre)[2][-1]
     i = int(np.abs((stations[0] - centre) @ normal).argmax())
     stations[0, i] -= 2.0 * ((stations[0, i] - centre) @ normal) * normal
-    return Estimate(stations, truth.clocks, truth.pulses, truth.emission), i
+    return NetworkEstimate(stations, truth.clocks, truth.pulses, truth.emission), i

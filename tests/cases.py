@@ -12,7 +12,9 @@ from math import factorial
 import numpy as np
 import pymap3d
 
-from optloc import MODELS, Bias, Frame, Motion, Problem, Stations, assemble, measured, simulate, station_array
+from optloc import Frame, Motion, Problem, Stations, assemble, measured, simulate, station_array
+from optloc.models import MODELS
+from optloc.problem import Bias
 
 STATIONS = {
     2: np.array([[0.0, 0.0], [9e3, 1e3], [10e3, 9e3], [1e3, 10e3], [4.5e3, -2e3], [-2e3, 5e3]]),

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from optloc import FORMULATIONS, LOSSES, MODELS, SOLVERS
 from optloc.lab.study.baselines import BASELINES
+from optloc.models import MODELS
+from optloc.problem import LOSSES
+from optloc.solvers import FORMULATIONS, SOLVERS
 from optloc.tracking import UPDATES
 
 PAGE = Path(__file__).parents[1] / "docs" / "contributing.md"

@@ -9,8 +9,9 @@ from cases import CASES, kitchen_sink, random_vector
 from often import few
 from runs import drawn, estimated, run, truth
 
-from optloc import InvalidProblem, gauss_newton, linearise, normal, predict, simulate, solve
+from optloc import InvalidProblem, simulate, solve
 from optloc.base.types import Prior
+from optloc.engine import gauss_newton, linearise, normal, predict
 
 LIBRARIES = ("array_api_strict", "torch", "jax.numpy")
 STARTS = 4

@@ -6,20 +6,8 @@ import numpy as np
 import pytest
 from cases import CASES, STATIONS, stations
 
-from optloc import (
-    ECEF,
-    Bias,
-    Frame,
-    InvalidProblem,
-    Motion,
-    Prior,
-    Stations,
-    assemble,
-    crlb,
-    measured,
-    solve,
-    station_array,
-)
+from optloc import Frame, InvalidProblem, Motion, Stations, assemble, crlb, measured, solve, station_array
+from optloc.problem import ECEF, Bias, Prior
 from optloc.problem.layout import Layout
 
 SIX = np.arange(6)

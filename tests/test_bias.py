@@ -6,7 +6,6 @@ from cases import STATIONS
 from often import few
 
 from optloc import (
-    ECEF,
     InvalidProblem,
     Motion,
     Stations,
@@ -14,14 +13,14 @@ from optloc import (
     constraints,
     crlb,
     measured,
-    predict,
     simulate,
     solve,
     station_array,
     with_bias,
-    with_known_bias,
 )
+from optloc.engine import predict
 from optloc.linear.evaluate import differentiate
+from optloc.problem import ECEF, with_known_bias
 
 A, B = np.array([1, 2, 3, 2]), np.array([0, 0, 0, 1])
 NAMES = ("ref", "north", "east", "west")

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from sources import nodes, walked
 
-from optloc import InvalidProblem, Motion, Status, assemble, measured, predict, simulate, solve, with_bias
+from optloc import InvalidProblem, Motion, Status, assemble, measured, simulate, solve, with_bias
 from optloc.base.types import FormName, Stations
+from optloc.engine import predict
 from optloc.problem.bias import with_known_bias
 from optloc.problem.forms import FORMS, BiasForm
 from optloc.proof.scope import unsupported

@@ -37,7 +37,7 @@ def test_averages_are_means_where_nothing_is_missing():
 def test_missing_rows_do_not_shift_the_middle():
     """Without noise the line through what is left of a block meets the full average to the curvature of the path."""
     problem = run(300)
-    exact = optloc.predict(problem, truth(problem))
+    exact = optloc.engine.predict(problem, truth(problem))
     weight = np.ones(problem.count)
     weight[np.random.default_rng(1).random(problem.count) < 0.3] = 0.0
     full = average_blocks(problem.with_rows(z=exact), 30)

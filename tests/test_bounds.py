@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optloc import InvalidProblem, Motion, Prior, Stations, assemble, crlb, measured, with_bias
+from optloc import InvalidProblem, Motion, Stations, assemble, crlb, measured, with_bias
 from optloc.base.frames import Frame
 from optloc.bounds.cramer_rao import _inverse, crlb_course
 from optloc.bounds.rank import observability
 from optloc.lab.papers import registration as scenes
 from optloc.linear.constraints import height
 from optloc.linear.normal import linearise, prior_parts
+from optloc.problem import Prior
 
 
 def problem_of(epochs, *, moving=True, prior=None, span="noise", station_sigma=1.0, scene=scenes.SPATIAL, gain=None):

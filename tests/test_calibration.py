@@ -8,12 +8,13 @@ from often import few
 from scipy.stats import chi2
 
 import optloc
-from optloc import InvalidProblem, Status, calibrate, network_of
+from optloc import InvalidProblem, Status, calibrate
 from optloc.kernels.jit import plain
+from optloc.sites.calibration import network_of
 from optloc.sites.calibration.blocks import settled
 from optloc.sites.calibration.calibrated import refuted_blocks
 from optloc.sites.calibration.gauge import departure, determined
-from optloc.sites.calibration.likelihood import Estimate, likelihood
+from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood
 from optloc.sites.calibration.rounds import starts_of
 
 EXACT = 1e-6
@@ -316,7 +317,7 @@ def test_joint_moves_find_the_cheaper_network_of_a_curved_valley():
     sent = rng.uniform(-100.0, 100.0, (count, 1))
     net = network_of(apart + sent + sigma * rng.normal(size=apart.shape), sigma)
     found = calibrate(net)
-    truth = Estimate(stations[None], np.zeros((1, n)), pulses[None], sent.T)
+    truth = NetworkEstimate(stations[None], np.zeros((1, n)), pulses[None], sent.T)
     assert found.cost <= likelihood(net).refine(truth)[1][0] + 0.01
     assert found.status == Status.AMBIGUOUS
     assert 1.0 < found.alternatives[0].gap < 2.0

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from cases import CASES
 
-from optloc import Certificate, simulate, solve
+from optloc import simulate, solve
 from optloc.base.records import join, overwrite, take
+from optloc.problem import Certificate
 from optloc.problem.claims import alike, choose, claim, untried
 
 GIVEN = [

@@ -43,7 +43,7 @@ def drawn(problem, seed, trials=None, begin=(40.0, -80.0, 120.0, 10.0)):
     base = problem.layout.n_shared
     for bias in walks(problem):
         truth[base + places(problem.layout, bias)[:, 0]] = begin
-    truth = optloc.wander(problem, truth, seed, trials)
+    truth = optloc.engine.wander(problem, truth, seed, trials)
     return optloc.simulate(problem, truth, seed + 1), truth
 
 
@@ -108,7 +108,9 @@ def test_a_walk_that_is_estimated_is_noise_that_is_correlated():
     noise = 9.0 * np.eye(plain.count) + np.where(
         station[:, None] == station, together[np.ix_(plain.epoch, plain.epoch)], 0.0
     )
-    rows = replace(plain, noise=optloc.Noise((optloc.noise.Block(np.arange(plain.count)[None], noise[None]),)))
+    rows = replace(
+        plain, noise=optloc.problem.Noise((optloc.problem.Block(np.arange(plain.count)[None], noise[None]),))
+    )
     other = optloc.solve(rows, "lsr", start=np.concatenate([fix.position, fix.take("clock")[0]]))
     np.testing.assert_allclose(fix.position, other.position, atol=1e-4)
     np.testing.assert_allclose(fix.covariance(), other.covariance(), rtol=1e-6)
@@ -119,8 +121,8 @@ def test_a_walk_that_is_estimated_is_noise_that_is_correlated():
 
 def test_the_bound_against_time_is_that_of_the_first_epochs():
     problem, truth = drawn(walking(30, density=0.04, sigma=100.0), 5)
-    course = optloc.crlb_course(problem, truth, [10, 20, 30])
-    first = optloc.epochs.cut(problem, 0, 20)
+    course = optloc.bounds.crlb_course(problem, truth, [10, 20, 30])
+    first = optloc.problem.cut(problem, 0, 20)
     np.testing.assert_allclose(course.covariance[1], optloc.crlb(first, truth[: first.layout.size]), rtol=1e-8)
     np.testing.assert_allclose(course.covariance[2], optloc.crlb(problem, truth), rtol=1e-8)
     assert (np.diff(course.total("position")) < 0.0).all()
@@ -144,10 +146,10 @@ def test_known_walks_and_splines_leave_the_problem():
         truth[:3] = TARGET
         truth[3:] = 30.0 * RNG.standard_normal(len(truth) - 3)
         values = problem.layout.take(truth, "clock")
-        expected = optloc.predict(problem, truth)
+        expected = optloc.engine.predict(problem, truth)
         known = with_known_bias(problem.with_rows(z=expected), "clock", values)
         assert not known.biases
-        np.testing.assert_allclose(known.observed, optloc.predict(known, TARGET), atol=1e-9)
+        np.testing.assert_allclose(known.observed, optloc.engine.predict(known, TARGET), atol=1e-9)
 
 
 def nees(order, trials, seed):
@@ -193,7 +195,7 @@ def test_clocks_and_positions_are_as_certain_as_is_said_over_500_runs():
 
 def test_steps_have_the_variance_of_their_definition():
     problem = walking(400, density=0.04, rate_density=1e-4)
-    x = optloc.wander(problem, np.zeros(problem.layout.size), 4)
+    x = optloc.engine.wander(problem, np.zeros(problem.layout.size), 4)
     value, rate = (problem.layout.take(x, name) for name in ("clock", "clock rate"))
     F, Q = process(problem.biases[0], problem.times)
     state = np.stack([value, rate], axis=-1)
@@ -214,7 +216,7 @@ def test_allan_deviations_become_densities_and_walks_have_these_deviations():
     # second differences of the error over tau: Allan's definition
     plain = run(4000, seconds=1.0)
     problem = with_bias(plain, "clock", members=["S2", "S3"], form="walk", density=density, rate_density=rate_density)
-    x = problem.layout.take(optloc.wander(problem, np.zeros(problem.layout.size), 8), "clock")
+    x = problem.layout.take(optloc.engine.wander(problem, np.zeros(problem.layout.size), 8), "clock")
     for n, expected in zip((1, 4, 16), allan, strict=False):
         second = x[2 * n :] - 2.0 * x[n:-n] + x[: -2 * n]
         assert np.sqrt(np.mean(second**2) / 2.0) / n / speed == pytest.approx(expected, rel=0.1)
@@ -232,7 +234,7 @@ def test_a_walk_and_a_spline_begin_together_on_both_sides_of_a_line_of_stations(
     problem = with_bias(problem, "spline", members=["S3"], form="spline", knots=3)
     truth = np.zeros(problem.layout.size)
     truth[:4] = 300.0, 400.0, 1.0, -2.0
-    fix = optloc.solve(optloc.simulate(problem, optloc.wander(problem, truth, 1), 2))
+    fix = optloc.solve(optloc.simulate(problem, optloc.engine.wander(problem, truth, 1), 2))
     assert fix.status == optloc.Status.AMBIGUOUS
     np.testing.assert_allclose(fix.x[:4] * [1.0, -1.0, 1.0, -1.0], fix.alternatives.x[0, :4], rtol=1e-5)
 
@@ -261,7 +263,7 @@ def test_a_spline_follows_a_clock_that_bends():
             ),
         ),
         motions=(optloc.Motion(), optloc.Motion(known=beacon)),
-        noise=optloc.noise.independent(np.full(2 * rows.count, 9.0)),
+        noise=optloc.problem.independent(np.full(2 * rows.count, 9.0)),
     )
     problem = with_bias(both, "clock", members=["S1", "S2", "S3", "S4"], form="spline", knots=6)
     truth = np.concatenate([TARGET, np.zeros(problem.layout.size - 3)])
@@ -300,7 +302,7 @@ def test_what_cannot_be_meant_is_refused(change, words):
 def test_what_adds_up_epochs_refuses_walks():
     problem, _ = drawn(walking(12, density=0.04), 5)
     with pytest.raises(InvalidProblem, match="ties each epoch to the next"):
-        optloc.Running.begin(problem, optloc.solve(problem, "roots+lsr"))
+        optloc.solvers.Running.begin(problem, optloc.solve(problem, "roots+lsr"))
     one = optloc.assemble(np.eye(3), optloc.measured("range", a=[0, 1, 2], sigma=1.0))
     with pytest.raises(InvalidProblem, match="needs several epochs"):
         with_bias(one, "clock", form="walk", density=1.0)
@@ -397,7 +399,7 @@ def test_an_aircraft_that_reports_lets_unsynchronised_receivers_fix_others():
     begin = np.zeros((30, 5))
     begin[0] = [350.0, -820.0, 130.0, 610.0, -240.0]
     silent = np.array([18e3, 24e3, 7.6e3, -150.0, -110.0, 0.0])
-    data = optloc.simulate(model, optloc.wander(model, np.concatenate([silent, begin.ravel()]), 3, trials), 4)
+    data = optloc.simulate(model, optloc.engine.wander(model, np.concatenate([silent, begin.ravel()]), 3, trials), 4)
     fix = optloc.solve(data)
     assert (fix.code == optloc.Status.UNPROVEN).sum() >= trials - 1  # one in a thousand may be told a misfit
     error = fix.x[:, :6] - silent

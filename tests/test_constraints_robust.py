@@ -10,9 +10,10 @@ from scipy.optimize import minimize
 from test_constraints import ENU, PLANE, SPACE, above, drawn, moving
 from verdicts import alone
 
-from optloc import Status, assemble, measured, simulate, solve, suspects
+from optloc import Status, assemble, measured, simulate, solve
 from optloc.linear.constraints import box, height, polygon, speed
 from optloc.problem.loss import LOSSES
+from optloc.solvers import suspects
 
 RING = np.array([[np.cos(t), np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 9)[:-1]]) * 3e3 + 2.5e3
 CORNER = ((0.0, 0.0), (2000.0, 9e3))

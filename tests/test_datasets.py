@@ -102,7 +102,7 @@ def test_sets_are_read_whole(data_dir, name, options, batch, epochs, truth):
 @pytest.mark.parametrize(("name", "options"), [("uwb", {"flight": "F01"}), ("plaza", {"form": "affine"})])
 def test_the_truth_explains_the_rows(data_dir, name, options):
     data = datasets.load(name, folder=data_dir, **options)
-    off = data.problem.observed - optloc.predict(data.problem, data.truth.ravel())
+    off = data.problem.observed - optloc.engine.predict(data.problem, data.truth.ravel())
     sigma = np.sqrt(variances(data.problem.noise, data.problem.count))
     assert np.median(np.abs(off) / sigma) < 0.9  # 0.67 of Gaussian errors
     assert np.abs(np.median(off / sigma)) < 0.3

@@ -74,7 +74,7 @@ def test_marks_are_known_and_few_blocks_are_not_run():
     assert len(left) <= len(code) / 5
 
 
-@pytest.mark.parametrize("name", sorted({key.split(":")[0] for key in optloc.FORMULATIONS}))
+@pytest.mark.parametrize("name", sorted({key.split(":")[0] for key in optloc.solvers.FORMULATIONS}))
 def test_every_formulation_has_a_page_with_all_its_arguments(name):
     page = THEORY / f"{name}.md"
     assert page.exists()
@@ -152,8 +152,8 @@ def exit_codes():
 
 def test_every_kind_and_every_method_is_in_the_page_on_choosing():
     text = text_of("how-to-choose.md")
-    assert [name for name in [*optloc.MODELS, *optloc.METHODS] if f"`{name}`" not in text] == []
-    stages = [name for name, entry in optloc.SOLVERS.items() if entry.role == "start"]
+    assert [name for name in [*optloc.models.MODELS, *optloc.solvers.METHODS] if f"`{name}`" not in text] == []
+    stages = [name for name, entry in optloc.solvers.SOLVERS.items() if entry.role == "start"]
     assert [name for name in stages if not re.search(rf"`{name}\b|\b{name}\+", text)] == []
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from often import few
 
-from optloc import ECEF, Bias, Frame, Motion, Stations, assemble, measured, simulate, solve
+from optloc import Frame, Motion, Stations, assemble, measured, simulate, solve
 from optloc.base.frames import geodetic_to_ecef
 from optloc.linear.constraints import height
+from optloc.problem import ECEF, Bias
 from optloc.solvers.starts.doppler import doppler_starts, dopplered
 
 EARTH_RATE = 7.292115e-5  # rad/s

@@ -7,8 +7,9 @@ import warnings
 import pytest
 from recipes import installed, write_package
 
-from optloc import MODELS, InvalidProblem, Model
-from optloc.base.registry import Table
+from optloc import InvalidProblem
+from optloc.base.registry import Registry
+from optloc.models import MODELS, Model
 from optloc.tracking import UPDATES
 
 BAD = {
@@ -17,11 +18,15 @@ BAD = {
     "is missing": ("", {"bad": "elsewhere:kind"}, ["does not load", "elsewhere"]),
     "is something else": ("kind = 3", {"bad": "module:kind"}, ["int", "does not belong"]),
     "is no kind": (
-        "import optloc\nkind = optloc.Model(abs, 'luminosity', 1, 'x')",
+        "import optloc\nkind = optloc.models.Model(abs, 'luminosity', 1, 'x')",
         {"bad": "module:kind"},
         ["unknown quantity 'luminosity'"],
     ),
-    "takes a name": ("import optloc\nkind = optloc.MODELS['groa']", {"tdoa": "module:kind"}, ["'tdoa' is taken"]),
+    "takes a name": (
+        "import optloc\nkind = optloc.models.MODELS['groa']",
+        {"tdoa": "module:kind"},
+        ["'tdoa' is taken"],
+    ),
 }
 
 
@@ -58,14 +63,14 @@ def test_of_two_packages_with_one_name_the_second_is_refused(tmp_path, monkeypat
 
 
 def test_a_package_may_look_at_the_table_while_it_is_loaded(tmp_path, monkeypatch):
-    text = "import optloc\nseen = sorted(optloc.MODELS)\nkind = optloc.MODELS['range']\n"
+    text = "import optloc\nseen = sorted(optloc.models.MODELS)\nkind = optloc.models.MODELS['range']\n"
     write_package(tmp_path, {"curious_module.py": text}, "curious", {"optloc.models": {"again": "curious_module:kind"}})
     with installed(tmp_path):
         assert MODELS["again"] is MODELS["range"]
 
 
 def test_a_table_is_a_dictionary_that_grows():
-    table = Table("optloc.none", callable, {"abs": abs})
+    table = Registry("optloc.none", callable, {"abs": abs})
     table["max"] = max
     assert list(table) == ["abs", "max"]
     assert len(table) == 2
@@ -78,7 +83,9 @@ def test_a_table_is_a_dictionary_that_grows():
 
 
 def test_the_names_of_optloc_need_no_look_at_packages():
-    code = "import optloc; optloc.MODELS['tdoa'], optloc.SOLVERS['lsr']; print(optloc.MODELS._found)"
+    code = (
+        "import optloc; optloc.models.MODELS['tdoa'], optloc.solvers.SOLVERS['lsr']; print(optloc.models.MODELS._found)"
+    )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "None"
 

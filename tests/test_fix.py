@@ -9,7 +9,8 @@ from cases import CASES, ENU, STATIONS, TARGET
 from often import few
 from scipy.stats import chi2
 
-from optloc import ECEF, NoSolution, Status, assemble, measured, simulate, solve
+from optloc import NoSolution, Status, assemble, measured, simulate, solve
+from optloc.problem import ECEF
 
 
 def many(name="tdoa-3d", trials=6, seed=3):

@@ -310,13 +310,13 @@ def test_a_problem_file_of_another_folder_is_whole(tmp_path):
 
 
 def test_code_comes_in_by_name_on_the_command_line_alone(tmp_path, monkeypatch):
-    (tmp_path / "mine.py").write_text("import optloc\noptloc.LOSSES['mine'] = optloc.LOSSES['cauchy']\n")
+    (tmp_path / "mine.py").write_text("import optloc\noptloc.LOSSES['mine'] = optloc.problem.LOSSES['cauchy']\n")
     site = document(tmp_path, tdoa())
     fix = ["fix", str(site), "--method", "mine", "--quiet"]
     plain = RUN.invoke(app, fix)
     assert plain.exit_code == 2, plain.stderr
     with monkeypatch.context() as later:
-        later.setitem(optloc.LOSSES, "mine", None)  # what the plugin adds goes again
+        later.setitem(optloc.problem.LOSSES, "mine", None)  # what the plugin adds goes again
         found = RUN.invoke(app, ["--plugin", str(tmp_path / "mine.py"), *fix])
     assert found.exit_code == 1, found.stderr  # a robust loss proves nothing: an answer that is not ok
 

@@ -7,7 +7,8 @@ import pytest
 from cases import CASES, STATIONS, TARGET, dense_covariance
 from hypothesis import given, settings, strategies as st
 
-from optloc import MODELS, assemble, crlb, measured, simulate, solve
+from optloc import assemble, crlb, measured, simulate, solve
+from optloc.models import MODELS
 from optloc.problem.noise import Block, Noise
 
 STARTED = sorted(name for name, case in CASES.items() if case.start)

@@ -6,7 +6,8 @@ from often import few
 from scipy.optimize import least_squares, minimize
 
 import optloc
-from optloc import Layers, Status, assemble, constraints, measured, solve
+from optloc import Status, assemble, constraints, measured, solve
+from optloc.models import Layers
 
 # Own rays: a direct path through the layers between both ends, found by the tangent of the angle at the fastest speed.
 

@@ -24,7 +24,7 @@ LAYERS = (
     "solvers uncertainty",
     "tracking station_health",
     "files multi_target",
-    "show",
+    "show advice",
     "cli",
     # neighbours, which import the faces of the core only
     "sites plugins",
@@ -153,7 +153,7 @@ def test_no_loose_module():
 
 
 # Limits of the contributing guide. A commit that adds a file raises the number of modules, so that each is a decision.
-MODULES, LINES, BODY, RECURRING = 437, 600, 60, 20
+MODULES, LINES, BODY, RECURRING = 443, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():
@@ -174,6 +174,13 @@ def test_a_module_name_stands_for_one_thing():
     """A name recurs only where the folder says what is done with it, as in `cli/track` and `plot/track`."""
     names = Counter(path.stem for path in modules(ROOT).values() if not path.stem.startswith("__"))
     assert len([name for name, count in names.items() if count > 1]) <= RECURRING
+
+
+def test_no_two_classes_have_one_name():
+    found = Counter(
+        node.name for path in modules(ROOT).values() for node in nodes(path) if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in found.items() if count > 1] == []
 
 
 # Words with one meaning, and the module that may define them: the plan of the engine, and the function that returns a

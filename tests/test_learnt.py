@@ -32,14 +32,14 @@ def problem(kind, dimension=3, **options):
 def test_a_known_bias_is_the_bias(kind, dimension, options, values):
     whole = problem(kind, dimension, **options)
     x = np.concatenate([TARGET[:dimension], np.ravel(values)])
-    z = optloc.predict(whole, x)
-    rest = optloc.with_known_bias(whole.with_rows(z=z), "unit", values)
+    z = optloc.engine.predict(whole, x)
+    rest = optloc.problem.with_known_bias(whole.with_rows(z=z), "unit", values)
     assert rest.biases == ()
-    np.testing.assert_allclose(optloc.predict(rest, x[:dimension]), rest.observed, atol=1e-12)
+    np.testing.assert_allclose(optloc.engine.predict(rest, x[:dimension]), rest.observed, atol=1e-12)
 
 
 def test_members_by_name_and_differences():
-    made = optloc.with_known_bias(run(3), "delay", {"S3": 7.0})
+    made = optloc.problem.with_known_bias(run(3), "delay", {"S3": 7.0})
     amount = made.rows[0].correction.reshape(3, 4)
     np.testing.assert_array_equal(amount, np.tile([0.0, 7.0, 0.0, 0.0], (3, 1)))
 
@@ -55,4 +55,4 @@ def test_members_by_name_and_differences():
 )
 def test_what_does_not_fit_is_refused(name, values, words):
     with pytest.raises(InvalidProblem, match=words):
-        optloc.with_known_bias(run(3), name, values)
+        optloc.problem.with_known_bias(run(3), name, values)

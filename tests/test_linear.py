@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from cases import CASES, STATIONS, TARGET, kitchen_sink, plain_predict, random_vector, turned, wrapped
 
-from optloc import Bias, Motion, Prior, Stations, assemble, linearise, measured, predict, simulate
+from optloc import Motion, Stations, assemble, measured, simulate
+from optloc.engine import linearise, predict
+from optloc.problem import Bias, Prior
 
 
 def _free(d):

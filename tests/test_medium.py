@@ -8,21 +8,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, minimize_scalar
 
 import optloc
-from optloc import (
-    Atmosphere,
-    Frame,
-    InvalidProblem,
-    Layers,
-    Motion,
-    Stations,
-    assemble,
-    crlb,
-    measured,
-    simulate,
-    solve,
-)
+from optloc import Frame, InvalidProblem, Motion, Stations, assemble, crlb, measured, simulate, solve
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.models import layers as rays, medium as media
+from optloc.models import Atmosphere, Layers, layers as rays, medium as media
 from optloc.models.layers import first_arrival
 from optloc.models.primitives import Jet, Point
 from optloc.show.pictures import plot_fixes
@@ -158,7 +146,7 @@ def test_sums_and_differences_are_those_of_paths(seed):
     rows = [measured(kind, a=[1, 2], b=[0, 1], sigma=1.0) for kind in ("tdoa", "range_sum")]
     x = np.array([300.0, 500.0, -700.0])
     one, two, three = (length(SEA, np.append(x, s)[None])[0] for s in stations)
-    values = optloc.predict(assemble(stations, *rows, medium=SEA), x)
+    values = optloc.engine.predict(assemble(stations, *rows, medium=SEA), x)
     np.testing.assert_allclose(values, [two - one, three - two, two + one, three + two], rtol=1e-14)
 
 
@@ -409,7 +397,7 @@ def test_locate_takes_layers():
         (
             HILLS - np.array([0, 0, 3000]),
             rows_of("range", 6, 1.0),
-            {"medium": SEA, "frame": optloc.ECEF},
+            {"medium": SEA, "frame": optloc.problem.ECEF},
             "third axis is up",
         ),
         (floor_and_surface(), measured("groa", a=[1, 2], b=0, sigma=0.1), {"medium": SEA}, "bent rays"),

@@ -6,9 +6,9 @@ import pymap3d
 import pytest
 from cases import RATE, STATIONS, TARGET, plain_h, turn_matrix, turned
 
-from optloc import ECEF, MODELS
-from optloc.models import Point, lifted_row
+from optloc.models import MODELS, Point, lifted_row
 from optloc.models.primitives import WGS84_A, WGS84_F, Jet, geodetic_height, geodetic_normal, rotate, wrap
+from optloc.problem import ECEF
 
 KINDS = [(kind, d) for kind, model in MODELS.items() for d in model.dimensions]
 BATCH = 40

@@ -5,7 +5,7 @@ import pytest
 from cases import STATIONS, TARGET
 
 from optloc import assemble, measured, simulate, solve
-from optloc.lab.papers.registration import SPATIAL, Setting
+from optloc.lab.papers.registration import SPATIAL, RegistrationSetting
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -24,7 +24,7 @@ def test_each_problem_has_its_own_stations(count):
 @pytest.mark.slow
 def test_a_long_run_ends_refined_on_all_its_epochs():
     """IPOPT sees block averages of it, whose minimum is another: least squares ends at that of all rows."""
-    setting = Setting(SPATIAL, 2, 1, 0)
+    setting = RegistrationSetting(SPATIAL, 2, 1, 0)
     drawn = setting.draw(150)
     found, expected = solve(drawn, "roots+nlp"), solve(drawn, "roots+lsr")
     assert found.answered.all()

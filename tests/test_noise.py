@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from cases import CASES, STATIONS, TARGET, dense_covariance, kitchen_sink
 
-from optloc import assemble, measured, normal, simulate, solve
+from optloc import assemble, measured, simulate, solve
+from optloc.engine import normal
 from optloc.linear.normal import linearise
 from optloc.linear.simulate import draw
 from optloc.problem import noise as noises

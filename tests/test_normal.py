@@ -8,8 +8,10 @@ import pytest
 from cases import CASES, STATIONS, TARGET, dense_covariance, kitchen_sink, plain_predict, random_vector, wrapped
 from often import few
 
-from optloc import Bias, Motion, Prior, assemble, crlb, linearise, measured, normal, simulate
+from optloc import Motion, assemble, crlb, measured, simulate
+from optloc.engine import linearise, normal
 from optloc.linear.normal import covariance, decrement, marginal, step, with_priors
+from optloc.problem import Bias, Prior
 
 
 def equations(problem, x):

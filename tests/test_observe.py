@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from optloc import Motion, Prior, Stations, assemble, crlb, measured, simulate, solve, with_bias
+from optloc import Motion, Stations, assemble, crlb, measured, simulate, solve, with_bias
 from optloc.base.frames import Frame
 from optloc.bounds.rank import observability
 from optloc.lab.papers import registration as scenes
 from optloc.linear.constraints import height
 from optloc.linear.normal import linearise
+from optloc.problem import Prior
 
 NAMES = tuple("ABCDEF")
 PLACE = np.random.default_rng(3).uniform(-5e3, 5e3, (6, 3))

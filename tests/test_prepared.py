@@ -11,7 +11,6 @@ from hypothesis import given, settings, strategies as st
 from optloc import (
     InvalidProblem,
     Motion,
-    Prior,
     Status,
     assemble,
     crlb,
@@ -26,6 +25,7 @@ from optloc.base.types import Band
 from optloc.engine.plan import plan_of
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
+from optloc.problem import Prior
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import in_parts
 from optloc.solvers.solution import solve_in_stages

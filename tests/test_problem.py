@@ -6,23 +6,10 @@ import numpy as np
 import pytest
 from cases import CASES, RATE, STATIONS, TARGET, kitchen_sink, plain_predict, random_vector, turned
 
-from optloc import (
-    Bias,
-    InvalidProblem,
-    Layout,
-    Motion,
-    Prior,
-    Stations,
-    Status,
-    assemble,
-    by_epoch,
-    linearise,
-    measured,
-    predict,
-    simulate,
-    solve,
-)
+from optloc import InvalidProblem, Motion, Stations, Status, assemble, measured, simulate, solve
 from optloc.base.types import Band
+from optloc.engine import linearise, predict
+from optloc.problem import Bias, Layout, Prior, by_epoch
 from optloc.problem.epochs import separable
 from optloc.problem.noise import Block, Noise
 

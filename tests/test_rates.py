@@ -11,13 +11,13 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 import optloc
-from optloc import ECEF, MODELS, InvalidProblem, Motion, assemble, measured, simulate, solve, with_bias
+from optloc import InvalidProblem, Motion, assemble, measured, simulate, solve, with_bias
 from optloc.bounds.cramer_rao import crlb
 from optloc.cli import app
 from optloc.files import load, read
 from optloc.linear.normal import linearise, normal
-from optloc.models import Point, distance
-from optloc.problem import noise as noises
+from optloc.models import MODELS, Point, distance
+from optloc.problem import ECEF, noise as noises
 from optloc.tracking import begun, followed, polynomial
 
 C, CARRIER = 299_792_458.0, 1090e6
@@ -421,7 +421,7 @@ def test_a_position_and_a_velocity_of_every_epoch(tmp_path):
     path.write_text(text)
     made = load(path)
     assert [slot.name for slot in made.layout.local] == ["position", "velocity"]
-    fix = solve(optloc.by_epoch(made), "searched")
+    fix = solve(optloc.problem.by_epoch(made), "searched")
     error = np.concatenate([fix.position, fix.velocity], axis=-1) - np.array([at(t) for t in problem.times])
     nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(fix.cov), error)
     assert nees.mean() == pytest.approx(4.0, abs=3.0 * np.sqrt(8.0 / 60))

@@ -17,13 +17,14 @@ from typer.testing import CliRunner
 from verdicts import alone
 
 import optloc
-from optloc import MODELS, InvalidProblem, Motion, Status, solve
+from optloc import InvalidProblem, Motion, Status, solve
 from optloc.cli import app
 from optloc.kernels.sums import equations_at
 from optloc.kernels.trace import evaluate, trace
 from optloc.lab.study.trial import compute
 from optloc.linear.evaluate import block_links, given
 from optloc.linear.normal import linearise
+from optloc.models import MODELS
 from optloc.tracking import collected, polynomial, tracked
 
 TRIALS = 200
@@ -291,7 +292,7 @@ def test_other_processes_find_it_too(package, file):
 
 # --------------------------------------------------------------------------- formulation, loss, solver and tracker
 def test_the_formulation_is_listed():
-    assert optloc.FORMULATIONS["discs"].source.endswith("2001")
+    assert optloc.solvers.FORMULATIONS["discs"].source.endswith("2001")
     assert any(row["formulation"] == "discs" for row in json.loads(run("list", "formulations", "--json")))
 
 
@@ -347,7 +348,7 @@ def test_the_loss_leaves_a_liar_aside():
     assert (fix.weights[:, 3] < 1e-3).all()
     assert (np.linalg.norm(fix.position - plain.position, axis=-1) < 20.0).all()
     # By its definition: the derivative of the cost is twice the weighted residual.
-    loss, u = optloc.LOSSES["welsch"], np.linspace(-6.0, 6.0, 121)
+    loss, u = optloc.problem.LOSSES["welsch"], np.linspace(-6.0, 6.0, 121)
     slope = (loss.rho(u + 1e-6) - loss.rho(u - 1e-6)) / 2e-6
     np.testing.assert_allclose(slope, 2.0 * u * loss.weight(u), atol=1e-6)
     assert abs(loss.efficiency - 0.95) < 2e-3

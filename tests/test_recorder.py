@@ -12,7 +12,7 @@ from recorder.listing import listing
 from recorder.recording import Recording, plain, read, record, solved
 from recorder.scope import REFINEMENTS, VARIANTS, own_words, scenes, shipped_methods
 
-from optloc import METHODS
+from optloc.solvers import METHODS
 
 KEY = ("tdoa-2d", "clean", 0, "auto")
 FIX = {

@@ -6,21 +6,10 @@ import numpy as np
 import pytest
 from cases import CASES, RATE, STATIONS, TARGET, dense_covariance, kitchen_sink, stations
 
-from optloc import (
-    Bias,
-    InvalidProblem,
-    Motion,
-    Prior,
-    Status,
-    assemble,
-    linearise,
-    measured,
-    normal,
-    reduce,
-    simulate,
-    solve,
-)
+from optloc import InvalidProblem, Motion, Status, assemble, measured, simulate, solve
+from optloc.engine import linearise, normal, reduce
 from optloc.linear.normal import covariance, step
+from optloc.problem import Bias, Prior
 
 PAIRS = {d: np.triu_indices(len(STATIONS[d]), 1) for d in (2, 3)}
 
@@ -132,7 +121,7 @@ def polish(problem, x):
 
 def loop_chi_square(problem):
     """Weighted misfit of the range rows among themselves: dense least squares over ranges and emission times."""
-    from optloc import MODELS
+    from optloc.models import MODELS
 
     rows, total = [], 0
     for block, first in zip(problem.rows, problem.starts, strict=True):

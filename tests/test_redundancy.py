@@ -100,7 +100,7 @@ def test_a_position_of_each_epoch_counts_where_its_target_is_received():
 
 
 def test_a_known_emission_time_is_no_unknown():
-    prior = optloc.Prior("emission[1]", np.zeros(1), np.eye(1))
+    prior = optloc.problem.Prior("emission[1]", np.zeros(1), np.eye(1))
     problem = heard(priors=[prior])
     assert int(degrees_of_freedom(problem)) == 60 - 5 - 4
 

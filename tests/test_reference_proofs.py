@@ -9,8 +9,9 @@ from cases import STATIONS, TARGET, stations
 from often import few
 
 import optloc
-from optloc import Bias, Motion, Prior, assemble, measured, simulate
+from optloc import Motion, assemble, measured, simulate
 from optloc.base.records import change
+from optloc.problem import Bias, Prior
 from optloc.problem.claims import claim
 from optloc.solvers.certificates.relaxations import METHODS, reference_bound
 from optloc.solvers.methods import compare_bounds

@@ -15,10 +15,11 @@ from scipy.optimize import least_squares
 from verdicts import alone
 
 import optloc
-from optloc import Frame, Status, crlb, observability, simulate, solve
+from optloc import Frame, Status, crlb, simulate, solve
 from optloc.base.types import Motion, Stations
+from optloc.bounds import observability
 from optloc.kernels.least_squares import refine
-from optloc.lab.papers.registration import PRINTED, Setting, rms, wander
+from optloc.lab.papers.registration import PRINTED, RegistrationSetting, rms, wander
 from optloc.linear.constraints import box, height, speed
 from optloc.solvers.starts.registration import turn_courses
 
@@ -237,7 +238,7 @@ def test_turns_about_a_line_of_stations_change_no_range(number):
     assert len(turned) == 7
     assert np.linalg.norm(turned[:, None, :3] - np.vstack([x, turned])[:, :3], axis=-1).max() > 1e3
     for other in turned:
-        np.testing.assert_allclose(optloc.predict(problem, other), optloc.predict(problem, x), atol=1e-5)
+        np.testing.assert_allclose(optloc.engine.predict(problem, other), optloc.engine.predict(problem, x), atol=1e-5)
 
 
 @pytest.mark.parametrize("chosen", [[0, 3], [0, 1, 3]], ids=["two", "three"])
@@ -364,7 +365,7 @@ def test_other_routes_reach_the_same_optimum(method, prior):
 
 
 def test_a_recursion_from_a_guess_diverges_where_no_guess_is_needed():
-    setting = Setting(PRINTED, 30, SEED, 1)
+    setting = RegistrationSetting(PRINTED, 30, SEED, 1)
     many, bound = setting.draw(600), setting.bound(600)
     (plain,) = wander(setting, many, (600,), (bound,), width=20.0)
     assert 1 <= plain.lost.sum() <= 5

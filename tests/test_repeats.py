@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from optloc import Prior, Status, assemble, measured, simulate, solve
+from optloc import Status, assemble, measured, simulate, solve
 from optloc.base.errors import InvalidProblem, NoSolution
 from optloc.base.types import Array
+from optloc.problem import Prior
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.repeats import ENOUGH, repeat
 

@@ -16,11 +16,11 @@ from scipy.stats import binom, chi2, poisson
 from typer.testing import CliRunner
 from verdicts import alone
 
-from optloc import Motion, Status, assemble, measured, rejected, simulate, solve
+from optloc import Motion, Status, assemble, measured, simulate, solve
 from optloc.cli import app
 from optloc.problem.loss import LOSSES
 from optloc.problem.noise import Block, Noise
-from optloc.solvers import pool
+from optloc.solvers import pool, rejected
 from optloc.solvers.outside import accept
 from optloc.solvers.robust.reweighting import Doubt, reweight
 from optloc.solvers.verdict.judge import judge

@@ -21,7 +21,7 @@ def test_updates_reach_the_whole_solution(case):
     }[case]
     problem, half = drawn(problem, 7, 2), problem.epochs // 2
     begun = cut(problem, 0, half)
-    running = optloc.Running.begin(begun, optloc.solve(begun, "lsr", start=truth(begun)))
+    running = optloc.solvers.Running.begin(begun, optloc.solve(begun, "lsr", start=truth(begun)))
     for first in range(half, problem.epochs, 5):
         running = running.update(cut(problem, first, min(first + 5, problem.epochs)))
     whole = optloc.solve(problem, "lsr", start=truth(problem))
@@ -40,7 +40,7 @@ def test_a_large_step_is_linearised_anew():
     """A solution of a wrong half-metre-a-second course jumps when the truth arrives: the sums alone would be wrong."""
     problem = drawn(run(400), 8, 1)
     early = cut(problem, 0, 60)
-    running = optloc.Running.begin(early, optloc.solve(early, "lsr", start=truth(early)))
+    running = optloc.solvers.Running.begin(early, optloc.solve(early, "lsr", start=truth(early)))
     before = running.linearised
     running = running.update(cut(problem, 60, 400))
     assert running.linearised == before + 1
@@ -53,8 +53,8 @@ def test_refusals():
     lost = optloc.solve(problem)
     lost.x[:] = np.nan
     with pytest.raises(InvalidProblem, match="no answer to begin from"):
-        optloc.Running.begin(problem, lost)
+        optloc.solvers.Running.begin(problem, lost)
     rows = optloc.measured("range", np.ones(4), a=[0, 1, 0, 1], epoch=[0, 0, 1, 1], sigma=1.0)
     free = optloc.assemble([[0.0, 0.0], [1.0, 0.0]], rows, motions=(Motion(span="epoch"),))
     with pytest.raises(InvalidProblem, match="free at each epoch"):
-        optloc.Running.begin(free, lost)
+        optloc.solvers.Running.begin(free, lost)

@@ -7,10 +7,12 @@ from often import few
 from verdicts import alone
 
 import optloc
-from optloc import ECEF, Motion, Status, assemble, measured, predict, simulate, solve
+from optloc import Motion, Status, assemble, measured, simulate, solve
 from optloc.base.frames import geodetic_to_ecef
+from optloc.engine import predict
 from optloc.linear.constraints import height
 from optloc.models.primitives import geodetic_normal
+from optloc.problem import ECEF
 
 SATELLITES = geodetic_to_ecef(*np.radians([[24.44, 25.09, 24.44], [125.21, 125.68, 125.99]]), np.full(3, 800e3))
 

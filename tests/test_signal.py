@@ -5,9 +5,10 @@ import pytest
 from bad_input import write
 from files.test_constraint_files import rows as inline
 
-from optloc import InvalidProblem, Signal, assemble, measured
+from optloc import InvalidProblem, assemble, measured
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files import read
+from optloc.problem import Signal
 from optloc.problem.noise import dense
 
 BAND, TIME = 1e6, 2e-3

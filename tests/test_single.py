@@ -7,8 +7,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from optloc import ECEF, Frame, Motion, Status, assemble, measured, prepare, simulate, solve
+from optloc import Frame, Motion, Status, assemble, measured, prepare, simulate, solve
 from optloc.kernels.jit import enabled
+from optloc.problem import ECEF
 from optloc.solvers.methods import Method
 from optloc.solvers.single import single
 

@@ -37,7 +37,7 @@ def problem_of(name):
         if "tdoa" in name:
             rows = measured("tdoa", a=[0, 0], b=[1, 2], sigma=15.0)
         height = optloc.constraints.height(exactly=100.0)
-        return drawn(assemble(SATELLITES, rows, frame=optloc.ECEF, constraints=[height]), BELOW)
+        return drawn(assemble(SATELLITES, rows, frame=optloc.problem.ECEF, constraints=[height]), BELOW)
     dimension, *kinds = name.split()
     d = int(dimension)
     parts = [rows_of(kind.rstrip("1"), 1 if kind.endswith("1") else 6) for kind in kinds]
@@ -176,5 +176,5 @@ def test_starts_of_others_stay_starts():
 def test_every_start_of_a_formulation_is_a_word_of_this_table():
     found = {word for form in FORMULATIONS.values() for word in form.starts}
     assert found <= set(WORDS)
-    unrefined = {name for name, entry in SOLVERS.items() if entry.role == "start"} - set(optloc.LOSSES)
+    unrefined = {name for name, entry in SOLVERS.items() if entry.role == "start"} - set(optloc.problem.LOSSES)
     assert unrefined == set(WORDS)

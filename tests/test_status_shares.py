@@ -7,8 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 import optloc
-from optloc import InvalidProblem, Status, assemble, measured, simulate, solve, station_array, status_shares
+from optloc import InvalidProblem, Status, assemble, measured, simulate, solve, station_array
 from optloc.cli import app
+from optloc.solvers import status_shares
 from optloc.solvers.shares import status_map
 
 PLACE = np.array([[0.0, 0.0], [40.0, 5.0], [35.0, 45.0], [-5.0, 30.0], [20.0, -15.0]])
@@ -52,7 +53,7 @@ def test_the_draws_at_a_place_depend_on_its_number_alone():
 
 def test_biases_and_priors_are_drawn():
     problem = template(0.5)
-    prior = optloc.Prior("position", np.zeros(2), np.diag([4.0, 4.0]))
+    prior = optloc.problem.Prior("position", np.zeros(2), np.diag([4.0, 4.0]))
     known = assemble(problem.stations, measured("range", a=np.arange(2), sigma=1.0), priors=(prior,))
     told = status_shares(known, np.array([15.0, 20.0]), 300)
     # the mean of the prior moves with the truth: a fix far from it would be a misfit

@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 from verdicts import alone
 
 import optloc
-from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, simulate, solve, with_bias
+from optloc import InvalidProblem, Motion, Status, assemble, measured, simulate, solve, with_bias
 from optloc.cli import app
 from optloc.kernels.least_squares import refine
 from optloc.model_checks.evidence import errors, influence, log_tail, reliability, significance
 from optloc.model_checks.groups import groups_of
+from optloc.problem import Prior
 from optloc.problem.arrival_times import as_arrivals, restore_order
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP
@@ -395,7 +396,7 @@ def test_epochs_and_batches_each_have_their_own_culprit():
     z[0, 0] += 400.0
     z[0, 7 + 4] -= 400.0
     z[1, 21 + 6] += 400.0
-    fix = optloc.suspects(made.with_rows(z=z))
+    fix = optloc.solvers.suspects(made.with_rows(z=z))
     assert fix.shape == (2, k)
     assert fix.explanations.shape == (2, k)
     found = [[tuple(s.name for s in fix.suspects[i, j]) for j in range(k)] for i in range(2)]
@@ -405,12 +406,12 @@ def test_epochs_and_batches_each_have_their_own_culprit():
 
 def test_what_may_be_wrong_can_be_chosen():
     made = spoiled(angles(), r3=0.05)
-    assert names(optloc.suspects(made, by="station")) == [("station S3",)]
-    assert names(optloc.suspects(made, by=("row",))) == [("azimuth of S3",)]
+    assert names(optloc.solvers.suspects(made, by="station")) == [("station S3",)]
+    assert names(optloc.solvers.suspects(made, by=("row",))) == [("azimuth of S3",)]
     with pytest.raises(InvalidProblem, match="station"):
-        optloc.suspects(made, by="statoin")
+        optloc.solvers.suspects(made, by="statoin")
     with pytest.raises(InvalidProblem, match="batch axes"):
-        optloc.suspects(made, solve(simulate(angles(), TARGET, 1, trials=2)))
+        optloc.solvers.suspects(made, solve(simulate(angles(), TARGET, 1, trials=2)))
     with pytest.raises(InvalidProblem, match="questions a fix"):
         solve(made, "suspects")
 
@@ -540,7 +541,7 @@ def test_everything_a_robust_fix_rejected_is_questioned():
     plain = solve(made, "searched")
     weights = plain.weights.copy()
     weights[3] = 0.0
-    fix = optloc.suspects(made, replace(plain, weights=weights))
+    fix = optloc.solvers.suspects(made, replace(plain, weights=weights))
     assert names(fix) == [("station S3",)]
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import optloc
-from optloc import Status, assemble, constraints, measured, mixture, samples, solve, station_array
+from optloc import Status, assemble, constraints, measured, solve, station_array
 from optloc.problem.chart import quantile
 from optloc.problem.truncated import Truncated
+from optloc.uncertainty import mixture, samples
 from optloc.uncertainty.outline import outline_of
 
 MANY = 200_000

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, NoSolution, Prior, Status, assemble, constraints, locate, measured, solve
+from optloc import InvalidProblem, NoSolution, Status, assemble, constraints, locate, measured, solve
 from optloc.cli.app import app
+from optloc.problem import Prior
 from optloc.show import fix_page
 
 SENTENCE = "no redundancy: a wrong measurement would not be noticed"

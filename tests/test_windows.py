@@ -97,7 +97,7 @@ def test_a_cut_keeps_the_time_of_states_and_drifts():
     problem = replace(problem, biases=(drift,))
     x = truth(problem)
     late = cut(problem, 12, 20)
-    np.testing.assert_allclose(optloc.predict(late, x), optloc.predict(problem, x)[48:], rtol=1e-12)
+    np.testing.assert_allclose(optloc.engine.predict(late, x), optloc.engine.predict(problem, x)[48:], rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -10,5 +10,5 @@ from importlib.resources import files
 import optloc
 from optloc.show.pictures import plot_residuals
 
-run = optloc.by_epoch(optloc.load(files("optloc") / "scenarios" / "run.toml"))
+run = optloc.problem.by_epoch(optloc.load(files("optloc") / "scenarios" / "run.toml"))
 figure = plot_residuals(run, optloc.solve(run), "A drive past five beacons")

@@ -32,7 +32,7 @@ _NOTHING = object()
 
 
 @dataclass(slots=True, eq=False)
-class _Place:
+class _CachePlace:
     """Where the value of a key stands; its lock is held by the thread that makes the value."""
 
     value: object = _NOTHING
@@ -61,7 +61,7 @@ class Cache(Generic[Value]):
     def __init__(self, most: int, weigh: Callable[[Value], int] | None = None) -> None:
         self._most, self._weigh = most, weigh
         self._lock, self._total = Lock(), 0
-        self._places: dict[Hashable, _Place] = {}  # in the order of their last use
+        self._places: dict[Hashable, _CachePlace] = {}  # in the order of their last use
         held_by_forks(self._lock, self._begin_child)
 
     def _begin_child(self) -> None:
@@ -80,7 +80,7 @@ class Cache(Generic[Value]):
     def find(self, key: Hashable, make: Callable[[], Value]) -> Value:
         """Return the value of a key, made by a call without arguments where it is not kept."""
         with self._lock:
-            place = self._places.pop(key, None) or _Place()
+            place = self._places.pop(key, None) or _CachePlace()
             self._places[key] = place
         if place.value is _NOTHING:
             # Not under the lock of all: a program takes a second, and links are needed to make tables.
@@ -94,7 +94,7 @@ class Cache(Generic[Value]):
         key = key_of(*values)
         return make(*values) if key is None else self.find(key, lambda: make(*values))
 
-    def _fill(self, key: Hashable, place: _Place, make: Callable[[], Value]) -> None:
+    def _fill(self, key: Hashable, place: _CachePlace, make: Callable[[], Value]) -> None:
         try:
             value = make()
         except BaseException:

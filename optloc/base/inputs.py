@@ -177,7 +177,7 @@ def at_most(what: str, count: int, where: str) -> None:
 
 def _beyond(what: str, count: str, limit: int, where: str) -> InvalidProblem:
     name = {"text": "bytes of text", "nesting": "levels of nesting"}.get(what, what)
-    by = f"--budget {what}=NUMBER, in Python with budget=optloc.Budget({what}=NUMBER)"
+    by = f"--budget {what}=NUMBER, in Python with budget=optloc.files.Budget({what}=NUMBER)"
     advice = f"make it smaller, or allow more with {by}"
     found = (
         f"there are {count} {name} than {limit}" if count == "more" else f"there are {count} {name}, {limit} at most"

@@ -216,7 +216,7 @@ def remove_unnamed() -> None:
         _remove(temporary)
 
 
-class Growing:
+class GrowingFile:
     """A file that grows beside its place and gets its name at the end: what a killed run had stays readable.
 
     Parameters

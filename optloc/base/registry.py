@@ -16,7 +16,7 @@ from optloc.base.errors import InvalidProblem
 T = TypeVar("T")
 
 
-class Table(MutableMapping[str, T]):
+class Registry(MutableMapping[str, T]):
     """A table by name, of what optloc has and of what installed packages add.
 
     The entry points are read when a name is asked for that optloc does not have, or when all names are: that costs some
@@ -112,7 +112,7 @@ def plugins() -> tuple[str, ...]:
 
 
 def load_plugin(name: str) -> None:
-    """Run a Python file or module that adds to the tables, such as ``optloc.MODELS["mine"] = ...``, once.
+    """Run a Python file or module that adds to the tables, such as ``optloc.models.MODELS["mine"] = ...``, once.
 
     Parameters
     ----------

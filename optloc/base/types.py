@@ -97,7 +97,7 @@ class Rows:
     Parameters
     ----------
     kind : str
-        A key of `optloc.MODELS`.
+        A key of `optloc.models.MODELS`.
     z : array (..., m)
         Measured values, SI units or radians.
     a, b : int array (m,)
@@ -372,7 +372,7 @@ _SENTENCES: dict[Status, str] = {
     Status.UNPROVEN: "Refined, but nothing proves that no other position explains the data about as well; the method "
     "'auto' tries to, the certificate says what is missing, and whoever can do without allows this status.",
     Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
-    "optloc.likelihood_region.",
+    "optloc.uncertainty.likelihood_region.",
     Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
     Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
     Status.TAILS: "The 95 % figures hold, as repeats of the measurement show; the 99.9 % region does not.",

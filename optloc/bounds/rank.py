@@ -126,7 +126,7 @@ def open_sentences(layout: Layout, information: Array) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Parts:
+class _InformationParts:
     """Standard deviations (n,), correlations (n, n), and a basis (q, n) of what is open, in units of `reach` (n,)."""
 
     sigma: Array
@@ -135,7 +135,7 @@ class _Parts:
     reach: Array
 
 
-def _take_apart(information: Array, size: Array, basis: Array) -> _Parts:
+def _take_apart(information: Array, size: Array, basis: Array) -> _InformationParts:
     """Return what information (n, n) on a basis (n, p) determines.
 
     `size` is the information before anything was eliminated: its rounding errors decide what counts as zero.
@@ -154,10 +154,10 @@ def _take_apart(information: Array, size: Array, basis: Array) -> _Parts:
     loose = (np.abs(null) > _NOTHING).any(-1)
     unit = known / np.where(sigma > 0.0, sigma, 1.0)[:, None]
     correlation = np.where(loose[:, None] | loose, 0.0, unit @ unit.T)
-    return _Parts(np.where(loose, np.inf, sigma), correlation, null.T, reach[:, 0])
+    return _InformationParts(np.where(loose, np.inf, sigma), correlation, null.T, reach[:, 0])
 
 
-def _open_sentences(layout: Layout, parts: _Parts) -> Iterator[str]:
+def _open_sentences(layout: Layout, parts: _InformationParts) -> Iterator[str]:
     """Yield sentences that name what is open: a common change of a family first, then what is left."""
     common = np.array([_entries(layout, slot) for slot in layout.shared if slot.members]).reshape(-1, layout.n_shared)
     found = [row for row in common / parts.reach if _inside(row, parts.open)]

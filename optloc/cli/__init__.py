@@ -8,7 +8,12 @@ if TYPE_CHECKING:
     from optloc.cli.app import app as app, main as main
     from optloc.cli.compile import TARGET as TARGET, problem_of as problem_of
     from optloc.cli.crlb import vector as vector
-    from optloc.cli.extensions import Asked as Asked, Extension as Extension, Part as Part, Rows as Rows
+    from optloc.cli.extensions import (
+        Extension as Extension,
+        KernelPart as KernelPart,
+        PictureRequest as PictureRequest,
+        Rows as Rows,
+    )
     from optloc.cli.listing import registry as registry
     from optloc.cli.options import (
         ANSWERS as ANSWERS,
@@ -18,11 +23,11 @@ if TYPE_CHECKING:
         AmbiguityDraws as AmbiguityDraws,
         Budget as Budget,
         Choose as Choose,
+        CommandGroup as CommandGroup,
         Costs as Costs,
         Criterion as Criterion,
         FailOne as FailOne,
         Force as Force,
-        Group as Group,
         Json as Json,
         Method as Method,
         Outside as Outside,
@@ -47,6 +52,6 @@ if TYPE_CHECKING:
         write_table as write_table,
         write_text as write_text,
     )
-    from optloc.cli.track import Wanted as Wanted, dynamics_of as dynamics_of, rules as rules
+    from optloc.cli.track import TrackOptions as TrackOptions, dynamics_of as dynamics_of, rules as rules
 
 __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from optloc.cli.doctor import doctor
-from optloc.cli.extensions import Asked, extensions
+from optloc.cli.extensions import PictureRequest, extensions
 from optloc.cli.from_table import EXAMPLES as CONVERSIONS, convert, table_told, takes_table
 from optloc.cli.options import (
     ANSWERS,
@@ -19,12 +19,12 @@ from optloc.cli.options import (
     Allow,
     Box,
     Budget,
+    CommandGroup,
     EmitterCount,
     Explain,
     FalseRows,
     Force,
     Geodetic,
-    Group,
     Height,
     Html,
     Json,
@@ -59,7 +59,7 @@ from optloc.cli.options import (
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
 app = typer.Typer(
-    cls=Group,
+    cls=CommandGroup,
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,  # a mistake of optloc shows its whole traceback
@@ -222,9 +222,9 @@ def track(
 
     It needs no guess. A table needs --stations and --sigma.
     """
-    from optloc.cli.track import Wanted, rules, run_track
+    from optloc.cli.track import TrackOptions, rules, run_track
 
-    wanted = Wanted(model, filter_, noise, memory, rules(gate, gap, loss), start, start_sigma, loss)
+    wanted = TrackOptions(model, filter_, noise, memory, rules(gate, gap, loss), start, start_sigma, loss)
     files = {"out": out, "plot": plot, "html": html}
     told = table_told(file, given)
     raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=told))
@@ -364,9 +364,9 @@ def check(
 
     Each epoch is fixed, and each station compared with what the others say: bias, scale, noise, outliers.
     """
-    from optloc.cli.check import Asked, run_check
+    from optloc.cli.check import CheckOptions, run_check
 
-    asked = Asked(not no_solve, method, by, out, plot)
+    asked = CheckOptions(not no_solve, method, by, out, plot)
     raise typer.Exit(run_check(file, as_json, asked, quiet=quiet, table=table_told(file, given)))
 
 
@@ -411,7 +411,7 @@ def plot(
     from optloc.cli.pictures import run_plot
 
     place = Path(f"{what}.png") if out is None else out
-    raise typer.Exit(run_plot(what, Asked(file, place, method, epoch), quiet))
+    raise typer.Exit(run_plot(what, PictureRequest(file, place, method, epoch), quiet))
 
 
 @app.command(

@@ -28,7 +28,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.reader import Loaded
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
 from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
 from optloc.model_checks.elements import By, batch_of
 from optloc.model_checks.geometry import Advice
@@ -46,7 +46,7 @@ _MEMBERS = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class CheckOptions:
     """What is wanted of station health: whether at all, how epochs are fixed, what makes a group, where it goes."""
 
     solve: bool = True
@@ -57,10 +57,15 @@ class Asked:
 
 
 def run_check(
-    file: Path, as_json: bool, asked: Asked | None = None, *, quiet: bool = False, table: Told | None = None
+    file: Path,
+    as_json: bool,
+    asked: CheckOptions | None = None,
+    *,
+    quiet: bool = False,
+    table: ColumnHints | None = None,
 ) -> int:
     """Print a summary of a file and its health; the exit code is 1 where some epoch cannot be fixed."""
-    asked = asked or Asked()
+    asked = asked or CheckOptions()
     # A file without measured values can be checked, too, before the campaign.
     outputs = partial(claim_outputs, table=asked.out, picture=asked.plot, inputs=[file])
     outputs()  # before a long table is read, and once it is known what else was read
@@ -86,7 +91,7 @@ def run_check(
     return 1 if found["epochs_with_too_few_rows"] else 0
 
 
-def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
+def _health(loaded: Loaded, asked: CheckOptions, quiet: bool) -> Checked | None:
     """Return the health of a file's stations and write what was asked for; None where it was not to be solved."""
     if not asked.solve:
         if asked.out is not None or asked.plot is not None:
@@ -377,7 +382,7 @@ def _told(value: float, error: float, unit: str) -> str:
     return with_sigma(float(value), float(error), unit).strip()
 
 
-def _write_health(health: Health, title: str, asked: Asked) -> None:
+def _write_health(health: Health, title: str, asked: CheckOptions) -> None:
     """Write the table and the picture of health that were asked for: both, or none."""
     with together():
         if asked.out is not None:

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Motion, Stations
-from optloc.cli.extensions import Part, extensions
+from optloc.cli.extensions import KernelPart, extensions
 from optloc.cli.output import Screen, dumps, meter
 from optloc.kernels.filter import filter_scan
 from optloc.kernels.jit import REPORTER, compiling, enabled, insist_on, names_in, plain
@@ -139,23 +139,23 @@ def _cover() -> None:
 
 # The longest first: there are as many processes as processors, at most two, and memory is a gigabyte each. Those that
 # share what they call do not begin side by side.
-_PARTS: Mapping[str, Part] = {
-    "proofs": Part(
+_PARTS: Mapping[str, KernelPart] = {
+    "proofs": KernelPart(
         "proofs of fixes", "optloc.proof", (_prove,), ("optloc.proof.batch._loop", "optloc.proof.batch._evaluate")
     ),
-    "tapes": Part(
+    "tapes": KernelPart(
         "fixes from rows of every kind",
         "optloc.engine",
         (_fix_tapes,),
         tuple(f"optloc.engine.fixes.fixes_{mark}" for mark in ("tapes", "one_by_tapes")),
     ),
-    "ranges": Part(
+    "ranges": KernelPart(
         "fixes from ranges",
         "optloc.engine",
         (_fix_ranges,),
         tuple(f"optloc.engine.fixes.fixes_{mark}" for mark in ("ranges", "one_by_ranges")),
     ),
-    "refinements": Part(
+    "refinements": KernelPart(
         "refinements and filters",
         "optloc.kernels",
         (_refine, _filter),
@@ -166,7 +166,7 @@ _PARTS: Mapping[str, Part] = {
             *(f"optloc.kernels.runs.{name}" for name in ("refine_runs", "sum_runs")),
         ),
     ),
-    "runs": Part(
+    "runs": KernelPart(
         "proofs of runs",
         "optloc.proof",
         (_prove_runs,),
@@ -177,19 +177,21 @@ _PARTS: Mapping[str, Part] = {
             "optloc.proof.runs.state_search.prove_course",
         ),
     ),
-    "speeds": Part(
+    "speeds": KernelPart(
         "proofs with an unknown speed",
         "optloc.proof",
         (_prove_scaled,),
         tuple(f"optloc.proof.scaled.scaled_proof.{name}" for name in ("prove_scaled", "_evaluate")),
     ),
-    "searches": Part("searches for starts", "optloc.proof", (_search,), ("optloc.proof.best_first.search_minima",)),
-    "regions": Part("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.cover.cover",)),
+    "searches": KernelPart(
+        "searches for starts", "optloc.proof", (_search,), ("optloc.proof.best_first.search_minima",)
+    ),
+    "regions": KernelPart("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.cover.cover",)),
 }
 
 
 @cache
-def parts() -> Mapping[str, Part]:
+def parts() -> Mapping[str, KernelPart]:
     """Return all that is compiled, by name; neighbours add theirs."""
     return {**_PARTS, **{name: part for one in extensions() for name, part in one.kernels().items()}}
 
@@ -255,7 +257,7 @@ def _started(name: str, variables: Mapping[str, str]) -> Iterator[str]:
             process.kill()
 
 
-def _compile(part: Part) -> None:
+def _compile(part: KernelPart) -> None:
     """Compile a part in this process, and write what is done to standard output."""
     for entry in (entry for each in parts().values() for entry in each.entries):
         import_module(entry.rpartition(".")[0])  # all kernels are known then

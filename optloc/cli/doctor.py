@@ -45,7 +45,7 @@ class Package:
 
 
 @dataclass(frozen=True, slots=True)
-class Advice:
+class MissingPackage:
     """What is missing, what it is for, and the command that brings it."""
 
     missing: str
@@ -110,23 +110,23 @@ def machine_code() -> dict[str, Any]:
     }
 
 
-def advice(found: list[Package], code: dict[str, Any]) -> list[Advice]:
+def advice(found: list[Package], code: dict[str, Any]) -> list[MissingPackage]:
     """Return what is missing with the command that brings it: what everybody needs first."""
     told = [
-        Advice(f"{one.name} >= {one.least}", "everything", f"pip install '{one.name}>={one.least}'")
+        MissingPackage(f"{one.name} >= {one.least}", "everything", f"pip install '{one.name}>={one.least}'")
         for one in found
         if not one.extra and one.state != "ok"
     ]
     if not found:
-        told.append(Advice("the installed package", "versions, extras of other packages", "pip install ."))
+        told.append(MissingPackage("the installed package", "versions, extras of other packages", "pip install ."))
     if not code["parts"]:
-        told.append(Advice("machine code", "speed: a thousand times", "unset NUMBA_DISABLE_JIT"))
+        told.append(MissingPackage("machine code", "speed: a thousand times", "unset NUMBA_DISABLE_JIT"))
     elif not all(code["parts"].values()):
         lacking = [name for name, there in code["parts"].items() if not there]
-        told.append(Advice("machine code", ", ".join(lacking), "optloc compile"))
+        told.append(MissingPackage("machine code", ", ".join(lacking), "optloc compile"))
     for extra in dict.fromkeys(one.extra for one in found if one.extra and one.state != "ok"):
         names = [one.name for one in found if one.extra == extra and one.state != "ok"]
-        told.append(Advice(", ".join(names), f"the extra {extra}", f"pip install 'optloc[{extra}]'"))
+        told.append(MissingPackage(", ".join(names), f"the extra {extra}", f"pip install 'optloc[{extra}]'"))
     return told
 
 

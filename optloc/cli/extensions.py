@@ -20,7 +20,7 @@ NEIGHBOURS = ("optloc.sites", "optloc.service", "optloc.lab")
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class PictureRequest:
     """What a picture is drawn of.
 
     Parameters
@@ -42,7 +42,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class KernelPart:
     """What one process compiles: how that is had, and the kernels that Python calls."""
 
     summary: str
@@ -78,8 +78,8 @@ class Extension:
 
     commands: Callable[[typer.Typer], None]
     lists: Mapping[str, Callable[[], Rows]] = field(default_factory=dict)
-    pictures: Mapping[str, Callable[[Asked], None]] = field(default_factory=dict)
-    kernels: Callable[[], Mapping[str, Part]] = dict
+    pictures: Mapping[str, Callable[[PictureRequest], None]] = field(default_factory=dict)
+    kernels: Callable[[], Mapping[str, KernelPart]] = dict
     facts: Mapping[str, Callable[[], dict[str, Any]]] = field(default_factory=dict)
 
 

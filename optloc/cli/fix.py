@@ -33,7 +33,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.reader import Loaded
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
 from optloc.files.schema import ConstraintTable
 from optloc.model_checks.advice import advise, advise_at, explained_at
 from optloc.model_checks.elements import GROUPINGS, By, batch_of
@@ -44,7 +44,7 @@ from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, records
 from optloc.show.fixes import (
     SHOWN,
-    Sheet,
+    FixSheet,
     alternative_sheet,
     as_p,
     bias_sheet,
@@ -86,7 +86,7 @@ def run_fix(
     late: bool = False,
     explain: bool = False,
     allow: tuple[Status, ...] = (),
-    table: Told | None = None,
+    table: ColumnHints | None = None,
 ) -> int:
     """Fix a file, or a table with what is told of it, under more constraints; write and print; return the exit code."""
     on_output = geojson_path is not None and str(geojson_path) == "-"
@@ -182,7 +182,7 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     _show_sheet(alternative_sheet(fix), console)
 
 
-def _show_sheet(sheet: Sheet | None, console: Console) -> None:
+def _show_sheet(sheet: FixSheet | None, console: Console) -> None:
     """Print a sheet with names of columns; nothing where there is none."""
     if sheet is None:
         return

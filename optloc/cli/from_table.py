@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from optloc.files.reader import Loaded
-    from optloc.files.readings import Told
+    from optloc.files.readings import ColumnHints
     from optloc.files.schema import ConstraintTable
     from optloc.files.table_problem import Converted, TableProblem
 
@@ -46,7 +46,7 @@ def _flag(text: str, flag: str) -> Any:
 
 
 _TEXT = str | None
-# Field of `optloc.files.readings.Told`: its option. One table, from which all commands that take tables have them.
+# Field of `optloc.files.readings.ColumnHints`: its option. All commands that take tables use this one list.
 _OPTIONS: dict[str, Any] = {
     "stations": Annotated[
         Path | None, _option("FILE", "Where the stations are: GeoJSON, CSV, Parquet or JSON.", "--stations")
@@ -185,9 +185,9 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
     """Convert a file, say what is understood before it is written, and return the exit code."""
     from optloc.cli.output import Screen, dumps, write_text
     from optloc.files.convert import convert as written, understood
-    from optloc.files.readings import Told
+    from optloc.files.readings import ColumnHints
 
-    told, console = Told(**given), Screen(quiet=quiet or as_json)
+    told, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
     if out is None:
         table_problem = understood(file, told)
         _tell(table_problem, console)
@@ -241,12 +241,12 @@ def _json(found: Converted) -> dict[str, Any]:
 # A table in the place of a problem file.
 
 
-def table_told(file: Path, given: Mapping[str, Any]) -> Told | None:
+def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
     """Return what is said of a table, None of a problem file; raise InvalidProblem where something is said of that."""
-    from optloc.files.readings import Told
+    from optloc.files.readings import ColumnHints
 
     if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
-        return Told(**given)
+        return ColumnHints(**given)
     said = [name for name, value in given.items() if value]
     if said:
         flag = {"what": "--as", "columns": "--column"}.get(said[0], f"--{said[0].replace('_', '-')}")
@@ -257,7 +257,7 @@ def table_told(file: Path, given: Mapping[str, Any]) -> Told | None:
 
 def read_problem(
     file: Path,
-    told: Told | None,
+    told: ColumnHints | None,
     more: Mapping[str, ConstraintTable] | None = None,
     *,
     values: bool = True,
@@ -270,7 +270,7 @@ def read_problem(
     ----------
     file : Path
         Problem file, or table.
-    told : Told, optional
+    told : ColumnHints, optional
         What is said of a table; None of a problem file.
     more : mapping, optional
         Further constraints.

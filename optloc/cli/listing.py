@@ -143,7 +143,7 @@ _LISTS: dict[str, Callable[[], Rows]] = {
     "methods": registry("method", "optloc:METHODS"),
     "losses": registry("loss", "optloc:LOSSES"),
     "trackers": registry("tracker", "optloc.tracking:UPDATES"),
-    "motions": registry("motion", "optloc.cli.track:MOTIONS"),
+    "motions": registry("motion", "optloc.tracking.named_models:MOTIONS"),
     "formats": registry("format", "optloc.show.formats:FORMATS"),
     "pictures": registry("picture", "optloc.cli.pictures:pictures"),
     "demos": registry("demo", "optloc.cli.starters:titles"),

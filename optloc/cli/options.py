@@ -128,7 +128,7 @@ def _flush(code: Any) -> Any:
     return code
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """Commands whose bad input is a sentence, not a traceback."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:

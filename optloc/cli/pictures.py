@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.cli.extensions import Asked, extensions
+from optloc.cli.extensions import PictureRequest, extensions
 from optloc.cli.output import Screen, claim_outputs, say, write_picture
 from optloc.files.reader import Loaded, read
 from optloc.problem.epochs import by_epoch, separable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def run_plot(what: str, asked: Asked, quiet: bool) -> int:
+def run_plot(what: str, asked: PictureRequest, quiet: bool) -> int:
     """Draw a picture, and return the exit code."""
     known = pictures()
     if what not in known:
@@ -30,7 +30,7 @@ def run_plot(what: str, asked: Asked, quiet: bool) -> int:
     return 0
 
 
-def _solve_all(asked: Asked) -> tuple[Loaded, Problem, Fix]:
+def _solve_all(asked: PictureRequest) -> tuple[Loaded, Problem, Fix]:
     """Return a file, its problem (epochs that share nothing as a batch) and its fixes."""
     from optloc.solvers.solution import solve
 
@@ -39,7 +39,7 @@ def _solve_all(asked: Asked) -> tuple[Loaded, Problem, Fix]:
     return loaded, problem, solve(problem, asked.method)
 
 
-def _solve_one(asked: Asked) -> tuple[Problem, Fix, str]:
+def _solve_one(asked: PictureRequest) -> tuple[Problem, Fix, str]:
     """Return the problem of one epoch, or of a run, with its fix and a title."""
     from optloc.solvers.solution import solve
 
@@ -55,7 +55,7 @@ def _solve_one(asked: Asked) -> tuple[Problem, Fix, str]:
     return problem, solve(problem, asked.method), f"{loaded.title}, epoch {label}"
 
 
-def _fix(asked: Asked) -> None:
+def _fix(asked: PictureRequest) -> None:
     """Stations, fix, 95 % ellipse and alternatives."""
     from optloc.show.pictures import plot_fixes
 
@@ -63,7 +63,7 @@ def _fix(asked: Asked) -> None:
     write_picture(plot_fixes(loaded.problem, fix, loaded.title), asked.out)
 
 
-def _residuals(asked: Asked) -> None:
+def _residuals(asked: PictureRequest) -> None:
     """Residuals by station."""
     from optloc.show.pictures import plot_residuals
 
@@ -71,26 +71,26 @@ def _residuals(asked: Asked) -> None:
     write_picture(plot_residuals(problem, fix, loaded.title), asked.out)
 
 
-def _draw_one(draw: Callable[..., Figure], asked: Asked) -> None:
+def _draw_one(draw: Callable[..., Figure], asked: PictureRequest) -> None:
     problem, fix, title = _solve_one(asked)
     write_picture(draw(problem, fix, title), asked.out)
 
 
-def _landscape(asked: Asked) -> None:
+def _landscape(asked: PictureRequest) -> None:
     """Cost over the place of the target."""
     from optloc.show.pictures import plot_landscape
 
     _draw_one(plot_landscape, asked)
 
 
-def _convergence(asked: Asked) -> None:
+def _convergence(asked: PictureRequest) -> None:
     """Where iterations from many starts end."""
     from optloc.show.pictures import plot_convergence
 
     _draw_one(plot_convergence, asked)
 
 
-def _biases(asked: Asked) -> None:
+def _biases(asked: PictureRequest) -> None:
     """Biases of a run against time, with 95 %."""
     from optloc.show.pictures import plot_biases
     from optloc.solvers.running import growing
@@ -99,21 +99,21 @@ def _biases(asked: Asked) -> None:
     write_picture(plot_biases(growing(problem, fix), loaded.title), asked.out)
 
 
-def _bound(asked: Asked) -> None:
+def _bound(asked: PictureRequest) -> None:
     """Map of the Cramer-Rao bound."""
     from optloc.cli.crlb import run_map
 
     run_map(asked.file, asked.out, None, None, None, None, geodetic=False, dilution=False)
 
 
-def _track(asked: Asked) -> None:
+def _track(asked: PictureRequest) -> None:
     """Track of a run, with sigma and NIS."""
-    from optloc.cli.track import Wanted, run_track
+    from optloc.cli.track import TrackOptions, run_track
 
-    run_track(asked.file, Wanted(), plot=asked.out, quiet=True)
+    run_track(asked.file, TrackOptions(), plot=asked.out, quiet=True)
 
 
-_PICTURES: dict[str, Callable[[Asked], None]] = {
+_PICTURES: dict[str, Callable[[PictureRequest], None]] = {
     "fix": _fix,
     "landscape": _landscape,
     "convergence": _convergence,
@@ -124,6 +124,6 @@ _PICTURES: dict[str, Callable[[Asked], None]] = {
 }
 
 
-def pictures() -> dict[str, Callable[[Asked], None]]:
+def pictures() -> dict[str, Callable[[PictureRequest], None]]:
     """Return the pictures by name, with those of the neighbours."""
     return {**_PICTURES, **{name: draw for one in extensions() for name, draw in one.pictures.items()}}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
@@ -14,9 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import is_stream
-from optloc.base.types import Array, Rows
 from optloc.cli.file_fixes import table_json
 from optloc.cli.from_table import read_problem
 from optloc.cli.options import coordinates
@@ -33,54 +32,19 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.reader import Loaded
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
 from optloc.files.writer import GrowingTable
-from optloc.linear.least_squares_ranges import reduce
-from optloc.problem.epochs import cut
-from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.show.formats.marks import Results
-from optloc.tracking.dynamics import Dynamics, current_statistical, polynomial, singer
+from optloc.tracking.differences import differences
+from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.named_models import motion_named
 from optloc.tracking.run import tracked
 from optloc.tracking.several_targets import alone
 from optloc.tracking.track import State
 from optloc.tracking.updates import filter_of, reweighted
-
-
-@dataclass(frozen=True, slots=True)
-class MotionModel:
-    """A model of motion that a track can be asked for by name.
-
-    Parameters
-    ----------
-    noise : float
-        Standard deviation of what drives it where ``--noise`` does not say, SI units.
-    summary : str
-        One line for listings.
-    make : callable
-        Dynamics of a standard deviation of the noise and of seconds over which accelerations last.
-    """
-
-    noise: float
-    summary: str
-    make: Callable[[float, float], Dynamics]
-
-
-# Of the order of ordinary traffic, which brakes and turns by 1 m/s^2; csm is told the largest acceleration, about 1 g.
-MOTIONS = {
-    "cv": MotionModel(1.0, "constant velocity, driven by an acceleration", lambda noise, _: polynomial(1, noise)),
-    "ca": MotionModel(1.0, "constant acceleration, driven by a jerk", lambda noise, _: polynomial(2, noise)),
-    "static": MotionModel(0.0, "a target that stays, driven by a velocity", lambda noise, _: polynomial(0, noise)),
-    "singer": MotionModel(1.0, "Singer's: an acceleration that lasts", lambda noise, memory: singer(memory, noise)),
-    "csm": MotionModel(
-        10.0,
-        "current statistical: Singer's about the present acceleration; the noise is its largest acceleration",
-        lambda noise, memory: current_statistical(memory, noise),
-    ),
-}
-"""Models of motion by name."""
 
 _CLEAN = {"ok", "started", "starting"}
 # Seconds between two additions to the table of a run that goes on: each takes a millisecond, ten scans' time.
@@ -90,7 +54,7 @@ _REASONS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class TrackOptions:
     """How a file is to be tracked; see the help of the command.
 
     Parameters
@@ -147,14 +111,14 @@ class TargetTrack:
 
 def run_track(
     file: Path,
-    wanted: Wanted,
+    wanted: TrackOptions,
     *,
     out: Path | None = None,
     as_json: bool = False,
     plot: Path | None = None,
     html: Path | None = None,
     quiet: bool = False,
-    table: Told | None = None,
+    table: ColumnHints | None = None,
 ) -> int:
     """Track the targets of a file or a table, write what was asked for, and return the exit code.
 
@@ -210,12 +174,9 @@ def _json(loaded: Loaded, columns: Columns) -> dict[str, Any]:
     return about | {"scans": records(columns)}
 
 
-def dynamics_of(wanted: Wanted) -> Dynamics:
+def dynamics_of(wanted: TrackOptions) -> Dynamics:
     """Return the model of motion; raise InvalidProblem for an unknown one."""
-    if wanted.model not in MOTIONS:
-        raise InvalidProblem(f"unknown model {wanted.model!r}", "--model", nearest(wanted.model, list(MOTIONS)))
-    motion = MOTIONS[wanted.model]
-    return motion.make(motion.noise if wanted.noise is None else wanted.noise, wanted.memory)
+    return motion_named(wanted.model, wanted.noise, wanted.memory, "--model")
 
 
 def rules(gate: float, gap: float | None, loss: str | None = None) -> Rules:
@@ -263,44 +224,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         yield name, run, tuple(loaded.epochs[k] for k in epochs)
 
 
-def differences(run: Problem) -> Problem:
-    """Return the run of one target with the differences of its arrivals, epoch by epoch, in the place of the arrivals.
-
-    A tracker's state has no emission times, and differences with their covariance say all that arrivals say of places.
-    """
-    scans = [reduce(cut(run, k, k + 1)) for k in range(run.epochs)]
-    kinds = dict.fromkeys(rows.kind for scan in scans for rows in scan.rows)
-    own: dict[str, list[Rows]] = {kind: [] for kind in kinds}
-    numbers = [np.zeros(scan.count, dtype=np.int64) for scan in scans]
-    count = 0
-    for kind, found in own.items():
-        for k, scan in enumerate(scans):
-            for rows, start in zip(scan.rows, scan.starts, strict=True):
-                if rows.kind == kind:
-                    numbers[k][start : start + rows.count] = np.arange(count, count + rows.count)
-                    found.append(replace(rows, epoch=np.full(rows.count, k)))
-                    count += rows.count
-    blocks = [
-        Block(numbers[k][block.row], block.covariance)
-        for k, scan in enumerate(scans)
-        for block in scan.noise.blocks
-        if block.row.size
-    ]
-    return replace(run, rows=tuple(_one_after_another(found) for found in own.values()), noise=Noise(tuple(blocks)))
-
-
-def _one_after_another(parts: list[Rows]) -> Rows:
-    """Return rows of one kind as one."""
-
-    def of(name: str) -> Array:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
-    columns: dict[str, Any] = {name: of(name) for name in names}
-    return replace(parts[0], **columns)
-
-
-def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:
+def _start(problem: Problem, dynamics: Dynamics, wanted: TrackOptions) -> State | None:
     """Return the initial state that options give."""
     if (wanted.start is None) != (wanted.sigma is None):
         lacking = "--start" if wanted.start is None else "--start-sigma"
@@ -381,9 +305,9 @@ def _write(
         if table is not None:
             table.file.discard()
     if plot is not None:
-        from optloc.show.pictures.track import Drawn, plot_tracks
+        from optloc.show.pictures.track import PlottedTrack, plot_tracks
 
-        drawn = [Drawn(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
+        drawn = [PlottedTrack(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
         write_picture(plot_tracks(drawn, title=loaded.title), plot)
     if html is not None:
         write_text(html, _map(loaded, ones))

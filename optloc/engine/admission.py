@@ -30,10 +30,10 @@ from optloc.engine.memory import (
     SPARE,
     UPPER_BOUND,
     Admission,
+    EngineModel,
+    EngineWorkspace,
     G,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.kernels.jit import compiled
@@ -51,7 +51,7 @@ _ON = 1e-15
 
 
 @compiled
-def _measure(a: Admission, room: Room, shift: int, last: int) -> None:
+def _measure(a: Admission, room: EngineWorkspace, shift: int, last: int) -> None:
     """Write the first quantities at row X, or at TRIAL with shift 1, and their gradients."""
     d, r, x, origin, table = room.d, room.registers, room.vector[X + shift], room.vector[ORIGIN], a.tapes.table
     for k in range(last):
@@ -70,7 +70,7 @@ def _measure(a: Admission, room: Room, shift: int, last: int) -> None:
 
 
 @compiled
-def restore(model: Model, room: Room, shift: int) -> None:
+def restore(model: EngineModel, room: EngineWorkspace, shift: int) -> None:
     """Put row X, or TRIAL with shift 1, back onto the exact surfaces, along the shortest way."""
     a, d = model.admission, room.d
     if room.scalar[RADIUS, 0] > 0.0:
@@ -98,7 +98,7 @@ def restore(model: Model, room: Room, shift: int) -> None:
 
 
 @compiled
-def _restore_radius(room: Room, shift: int) -> None:
+def _restore_radius(room: EngineWorkspace, shift: int) -> None:
     """Put row X, or TRIAL with shift 1, at its distance from CENTRE."""
     x, centre, far = room.vector[X + shift], room.vector[CENTRE], room.scalar[SPARE]
     for lane in range(LANES):
@@ -114,7 +114,7 @@ def _restore_radius(room: Room, shift: int) -> None:
 
 
 @compiled
-def _square(left: Array, right: Array, room: Room, d: int) -> None:
+def _square(left: Array, right: Array, room: EngineWorkspace, d: int) -> None:
     """Factor the products (c, c, W) of gradients (c, d, W) with vectors (c, d, W)."""
     small, pivot, diagonal = room.small, room.pivot[0], room.pivot[1]
     for k in range(len(small[0])):
@@ -130,7 +130,7 @@ def _square(left: Array, right: Array, room: Room, d: int) -> None:
 
 
 @compiled
-def evaluate(model: Model, rows: Any, room: Room, shift: int) -> None:
+def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -> None:
     """Write information, right side and cost at row X, or at TRIAL with shift 1.
 
     On exact surfaces the information across them is enlarged to the size of that along them: what is held to them
@@ -160,7 +160,7 @@ def evaluate(model: Model, rows: Any, room: Room, shift: int) -> None:
 
 
 @compiled
-def _point_out(room: Room, shift: int, out: Array) -> None:
+def _point_out(room: EngineWorkspace, shift: int, out: Array) -> None:
     """Write the direction (d, W) away from CENTRE."""
     for j in range(room.d):
         for lane in range(LANES):
@@ -168,7 +168,7 @@ def _point_out(room: Room, shift: int, out: Array) -> None:
 
 
 @compiled
-def coarsen(model: Model, room: Room) -> None:
+def coarsen(model: EngineModel, room: EngineWorkspace) -> None:
     """Let the rounding of residuals be no less than what putting back onto a surface around the Earth does to them."""
     a, blur = model.admission, room.scalar[BLUR]
     if a.exact == 0 or not a.earth:
@@ -181,7 +181,7 @@ def coarsen(model: Model, room: Room) -> None:
 
 
 @compiled
-def hold(model: Model, room: Room) -> None:
+def hold(model: EngineModel, room: EngineWorkspace) -> None:
     """Take from the step in MOVE what leads off the exact surfaces; the information is factored in LOWER."""
     a, d, move = model.admission, room.d, room.vector[MOVE]
     if a.exact == 0:
@@ -196,7 +196,7 @@ def hold(model: Model, room: Room) -> None:
 
 
 @compiled
-def _keep_off(room: Room, move: Array, p: int) -> None:
+def _keep_off(room: EngineWorkspace, move: Array, p: int) -> None:
     """Take from a vector (p, W) the combination of `room.push` that makes it lie along the surfaces."""
     face, push, part, d = room.face[0], room.push, room.part, room.d
     _square(face, push, room, d)
@@ -214,7 +214,7 @@ def _keep_off(room: Room, move: Array, p: int) -> None:
 
 
 @compiled
-def hold_covariance(model: Model, room: Room) -> None:
+def hold_covariance(model: EngineModel, room: EngineWorkspace) -> None:
     """Make the covariance in the lower half of H_TRIAL that along the exact surfaces."""
     a, d, cov, column = model.admission, room.d, room.matrix[H_TRIAL], room.vector[MOVE]
     if a.exact == 0:
@@ -244,7 +244,7 @@ def hold_covariance(model: Model, room: Room) -> None:
 
 
 @compiled
-def find_multipliers(model: Model, room: Room) -> None:
+def find_multipliers(model: EngineModel, room: EngineWorkspace) -> None:
     """Write to `room.part` what balances the gradient of the cost at row X."""
     a, d, part, face = model.admission, room.d, room.part, room.face[0]
     if a.exact == 0:
@@ -261,7 +261,7 @@ def find_multipliers(model: Model, room: Room) -> None:
 
 
 @compiled
-def admit(model: Model, room: Room, out: Array) -> None:
+def admit(model: EngineModel, room: EngineWorkspace, out: Array) -> None:
     """Write 0.0 to `out` (W,) where row X breaks a constraint, or where the Earth hides it from a used station."""
     a = model.admission
     sides = room.side.shape[1]
@@ -286,7 +286,7 @@ measured; 50 km from the ground to a target in space: only what is clearly on th
 
 
 @compiled
-def _is_hidden(model: Model, room: Room, lane: int) -> bool:
+def _is_hidden(model: EngineModel, room: EngineWorkspace, lane: int) -> bool:
     """Return whether the Earth hides row X of a lane from a station with a row of it: `optloc.solvers.inequalities`."""
     a, origin, base = model.admission, room.vector[ORIGIN], room.axes[BASE]
     high = 0.0

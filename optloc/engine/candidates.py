@@ -27,9 +27,9 @@ from optloc.engine.memory import (
     SECOND,
     SPREAD,
     TRIAL,
+    EngineModel,
+    EngineWorkspace,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.engine.refinement import refine
@@ -45,16 +45,16 @@ _TOLERANCE, _STEPS = 1e-2, 40
 
 
 @compiled
-def refine_candidates(model: Model, rows: Any, room: Room, spot: Array) -> None:
+def refine_candidates(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array) -> None:
     """Refine candidates, and write the best to row X, and to row OTHER another minimum where there is one.
 
     Parameters
     ----------
-    model : Model
+    model : EngineModel
         How measurements become a start.
     rows : named tuple
         Of the evaluator.
-    room : Room
+    room : EngineWorkspace
         Of the block; lanes without a candidate that is admitted are not good.
     spot : array (CANDIDATES, d + 1, W)
         Candidates from the origin, NaN for an empty place; their costs are written behind the coordinates.
@@ -79,7 +79,7 @@ def refine_candidates(model: Model, rows: Any, room: Room, spot: Array) -> None:
 
 
 @compiled
-def _keep(room: Room, spot: Array) -> None:
+def _keep(room: EngineWorkspace, spot: Array) -> None:
     """Write where the refinement of a candidate ended, and keep the best so far, with its information, as FIX."""
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
@@ -97,7 +97,7 @@ def _keep(room: Room, spot: Array) -> None:
 
 
 @compiled
-def _choose(model: Model, room: Room, spot: Array) -> None:
+def _choose(model: EngineModel, room: EngineWorkspace, spot: Array) -> None:
     """Write the best candidate to row X, and the cheapest of those at other minima to row OTHER.
 
     A lane is not good if a third minimum is as good as a rival. Nor is it if the best one is poor: places in between
@@ -124,7 +124,7 @@ def _choose(model: Model, room: Room, spot: Array) -> None:
 
 
 @compiled
-def _is_apart(room: Room, spot: Array, row: int, lane: int) -> bool:
+def _is_apart(room: EngineWorkspace, spot: Array, row: int, lane: int) -> bool:
     """Return whether a candidate of a lane is more than three standard deviations of FIX from a row of vectors."""
     apart = 0.0
     for i in range(room.d):
@@ -144,7 +144,7 @@ RINGS = len(_RADII)
 
 
 @compiled
-def look_around(model: Model, rows: Any, room: Room, spot: Array, rings: int) -> None:
+def look_around(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array, rings: int) -> None:
     """Write the cheapest place of each sector about the stations to `spot`, see `refine_candidates`.
 
     The rings count from the nearest; a surface makes one of all.

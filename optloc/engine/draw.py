@@ -22,7 +22,7 @@ from optloc.engine.memory import (
     SEEN,
     SIGN,
     Admission,
-    Model,
+    EngineModel,
 )
 from optloc.engine.ranges import RangeRows
 from optloc.engine.tapes import TapeRows
@@ -44,16 +44,16 @@ _NOTHING = 1e-12
 _LEVEL = 1e-9
 
 
-class Drawn(NamedTuple):
+class SimulatedBatch(NamedTuple):
     """The places of a plan, how its measurements become a start, and its rows."""
 
     node: Array
-    model: Model
+    model: EngineModel
     rows: Callable[[Problem], Any]
     ranged: bool
 
 
-def draw_ranges(one: Problem, admission: Admission) -> Drawn | None:
+def draw_ranges(one: Problem, admission: Admission) -> SimulatedBatch | None:
     """Return rows that are sums of ranges; None where they lack rows for a start, or links between stations."""
     offset = None
     if one.stations.unknown_for:  # along the lines to the target, they are noise
@@ -72,10 +72,10 @@ def draw_ranges(one: Problem, admission: Admission) -> Drawn | None:
         assert one.stations.covariance is not None
         first = offset.reshape(-1, one.dimension)[node[1], 0]
         made = made._replace(wander=np.array(one.stations.covariance[node[1], 0, 0]), offset=first)
-    return Drawn(node, model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made, True)
+    return SimulatedBatch(node, model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made, True)
 
 
-def draw_tapes(one: Problem, admission: Admission, dof: int) -> Drawn | None:
+def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch | None:
     """Return rows as tapes; None where they have none, or no start."""
     found = _find_ranges(one)
     node = _nodes(one, found)
@@ -93,7 +93,7 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> Drawn | None:
         model = model._replace(start=start, height=height)
     elif start == BY_PLACES:
         model = model._replace(start=start, limit=largest(dof, _POOR))
-    return Drawn(node, model, make, False)
+    return SimulatedBatch(node, model, make, False)
 
 
 def _find_ranges(one: Problem) -> Ranges | None:
@@ -108,7 +108,7 @@ _THREE = 3
 
 
 def _start_of(one: Problem, found: Ranges | None, admission: Admission, lifted: int) -> int | None:
-    """Return the way fixes start, see `Model.start`; None for rows without a start.
+    """Return the way fixes start, see `EngineModel.start`; None for rows without a start.
 
     Squared ranges need a linear row for each coordinate; the quadric gives the last unknown.
     """
@@ -126,7 +126,7 @@ def _start_of(one: Problem, found: Ranges | None, admission: Admission, lifted: 
 
 
 def _height_of(one: Problem) -> int | None:
-    """Return the source of the height of the target, see `Model.height`."""
+    """Return the source of the height of the target, see `EngineModel.height`."""
     held = [band for band in one.constraints if is_exact(band)]
     for i, band in enumerate(held):
         if isinstance(band, Band) and band.kind == "height":
@@ -164,7 +164,7 @@ def _known(found: Ranges | None) -> Array:
     return np.zeros(0, dtype=np.int64) if found is None else np.flatnonzero(found.inside[0])
 
 
-def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> Model | None:
+def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> EngineModel | None:
     """Return the maps from measurements of one problem to a start by squares; None where noise is singular."""
     count, s, flat, known = one.count, node.shape[1], one.flat(), _known(found)
     white = np.eye(s)
@@ -188,7 +188,7 @@ def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission
     station[HEARD], station[SEEN] = _hearing(one, node)
     row = np.stack([one.correction + added, precision, 1.0 / (1.0 + gain)])
     anchor, ahead = _anchors(one)[0], directions(one.dimension)
-    return Model(row, anchor, linear, station, reference, white, admission, BY_SQUARES, -1, ahead, np.inf)
+    return EngineModel(row, anchor, linear, station, reference, white, admission, BY_SQUARES, -1, ahead, np.inf)
 
 
 def _hearing(one: Problem, node: Array) -> tuple[Array, Array]:

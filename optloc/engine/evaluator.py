@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from optloc.base.types import Array
-from optloc.engine.memory import Model, Room
+from optloc.engine.memory import EngineModel, EngineWorkspace
 from optloc.kernels.jit import compiled, with_constants
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
@@ -31,79 +31,79 @@ def count_lifted(rows: Any) -> int:
 
 
 @compiled
-def keep(model: Model, rows: Any, stations: int, d: int, size: int) -> Any:
+def keep(model: EngineModel, rows: Any, stations: int, d: int, size: int) -> Any:
     """Return the rows with the memory that an evaluator keeps for a block: what the kernels below take."""
     raise NotImplementedError
 
 
 @compiled
-def load(rows: Any, z: Array, room: Room, anew: bool) -> None:
+def load(rows: Any, z: Array, room: EngineWorkspace, anew: bool) -> None:
     """Take measurements (N, m) of a block, whose stations are new ones or not."""
     raise NotImplementedError
 
 
 @compiled
-def minimise_start(model: Model, rows: Any, room: Room, first: bool) -> None:
+def minimise_start(model: EngineModel, rows: Any, room: EngineWorkspace, first: bool) -> None:
     """Write the minimiser of the weighed squared-range rows to `room.y`, and to SOLVABLE whether it is one."""
     raise NotImplementedError
 
 
 @compiled
-def scout(model: Model, rows: Any, room: Room) -> None:
-    """Write starts that squared ranges do not give to row X, and second ones to row OTHER, see `Model.start`."""
+def scout(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
+    """Write starts that squared ranges do not give to row X, and second ones to row OTHER, see `EngineModel.start`."""
     raise NotImplementedError
 
 
 @compiled
-def complete(rows: Any, room: Room) -> None:
+def complete(rows: Any, room: EngineWorkspace) -> None:
     """Write the start of the other unknowns, after the position, to row X."""
     raise NotImplementedError
 
 
 @compiled
-def equations(rows: Any, room: Room, shift: int) -> None:
+def equations(rows: Any, room: EngineWorkspace, shift: int) -> None:
     """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
     raise NotImplementedError
 
 
 @compiled
-def costs(rows: Any, room: Room) -> None:
+def costs(rows: Any, room: EngineWorkspace) -> None:
     """Write to COST_TRIAL the cost at TRIAL, the least over the other unknowns."""
     raise NotImplementedError
 
 
 @compiled
-def bow_of(rows: Any, room: Room) -> float:
+def bow_of(rows: Any, room: EngineWorkspace) -> float:
     """Return the curvature b of the rows: over a step D at range r all residuals change by up to b D^2 / r more."""
     raise NotImplementedError
 
 
 @compiled
-def note_nearest(rows: Any, room: Room, least: Array) -> None:
+def note_nearest(rows: Any, room: EngineWorkspace, least: Array) -> None:
     """Write the range to the nearest station (W,) where the equations were written last."""
     raise NotImplementedError
 
 
 @compiled
-def bend(rows: Any, room: Room) -> None:
+def bend(rows: Any, room: EngineWorkspace) -> None:
     """Write half the second derivatives of the cost at row X to H_TRIAL."""
     raise NotImplementedError
 
 
 @compiled
-def measure_infinity(rows: Any, room: Room) -> None:
+def measure_infinity(rows: Any, room: EngineWorkspace) -> None:
     """Write to BEYOND what infinity costs, see `optloc.engine.memory.Answer.infinity`."""
     raise NotImplementedError
 
 
 @compiled
-def search_infinity(model: Model, rows: Any, room: Room) -> None:
+def search_infinity(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
     """Write the same by whatever means; row X and its information stay as they are."""
     raise NotImplementedError
 
 
 @compiled
-def finish(rows: Any, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+def finish(rows: Any, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Write the unknowns that are not refined of the first lanes, or of those that are marked, to x (N, size)."""
     raise NotImplementedError
 

@@ -64,9 +64,9 @@ from optloc.engine.memory import (
     UPPER_BOUND,
     VALUE,
     Answer,
+    EngineModel,
+    EngineWorkspace,
     H,
-    Model,
-    Room,
     X,
     make_room,
 )
@@ -94,13 +94,13 @@ _WORTH = LANES // 2
 
 @compiled
 def fixes(
-    model: Model, rows: Any, z: Array, station: Array, tolerance: float, most: int, given: bool, answer: Answer
+    model: EngineModel, rows: Any, z: Array, station: Array, tolerance: float, most: int, given: bool, answer: Answer
 ) -> int:
     """Fix N positions, each from measurements alone, and return the greatest number of steps.
 
     Parameters
     ----------
-    model : Model
+    model : EngineModel
         How measurements become a start.
     rows : named tuple
         Of the evaluator.
@@ -168,7 +168,7 @@ def _take(item: Array, order: Array | None, first: int, count: int) -> int:
 
 
 @compiled
-def _see(model: Model, rows: Any, z: Array, station: Array, room: Room, begins: bool) -> None:
+def _see(model: EngineModel, rows: Any, z: Array, station: Array, room: EngineWorkspace, begins: bool) -> None:
     """Take measurements and stations of a block; stations that all problems share are taken when a call begins."""
     scalar, vector, anew = room.scalar, room.vector, len(station) > 1 or begins
     level = model.admission.level
@@ -194,7 +194,14 @@ def _see(model: Model, rows: Any, z: Array, station: Array, room: Room, begins: 
 
 @compiled
 def _refine(
-    model: Model, rows: Any, z: Array, room: Room, size: int, tolerance: float, limit: int, answer: Answer
+    model: EngineModel,
+    rows: Any,
+    z: Array,
+    room: EngineWorkspace,
+    size: int,
+    tolerance: float,
+    limit: int,
+    answer: Answer,
 ) -> int:
     """Refine the unknowns of a block and write them; return the greatest number of steps."""
     refine(model, rows, room, tolerance, limit)
@@ -206,7 +213,7 @@ def _refine(
 
 
 @compiled
-def _write_fixes(model: Model, rows: Any, z: Array, room: Room, size: int, answer: Answer) -> None:
+def _write_fixes(model: EngineModel, rows: Any, z: Array, room: EngineWorkspace, size: int, answer: Answer) -> None:
     """Write unknowns, covariances and costs of the first lanes, and to FIX_GOOD which are settled."""
     scalar = room.scalar
     _invert(room)
@@ -248,10 +255,10 @@ def _place(vector: Array, item: Array, x: Array, mark: Array, marked: bool, size
 
 @compiled
 def _examine(
-    model: Model,
+    model: EngineModel,
     rows: Any,
     z: Array,
-    room: Room,
+    room: EngineWorkspace,
     size: int,
     tolerance: float,
     given: bool,
@@ -301,7 +308,9 @@ def _examine(
 
 
 @compiled
-def _measure_closely(model: Model, rows: Any, room: Room, size: int, answer: Answer, look: Array, turned: bool) -> None:
+def _measure_closely(
+    model: EngineModel, rows: Any, room: EngineWorkspace, size: int, answer: Answer, look: Array, turned: bool
+) -> None:
     """Measure the shape in metres along turned axes as well, if asked, and in inverse range where it is poor there."""
     kappa, item, number, far = room.vector[ROW, 0], room.item, answer.number, 0
     if turned:
@@ -327,7 +336,7 @@ def _measure_closely(model: Model, rows: Any, room: Room, size: int, answer: Ans
 
 
 @compiled
-def _look_beyond(model: Model, rows: Any, room: Room, size: int, answer: Answer) -> None:
+def _look_beyond(model: EngineModel, rows: Any, room: EngineWorkspace, size: int, answer: Answer) -> None:
     """Search infinity for the fixes that are bent."""
     number = answer.number
     search_infinity(model, rows, room)
@@ -339,11 +348,11 @@ def _look_beyond(model: Model, rows: Any, room: Room, size: int, answer: Answer)
 
 @compiled
 def _pursue(
-    model: Model,
+    model: EngineModel,
     rows: Any,
     z: Array,
     station: Array,
-    room: Room,
+    room: EngineWorkspace,
     tolerance: float,
     given: bool,
     answer: Answer,
@@ -377,10 +386,10 @@ def _pursue(
 
 @compiled
 def _end_images(
-    model: Model,
+    model: EngineModel,
     rows: Any,
     z: Array,
-    room: Room,
+    room: EngineWorkspace,
     size: int,
     answer: Answer,
     look: Array,
@@ -425,7 +434,7 @@ def _end_images(
 
 
 @compiled
-def _is_likelier(room: Room, lane: int) -> bool:
+def _is_likelier(room: EngineWorkspace, lane: int) -> bool:
     """Return whether row X is the likelier of two minima of one cost: nearer to the stations than FIX, or upper.
 
     Distances that differ in the seventh digit of their logarithm differ by rounding.
@@ -463,7 +472,9 @@ def _exchange(answer: Answer, i: int) -> None:
 
 
 @compiled
-def _look_again(model: Model, rows: Any, z: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
+def _look_again(
+    model: EngineModel, rows: Any, z: Array, room: EngineWorkspace, size: int, answer: Answer, look: Array
+) -> None:
     """Write covariance and shape of fixes in row X again."""
     evaluate(model, rows, room, 0)
     for lane in range(LANES):
@@ -473,7 +484,7 @@ def _look_again(model: Model, rows: Any, z: Array, room: Room, size: int, answer
 
 
 @compiled
-def _resume(model: Model, x: Array, room: Room) -> None:
+def _resume(model: EngineModel, x: Array, room: EngineWorkspace) -> None:
     """Go on from the positions reached so far."""
     item, vector = room.item, room.vector
     for j in range(vector.shape[1]):
@@ -485,7 +496,7 @@ def _resume(model: Model, x: Array, room: Room) -> None:
 
 
 @compiled
-def _invert(room: Room) -> None:
+def _invert(room: EngineWorkspace) -> None:
     """Write the lower half of the covariance over H_TRIAL, and whether it is regular and the fix near to SOLVABLE."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     p = vector.shape[1]

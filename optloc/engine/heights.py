@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.engine.candidates import CANDIDATES
-from optloc.engine.memory import LOWER_BOUND, ORIGIN, SIGN, Model, Room
+from optloc.engine.memory import LOWER_BOUND, ORIGIN, SIGN, EngineModel, EngineWorkspace
 from optloc.kernels.jit import compiled
 from optloc.kernels.polynomial import real_roots
 from optloc.kernels.systems import LANES
@@ -33,14 +33,14 @@ _RANGE = _N  # behind the coordinates of two rows: how the ranges to the other s
 
 
 @compiled
-def meet_ellipsoid(model: Model, room: Room, w: Array, spot: Array) -> None:
+def meet_ellipsoid(model: EngineModel, room: EngineWorkspace, w: Array, spot: Array) -> None:
     """Write where the ranges to the first three stations meet the ellipsoid of a known height to `spot`.
 
     Parameters
     ----------
-    model : Model
+    model : EngineModel
         With the source of the height.
-    room : Room
+    room : EngineWorkspace
         Of the block.
     w : array (VECTORS, DEGREE + 2)
         Scratch.
@@ -56,7 +56,7 @@ def meet_ellipsoid(model: Model, room: Room, w: Array, spot: Array) -> None:
 
 
 @compiled
-def _place_stations(model: Model, room: Room, w: Array, lane: int) -> None:
+def _place_stations(model: EngineModel, room: EngineWorkspace, w: Array, lane: int) -> None:
     """Write the first three stations, Earth-centred in radii, to the first rows of w."""
     globe, origin = model.admission.globe, room.vector[ORIGIN]
     for s in range(3):
@@ -81,7 +81,7 @@ def _cross(w: Array, a: int, b: int, out: int) -> None:
 
 
 @compiled
-def _meet(model: Model, room: Room, w: Array, height: float, lane: int, spot: Array) -> None:
+def _meet(model: EngineModel, room: EngineWorkspace, w: Array, height: float, lane: int, spot: Array) -> None:
     """Write the points of one lane.
 
     On the plane curve ``base + along t + n mu`` with ``mu^2 = q(t)`` all ranges are right. On the ellipsoid
@@ -132,7 +132,9 @@ def _form(w: Array, a: int, b: int, height: float) -> float:
 
 
 @compiled
-def _cut(room: Room, model: Model, w: Array, height: float, lane: int, spot: Array, curve: Any) -> None:
+def _cut(
+    room: EngineWorkspace, model: EngineModel, w: Array, height: float, lane: int, spot: Array, curve: Any
+) -> None:
     """Write the points of a curve on the ellipsoid."""
     q0, q1, q2, scale, shift = curve
     alpha = _form(w, _N, _N, height)
@@ -163,7 +165,9 @@ def _cut(room: Room, model: Model, w: Array, height: float, lane: int, spot: Arr
 
 
 @compiled
-def _put(room: Room, model: Model, w: Array, t: float, across: float, lane: int, spot: Array, count: int) -> int:
+def _put(
+    room: EngineWorkspace, model: EngineModel, w: Array, t: float, across: float, lane: int, spot: Array, count: int
+) -> int:
     """Write a point of the curve as the next candidate unless it is there, and return whether it was written."""
     globe, origin, point = model.admission.globe, room.vector[ORIGIN], w[_FIRST]
     for i in range(3):

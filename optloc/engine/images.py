@@ -38,10 +38,10 @@ from optloc.engine.memory import (
     SHARE,
     SPARE,
     STEPS,
+    EngineModel,
+    EngineWorkspace,
     G,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.engine.refinement import decide, propose
@@ -73,7 +73,7 @@ _WEAK = 1e-11
 
 
 @compiled
-def find_plane(room: Room) -> None:
+def find_plane(room: EngineWorkspace) -> None:
     """Write the direction in which the stations spread least to row NORMAL."""
     s, d = room.place.shape[:2]
     normal, least, spare = room.vector[NORMAL], room.scalar[LOW], room.scalar[SPARE]
@@ -99,7 +99,7 @@ def find_plane(room: Room) -> None:
 
 
 @compiled
-def keep_fix(room: Room) -> None:
+def keep_fix(room: EngineWorkspace) -> None:
     """Keep position and information of the fix, and its height above the stations' plane."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     for lane in range(LANES):
@@ -116,7 +116,7 @@ def keep_fix(room: Room) -> None:
 
 
 @compiled
-def reflect(model: Model, room: Room) -> None:
+def reflect(model: EngineModel, room: EngineWorkspace) -> None:
     """Start the refinement of mirror images of kept fixes, or of second starts; what is not good has none."""
     vector, scalar, d = room.vector, room.scalar, room.d
     for i in range(vector.shape[1]):
@@ -131,16 +131,16 @@ def reflect(model: Model, room: Room) -> None:
 
 
 @compiled
-def follow(model: Model, rows: Any, room: Room, tolerance: float, fewest: int, every: bool) -> None:
+def follow(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: float, fewest: int, every: bool) -> None:
     """Refine the unknowns of lanes that are alive, until fewer of them are left than are worth a block.
 
     Parameters
     ----------
-    model : Model
+    model : EngineModel
         With the constraints that hold fixes.
     rows : named tuple
         Of the evaluator.
-    room : Room
+    room : EngineWorkspace
         Unknowns, damping, steps, and what `keep_fix` wrote in. Lanes that arrived somewhere stay good and are no longer
         alive; those that are given up are not good.
     tolerance : float
@@ -167,7 +167,7 @@ def follow(model: Model, rows: Any, room: Room, tolerance: float, fewest: int, e
 
 
 @compiled
-def _note_nearest(rows: Any, room: Room, nearest: Array, every: bool) -> None:
+def _note_nearest(rows: Any, room: EngineWorkspace, nearest: Array, every: bool) -> None:
     """Write the range to the nearest station, where the last step was kept."""
     kept, least = room.scalar[SPARE], room.scalar[LOW]
     note_nearest(rows, room, least)
@@ -176,7 +176,7 @@ def _note_nearest(rows: Any, room: Room, nearest: Array, every: bool) -> None:
 
 
 @compiled
-def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
+def watch(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> float:
     """Give up refinements that lead to no rival, and return how many lanes are alive.
 
     Two reasons end one. Within a ball of radius D about it no position costs as little as a rival. Over a step of
@@ -188,7 +188,7 @@ def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
     ----------
     bow : float
         Of `optloc.engine.evaluator.bow_of`.
-    room : Room
+    room : EngineWorkspace
         Proposed steps, and what `keep_fix` wrote in; ALIVE and GOOD are written.
     nearest : array (W,)
         Ranges to the nearest stations, metres.
@@ -224,7 +224,7 @@ def watch(bow: float, room: Room, nearest: Array, every: bool) -> float:
 
 
 @compiled
-def confirm(model: Model, rows: Any, room: Room) -> float:
+def confirm(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
     """Leave good only the lanes that arrived at a rival, and return how many did.
 
     Where a damped refinement ends is no minimum yet: the undamped step must be short there, too, and the curvature of
@@ -257,7 +257,7 @@ def confirm(model: Model, rows: Any, room: Room) -> float:
 
 
 @compiled
-def _require_rest(model: Model, room: Room) -> None:
+def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
     """Keep the lanes whose undamped step is short."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, move, length = vector.shape[1], vector[MOVE], scalar[SPARE]

@@ -18,9 +18,9 @@ from optloc.engine.memory import (
     GOOD,
     RADIUS,
     SPREAD,
+    EngineModel,
+    EngineWorkspace,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.engine.refinement import refine
@@ -35,7 +35,7 @@ _TOLERANCE, _STEPS = 1e-2, 12
 
 
 @compiled
-def search_sphere(model: Model, rows: Any, room: Room, spot: Array) -> None:
+def search_sphere(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array) -> None:
     """Write the least cost of infinity to BEYOND; row X and its information stay as they are.
 
     The direction of the fix is refined, and the cheapest of each sector.
@@ -62,7 +62,7 @@ def search_sphere(model: Model, rows: Any, room: Room, spot: Array) -> None:
 
 
 @compiled
-def _bring_back(room: Room) -> None:
+def _bring_back(room: EngineWorkspace) -> None:
     """Copy row FIX and its information to row X."""
     vector, matrix = room.vector, room.matrix
     for i in range(vector.shape[1]):

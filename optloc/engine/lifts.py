@@ -24,7 +24,7 @@ from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 
 
-class Entry(NamedTuple):
+class LiftEntry(NamedTuple):
     """A row ``x . position + last y_last = right``.
 
     Parameters
@@ -43,14 +43,14 @@ class Entry(NamedTuple):
     factor: Callable[[Point], Any]
 
 
-class Known(NamedTuple):
+class KnownLift(NamedTuple):
     """A range ``offset + sign t`` that takes the place of one in a row; t is the last coordinate."""
 
     offset: Any
     sign: Any
 
 
-def pair_elevation(m: Any, azimuth: Any, a: Point) -> Entry:
+def pair_elevation(m: Any, azimuth: Any, a: Point) -> LiftEntry:
     """Return [sin E cos A, sin E sin A, -cos E] . (x - s) = 0 in the station's axes; its error is range times n_E.
 
     The normal of the cone of elevation E in the measured azimuth A is at right angles to the line of sight.
@@ -59,10 +59,10 @@ def pair_elevation(m: Any, azimuth: Any, a: Point) -> Entry:
     own = (xp.sin(m) * xp.cos(azimuth), xp.sin(m) * xp.sin(azimuth), -1.0 * xp.cos(m))
     basis = a.axes or tuple(tuple(float(i == j) for j in range(3)) for i in range(3))
     normal = tuple(own[0] * basis[0][c] + own[1] * basis[1][c] + own[2] * basis[2][c] for c in range(3))
-    return Entry(normal, 0.0, dot(normal, a.position), lambda t: distance(t, a))
+    return LiftEntry(normal, 0.0, dot(normal, a.position), lambda t: distance(t, a))
 
 
-def enter(model: Model, m: Any, a: Point, b: Point, known: tuple[Known, Known] | None) -> Entry | None:
+def enter(model: Model, m: Any, a: Point, b: Point, known: tuple[KnownLift, KnownLift] | None) -> LiftEntry | None:
     """Return the row of a measured value, or None where it is not linear.
 
     Parameters
@@ -73,7 +73,7 @@ def enter(model: Model, m: Any, a: Point, b: Point, known: tuple[Known, Known] |
         Value, SI units or radians.
     a, b : Point
         Its stations, scaled.
-    known : tuple of two Known, optional
+    known : tuple of two KnownLift, optional
         Ranges that take the place of those to a and b; None where ranges are not known, nor up to a common unknown.
     """
     lifted = lifted_row(model, m, a, b)
@@ -82,13 +82,13 @@ def enter(model: Model, m: Any, a: Point, b: Point, known: tuple[Known, Known] |
     terms = [(c, place) for place, c in enumerate((lifted.ra, lifted.rb)) if not _vanishes(c)]
     x = (0.0,) * len(a.position) if lifted.x is None else lifted.x
     if not terms:
-        return Entry(x, 0.0, -1.0 * lifted.constant, lambda t: lifted.factor(t, a, b))
+        return LiftEntry(x, 0.0, -1.0 * lifted.constant, lambda t: lifted.factor(t, a, b))
     if known is not None:
         last: Any = 0.0
         right: Any = -1.0 * lifted.constant
         for c, place in terms:
             last, right = last + c * known[place].sign, right - c * known[place].offset
-        return Entry(x, last, right, lambda t: lifted.factor(t, a, b))
+        return LiftEntry(x, last, right, lambda t: lifted.factor(t, a, b))
     if lifted.x is not None:
         return None
     # ra r_a = -rb r_b, so p r_a^2 = q r_b^2: exact, as both sides are positive; p = q is a plane
@@ -96,7 +96,7 @@ def enter(model: Model, m: Any, a: Point, b: Point, known: tuple[Known, Known] |
     squared = tuple(-2.0 * (p * u - q * v) for u, v in zip(a.position, b.position, strict=True))
     right = q * dot(b.position, b.position) - p * dot(a.position, a.position)
     # d(p r_a^2 - q r_b^2) = (sqrt p r_a + sqrt q r_b) d(...), and both terms are equal at the place
-    return Entry(squared, p - q, right, lambda t: 2.0 * root * distance(t, b) * lifted.factor(t, a, b))
+    return LiftEntry(squared, p - q, right, lambda t: 2.0 * root * distance(t, b) * lifted.factor(t, a, b))
 
 
 def _vanishes(value: Any) -> bool:
@@ -172,12 +172,12 @@ def _tape_of(model: Model, d: int, turned: bool, paired: bool, known: bool) -> T
 
     a, b, m = point(_A, turned), point(_B, False), recorder.input(_M)
     ranges = (
-        Known(recorder.input(_KNOWN_A), recorder.input(_SIGN_A)),
-        Known(recorder.input(_KNOWN_B), recorder.input(_SIGN_B)),
+        KnownLift(recorder.input(_KNOWN_A), recorder.input(_SIGN_A)),
+        KnownLift(recorder.input(_KNOWN_B), recorder.input(_SIGN_B)),
     )
     try:
         if paired:
-            entry: Entry | None = pair_elevation(m, recorder.input(_AZIMUTH), a)
+            entry: LiftEntry | None = pair_elevation(m, recorder.input(_AZIMUTH), a)
         else:
             entry = enter(model, m, a, b, ranges if known else None)
         if entry is None:

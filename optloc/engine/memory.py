@@ -30,7 +30,7 @@ FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND, RADIUS = range(14,
 
 
 LOWER_BOUND, UPPER_BOUND, BOUNDED = range(3)
-"""Rows of `Room.side`."""
+"""Rows of `EngineWorkspace.side`."""
 
 
 class Admission(NamedTuple):
@@ -58,15 +58,15 @@ class Admission(NamedTuple):
 
 
 SIGN, RANGED, HEARD, SEEN = range(4)
-"""Rows of `Model.station`: how the unknown range t enters, zeros where the ranges are determined; 1.0 for the stations
-whose range is known, up to t; 1.0 for those with a row, and for those with an angle."""
+"""Rows of `EngineModel.station`: how the unknown range t enters, zeros where the ranges are determined; 1.0 for the
+stations whose range is known, up to t; 1.0 for those with a row, and for those with an angle."""
 
 
 BY_SQUARES, BY_HEIGHT, BY_PLACES = range(3)
 """How a fix starts: squared ranges and linear rows; where ranges meet a known height; the cheapest of many places."""
 
 
-class Model(NamedTuple):
+class EngineModel(NamedTuple):
     """How measurements z become a start: linear maps to ranges to s stations, and what the rows are corrected by.
 
     Parameters
@@ -109,7 +109,7 @@ class Model(NamedTuple):
     limit: float
 
 
-class Found(NamedTuple):
+class EngineResult(NamedTuple):
     """One line of `Answer.number`; `Answer` has the columns by the same names."""
 
     cost: float
@@ -120,7 +120,7 @@ class Found(NamedTuple):
     kappa_far: float
 
 
-COST_OF_FIX, COST_OF_RIVAL, SETTLED, AT_INFINITY, KAPPA, KAPPA_FAR = range(len(Found._fields))
+COST_OF_FIX, COST_OF_RIVAL, SETTLED, AT_INFINITY, KAPPA, KAPPA_FAR = range(len(EngineResult._fields))
 """Columns of `Answer.number`."""
 MULTIPLIER, VALUE, GRADIENT = range(3)
 """Last axis of `Answer.side`."""
@@ -138,7 +138,7 @@ class Answer(NamedTuple):
     rival : array (N, size)
         Another minimum that the mirror image of the fix leads to, and which costs no more than `LISTED` more; NaN.
     number : array (N, 6)
-        See `Found`.
+        See `EngineResult`.
     side : array (N, k, 2 + d)
         Of each held or bounded quantity its multiplier, where it is held: the gradient of the cost and all gradients
         times their multipliers add up to nothing; its value, and its gradient.
@@ -198,7 +198,7 @@ class Answer(NamedTuple):
         return self.side[..., GRADIENT:]
 
 
-class Room(NamedTuple):
+class EngineWorkspace(NamedTuple):
     """Memory of a block of W problems of p unknowns, the first d of which are the position, and of s stations.
 
     Parameters
@@ -210,7 +210,7 @@ class Room(NamedTuple):
     seen : array (m, W)
         Measurements.
     value : array (s + v, W)
-        Their images under `Model.linear`.
+        Their images under `EngineModel.linear`.
     place : array (s, d, W)
         Stations from the origin, metres.
     squared, rows : array (s, d + 2, W), (s + l, d + 2, W)
@@ -254,11 +254,11 @@ class Room(NamedTuple):
 
 
 @compiled
-def make_room(model: Model, stations: int, d: int, unknowns: int, others: int) -> Room:
+def make_room(model: EngineModel, stations: int, d: int, unknowns: int, others: int) -> EngineWorkspace:
     """Return the memory of a block of problems, for numbers of stations, coordinates, unknowns and linear rows."""
     s, p, m = stations, unknowns, model.row.shape[1]
     c, k = model.admission.exact, model.admission.level.shape[1]
-    return Room(
+    return EngineWorkspace(
         d,
         np.empty(LANES, np.int64),
         np.zeros((m, LANES)),

@@ -23,7 +23,7 @@ from optloc.engine.memory import (
     GRADIENT,
     KAPPA_FAR,
     Answer,
-    Model,
+    EngineModel,
 )
 from optloc.engine.tapes import TapeRows
 from optloc.kernels.jit import enabled, ready, usable
@@ -60,7 +60,7 @@ class Plan:
         Degrees of freedom.
     node : int array (2, s)
         Epoch and station of each place that takes part; the epoch is 0 where stations stay.
-    model : Model
+    model : EngineModel
         How measurements become a start.
     rows : callable
         Maps problems without batch axes, or a flat batch, to the rows as an evaluator takes them.
@@ -79,7 +79,7 @@ class Plan:
     weight: Array
     dof: int
     node: Array
-    model: Model
+    model: EngineModel
     rows: Callable[[Problem], Any]
     ranged: bool
     size: int
@@ -155,7 +155,7 @@ class Load(NamedTuple):
 
     Parameters
     ----------
-    model : Model
+    model : EngineModel
         With the levels of constraints.
     rows : named tuple
         Of the evaluator.
@@ -163,7 +163,7 @@ class Load(NamedTuple):
         Places that take part, metres.
     """
 
-    model: Model
+    model: EngineModel
     rows: Any
     place: Array
 

@@ -26,10 +26,10 @@ from optloc.engine.memory import (
     SOLVABLE,
     SPARE,
     TRIAL,
+    EngineModel,
+    EngineWorkspace,
     G,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.kernels.gtrs import minimise
@@ -45,7 +45,7 @@ class RangeRows(NamedTuple):
     correction : array (m,)
         Known amount by which each measurement exceeds the model, metres.
     K : array (q, s)
-        Whitened rows, 1/metres. In `Model.linear` the maps to u follow the maps to ranges; then come the maps to
+        Whitened rows, 1/metres. In `EngineModel.linear` the maps to u follow the maps to ranges; then come the maps to
         emission times for zero ranges, and to loops.
     travel : array (e, s)
         How the ranges reduce the emission times.
@@ -113,7 +113,7 @@ def count_lifted(rows: RangeRows) -> int:
 
 
 @compiled
-def keep(model: Model, rows: RangeRows, stations: int, d: int, size: int) -> RangeBlock:
+def keep(model: EngineModel, rows: RangeRows, stations: int, d: int, size: int) -> RangeBlock:
     """Return the rows with the memory for a block of problems."""
     q = len(rows.K)
     return RangeBlock(
@@ -128,7 +128,7 @@ def keep(model: Model, rows: RangeRows, stations: int, d: int, size: int) -> Ran
 
 
 @compiled
-def load(block: RangeBlock, z: Array, room: Room, anew: bool) -> None:
+def load(block: RangeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
     """Write the cost of the loops; of new stations what they say of infinity."""
     first, loop = len(room.place) + len(block.rows.K) + len(block.rows.start), room.scalar[LOOP]
     for lane in range(LANES):
@@ -141,23 +141,23 @@ def load(block: RangeBlock, z: Array, room: Room, anew: bool) -> None:
 
 
 @compiled
-def minimise_start(model: Model, block: RangeBlock, room: Room, first: bool) -> None:
+def minimise_start(model: EngineModel, block: RangeBlock, room: EngineWorkspace, first: bool) -> None:
     """Write the minimiser of the weighed squared-range rows."""
     minimise(room.rows, model.reference >= 0, room.y, room.scalar[SOLVABLE], room.work)
 
 
 @compiled
-def scout(model: Model, block: RangeBlock, room: Room) -> None:
+def scout(model: EngineModel, block: RangeBlock, room: EngineWorkspace) -> None:
     """Do nothing: sums of ranges that lack rows are run as tapes."""
 
 
 @compiled
-def complete(block: RangeBlock, room: Room) -> None:
+def complete(block: RangeBlock, room: EngineWorkspace) -> None:
     """Do nothing: the position is all that is refined."""
 
 
 @compiled
-def equations(block: RangeBlock, room: Room, shift: int) -> None:
+def equations(block: RangeBlock, room: EngineWorkspace, shift: int) -> None:
     """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
     s, vector, scalar = len(room.place), room.vector, room.scalar
     _equations(
@@ -177,7 +177,7 @@ def equations(block: RangeBlock, room: Room, shift: int) -> None:
 
 
 @compiled
-def costs(block: RangeBlock, room: Room) -> None:
+def costs(block: RangeBlock, room: EngineWorkspace) -> None:
     """Write the cost at TRIAL to COST_TRIAL: a third of the work of `equations`."""
     s, scalar = len(room.place), room.scalar
     u, trial = room.value[s : s + len(block.rows.K)], room.vector[TRIAL]
@@ -185,7 +185,7 @@ def costs(block: RangeBlock, room: Room) -> None:
 
 
 @compiled
-def bow_of(block: RangeBlock, room: Room) -> float:
+def bow_of(block: RangeBlock, room: EngineWorkspace) -> float:
     """Return the curvature b of all residuals: over a step D at range r they change by up to b D^2 / r more.
 
     A range exceeds its linear prediction by 0 to ``D^2 / 2 r``. All residuals together are off by
@@ -195,7 +195,7 @@ def bow_of(block: RangeBlock, room: Room) -> float:
 
 
 @compiled
-def note_nearest(block: RangeBlock, room: Room, least: Array) -> None:
+def note_nearest(block: RangeBlock, room: EngineWorkspace, least: Array) -> None:
     """Write the range to the nearest station (W,)."""
     r = block.r
     for lane in range(LANES):
@@ -206,13 +206,13 @@ def note_nearest(block: RangeBlock, room: Room, least: Array) -> None:
 
 
 @compiled
-def search_infinity(model: Model, block: RangeBlock, room: Room) -> None:
+def search_infinity(model: EngineModel, block: RangeBlock, room: EngineWorkspace) -> None:
     """Write what infinity costs: that is known in closed form."""
     measure_infinity(block, room)
 
 
 @compiled
-def finish(block: RangeBlock, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+def finish(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Write emission times and station errors at row X."""
     if not len(block.rows.start) and not len(block.rows.wander):
         return
@@ -226,7 +226,7 @@ def finish(block: RangeBlock, z: Array, room: Room, size: int, mark: Array, mark
 
 
 @compiled
-def _emit(block: RangeBlock, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+def _emit(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Write the emission times: less the ranges' share, plus the measurement that they count from."""
     item, r, sent, start, d = room.item, block.r, block.sent, block.rows.start, room.d
     first = len(room.place) + len(block.rows.K)
@@ -245,7 +245,7 @@ def _emit(block: RangeBlock, z: Array, room: Room, size: int, mark: Array, marke
 
 
 @compiled
-def _write_residuals(block: RangeBlock, room: Room) -> None:
+def _write_residuals(block: RangeBlock, room: EngineWorkspace) -> None:
     """Write the whitened residuals of ranges that are at hand."""
     K, residual, r, s = block.rows.K, block.residual, block.r, len(room.place)
     for k in range(len(K)):
@@ -259,7 +259,9 @@ def _write_residuals(block: RangeBlock, room: Room) -> None:
 
 
 @compiled
-def _shift(block: RangeBlock, room: Room, station: int, size: int, mark: Array, marked: bool, x: Array) -> None:
+def _shift(
+    block: RangeBlock, room: EngineWorkspace, station: int, size: int, mark: Array, marked: bool, x: Array
+) -> None:
     """Write the error of a station: along the line to the target, by what the residuals say of its range."""
     K, residual, unit, first = block.rows.K, block.residual, block.unit, block.rows.offset[station]
     for lane in range(size):
@@ -378,7 +380,7 @@ def _costs(K: Array, u: Array, place: Array, x: Array, r: Array, left: Array, lo
 
 
 @compiled
-def bend(block: RangeBlock, room: Room) -> None:
+def bend(block: RangeBlock, room: EngineWorkspace) -> None:
     """Write half the second derivatives of the cost to H_TRIAL: the information, less what bent fronts do to it."""
     vector, matrix, scalar, K = room.vector, room.matrix, room.scalar, block.rows.K
     s, d = room.place.shape[:2]
@@ -418,7 +420,7 @@ _UNIT = 1e-12
 
 
 @compiled
-def _see_far(block: RangeBlock, room: Room) -> None:
+def _see_far(block: RangeBlock, room: EngineWorkspace) -> None:
     """Write the map from directions to whitened rows, turned to its principal axes, and its squared singular values."""
     s, d = room.place.shape[:2]
     flat = block.flat
@@ -435,7 +437,7 @@ def _see_far(block: RangeBlock, room: Room) -> None:
 
 
 @compiled
-def _turn_to_axes(block: RangeBlock, room: Room) -> None:
+def _turn_to_axes(block: RangeBlock, room: EngineWorkspace) -> None:
     """Turn the map to the principal axes of its square."""
     flat, stiff, row = block.flat, block.stiff, room.vector[MOVE]
     work, axes, d = room.axes[EIGEN], room.axes[AXES], room.d
@@ -463,14 +465,14 @@ def _turn_to_axes(block: RangeBlock, room: Room) -> None:
 
 
 @compiled
-def measure_infinity(block: RangeBlock, room: Room) -> None:
+def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
     """Write the least cost at infinity to BEYOND: exact where it is within `BEYOND_DOUBT` of FIX_COST, else a bound.
 
     Parameters
     ----------
     block : RangeBlock
         Rows and memory.
-    room : Room
+    room : EngineWorkspace
         LOOP, FIX_COST and what `_see_far` wrote in; rows of scratch are overwritten.
     """
     scalar, vector = room.scalar, room.vector
@@ -506,7 +508,7 @@ def measure_infinity(block: RangeBlock, room: Room) -> None:
 
 @compiled
 def _begin(
-    u: Array, block: RangeBlock, room: Room, g: Array, gap: Array, total: Array, least: Array, more: Array
+    u: Array, block: RangeBlock, room: EngineWorkspace, g: Array, gap: Array, total: Array, least: Array, more: Array
 ) -> None:
     """Write g, gaps of the eigenvalues, the cost without ranges, the least eigenvalue, and the first multiplier.
 
@@ -580,7 +582,7 @@ def _lengthen(y: Array, gap: Array, spare: Array) -> None:
 
 
 @compiled
-def _weigh(u: Array, block: RangeBlock, room: Room, y: Array, left: Array, cost: Array) -> None:
+def _weigh(u: Array, block: RangeBlock, room: EngineWorkspace, y: Array, left: Array, cost: Array) -> None:
     """Write the cost of remote emitters in directions y (d, W): from residuals, which cancel less than the bound."""
     for lane in range(LANES):
         cost[lane] = room.scalar[LOOP, lane]

@@ -27,10 +27,10 @@ from optloc.engine.memory import (
     SPARE,
     STEPS,
     TRIAL,
+    EngineModel,
+    EngineWorkspace,
     G,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
@@ -39,16 +39,16 @@ from optloc.kernels.systems import LANES, factor_plain, solve_plain
 
 
 @compiled
-def refine(model: Model, rows: Any, room: Room, tolerance: float, limit: int) -> None:
+def refine(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: float, limit: int) -> None:
     """Refine the unknowns of the lanes that are good; those that do not finish in time stay alive.
 
     Parameters
     ----------
-    model : Model
+    model : EngineModel
         With the constraints that hold fixes.
     rows : named tuple
         Of the evaluator.
-    room : Room
+    room : EngineWorkspace
         Unknowns in row X, rounding error and which lanes are good in; unknowns, right sides, information (lower half),
         costs, steps, which are alive and which good out.
     tolerance : float
@@ -78,7 +78,7 @@ def refine(model: Model, rows: Any, room: Room, tolerance: float, limit: int) ->
 
 
 @compiled
-def propose(model: Model, room: Room) -> None:
+def propose(model: EngineModel, room: EngineWorkspace) -> None:
     """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d = vector.shape[1]
@@ -112,7 +112,7 @@ def propose(model: Model, room: Room) -> None:
 
 
 @compiled
-def decide(room: Room, tolerance: float) -> bool:
+def decide(room: EngineWorkspace, tolerance: float) -> bool:
     """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
     vector, matrix, scalar, face = room.vector, room.matrix, room.scalar, room.face
     d = vector.shape[1]

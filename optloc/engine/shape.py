@@ -26,10 +26,10 @@ from optloc.engine.memory import (
     SHARE,
     SPARE,
     TRIAL,
+    EngineModel,
+    EngineWorkspace,
     G,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.kernels.jit import compiled
@@ -51,16 +51,18 @@ _HORIZON = 1e-6
 
 
 @compiled
-def measure_shape(model: Model, rows: Any, room: Room, inverse: bool, turned: bool, out: Array) -> None:
+def measure_shape(
+    model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool, turned: bool, out: Array
+) -> None:
     """Find kappa of fixes in row X, with their information and costs.
 
     Parameters
     ----------
-    model : Model
+    model : EngineModel
         With the constraints that hold fixes.
     rows : named tuple
         Of the evaluator.
-    room : Room
+    room : EngineWorkspace
         Unknowns, information, covariance in H_TRIAL, and costs; rows of scratch are overwritten.
     inverse : bool
         In inverse range about the mean of the stations that take part, instead of in metres.
@@ -95,7 +97,7 @@ def measure_shape(model: Model, rows: Any, room: Room, inverse: bool, turned: bo
 
 
 @compiled
-def _leave_position(room: Room) -> None:
+def _leave_position(room: EngineWorkspace) -> None:
     """Eliminate the other unknowns: write the information about the position, and how they follow it, to MARGIN."""
     p, left, right = room.vector.shape[1], room.matrix[MARGIN], room.vector[MOVE]
     for i in range(p):
@@ -126,7 +128,7 @@ def _even(eigen: Array, i: int, j: int, lane: int) -> float:
 
 
 @compiled
-def _turn(model: Model, rows: Any, room: Room, inverse: bool) -> None:
+def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -> None:
     """Go along the diagonals between axes of equal eigenvalues, and note them where they are equal."""
     vector, axes, scalar = room.vector, room.axes, room.scalar
     d, share = room.d, scalar[SHARE]
@@ -184,7 +186,7 @@ def _span(vector: Array, base: Array, r: Array) -> None:
 
 
 @compiled
-def _axes(room: Room, inverse: bool, held: bool, spare: Array) -> None:
+def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> None:
     """Write the principal axes of the position's information, or of it in the chart, one sigma long, to AXES."""
     d, base, work, axes = room.d, room.axes[BASE], room.axes[EIGEN], room.axes[AXES]
     source = room.matrix[H_TRIAL if held else MARGIN if room.vector.shape[1] > d else H]
@@ -231,7 +233,7 @@ def _drop_exact(variance: Array, most: Array) -> None:
 
 
 @compiled
-def _probe(model: Model, rows: Any, room: Room, inverse: bool) -> None:
+def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -> None:
     """Find the cost a step MOVE away, and one over the rise of a quadratic one; a step past the horizon ends there."""
     vector, scalar, base = room.vector, room.scalar, room.axes[BASE]
     d, move, trial, share, w = room.d, vector[MOVE], vector[TRIAL], scalar[SHARE], scalar[SPARE]
@@ -268,7 +270,7 @@ def _probe(model: Model, rows: Any, room: Room, inverse: bool) -> None:
 
 
 @compiled
-def _spare_still(room: Room, axis: int) -> None:
+def _spare_still(room: EngineWorkspace, axis: int) -> None:
     """Let the cost rise like a Gaussian's where an axis has no length: surfaces hold fixes across it."""
     scalar = room.scalar
     for lane in range(LANES):

@@ -21,8 +21,8 @@ from optloc.engine.memory import (
     SOLVABLE,
     SPARE,
     SPREAD,
-    Model,
-    Room,
+    EngineModel,
+    EngineWorkspace,
     X,
 )
 from optloc.kernels.gtrs import meet
@@ -35,7 +35,7 @@ range has no first-order error, and its weight would be infinite."""
 
 
 @compiled
-def begin(model: Model, rows: Any, room: Room) -> None:
+def begin(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
     """Find starts: squared ranges weighed as equal first, then by the ranges of that answer; or in other ways."""
     scalar, s = room.scalar, len(room.place)
     if model.start != BY_SQUARES:
@@ -191,7 +191,7 @@ def square(
     c : array (s, W)
         Least-squares ranges, metres.
     station : array (4, s)
-        Of `optloc.engine.memory.Model`.
+        Of `optloc.engine.memory.EngineModel`.
     reference : int
         Station whose range is t; -1 where ranges are determined.
     place, spread : array (s, d, W), (W,)

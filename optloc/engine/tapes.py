@@ -26,16 +26,16 @@ from optloc.engine.memory import (
     SOLVABLE,
     SPARE,
     TRIAL,
+    EngineModel,
+    EngineWorkspace,
     G,
     H,
-    Model,
-    Room,
     X,
 )
 from optloc.engine.start import NEAR
 from optloc.kernels.gtrs import minimise
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import Cells, arrange, blur_of, gather, load as load_lane, memory, price
+from optloc.kernels.lanes import LaneCells, arrange, blur_of, gather, load as load_lane, memory, price
 from optloc.kernels.pack import Numbers
 from optloc.kernels.polynomial import DEGREE
 from optloc.kernels.systems import LANES, eliminate_last, factor_plain, solve_plain
@@ -80,7 +80,7 @@ class TapeBlock(NamedTuple):
     ----------
     rows : TapeRows
         Rows of all problems.
-    at, m : Cells, array
+    at, m : LaneCells, array
         Addresses in the memory of lanes, and this memory.
     r : array
         Registers.
@@ -89,7 +89,7 @@ class TapeBlock(NamedTuple):
     """
 
     rows: TapeRows
-    at: Cells
+    at: LaneCells
     m: Array
     r: Array
     spot: Array
@@ -109,7 +109,7 @@ def count_lifted(rows: TapeRows) -> int:
 
 
 @compiled
-def keep(model: Model, rows: TapeRows, stations: int, d: int, size: int) -> TapeBlock:
+def keep(model: EngineModel, rows: TapeRows, stations: int, d: int, size: int) -> TapeBlock:
     """Return the rows with the memory for a block of problems."""
     at = arrange(rows.tables, rows.numbers, size)
     m, r = memory(rows.tables, at, LANES)
@@ -120,7 +120,7 @@ def keep(model: Model, rows: TapeRows, stations: int, d: int, size: int) -> Tape
 
 
 @compiled
-def load(block: TapeBlock, z: Array, room: Room, anew: bool) -> None:
+def load(block: TapeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
     """Bring the numbers of a block into its lanes."""
     c, at, m = block.rows.numbers, block.at, block.m
     for lane in range(LANES):
@@ -132,7 +132,7 @@ def load(block: TapeBlock, z: Array, room: Room, anew: bool) -> None:
 
 
 @compiled
-def minimise_start(model: Model, block: TapeBlock, room: Room, first: bool) -> None:
+def minimise_start(model: EngineModel, block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
     """Write the minimiser of the weighed squared-range rows, and of the other linear rows."""
     _lift(block, room, first)
     if block.rows.lifts.flat:
@@ -142,7 +142,7 @@ def minimise_start(model: Model, block: TapeBlock, room: Room, first: bool) -> N
 
 
 @compiled
-def _lift(block: TapeBlock, room: Room, first: bool) -> None:
+def _lift(block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
     """Write the linear rows behind the range rows, weighed by their error at the last answer."""
     lifts, r = block.rows.lifts, block.r
     s, scale, spare = len(room.place), room.scalar[SCALE], room.scalar[SPARE]
@@ -161,7 +161,7 @@ def _lift(block: TapeBlock, room: Room, first: bool) -> None:
 
 
 @compiled
-def _enter(lifts: Lifts, b: int, room: Room, r: Array, row: int, low: int, inverse: Array) -> None:
+def _enter(lifts: Lifts, b: int, room: EngineWorkspace, r: Array, row: int, low: int, inverse: Array) -> None:
     """Write the inputs of a row of a block into their registers; `inverse` is one over the scale."""
     table = lifts.tapes.table
     begin = table[b, INPUT]
@@ -192,7 +192,7 @@ def _weigh(table: Array, b: int, sigma: float, r: Array, low: int, first: bool, 
 
 
 @compiled
-def _minimise_flat(room: Room) -> None:
+def _minimise_flat(room: EngineWorkspace) -> None:
     """Write the least-squares position: no row has the last coordinate, and the quadric would only invent one."""
     rows, y, d, vector, work = room.rows, room.y, room.d, room.vector, room.axes[0]
     diagonal, inverse, solvable = vector[DIAGONAL][:d], vector[MOVE][:d], room.scalar[SOLVABLE]
@@ -227,7 +227,7 @@ _MOST = 1e13
 
 
 @compiled
-def scout(model: Model, block: TapeBlock, room: Room) -> None:
+def scout(model: EngineModel, block: TapeBlock, room: EngineWorkspace) -> None:
     """Write the best candidates to rows X and OTHER."""
     for k in range(room.d, room.vector.shape[1]):
         for lane in range(LANES):
@@ -240,7 +240,7 @@ def scout(model: Model, block: TapeBlock, room: Room) -> None:
 
 
 @compiled
-def complete(block: TapeBlock, room: Room) -> None:
+def complete(block: TapeBlock, room: EngineWorkspace) -> None:
     """Write the other unknowns that fit the position best: exact where rows are linear in them."""
     vector, d, p = room.vector, room.d, room.vector.shape[1]
     if p == d:
@@ -264,7 +264,7 @@ def complete(block: TapeBlock, room: Room) -> None:
 
 
 @compiled
-def _copy(room: Room, shift: int) -> None:
+def _copy(room: EngineWorkspace, shift: int) -> None:
     """Copy information and right side at row X, or at TRIAL with shift 1, to REST and MOVE."""
     p, left = room.vector.shape[1], room.matrix[REST]
     for i in range(p):
@@ -276,7 +276,7 @@ def _copy(room: Room, shift: int) -> None:
 
 
 @compiled
-def equations(block: TapeBlock, room: Room, shift: int) -> None:
+def equations(block: TapeBlock, room: EngineWorkspace, shift: int) -> None:
     """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
     m = _evaluate(block, room, shift)
     p, last = room.vector.shape[1], block.at.after
@@ -292,7 +292,7 @@ def equations(block: TapeBlock, room: Room, shift: int) -> None:
 
 
 @compiled
-def _evaluate(block: TapeBlock, room: Room, shift: int) -> Any:
+def _evaluate(block: TapeBlock, room: EngineWorkspace, shift: int) -> Any:
     """Write the equations at row X, or at TRIAL with shift 1, into the memory of the lanes, which is returned."""
     m = _enter_place(block, room, shift)
     gather(block.rows.tables, block.rows.numbers, m, block.r, block.at, True, LANES)
@@ -300,7 +300,7 @@ def _evaluate(block: TapeBlock, room: Room, shift: int) -> Any:
 
 
 @compiled
-def _enter_place(block: TapeBlock, room: Room, shift: int) -> Any:
+def _enter_place(block: TapeBlock, room: EngineWorkspace, shift: int) -> Any:
     """Write row X, or TRIAL with shift 1, into the memory of the lanes, which is returned."""
     x, origin = room.vector[X + shift], room.vector[ORIGIN]
     for i in range(room.vector.shape[1]):
@@ -310,7 +310,7 @@ def _enter_place(block: TapeBlock, room: Room, shift: int) -> Any:
 
 
 @compiled
-def costs(block: TapeBlock, room: Room) -> None:
+def costs(block: TapeBlock, room: EngineWorkspace) -> None:
     """Write the cost at TRIAL, the least over the other unknowns, to COST_TRIAL."""
     p, d, at = room.vector.shape[1], room.d, block.at.after
     if p == d:
@@ -333,20 +333,20 @@ def costs(block: TapeBlock, room: Room) -> None:
 
 
 @compiled
-def bow_of(block: TapeBlock, room: Room) -> float:
+def bow_of(block: TapeBlock, room: EngineWorkspace) -> float:
     """Return infinity: tapes have no bound of their curvature."""
     return np.inf
 
 
 @compiled
-def note_nearest(block: TapeBlock, room: Room, least: Array) -> None:
+def note_nearest(block: TapeBlock, room: EngineWorkspace, least: Array) -> None:
     """Write that no station is near."""
     for lane in range(LANES):
         least[lane] = np.inf
 
 
 @compiled
-def bend(block: TapeBlock, room: Room) -> None:
+def bend(block: TapeBlock, room: EngineWorkspace) -> None:
     """Write the information to H_TRIAL: tapes have first derivatives only."""
     p = room.vector.shape[1]
     for i in range(p):
@@ -356,14 +356,14 @@ def bend(block: TapeBlock, room: Room) -> None:
 
 
 @compiled
-def measure_infinity(block: TapeBlock, room: Room) -> None:
+def measure_infinity(block: TapeBlock, room: EngineWorkspace) -> None:
     """Write infinity where no far position fits, else NaN: not measured."""
     for lane in range(LANES):
         room.scalar[BEYOND, lane] = np.inf if block.rows.bounded else np.nan
 
 
 @compiled
-def search_infinity(model: Model, block: TapeBlock, room: Room) -> None:
+def search_infinity(model: EngineModel, block: TapeBlock, room: EngineWorkspace) -> None:
     """Write to BEYOND what infinity costs: a search, for fixes that are bent."""
     if block.rows.bounded or block.rows.scaled:
         measure_infinity(block, room)
@@ -372,5 +372,5 @@ def search_infinity(model: Model, block: TapeBlock, room: Room) -> None:
 
 
 @compiled
-def finish(block: TapeBlock, z: Array, room: Room, size: int, mark: Array, marked: bool, x: Array) -> None:
+def finish(block: TapeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
     """Do nothing: all unknowns are refined."""

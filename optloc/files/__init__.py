@@ -15,7 +15,7 @@ if TYPE_CHECKING:
         within as within,
     )
     from optloc.base.outputs import (
-        Growing as Growing,
+        GrowingFile as GrowingFile,
         claim as claim,
         is_stream as is_stream,
         make_folder as make_folder,

@@ -27,9 +27,9 @@ from optloc.files.reading_report import about, check_receivers, left_over, uses_
 from optloc.files.readings import (
     CARTESIAN,
     CONVENTIONS,
+    ColumnHints,
     Named,
     Readings,
-    Told,
     as_angles,
     holds_names,
     named_columns,
@@ -38,7 +38,7 @@ from optloc.files.readings import (
     sorts_of,
     without,
 )
-from optloc.files.roles import Places, Roles, in_space, places_of
+from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
 from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
 from optloc.files.schema import Units
 from optloc.files.shapes import epochs_of, inline, long, wide
@@ -58,7 +58,7 @@ _FEW = 3
 def convert(
     source: Path,
     out: Path,
-    told: Told | None = None,
+    told: ColumnHints | None = None,
     *,
     tell: Callable[[TableProblem], object] = lambda _: None,
     **options: Any,
@@ -73,12 +73,12 @@ def convert(
         orbits of satellites, as two-line elements, OMM (JSON, CSV) or SP3.
     out : Path
         Problem file to write, .toml; its tables go to CSV files beside it. Of stations alone: the CSV file.
-    told : Told, optional
+    told : ColumnHints, optional
         What the table does not say itself.
     tell : callable, optional
         Is given the problem of a table before it is written.
     **options
-        The same, one by one: the fields of `Told`.
+        The same, one by one: the fields of `ColumnHints`.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def convert(
     InvalidProblem
         Naming the file, the row and the column.
     """
-    told = replace(told or Told(), **options)
+    told = replace(told or ColumnHints(), **options)
     _check_told(told)
     claim(out, inputs=[source, *(path for path in (told.stations, told.times) if path)])
     if told.times is not None or source.suffix.lower() in _ORBITS:
@@ -107,7 +107,7 @@ def convert(
     return Converted(table_problem.write(out), loaded, table_problem.notes, table_problem.as_read)
 
 
-def _check_told(told: Told) -> None:
+def _check_told(told: ColumnHints) -> None:
     """Refuse roles, frames and conventions that there are none of."""
     for role in told.columns:
         role_named(role)
@@ -133,7 +133,7 @@ def _sort(word: str) -> str:
     return "arrivals" if kind == "toa" else kind
 
 
-def understood(source: Path, told: Told) -> TableProblem:
+def understood(source: Path, told: ColumnHints) -> TableProblem:
     """Return what a table of readings or pseudoranges is, with what it does not say itself.
 
     Raises
@@ -151,7 +151,7 @@ def understood(source: Path, told: Told) -> TableProblem:
     return table_problem
 
 
-def _of_table(source: Path, told: Told) -> TableProblem:
+def _of_table(source: Path, told: ColumnHints) -> TableProblem:
     """Return what a table is."""
     table = without(read_table(source), told.ignore)
     own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
@@ -181,7 +181,7 @@ def _of_table(source: Path, told: Told) -> TableProblem:
     return _plan(roles, told, place, source, [long(roles, form, told, place, heard, forms) for form in forms], named)
 
 
-def _of_receivers(roles: Roles, place: Places) -> list[Named]:
+def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
     """Return the columns that are called after stations, without those that have another role.
 
     Raises
@@ -200,7 +200,7 @@ def _of_receivers(roles: Roles, place: Places) -> list[Named]:
     return kept
 
 
-def _is_long(roles: Roles, told: Told, place: Places) -> bool:
+def _is_long(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> bool:
     """Return whether a table has one reading a row: a column of stations, and one of readings."""
     if "station" in roles.told:
         return True
@@ -211,7 +211,7 @@ def _is_long(roles: Roles, told: Told, place: Places) -> bool:
     return bool({*sorts_of(roles, told)} - {"times"})
 
 
-def _unknown(roles: Roles, told: Told) -> InvalidProblem:
+def _unknown(roles: Roles, told: ColumnHints) -> InvalidProblem:
     """Return what is said of a table whose columns do not tell what it is."""
     columns = list(roles.table.columns)
     what = f"the columns {', '.join(columns)} do not tell what this is"
@@ -221,7 +221,7 @@ def _unknown(roles: Roles, told: Told) -> InvalidProblem:
     return InvalidProblem(what, roles.table.source, advice)
 
 
-def _may_be(one: Named, told: Told) -> bool:
+def _may_be(one: Named, told: ColumnHints) -> bool:
     """Return whether a column that names stations holds what is asked for."""
     return told.what is None or one.form in (None, told.what)
 
@@ -230,7 +230,12 @@ def _may_be(one: Named, told: Told) -> bool:
 
 
 def _plan(
-    roles: Roles, told: Told, place: Places, source: Path, found: Sequence[Readings], named: Sequence[Named]
+    roles: Roles,
+    told: ColumnHints,
+    place: ColumnPlaces,
+    source: Path,
+    found: Sequence[Readings],
+    named: Sequence[Named],
 ) -> TableProblem:
     """Return what readings become; `named` are the columns that are called after stations."""
     place = in_space(place) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else place
@@ -259,7 +264,7 @@ def _plan(
     return TableProblem(source, sections, place, tuple(read), tuple(notes), lines, after, height, uses)
 
 
-def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:
+def _height(found: Sequence[Readings], place: ColumnPlaces) -> tuple[str, str]:
     """Return what is known of the height of a target on Earth without a reading, as a line of a file, and a remark."""
     if place.frame != "geodetic":
         return "", ""
@@ -276,7 +281,7 @@ def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:
     return "", ""
 
 
-def _sigmas(told: Told, found: Sequence[Readings]) -> list[str | None]:
+def _sigmas(told: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
     """Return the standard deviation of each sort as it is written, None where the table has its own."""
     if told.sigma is None:
         for one in found:
@@ -298,7 +303,7 @@ def _sigmas(told: Told, found: Sequence[Readings]) -> list[str | None]:
     return [given.get(one.form.kind) for one in found]
 
 
-def _sp_speed(told: Told) -> float:
+def _sp_speed(told: ColumnHints) -> float:
     """Return the speed that turns S minus P into a range, metres per second."""
     if told.vp is None or told.vs is None:
         advice = "say both, such as --vp '6 km/s' --vs '3.5 km/s'"
@@ -326,7 +331,7 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
 
 
-def _with_declination(section: Section, found: Readings, told: Told) -> Section:
+def _with_declination(section: Section, found: Readings, told: ColumnHints) -> Section:
     """Return a section of bearings with the declination that is told."""
     if told.declination is None or found.form.kind != "azimuth":
         return section
@@ -364,7 +369,7 @@ def _from_first(found: Readings, columns: dict[str, Any]) -> Decimals:
     return found.values.since(first, message)
 
 
-def _few(sections: Sequence[Section], told: Told) -> list[str]:
+def _few(sections: Sequence[Section], told: ColumnHints) -> list[str]:
     """Return what is to be said of epochs with few readings."""
     names = [name for name in ("epoch", "target") if name in sections[0].columns] or ["time"]
     held = [section.columns for section in sections if set(names) <= set(section.columns)]

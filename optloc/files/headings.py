@@ -12,15 +12,15 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.units import UNITS
 from optloc.files.cells import Decimals, numbers
 from optloc.files.columns import stem, unit_of
-from optloc.files.readings import BOW, COMPASS, Readings, Told, in_unit, marks_of
-from optloc.files.roles import Places, Roles
+from optloc.files.readings import BOW, COMPASS, ColumnHints, Readings, in_unit, marks_of
+from optloc.files.roles import ColumnPlaces, Roles
 
 # A turn in each unit, and the radians of one: an angle without unit that is larger is in degrees.
 _TURNS = {"deg": Decimal(360)}
 _RADIANS = Decimal("6.2832")
 
 
-def heading_of(found: Readings, roles: Roles, told: Told) -> str | None:
+def heading_of(found: Readings, roles: Roles, told: ColumnHints) -> str | None:
     """Return the column of headings that is added to bearings; None where they are counted from elsewhere.
 
     Parameters
@@ -29,7 +29,7 @@ def heading_of(found: Readings, roles: Roles, told: Told) -> str | None:
         Azimuths.
     roles : Roles
         Columns of the table.
-    told : Told
+    told : ColumnHints
         The convention, where it is stated: any but that of the bow leaves the headings out.
 
     Raises
@@ -46,7 +46,7 @@ def heading_of(found: Readings, roles: Roles, told: Told) -> str | None:
     return column
 
 
-def from_bow(found: Readings, roles: Roles, column: str, told: Told) -> Readings:
+def from_bow(found: Readings, roles: Roles, column: str, told: ColumnHints) -> Readings:
     """Return bearings clockwise from north: those from the bow with the heading of their row added.
 
     Parameters
@@ -57,7 +57,7 @@ def from_bow(found: Readings, roles: Roles, column: str, told: Told) -> Readings
         Columns of the table.
     column : str
         The headings, clockwise from north.
-    told : Told
+    told : ColumnHints
         Whether the convention is stated, and what the unit is without one in the name of the column.
 
     Raises
@@ -94,12 +94,12 @@ def from_bow(found: Readings, roles: Roles, column: str, told: Told) -> Readings
     return replace(found, values=Decimals.of(sums), azimuth=COMPASS, heading=column, notes=(note, *found.notes))
 
 
-def stations_turned(place: Places, found: Sequence[Readings]) -> tuple[Places, str]:
+def stations_turned(place: ColumnPlaces, found: Sequence[Readings]) -> tuple[ColumnPlaces, str]:
     """Return stations with the headings of their table where bearings are read from them, and a remark.
 
     Parameters
     ----------
-    place : Places
+    place : ColumnPlaces
         Stations, with a column of headings where their table has one.
     found : sequence of Readings
         All readings.
@@ -127,7 +127,7 @@ def stations_turned(place: Places, found: Sequence[Readings]) -> tuple[Places, s
     return replace(place, columns={**place.columns, "heading_deg": np.nan_to_num(headings)}), note
 
 
-def _unit(column: str, held: list[Decimal], told: Told, where: str) -> str:
+def _unit(column: str, held: list[Decimal], told: ColumnHints, where: str) -> str:
     """Return the unit of headings: the one in the name of their column, or the one that their size or --unit tells."""
     known = UNITS["angle"]
     own = unit_of(column, known) or (told.unit if told.unit in known else None)

@@ -32,7 +32,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
+class RowChunk:
     """Rows of one kind.
 
     Parameters
@@ -113,7 +113,7 @@ class Context:
 
 def chunks_of(
     section: MeasurementsTable, table: Table, stations: tuple[str, ...], where: str, speed: float, *, values: bool
-) -> list[Chunk]:
+) -> list[RowChunk]:
     """Return the rows of one ``[[measurements]]`` table, one chunk for each of its kinds.
 
     Parameters
@@ -132,7 +132,7 @@ def chunks_of(
         Whether measured values are needed; without them a missing column z is NaN.
     """
 
-    def chunk(kind: str, pick: Array) -> Chunk:
+    def chunk(kind: str, pick: Array) -> RowChunk:
         own = table if len(pick) == table.count else table.take(pick)
         part = Context(section, own, stations, where, speed, values)
         return replace(_chunk(part, kind), row=pick, table=table)
@@ -151,7 +151,7 @@ def chunks_of(
     return made
 
 
-def _chunk(c: Context, kind: str) -> Chunk:
+def _chunk(c: Context, kind: str) -> RowChunk:
     section, table = c.section, c.table
     model = kind_model(kind, join(c.where, "key 'kind'"))
     convention = section.azimuth if kind == "azimuth" else "east-counterclockwise"
@@ -172,7 +172,7 @@ def _chunk(c: Context, kind: str) -> Chunk:
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
     east, day = _declination(c, units.name(name)) if kind == "azimuth" else (0.0, None)
     correction = _correction(c, units, unit)
-    return Chunk(
+    return RowChunk(
         kind, np.arange(table.count), z, a, b, weight, correction + east if east else correction, unit, units,
         units.name(name), np.broadcast_to(unit.slope(z), z.shape), np.broadcast_to(0.0, z.shape),
         sigma, arrival, covariance, signal_of(c),
@@ -306,12 +306,12 @@ def _declination(c: Context, unit: str) -> tuple[float, date | None]:
     return angle_of(given, unit, place), None
 
 
-def with_declination(chunk: Chunk, epoch: Array, stations: Stations, frame: Frame) -> Chunk:
+def with_declination(chunk: RowChunk, epoch: Array, stations: Stations, frame: Frame) -> RowChunk:
     """Return a chunk with the magnetic declination of its day at its stations among the corrections.
 
     Parameters
     ----------
-    chunk : Chunk
+    chunk : RowChunk
         Rows of one kind.
     epoch : int array (m,)
         Epoch of each.
@@ -330,7 +330,7 @@ def with_declination(chunk: Chunk, epoch: Array, stations: Stations, frame: Fram
     return replace(chunk, correction=chunk.correction + east, declination=east[used])
 
 
-def declination_told(chunks: Sequence[Chunk]) -> str:
+def declination_told(chunks: Sequence[RowChunk]) -> str:
     """Return the declination that the date of a file stands for, in words; empty where no date gives one."""
     found = [chunk.declination for chunk in chunks if chunk.declination is not None and len(chunk.declination)]
     if not found:
@@ -339,7 +339,7 @@ def declination_told(chunks: Sequence[Chunk]) -> str:
     return f"; magnetic declination {low if low == high else f'{low} to {high}'} deg, east positive"
 
 
-def with_baseline(chunk: Chunk, baseline: Array) -> Chunk:
+def with_baseline(chunk: RowChunk, baseline: Array) -> RowChunk:
     """Return a chunk of excess paths with the distance (m,) of its stations added."""
     return replace(chunk, z=chunk.z + baseline * (chunk.weight > 0.0), baseline=baseline)
 
@@ -468,7 +468,7 @@ def square(rows: list[list[float]], where: str) -> Array:
 
 
 def check_repeats(
-    chunks: Sequence[Chunk], index: Sequence[Array], target: Sequence[Array], stations: Sequence[str], epochs: Epochs
+    chunks: Sequence[RowChunk], index: Sequence[Array], target: Sequence[Array], stations: Sequence[str], epochs: Epochs
 ) -> None:
     """Refuse a row that another one repeats.
 
@@ -478,7 +478,7 @@ def check_repeats(
 
     Parameters
     ----------
-    chunks : sequence of Chunk
+    chunks : sequence of RowChunk
         Rows of each kind of each table.
     index, target : sequence of int array (m,)
         Epoch and target of each row of each chunk.
@@ -510,7 +510,7 @@ def check_repeats(
             raise _repeated((chunks[two[0]], two[1]), (chunks[one[0]], one[1]), stations, epoch)
 
 
-def _table(chunk: Chunk, index: Array, target: Array, number: int) -> Array:
+def _table(chunk: RowChunk, index: Array, target: Array, number: int) -> Array:
     """Return the number of the chunk, what makes rows equal, and the place in the chunk, as columns (9, present)."""
     # With noise of arrivals a second row of the same stations has the same noise, whatever its value: a copy, too.
     own = chunk.arrival is None and chunk.signal is None
@@ -524,7 +524,7 @@ def _table(chunk: Chunk, index: Array, target: Array, number: int) -> Array:
 
 
 def _repeated(
-    again: tuple[Chunk, int], first: tuple[Chunk, int], stations: Sequence[str], epoch: str
+    again: tuple[RowChunk, int], first: tuple[RowChunk, int], stations: Sequence[str], epoch: str
 ) -> InvalidProblem:
     (chunk, i), (other, j) = again, first
     names = "-".join(stations[s] for s in (chunk.a[i], chunk.b[i]) if s >= 0)

@@ -133,9 +133,9 @@ def locate(
     frame : "cartesian" or "ecef"
         What x, y, z of stations mean.
     speed : float, (float, float), Layers or Atmosphere
-        Propagation speed, m/s: light, or `optloc.units.sound_in_air` and `sound_in_water`; or `optloc.Layers` and
-        `optloc.Atmosphere`, through which rays bend. A pair is a speed and its standard deviation: the speed is then
-        estimated with the position, from all measurements that are times.
+        Propagation speed, m/s: light, or `optloc.units.sound_in_air` and `sound_in_water`; or `optloc.models.Layers`
+        and `optloc.models.Atmosphere`, through which rays bend. A pair is a speed and its standard deviation: the speed
+        is then estimated with the position, from all measurements that are times.
     method : str
         As of `optloc.solve`.
 
@@ -202,7 +202,7 @@ def _speed(given: Any) -> float | Medium:
         _speed(given[1])  # as positive as the speed
         return _speed(given[0])
     if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
-        advice = "give metres per second, optloc.Layers or optloc.Atmosphere"
+        advice = "give metres per second, optloc.models.Layers or optloc.models.Atmosphere"
         raise InvalidProblem("the speed is no positive number", "speed", advice)
     return float(given)
 

@@ -16,7 +16,7 @@ from optloc.base.inputs import Budget, access, at_most
 from optloc.base.types import Array, Bias, Rows, Stations
 from optloc.files.measurements import (
     ESTIMATE,
-    Chunk,
+    RowChunk,
     check_repeats,
     chunks_of,
     declination_told,
@@ -118,7 +118,7 @@ class Draft:
         Settings.
     tables : tuple of Table
         Rows of each ``[[measurements]]``.
-    chunks : tuple of Chunk
+    chunks : tuple of RowChunk
         The same in SI units, one for each kind of each table.
     numbers : tuple of int array (m,)
         Global row number of each row of each chunk.
@@ -129,7 +129,7 @@ class Draft:
     loaded: Loaded
     file: ProblemFile
     tables: tuple[Table, ...]
-    chunks: tuple[Chunk, ...]
+    chunks: tuple[RowChunk, ...]
     numbers: tuple[Array, ...]
     moving: bool
 
@@ -285,7 +285,7 @@ def _problem(
     return _check(made, source, medium_in(file, source))
 
 
-def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
+def _epochs(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> Epochs:
     columns: dict[str, Array | None] = {}
     for key in ("label", "time", "written", "target"):
         parts = [getattr(chunk, key) for chunk in chunks]
@@ -308,12 +308,12 @@ def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
     return epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free, source)
 
 
-def _stations_used(chunk: Chunk, epoch: Array) -> Array:
+def _stations_used(chunk: RowChunk, epoch: Array) -> Array:
     pairs = [np.stack([epoch, station], axis=-1)[(station >= 0) & (chunk.weight > 0)] for station in (chunk.a, chunk.b)]
     return np.concatenate(pairs)
 
 
-def _add_baseline(chunk: Chunk, epoch: Array, stations: Stations) -> Chunk:
+def _add_baseline(chunk: RowChunk, epoch: Array, stations: Stations) -> RowChunk:
     if not chunk.excess:
         return chunk
     place = stations.position[epoch if len(stations.position) > 1 else np.zeros_like(epoch)]
@@ -322,7 +322,7 @@ def _add_baseline(chunk: Chunk, epoch: Array, stations: Stations) -> Chunk:
 
 
 def _rows(
-    chunks: Sequence[Chunk], index: Sequence[Array], target: Sequence[Array]
+    chunks: Sequence[RowChunk], index: Sequence[Array], target: Sequence[Array]
 ) -> tuple[tuple[Rows, ...], list[Array]]:
     """Return the rows of each kind, and the global number of each row of each chunk."""
     # A problem has one block of rows for each kind, in the order of appearance; numbers lead back to the chunks.
@@ -359,7 +359,7 @@ def _concatenate(parts: Sequence[Array]) -> Array:
 
 def _noise(
     file: ProblemFile,
-    chunks: Sequence[Chunk],
+    chunks: Sequence[RowChunk],
     numbers: Sequence[Array],
     index: Sequence[Array],
     target: Sequence[Array],
@@ -376,13 +376,13 @@ def _noise(
 
 
 def noise_of(
-    chunks: Sequence[Chunk], numbers: Sequence[Array], epochs: Sequence[Array], targets: Sequence[Array]
+    chunks: Sequence[RowChunk], numbers: Sequence[Array], epochs: Sequence[Array], targets: Sequence[Array]
 ) -> Noise:
     """Return the noise of chunks.
 
     Parameters
     ----------
-    chunks : sequence of Chunk
+    chunks : sequence of RowChunk
         Rows with their own noise.
     numbers, epochs, targets : sequence of int array (m,)
         Global row number, epoch and target of each row of each chunk.
@@ -406,7 +406,7 @@ def noise_of(
     return group(blocks)
 
 
-def _arrivals(chunk: Chunk, members: Array) -> Array:
+def _arrivals(chunk: RowChunk, members: Array) -> Array:
     """Return the covariance (g, r, r) of groups of rows (g, r) that combine what stations measure independently."""
     signs = MODELS[chunk.kind].signs
     assert signs is not None
@@ -420,14 +420,14 @@ def _arrivals(chunk: Chunk, members: Array) -> Array:
     return covariance
 
 
-def _by_signal(chunk: Chunk, signal: Signal, members: Array) -> Array:
+def _by_signal(chunk: RowChunk, signal: Signal, members: Array) -> Array:
     try:
         return signal.covariance(chunk.kind, chunk.a[members], chunk.b[members])
     except InvalidProblem as error:
         raise InvalidProblem(error.what, join(chunk.table.source, f"key {error.where!r}"), error.advice) from None
 
 
-def _per_epoch_block(chunk: Chunk, number: Array, epoch: Array, matrix: Array) -> Block:
+def _per_epoch_block(chunk: RowChunk, number: Array, epoch: Array, matrix: Array) -> Block:
     return per_epoch(number, epoch, chunk.slope, matrix, join(chunk.table.source, "covariance"), int(chunk.row[0]))
 
 

@@ -17,14 +17,14 @@ from optloc.files.readings import (
     CARTESIAN,
     COMPASS,
     COUNTER,
+    ColumnHints,
     Named,
     Readings,
-    Told,
     quoted,
     sort_named,
     unused_measurement,
 )
-from optloc.files.roles import Places, Roles, check_told, place_roles
+from optloc.files.roles import ColumnPlaces, Roles, check_told, place_roles
 from optloc.files.table import Table
 from optloc.files.words import numbered
 
@@ -40,7 +40,7 @@ _ORIENTED = {
 
 def uses_of(
     roles: Roles,
-    told: Told,
+    told: ColumnHints,
     found: Sequence[Readings],
     epochs: Mapping[str, Array],
     sigmas: Sequence[str | None],
@@ -51,7 +51,7 @@ def uses_of(
     ----------
     roles : Roles
         The table.
-    told : Told
+    told : ColumnHints
         What the user says of it.
     found : sequence of Readings
         The readings, one set for each sort.
@@ -123,8 +123,8 @@ def left_over(
 
 def about(
     roles: Roles,
-    told: Told,
-    place: Places,
+    told: ColumnHints,
+    place: ColumnPlaces,
     found: Sequence[Readings],
     epochs: Mapping[str, Array],
     uses: Mapping[str, str],

@@ -81,7 +81,7 @@ CONVENTIONS = (COMPASS, CARTESIAN, COUNTER, BOW)
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class ColumnHints:
     """What is said of a table that it does not say itself; each is an option of the command line.
 
     Parameters
@@ -309,7 +309,7 @@ def _form_of(word: str, unit: str | None) -> str | None:
     return role if role == "sp" or role in _SEEN else None
 
 
-def sigma_told(told: Told, kind: str) -> str | None:
+def sigma_told(told: ColumnHints, kind: str) -> str | None:
     """Return the standard deviation that the user states for a kind, None where --sigma does not name the kind."""
     if told.sigma is None or "=" not in told.sigma:
         return told.sigma
@@ -339,7 +339,7 @@ def without(table: Table, ignored: Sequence[str]) -> Table:
     return replace(table, columns=columns, others=others)
 
 
-def sorts_of(roles: Roles, told: Told) -> list[str]:
+def sorts_of(roles: Roles, told: ColumnHints) -> list[str]:
     """Return the sorts of readings of a table with one reading a row; none where its columns do not tell."""
     if told.what is not None:
         return ["times" if told.what == "arrivals" and roles.find("toa") is None else told.what]
@@ -374,7 +374,7 @@ def _kind_within(column: str, unit: str | None) -> str | None:
     return next((role for name in named if (role := role_of(name)) is not None and role in MODELS), None)
 
 
-def as_angles(roles: Roles, told: Told) -> Roles:
+def as_angles(roles: Roles, told: ColumnHints) -> Roles:
     """Return roles in which a column `elevation` without a unit is an angle or a height, as the options say.
 
     Raises
@@ -423,7 +423,7 @@ def unused_measurement(column: str, lengths: bool = False) -> str | None:
 # Units, gaps, repeats.
 
 
-def unit_for(column: str, form: Form, told: Told, held: Decimals, where: str) -> tuple[str, str]:
+def unit_for(column: str, form: Form, told: ColumnHints, held: Decimals, where: str) -> tuple[str, str]:
     """Return the unit of a column and a remark; raise InvalidProblem where neither its name nor --unit says it."""
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     own = unit_of(column, known)
@@ -451,7 +451,7 @@ def in_unit(value: Decimal, unit: str, wanted: str, form: Form) -> Decimal:
     return value * Decimal(repr(known[unit])) / Decimal(repr(known[wanted]))
 
 
-def marks_of(told: Told) -> frozenset[Decimal] | None:
+def marks_of(told: ColumnHints) -> frozenset[Decimal] | None:
     """Return the numbers that stand for no reading; None where nothing is said of them."""
     if told.missing is None:
         return None
@@ -465,7 +465,7 @@ def marks_of(told: Told) -> frozenset[Decimal] | None:
         raise InvalidProblem(f"{told.missing!r} is no list of numbers", "--missing", advice) from None
 
 
-def without_gaps(found: Readings, epoch: Array, told: Told, table: Table, empty: int) -> Readings:
+def without_gaps(found: Readings, epoch: Array, told: ColumnHints, table: Table, empty: int) -> Readings:
     """Return readings without those that a number marks as missing; one that may be such a mark is asked for.
 
     Parameters
@@ -474,7 +474,7 @@ def without_gaps(found: Readings, epoch: Array, told: Told, table: Table, empty:
         All numbers.
     epoch : int array (m,)
         Number of the epoch of each.
-    told : Told
+    told : ColumnHints
         What is known of such numbers.
     table : Table
         Where they are from.
@@ -533,7 +533,9 @@ def _begins(found: Readings, epoch: Array) -> bool:
     return bool((units >= 0).all() and (zeros[np.unique(epoch)] == 1).all())
 
 
-def without_repeats(found: Readings, epoch: Array, told: Told, table: Table, label: Callable[[int], str]) -> Readings:
+def without_repeats(
+    found: Readings, epoch: Array, told: ColumnHints, table: Table, label: Callable[[int], str]
+) -> Readings:
     """Return readings of which none repeats another: their means where that is asked for, else they are refused.
 
     Parameters
@@ -542,7 +544,7 @@ def without_repeats(found: Readings, epoch: Array, told: Told, table: Table, lab
         All of them.
     epoch : int array (m,)
         Number of the epoch and target of each.
-    told : Told
+    told : ColumnHints
         Whether means are wanted.
     table : Table
         Where they are from.

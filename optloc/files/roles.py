@@ -326,7 +326,7 @@ def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
+class ColumnPlaces:
     """Stations: the columns of a stations table (s,), the frame that they need, and the unit of lengths."""
 
     columns: Mapping[str, Array]
@@ -340,7 +340,7 @@ class Places:
         return [str(name) for name in self.columns["name"]]
 
 
-def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> Places:
+def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnPlaces:
     """Return the stations of a file; `frame` is that of x, y, z."""
     if path.suffix.lower() == ".geojson":
         return _of_geojson(json_of(read_text(path), path.name), path.name)
@@ -374,7 +374,7 @@ def check_told(roles: Roles, used: Collection[str]) -> None:
         raise InvalidProblem(what, "--column", "leave it out, or say with --as what the table holds")
 
 
-def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Places:
+def placed(roles: Roles, frame: str | None, names: Array | None = None) -> ColumnPlaces:
     """Return the stations of a table; `names` (s,) are theirs where no column has them, `frame` is that of x, y, z."""
     names = roles.labels("name") if names is None else names
     lat, x = roles.find("lat"), roles.find("x")
@@ -386,7 +386,7 @@ def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Place
         degrees = {f"{axis}_deg": scaled(roles, axis, "angle", "deg") for axis in ("lat", "lon")}
         height, unit = _upwards(roles, "height")
         degrees["height"] = np.zeros(len(names)) if height is None else height
-        return Places({"name": names} | degrees, "geodetic", unit, _FLAT if height is None else "")
+        return ColumnPlaces({"name": names} | degrees, "geodetic", unit, _FLAT if height is None else "")
     up, unit = _upwards(roles, "z")
     assert x is not None
     unit = unit_of(x, UNITS["length"]) or "m"
@@ -394,10 +394,10 @@ def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Place
     if up is not None:
         axes["z"] = _upwards(roles, "z", unit)[0]
     # What calls itself so is along the axes of the Earth, and its fixes have latitudes.
-    return Places({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
+    return ColumnPlaces({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
 
-def in_space(place: Places) -> Places:
+def in_space(place: ColumnPlaces) -> ColumnPlaces:
     """Return stations with a third coordinate: 0 where their table gives none."""
     if place.frame == "geodetic" or "z" in place.columns:
         return place
@@ -426,7 +426,7 @@ def _upwards(roles: Roles, role: Literal["height", "z"], unit: str | None = None
     return (-values if found == "depth" else values), unit
 
 
-def _of_geojson(data: Any, source: str) -> Places:
+def _of_geojson(data: Any, source: str) -> ColumnPlaces:
     """Return the points of a GeoJSON feature collection (RFC 7946: longitude, latitude, height above WGS 84)."""
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list):
@@ -443,7 +443,7 @@ def _of_geojson(data: Any, source: str) -> Places:
     known = [h is not None for h in height]
     columns["height"] = np.array([0.0 if h is None else h for h in height])
     lacking = "" if all(known) else f"{known.count(False)} of {len(known)} points have no height: it is taken to be 0"
-    return Places(columns, "geodetic", "m", _FLAT if not any(known) else lacking)
+    return ColumnPlaces(columns, "geodetic", "m", _FLAT if not any(known) else lacking)
 
 
 def _kind(feature: Mapping[str, Any]) -> Any:

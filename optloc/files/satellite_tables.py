@@ -18,8 +18,8 @@ from optloc.files.foreign import read_table
 from optloc.files.orbits import read_orbits
 from optloc.files.pseudoranges import at_reception, received
 from optloc.files.reading_report import left_over
-from optloc.files.readings import Told, sort_named
-from optloc.files.roles import Places, Roles, check_told, places_of, scaled
+from optloc.files.readings import ColumnHints, sort_named
+from optloc.files.roles import ColumnPlaces, Roles, check_told, places_of, scaled
 from optloc.files.schema import Units
 from optloc.files.shapes import sigma_column, sigma_of
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
@@ -33,7 +33,7 @@ AT_RECEPTION = ("# Satellites are where they were when they sent, along the axes
 _TURNED = "satellites are turned with the Earth during the flight of the signal; --turned takes them as they are"
 
 
-def pseudoranges(source: Path, roles: Roles, told: Told) -> TableProblem:
+def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
     """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
     form = sort_named("arrivals")
     own = sigma_column(roles, form, told, [form])
@@ -73,11 +73,11 @@ def pseudoranges(source: Path, roles: Roles, told: Told) -> TableProblem:
     ]
     read += [("sigma", f"of pseudoranges, from column {own}")] if "sigma" in columns else []
     read += [("not used", ", ".join(rest))] if rest else []
-    places = Places(satellites, "ecef", length)
+    places = ColumnPlaces(satellites, "ecef", length)
     return TableProblem(source, (section,), places, tuple(read), notes, AT_RECEPTION, uses=uses)
 
 
-def gnss(source: Path, told: Told) -> TableProblem:
+def gnss(source: Path, told: ColumnHints) -> TableProblem:
     """Return what a receiver of navigation satellites has seen as arrivals, like a table of pseudoranges."""
     if told.columns or told.ignore:
         flag = "--column" if told.columns else "--ignore"
@@ -87,7 +87,7 @@ def gnss(source: Path, told: Told) -> TableProblem:
     columns["sigma"] = np.round(found.sigma, 3)
     places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
     section = Section("toa", columns, "m", None, "the range and the receiver's clock")
-    return TableProblem(source, (section,), Places(places, "ecef", "m"), found.about, found.notes, AT_RECEPTION)
+    return TableProblem(source, (section,), ColumnPlaces(places, "ecef", "m"), found.about, found.notes, AT_RECEPTION)
 
 
 def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:

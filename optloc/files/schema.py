@@ -131,7 +131,7 @@ _WHAT = {
 }
 
 
-class _Table(BaseModel):
+class _FileTable(BaseModel):
     """A table of the file; keys that it does not know are refused."""
 
     # Strict and closed: a number in quotes or a misspelt key is refused, never guessed.
@@ -140,7 +140,7 @@ class _Table(BaseModel):
     )
 
 
-class Origin(_Table):
+class Origin(_FileTable):
     """A point on Earth, WGS 84."""
 
     lat_deg: float
@@ -151,7 +151,7 @@ class Origin(_Table):
     """Height above the ellipsoid, metres."""
 
 
-class FrameTable(_Table):
+class FrameTable(_FileTable):
     """The frame in which positions are computed and answered."""
 
     kind: Literal["cartesian", "ecef", "enu", "geodetic"] = "cartesian"
@@ -162,7 +162,7 @@ class FrameTable(_Table):
     """Dimension of the positions; by default 3 where there is a z or a height."""
 
 
-class DataTable(_Table):
+class DataTable(_FileTable):
     """Where rows come from: a file, or the table itself."""
 
     file: str | None = None
@@ -195,7 +195,7 @@ class StationsTable(DataTable):
     at each epoch."""
 
 
-class DeclinationTable(_Table):
+class DeclinationTable(_FileTable):
     """The magnetic declination of the World Magnetic Model at each station."""
 
     date: str
@@ -280,7 +280,7 @@ class TargetTable(DataTable):
         return self.motion or ("known" if given else None)
 
 
-class ConstraintTable(_Table):
+class ConstraintTable(_FileTable):
     """What the answer must meet."""
 
     kind: Literal["box", "height", "above-ground", "polygon", "visible", "speed"]
@@ -316,7 +316,7 @@ _LAYERS = 1000
 _MANY = 100
 
 
-class BiasTable(_Table):
+class BiasTable(_FileTable):
     """A family of unknown systematic errors."""
 
     name: str = Field(min_length=1)
@@ -348,7 +348,7 @@ class BiasTable(_Table):
     """Of a spline: the times in seconds between which it is a cubic polynomial, or how many evenly spaced ones."""
 
 
-class PriorTable(_Table):
+class PriorTable(_FileTable):
     """Prior knowledge of an unknown."""
 
     name: str
@@ -361,7 +361,7 @@ class PriorTable(_Table):
     """Unit of both; metres, metres per second, metres per second squared by default."""
 
 
-class SoundTable(_Table):
+class SoundTable(_FileTable):
     """The medium through which sound comes."""
 
     medium: Literal["air", "fresh water", "sea water"]
@@ -374,7 +374,7 @@ class SoundTable(_Table):
     """Metres below the surface."""
 
 
-class SpeedTable(_Table):
+class SpeedTable(_FileTable):
     """A speed that is not quite known."""
 
     value: Amount
@@ -383,7 +383,7 @@ class SpeedTable(_Table):
     """Its standard deviation, likewise."""
 
 
-class MediumTable(_Table):
+class MediumTable(_FileTable):
     """What the waves come through where their speed is not one number: each row is then measured along its rays."""
 
     kind: Literal["layers", "atmosphere"]
@@ -406,14 +406,14 @@ class MediumTable(_Table):
     """Of an atmosphere: metres over which it falls to 1 / e; 7350 by default."""
 
 
-class WindowTable(_Table):
+class WindowTable(_FileTable):
     """How rows are put together to epochs by their times."""
 
     window: str | None = None
     """Length of an epoch, such as "0.1 s"; by default rows of exactly equal time belong together."""
 
 
-class ProblemFile(_Table):
+class ProblemFile(_FileTable):
     """A problem file."""
 
     format: Literal[1, 2]

@@ -18,10 +18,10 @@ from optloc.files.headings import from_bow, heading_of
 from optloc.files.readings import (
     CARTESIAN,
     COMPASS,
+    ColumnHints,
     Form,
     Named,
     Readings,
-    Told,
     in_unit,
     sigma_told,
     sort_named,
@@ -29,7 +29,7 @@ from optloc.files.readings import (
     without_gaps,
     without_repeats,
 )
-from optloc.files.roles import Places, Roles, placed
+from optloc.files.roles import ColumnPlaces, Roles, placed
 from optloc.files.schema import Units
 from optloc.files.table import Table
 from optloc.files.words import equal_rows, numbered
@@ -42,7 +42,7 @@ _SHOWN = 4
 # A column for each receiver, or for each pair.
 
 
-def wide(roles: Roles, told: Told, columns: Sequence[Named], place: Places) -> list[Readings]:
+def wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
     """Return the readings of a table that has a column for each receiver, one set for each sort."""
     sorts: dict[str, list[Named]] = {}
     for one in columns:
@@ -62,10 +62,10 @@ def wide(roles: Roles, told: Told, columns: Sequence[Named], place: Places) -> l
 def _wide_sort(
     roles: Roles,
     form: Form,
-    told: Told,
+    told: ColumnHints,
     columns: Sequence[Named],
     errors: Sequence[Named],
-    place: Places,
+    place: ColumnPlaces,
     forms: Mapping[str, Form],
 ) -> Readings:
     """Return the readings of one sort; `errors` are the columns of standard deviations, `forms` all sorts by name."""
@@ -125,7 +125,7 @@ def _allows(form: Form, column: str) -> bool:
     return unit is None or unit in UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
 
 
-def sigma_column(roles: Roles, form: Form, told: Told, forms: Sequence[Form]) -> str | None:
+def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Form]) -> str | None:
     """Return the column of standard deviations of a sort of readings, None where --sigma states them or none has them.
 
     Parameters
@@ -134,7 +134,7 @@ def sigma_column(roles: Roles, form: Form, told: Told, forms: Sequence[Form]) ->
         The table.
     form : Form
         The sort.
-    told : Told
+    told : ColumnHints
         What the user says of the table.
     forms : sequence of Form
         All sorts of the table.
@@ -178,7 +178,7 @@ def sigma_of(table: Table, column: str, form: Form, unit: str, pick: Array) -> A
     return np.asarray(held.values.floats()[place[pick]] * known[own] / known[unit])
 
 
-def _ends(one: Named, form: Form, told: Told, source: str) -> tuple[str, str | None]:
+def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, str | None]:
     """Return the stations of a column of a wide table."""
     if form.stations == 1 and len(one.ends) == 1:
         return one.ends[0], None
@@ -195,7 +195,7 @@ def _ends(one: Named, form: Form, told: Told, source: str) -> tuple[str, str | N
 # One reading a row.
 
 
-def inline(roles: Roles, told: Told) -> tuple[Places, Array]:
+def inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
     """Return the stations of a table that says in each row where its station was, and the name of each row's."""
     count = roles.table.count
     role = next((role for role in ("station", "name") if roles.find(role)), None)
@@ -216,7 +216,9 @@ def inline(roles: Roles, told: Told) -> tuple[Places, Array]:
     return replace(every, columns=columns), np.array(heard, dtype=object)
 
 
-def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | None, forms: Sequence[Form]) -> Readings:
+def long(
+    roles: Roles, form: Form, told: ColumnHints, place: ColumnPlaces, heard: Array | None, forms: Sequence[Form]
+) -> Readings:
     """Return the readings of one sort of a table that has one a row.
 
     Parameters
@@ -225,9 +227,9 @@ def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | Non
         The table.
     form : Form
         The sort.
-    told : Told
+    told : ColumnHints
         What the user says of the table.
-    place : Places
+    place : ColumnPlaces
         The stations.
     heard : object array (m,), optional
         Stations of the rows, where the table has no column of them.
@@ -258,7 +260,7 @@ def _of_column(form: Form, unit: str, held: NumberColumn, column: str, a: Array)
     return Readings(form, unit, held.values, held.row, (column,), np.zeros(len(held.row), dtype=int), a[held.row])
 
 
-def _others(roles: Roles, told: Told) -> tuple[str | None, Array]:
+def _others(roles: Roles, told: ColumnHints) -> tuple[str | None, Array]:
     """Return the sign of differences, where it is known, and the second station of each row."""
     column = roles.find("reference")
     if told.reference is not None:
@@ -270,7 +272,7 @@ def _others(roles: Roles, told: Told) -> tuple[str | None, Array]:
     return ("a-farther" if against else None), roles.labels("reference")
 
 
-def _picks(roles: Roles, told: Told, place: Places) -> Readings:
+def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
     """Return S minus P of a table with a column for each, or with a column of phases."""
     table, zone = roles.table, told.zone
 
@@ -319,7 +321,9 @@ def _picks(roles: Roles, told: Told, place: Places) -> Readings:
 # What all have in common: stations that are known, no gaps, no repeats, a sign and a convention.
 
 
-def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: int, positive: str | None) -> Readings:
+def _settled(
+    found: Readings, roles: Roles, told: ColumnHints, place: ColumnPlaces, empty: int, positive: str | None
+) -> Readings:
     """Return readings whose stations are known, of which none is missing or repeated, with sign and convention."""
     table, known = roles.table, set(place.names)
     for end in (found.a, found.b):
@@ -377,7 +381,7 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     return replace(found, notes=(*found.notes, note))
 
 
-def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readings:
+def _oriented(found: Readings, told: ColumnHints, place: ColumnPlaces, source: str) -> Readings:
     """Return azimuths with their convention: as told, as their name says, or, on Earth, that of a compass."""
     named = any(word in stem(found.columns[0]) for word in (BEARING, "brg", "compass", "heading"))
     if found.heading is not None:
@@ -391,7 +395,7 @@ def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readin
     return replace(found, azimuth=COMPASS, notes=(*found.notes, note))
 
 
-def epochs_of(roles: Roles, told: Told, found: Sequence[Readings]) -> dict[str, Array]:
+def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
     """Return the columns epoch, time and target (n,) of the rows of a table, those that there are."""
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}

@@ -17,7 +17,7 @@ from optloc.base.outputs import together, write_text
 from optloc.base.types import Array
 from optloc.files.cells import Decimals
 from optloc.files.reader import Loaded, assemble
-from optloc.files.roles import Places
+from optloc.files.roles import ColumnPlaces
 from optloc.files.schema import ConstraintTable, document_of
 from optloc.files.table import Table
 from optloc.files.words import Words
@@ -49,7 +49,7 @@ class TableProblem:
         The table.
     sections : tuple of Section
         The measurements.
-    places : Places
+    places : ColumnPlaces
         The stations.
     about : tuple of (str, str)
         What was understood: a word, and what it is.
@@ -67,7 +67,7 @@ class TableProblem:
 
     source: Path
     sections: tuple[Section, ...]
-    places: Places
+    places: ColumnPlaces
     about: tuple[tuple[str, str], ...]
     notes: tuple[str, ...] = ()
     lines: tuple[str, ...] = ()

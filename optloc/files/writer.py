@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import read_bytes
-from optloc.base.outputs import Growing, claim, together, write_text, written
+from optloc.base.outputs import GrowingFile, claim, together, write_text, written
 from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
 from optloc.files.table import Table, is_empty
@@ -91,11 +91,11 @@ class GrowingTable:
     Parameters
     ----------
     path : Path
-        The table; see `optloc.base.outputs.Growing`.
+        The table; see `optloc.base.outputs.GrowingFile`.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.file, self.rows, self.when = path, Growing(path), 0, -math.inf
+        self.path, self.file, self.rows, self.when = path, GrowingFile(path), 0, -math.inf
 
     def add(self, columns: Mapping[str, Any]) -> None:
         """Add rows, the same columns each time; raise InvalidProblem where that fails."""

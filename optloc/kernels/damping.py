@@ -34,7 +34,7 @@ _MOST = 1e12
 _FALL, _QUICK_FALL, _AGREED = 1.0 / 3.0, 0.1, 0.9
 
 
-class Rules(NamedTuple):
+class StopRules(NamedTuple):
     """When a refinement ends; see `optloc.kernels.least_squares.refine`, whose defaults these are."""
 
     tolerance: float = 1e-7

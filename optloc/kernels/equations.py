@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.threads import mapped, thread_count
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import Cells, add_groups, add_priors, arrange, blocks, clear, gather, load, memory
+from optloc.kernels.lanes import LaneCells, add_groups, add_priors, arrange, blocks, clear, gather, load, memory
 from optloc.kernels.pack import Numbers, Packed
 from optloc.kernels.tables import Tables
 from optloc.linear.normal import Normal
@@ -97,7 +97,7 @@ def _epochs(
     c: Numbers,
     m: Array,
     r: Array,
-    room: Cells,
+    room: LaneCells,
     begin: int,
     used: int,
     priors: bool,

@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.kernels.jit import compiled, put
-from optloc.kernels.lanes import Cells, arrange, load, measure, memory
+from optloc.kernels.lanes import LaneCells, arrange, load, measure, memory
 from optloc.kernels.pack import Numbers
 from optloc.kernels.systems import cholesky, solve_factored, substitute
 from optloc.kernels.tables import FIRST, GROUP_COLUMN, Tables
@@ -121,7 +121,7 @@ class _Space(NamedTuple):
 
     m: Array
     r: Array
-    room: Cells
+    room: LaneCells
     P: Array
     root: Array
     factor: Array

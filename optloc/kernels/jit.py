@@ -169,14 +169,14 @@ def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
 
     events: Any = event  # without types
 
-    class Told(events.Listener):  # type: ignore[misc]
+    class CompileReport(events.Listener):  # type: ignore[misc]
         def on_start(self, found: Any) -> None:
             tell(name_of(found.data["dispatcher"].py_func), False)
 
         def on_end(self, found: Any) -> None:
             tell(name_of(found.data["dispatcher"].py_func), True)
 
-    listener = Told()
+    listener = CompileReport()
     events.register("numba:compile", listener)
     return partial(events.unregister, "numba:compile", listener)
 

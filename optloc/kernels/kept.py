@@ -75,7 +75,7 @@ def _used(path: Path) -> float:
         return 0.0
 
 
-class _Place:
+class _KeptPlace:
     """Where the machine code of a function is kept, as numba asks for it (a cache locator)."""
 
     def __init__(self, function: Callable[..., Any], place: Path, digest: str) -> None:
@@ -103,11 +103,11 @@ def _entries() -> tuple[Any, Any]:
     numba: Any = caching  # half typed
 
     class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
-        def __init__(self, place: _Place, function: Callable[..., Any]) -> None:
+        def __init__(self, place: _KeptPlace, function: Callable[..., Any]) -> None:
             self._locator, self._lineno = place, function.__code__.co_firstlineno
             self._filename_base = base_of(name_of(function), place.get_disambiguator())
 
-    class Callee(Impl):
+    class CachedCallee(Impl):
         def rebuild(self, target_context: Any, payload: Any) -> Any:
             def read(stored: Any) -> Any:
                 return callee_library().read(target_context.codegen(), stored)
@@ -119,7 +119,7 @@ def _entries() -> tuple[Any, Any]:
             )
             return super().rebuild(context, payload)._replace(target_context=target_context)
 
-    return Impl, Callee
+    return Impl, CachedCallee
 
 
 def _fields(kind: Any) -> tuple[Any, ...]:
@@ -139,10 +139,10 @@ def _cache_type() -> Any:
 
     numba: Any = caching  # half typed
 
-    class Kept(numba.FunctionCache):  # type: ignore[misc]
+    class CachedKernel(numba.FunctionCache):  # type: ignore[misc]
         def __init__(self, kernel: Compilable, place: Path, *, callee: bool) -> None:
             function = kernel.function
-            self._impl_class = partial(_entries()[callee], _Place(function, place, digest_of(kernel)))
+            self._impl_class = partial(_entries()[callee], _KeptPlace(function, place, digest_of(kernel)))
             super().__init__(function)
             self._name = name_of(function)
             self._installed = None if callee else installed()
@@ -183,7 +183,7 @@ def _cache_type() -> Any:
             except OSError as error:  # a full disk: the code serves this process
                 _LOG.warning("machine code of %s cannot be kept on disk: %s", self._name, error)
 
-    return Kept
+    return CachedKernel
 
 
 def kept(kernel: Compilable, *, callee: bool) -> Any:

@@ -51,7 +51,7 @@ A few lanes share the choice of an operation over several rows; twice the most l
 """
 
 
-class Cells(NamedTuple):
+class LaneCells(NamedTuple):
     """First cell of each part, for p unknowns of which n are shared and l local."""
 
     own: int  # sources, whitening matrices and priors that each problem has to itself
@@ -86,7 +86,7 @@ _LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
 
 
 @compiled
-def arrange(t: Tables, c: Numbers, size: int) -> Cells:
+def arrange(t: Tables, c: Numbers, size: int) -> LaneCells:
     """Return where things stand for problems of p = `size` unknowns."""
     n, local, largest = t.shared, t.local, 0
     for i in range(t.groups, c.place.shape[0]):
@@ -109,7 +109,7 @@ def arrange(t: Tables, c: Numbers, size: int) -> Cells:
     local_scale = own_local + local * local
     half = local_scale + local
     state = half + (n + 1) * local
-    return Cells(
+    return LaneCells(
         own,
         observed,
         present,
@@ -146,7 +146,7 @@ def load(
 
 
 @compiled
-def blur_of(sigma: Array, size: Array, m: Array, room: Cells, lane: int, item: int) -> float:
+def blur_of(sigma: Array, size: Array, m: Array, room: LaneCells, lane: int, item: int) -> float:
     """Return the rounding error of the whitened residuals: arrival times that count from long ago are coarse."""
     row, squares = item if sigma.shape[0] > 1 else 0, 0.0
     for i in range(sigma.shape[1]):
@@ -177,7 +177,7 @@ def blocks(packed: Packed, size: int, count: int) -> int:
 
 
 @compiled
-def memory(t: Tables, room: Cells, lanes: Constant) -> tuple[Array, Array]:
+def memory(t: Tables, room: LaneCells, lanes: Constant) -> tuple[Array, Array]:
     """Return cells and registers for a number of lanes."""
     return np.zeros((room.cells, lanes)), np.empty((t.registers, max(LENGTH, lanes)))
 
@@ -235,7 +235,9 @@ def _rare(operation: int, r: Array, to: int, u: int, v: int, count: Constant) ->
 
 
 @compiled
-def measure(t: Tables, common: Array, m: Array, r: Array, room: Cells, packet: int, x: int, lanes: Constant) -> None:
+def measure(
+    t: Tables, common: Array, m: Array, r: Array, room: LaneCells, packet: int, x: int, lanes: Constant
+) -> None:
     """Write derivatives and residuals of a packet: columns of the row's group, then the residual.
 
     Parameters
@@ -248,7 +250,7 @@ def measure(t: Tables, common: Array, m: Array, r: Array, room: Cells, packet: i
         Memory; the rows of the packet are written to `room.rows`.
     r : array (registers, LENGTH)
         Registers.
-    room : Cells
+    room : LaneCells
         Where things stand.
     packet : int
         Which rows.
@@ -376,7 +378,7 @@ def _mask(m: Array, value: int, present: int, lanes: Constant) -> None:
 
 
 @compiled
-def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool, lanes: Constant) -> None:
+def gather(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, priors: bool, lanes: Constant) -> None:
     """Write the normal equations at `room.trial` into `room.after`.
 
     Parameters
@@ -389,7 +391,7 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool,
         Memory.
     r : array (registers, LENGTH)
         Registers.
-    room : Cells
+    room : LaneCells
         Where things stand.
     priors : bool
         Whether Gaussian priors are added.
@@ -404,7 +406,7 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, priors: bool,
 
 
 @compiled
-def price(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, lanes: Constant) -> None:
+def price(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, lanes: Constant) -> None:
     """Write the cost at `room.trial`, the last cell of `room.after`."""
     total = room.after + (t.shared + t.local + 1) ** 2 - 1
     for b in range(lanes):
@@ -427,7 +429,16 @@ ALL = -1
 
 @compiled
 def add_groups(
-    t: Tables, c: Numbers, m: Array, r: Array, room: Cells, x: int, epoch: int, group: int, packet: int, lanes: Constant
+    t: Tables,
+    c: Numbers,
+    m: Array,
+    r: Array,
+    room: LaneCells,
+    x: int,
+    epoch: int,
+    group: int,
+    packet: int,
+    lanes: Constant,
 ) -> tuple[int, int]:
     """Add the rows of an epoch at the vectors of cell x on to `room.after`; return the next group and packet.
 
@@ -443,7 +454,9 @@ def add_groups(
 
 
 @compiled
-def add_priors(t: Tables, c: Numbers, m: Array, room: Cells, x: int, local: bool, epoch: int, lanes: Constant) -> None:
+def add_priors(
+    t: Tables, c: Numbers, m: Array, room: LaneCells, x: int, local: bool, epoch: int, lanes: Constant
+) -> None:
     """Add the priors of the shared unknowns, or of those of an epoch, to the equations in `room.after`."""
     for i in range(t.groups, c.place.shape[0]):
         if (c.place[i, PRIOR_LOCAL] == 1) == local:
@@ -461,7 +474,7 @@ def clear(m: Array, first: int, count: int, lanes: Constant) -> None:
 
 
 @compiled
-def add_group(t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, lanes: Constant) -> None:
+def add_group(t: Tables, common: Array, place: Array, m: Array, room: LaneCells, group: int, lanes: Constant) -> None:
     """Add the whitened rows of a group to the equations in `room.after`."""
     line = t.group + group
     begin, size = t.table[line, GROUP_COLUMN], t.table[line, GROUP_ROWS]
@@ -472,7 +485,7 @@ def add_group(t: Tables, common: Array, place: Array, m: Array, room: Cells, gro
 
 @compiled
 def whiten_group(
-    t: Tables, common: Array, place: Array, m: Array, room: Cells, group: int, residual: bool, lanes: Constant
+    t: Tables, common: Array, place: Array, m: Array, room: LaneCells, group: int, residual: bool, lanes: Constant
 ) -> int:
     """Whiten the rows of a group, or their residuals alone, and return the cell of the first."""
     line = t.group + group
@@ -551,7 +564,7 @@ def _square(
 
 @compiled
 def _add_prior(
-    common: Array, place: int, size: int, m: Array, room: Cells, x: int, start: int, last: int, lanes: Constant
+    common: Array, place: int, size: int, m: Array, room: LaneCells, x: int, start: int, last: int, lanes: Constant
 ) -> None:
     """Add a Gaussian prior of the `size` unknowns at cell x on, whose first column is `start`."""
     error, pull, to = room.error, room.error + size, room.after

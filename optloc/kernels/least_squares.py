@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, StopRules, judge
 from optloc.kernels.pack import PackedRuns, coarseness
 from optloc.kernels.sums import equations_at, packed, serves, sums_at
 from optloc.linear.constraints import Face, is_height
@@ -134,7 +134,7 @@ def refine(
     """
     # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost; sixty steps are ten
     # times what fixes near their stations take.
-    rules = Rules(float(tolerance), int(limit), bool(damped))
+    rules = StopRules(float(tolerance), int(limit), bool(damped))
     quick = None if face or folded or limits else _by_machine_code(problem, start, item, rules)
     if quick is not None:
         return quick
@@ -156,7 +156,7 @@ def refine(
 # By numpy: all problems of a batch side by side, those that are finished leave it.
 
 
-def _remade(problem: Problem, start: Array, rules: Rules, face: Face = (), limits: Limits | None = None) -> Refined:
+def _remade(problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None) -> Refined:
     return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
 
@@ -185,7 +185,7 @@ def _iterate(
     problem: Problem,
     start: Array,
     weights: _Weights,
-    rules: Rules,
+    rules: StopRules,
     face: Face,
     folded: Folded | None,
     limits: Limits | None,
@@ -194,9 +194,9 @@ def _iterate(
     with np.errstate(all="ignore"):
         start = Equalities.of(problem, face).restore(start) if face else start
         start = start if limits is None else limits.clip(start)
-        state = _State.begin(problem, start, weights)
+        state = _DescentState.begin(problem, start, weights)
         active = np.arange(len(start))
-        part = _Part(problem, weights, face, _blur(problem, len(start)), folded, limits)
+        part = _LanePart(problem, weights, face, _blur(problem, len(start)), folded, limits)
         for iteration in range(rules.limit):
             # The status until another is found: what still moves.
             moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
@@ -210,7 +210,7 @@ def _iterate(
 
 
 @dataclass(slots=True)
-class _State:
+class _DescentState:
     """What the iteration remembers of every problem; only the active entries change."""
 
     x: Array
@@ -221,7 +221,7 @@ class _State:
     iterations: Array
 
     @classmethod
-    def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _State:
+    def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _DescentState:
         count = len(start)
         equations = _own(weights.equations(problem, start))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
@@ -237,7 +237,7 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
+class _LanePart:
     """The problems still moving."""
 
     problem: Problem
@@ -247,11 +247,13 @@ class _Part:
     folded: Folded | None
     limits: Limits | None
 
-    def take(self, items: Array) -> _Part:
+    def take(self, items: Array) -> _LanePart:
         """Return some of them."""
         folded = None if self.folded is None else self.folded.take(items)
         limits = None if self.limits is None else self.limits.take(items)
-        return _Part(self.problem.take(items), self.weights.take(items), self.face, self.blur[items], folded, limits)
+        return _LanePart(
+            self.problem.take(items), self.weights.take(items), self.face, self.blur[items], folded, limits
+        )
 
     @property
     def held(self) -> Equalities | Folded | None:
@@ -288,7 +290,7 @@ def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | fl
     return np.asarray(_ROUNDINGS * np.finfo(float).eps * WGS84_A * np.sqrt(np.maximum(information, 0.0)))
 
 
-def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration: int) -> None:
+def _advance(part: _LanePart, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
     """Try one step of every problem still moving."""
     # Most batches end together: as long as all move, arrays are handed on instead of gathered.
     everything = len(active) == len(state.x)
@@ -324,7 +326,7 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
         state.status[active[~found.better]] = Status.NUMERICAL
 
 
-def _keep(state: _State, active: Array, better: Array, x: Array, after: Normal) -> None:
+def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
     if better.all() and len(active) == len(state.x):
         state.x, state.equations = x, _own(after)
         return
@@ -351,7 +353,7 @@ _UNKNOWNS, _OF_RUNS = 40, 70
 _WEIGHED = 2**21
 
 
-def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: Rules) -> Refined | None:
+def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: StopRules) -> Refined | None:
     """Return the refinement by machine code, or None without machine code for the problem."""
     most = _OF_RUNS if problem.layout.n_local and problem.epochs > 1 else _UNKNOWNS
     few = problem.layout.n_shared + problem.layout.n_local <= most
@@ -372,7 +374,9 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
     return _join(found) if len(found) == len(parts) else None
 
 
-def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules) -> Refined | None:
+def _at_once(
+    problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: StopRules
+) -> Refined | None:
     """Return the refinement by machine code with given weights, or None without machine code."""
     found = packed(problem, noise)
     if found is None:
@@ -398,7 +402,7 @@ def _at_once(problem: Problem, start: Array, item: Array, noise: tuple[Whitener,
     return Refined(done.x, done.cost, done.status, done.iterations, make)
 
 
-def _anew(problem: Problem, start: Array, rules: Rules) -> Refined | None:
+def _anew(problem: Problem, start: Array, rules: StopRules) -> Refined | None:
     """Return the refinement of one start of each problem, with weights of the start and then of the end."""
     done = None
     for _ in range(WEIGHINGS):

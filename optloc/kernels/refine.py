@@ -12,11 +12,11 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, StopRules, judge_lane
 from optloc.kernels.equations import chunks, normal_at
 from optloc.kernels.jit import compiled
 from optloc.kernels.lanes import (
-    Cells,
+    LaneCells,
     add_groups,
     add_priors,
     arrange,
@@ -77,7 +77,7 @@ LEFT_OPEN = -1
 
 
 @compiled
-def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rules, out: Answers) -> None:
+def refine_block(packed: Packed, item: Array, first: int, last: int, rules: StopRules, out: Answers) -> None:
     """Refine the starts first <= i < last; several threads may work on one set of answers.
 
     Parameters
@@ -88,7 +88,7 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
         Problem of each start.
     first, last : int
         Which starts.
-    rules : Rules
+    rules : StopRules
         When to stop.
     out : Answers
         Starts; they become the answers. Status: ok, max iterations, stalled, numerical, `LEFT_OPEN`. Neither
@@ -147,7 +147,7 @@ def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: in
 
 
 @compiled
-def begin(c: Numbers, m: Array, room: Cells, tag: Array, used: int, item: Array, x: Array) -> None:
+def begin(c: Numbers, m: Array, room: LaneCells, tag: Array, used: int, item: Array, x: Array) -> None:
     """Bring the starts of empty lanes into them."""
     for b in range(used):
         if tag[FRESH, b] == EMPTY:
@@ -171,7 +171,9 @@ def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
 
 
 @compiled
-def _judge(m: Array, room: Cells, size: int, runs: bool, line: int, tag: Array, rules: Rules, used: int) -> None:
+def _judge(
+    m: Array, room: LaneCells, size: int, runs: bool, line: int, tag: Array, rules: StopRules, used: int
+) -> None:
     """Take the places tried that are better, and set damping and status."""
     state, total = room.state, room.after + line * line - 1
     better, cost = state + BETTER, state + COST
@@ -195,7 +197,7 @@ def _judge(m: Array, room: Cells, size: int, runs: bool, line: int, tag: Array, 
 
 
 @compiled
-def judge_trial(m: Array, room: Cells, now: int, after: int, rules: Rules, b: int) -> int:
+def judge_trial(m: Array, room: LaneCells, now: int, after: int, rules: StopRules, b: int) -> int:
     """Return the status of a lane after a step; say whether it is better and set the damping."""
     state = room.state
     better, small, stuck, m[state + DAMPING, b], m[state + GROWTH, b] = judge_lane(
@@ -216,7 +218,7 @@ def judge_trial(m: Array, room: Cells, now: int, after: int, rules: Rules, b: in
 
 
 @compiled
-def _finish(m: Array, room: Cells, tag: Array, lane: int, out: Answers) -> None:
+def _finish(m: Array, room: LaneCells, tag: Array, lane: int, out: Answers) -> None:
     """Write the answer of a lane."""
     start, size = tag[START, lane], out.matrix.shape[-1]
     last = room.now + size * (size + 1)
@@ -232,7 +234,7 @@ def _finish(m: Array, room: Cells, tag: Array, lane: int, out: Answers) -> None:
 
 
 @compiled
-def _advance(m: Array, room: Cells, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
+def _advance(m: Array, room: LaneCells, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
     """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
     size, damping, gain = n + local, room.state + DAMPING, room.state + GAIN
     vector = room.now + size * (size + 1)
@@ -255,7 +257,9 @@ def _advance(m: Array, room: Cells, n: int, local: int, tag: Array, damped: bool
 
 
 @compiled
-def _advance_run(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, tag: Array, damped: bool, used: int) -> None:
+def _advance_run(
+    t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array, damped: bool, used: int
+) -> None:
     """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
     n, damping, gain = t.shared, room.state + DAMPING, room.state + GAIN
     vector = room.now + (n + t.local) * (n + t.local + 1)
@@ -279,7 +283,7 @@ def _advance_run(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, tag: Ar
 
 
 @compiled
-def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, tag: Array, summing: bool, lanes: int) -> None:
+def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array, summing: bool, lanes: int) -> None:
     """Go through the epochs at `room.best`: sum up the shared system (in `room.now` undamped), or step their own."""
     n, local, last = t.shared, t.local, t.shared + t.local
     group, packet, line = 0, 0, last + 1
@@ -310,7 +314,7 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Cells, tag: Array, su
 
 
 @compiled
-def _own(m: Array, room: Cells, tag: Array, n: int, local: int, epoch: int, lanes: int) -> None:
+def _own(m: Array, room: LaneCells, tag: Array, n: int, local: int, epoch: int, lanes: int) -> None:
     """Write the step of the unknowns of an epoch."""
     complete(m, room, n, local, lanes)
     vector, at = room.after + (n + local) * (n + local + 1) + n, n + epoch * local
@@ -322,7 +326,7 @@ def _own(m: Array, room: Cells, tag: Array, n: int, local: int, epoch: int, lane
 
 
 @compiled
-def _add(m: Array, room: Cells, n: int, line: int, lanes: int) -> None:
+def _add(m: Array, room: LaneCells, n: int, line: int, lanes: int) -> None:
     """Add the damped sums of all epochs to what their unknowns cost them."""
     for i in range(n):
         for j in range(i + 1):
@@ -336,7 +340,7 @@ def _add(m: Array, room: Cells, n: int, line: int, lanes: int) -> None:
 # Refinements of many starts spread over threads, by the kernel that serves the problem.
 
 
-def refined(packed: Packed, item: Array, start: Array, rules: Rules) -> tuple[Answers, Array]:
+def refined(packed: Packed, item: Array, start: Array, rules: StopRules) -> tuple[Answers, Array]:
     """Return where the refinements of starts (M, size) of given problems end, and where numpy must take over, (M,).
 
     Parameters
@@ -347,7 +351,7 @@ def refined(packed: Packed, item: Array, start: Array, rules: Rules) -> tuple[An
         Problem of each start.
     start : array (M, size)
         Starting vectors.
-    rules : Rules
+    rules : StopRules
         When to stop.
     """
     out = answers(start, 0 if is_run(packed.tables) else None)

@@ -14,10 +14,10 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
-from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, Rules, judge_lane
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, StopRules, judge_lane
 from optloc.kernels.equations import Sums
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import Cells, add_priors, arrange, blocks, blur_of, clear, gather, load, memory
+from optloc.kernels.lanes import LaneCells, add_priors, arrange, blocks, blur_of, clear, gather, load, memory
 from optloc.kernels.pack import Packed, PackedRuns
 from optloc.kernels.refine import CLOSED, DAMPING, LIMIT, NUMERICAL, SOLVABLE, Answers, answers
 from optloc.kernels.systems import backward, complete, eliminate, factor, factor_local, forward
@@ -29,7 +29,7 @@ LEFT_OPEN = -1
 """Status of a start if an epoch left local unknowns open: numpy refines it."""
 
 
-class Share(NamedTuple):
+class EpochShare(NamedTuple):
     """Sums over the epochs of a run, and the local equations of each epoch.
 
     Parameters
@@ -51,13 +51,13 @@ class Share(NamedTuple):
 
 
 @compiled
-def _share(n: int, local: int, parts: int, lanes: int) -> Share:
-    return Share(np.zeros((n, n)), np.zeros(n), np.zeros(1), np.zeros((parts, local * (n + local + 2), lanes)))
+def _share(n: int, local: int, parts: int, lanes: int) -> EpochShare:
+    return EpochShare(np.zeros((n, n)), np.zeros(n), np.zeros(1), np.zeros((parts, local * (n + local + 2), lanes)))
 
 
 @compiled
 def _evaluate(
-    packed: Packed, m: Array, r: Array, room: Cells, item: int, epochs: int, x: Array, priors: bool, out: Share
+    packed: Packed, m: Array, r: Array, room: LaneCells, item: int, epochs: int, x: Array, priors: bool, out: EpochShare
 ) -> None:
     """Write the equations of a run at its vector x (n + k l,)."""
     t, c = packed
@@ -85,7 +85,7 @@ def _evaluate(
 
 
 @compiled
-def _blur(packed: Packed, m: Array, room: Cells, item: int, epochs: int) -> float:
+def _blur(packed: Packed, m: Array, room: LaneCells, item: int, epochs: int) -> float:
     """Return the rounding error of the whitened residuals of a run."""
     c, squares = packed.numbers, 0.0
     for i in range(item * epochs, (item + 1) * epochs):
@@ -107,7 +107,7 @@ def _keep(m: Array, rows: int, vector: int, count: int, local: int, own: Array, 
 
 
 @compiled
-def _sum(m: Array, matrix: int, line: int, vector: int, cost: int, n: int, used: int, out: Share) -> None:
+def _sum(m: Array, matrix: int, line: int, vector: int, cost: int, n: int, used: int, out: EpochShare) -> None:
     """Add the equations of the shared unknowns and the costs of all lanes."""
     for i in range(n):
         for j in range(i + 1):
@@ -120,7 +120,7 @@ def _sum(m: Array, matrix: int, line: int, vector: int, cost: int, n: int, used:
 
 
 @compiled
-def _factor_epochs(m: Array, room: Cells, n: int, local: int, own: Array, damping: float, used: int) -> None:
+def _factor_epochs(m: Array, room: LaneCells, n: int, local: int, own: Array, damping: float, used: int) -> None:
     """Factor the damped systems of the local unknowns; CLOSED is 1.0 where they are determined."""
     line = n + local + 1
     for cell in range(local * line):
@@ -136,7 +136,15 @@ def _factor_epochs(m: Array, room: Cells, n: int, local: int, own: Array, dampin
 
 @compiled
 def _reduce(
-    m: Array, room: Cells, n: int, local: int, epochs: int, now: Share, damping: float, matrix: Array, vector: Array
+    m: Array,
+    room: LaneCells,
+    n: int,
+    local: int,
+    epochs: int,
+    now: EpochShare,
+    damping: float,
+    matrix: Array,
+    vector: Array,
 ) -> bool:
     """Write the shared system (n, n), (n,) without the local unknowns; return if each epoch determines all of them.
 
@@ -165,7 +173,7 @@ def _reduce(
 
 
 @compiled
-def _factor_shared(m: Array, room: Cells, n: int, matrix: Array) -> bool:
+def _factor_shared(m: Array, room: LaneCells, n: int, matrix: Array) -> bool:
     """Factor the shared system in the first lane; return whether it is positive definite."""
     for i in range(n):
         for j in range(i + 1):
@@ -176,7 +184,7 @@ def _factor_shared(m: Array, room: Cells, n: int, matrix: Array) -> bool:
 
 
 @compiled
-def _solve_shared(m: Array, room: Cells, n: int, right: Array) -> None:
+def _solve_shared(m: Array, room: LaneCells, n: int, right: Array) -> None:
     """Replace a vector (n,) by the solution of the shared system, which is factored."""
     for i in range(n):
         m[room.step + i, 0] = right[i]
@@ -188,7 +196,15 @@ def _solve_shared(m: Array, room: Cells, n: int, right: Array) -> None:
 
 @compiled
 def _step(
-    m: Array, room: Cells, n: int, local: int, epochs: int, now: Share, damping: float, matrix: Array, move: Array
+    m: Array,
+    room: LaneCells,
+    n: int,
+    local: int,
+    epochs: int,
+    now: EpochShare,
+    damping: float,
+    matrix: Array,
+    move: Array,
 ) -> int:
     """Write the damped step of the shared unknowns to `move` (n,); return its status, see `LEFT_OPEN`."""
     if not _reduce(m, room, n, local, epochs, now, damping, matrix, move):
@@ -201,7 +217,16 @@ def _step(
 
 @compiled
 def _move(
-    m: Array, room: Cells, n: int, local: int, epochs: int, now: Share, damping: float, move: Array, x: Array, to: Array
+    m: Array,
+    room: LaneCells,
+    n: int,
+    local: int,
+    epochs: int,
+    now: EpochShare,
+    damping: float,
+    move: Array,
+    x: Array,
+    to: Array,
 ) -> float:
     """Write the vector one step from x, and return the squared length of the step in its own standard deviations."""
     lanes, gain = m.shape[1], 0.0
@@ -248,7 +273,7 @@ class Spread(NamedTuple):
 
 @compiled
 def _spread(
-    m: Array, room: Cells, n: int, local: int, epochs: int, now: Share, vector: Array, start: int, out: Spread
+    m: Array, room: LaneCells, n: int, local: int, epochs: int, now: EpochShare, vector: Array, start: int, out: Spread
 ) -> None:
     """Write the covariances of a run from its equations; `vector` (n,) is scratch."""
     lanes, matrix, covariance = m.shape[1], out.information[start], out.covariance[start]
@@ -273,7 +298,7 @@ def _spread(
 
 @compiled
 def _spread_epochs(
-    m: Array, room: Cells, n: int, local: int, covariance: Array, first: int, used: int, out: Array
+    m: Array, room: LaneCells, n: int, local: int, covariance: Array, first: int, used: int, out: Array
 ) -> None:
     """Write the covariance of the local unknowns of epochs, whose systems are factored."""
     size = out.shape[1]
@@ -299,7 +324,7 @@ def _spread_epochs(
 
 @compiled
 def refine_runs(
-    packed: Packed, item: Array, epochs: int, first: int, last: int, rules: Rules, out: Answers, spread: Spread
+    packed: Packed, item: Array, epochs: int, first: int, last: int, rules: StopRules, out: Answers, spread: Spread
 ) -> None:
     """Refine the starts first <= i < last of runs; several threads may work on one set of answers.
 
@@ -313,7 +338,7 @@ def refine_runs(
         Number k of epochs of a run.
     first, last : int
         Which starts.
-    rules : Rules
+    rules : StopRules
         When to stop.
     out : Answers
         Starts; they become the answers. Status: ok, max iterations, stalled, numerical, `LEFT_OPEN`. Neither
@@ -392,13 +417,15 @@ def sum_runs(
 # From Python: runs whose epochs are alike.
 
 
-def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: Rules) -> tuple[Answers, Array]:
+def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: StopRules) -> tuple[Answers, Array]:
     """Return the ends of refinements of starts (M, size) of given runs (M,), and whether numpy must take over, (M,)."""
     done, _ = fixed_runs(runs, item, start, rules, None)
     return done, np.asarray(done.status == LEFT_OPEN)
 
 
-def fixed_runs(runs: PackedRuns, item: Array, start: Array, rules: Rules, size: int | None) -> tuple[Answers, Spread]:
+def fixed_runs(
+    runs: PackedRuns, item: Array, start: Array, rules: StopRules, size: int | None
+) -> tuple[Answers, Spread]:
     """Return the ends of refinements and the covariances there, of the first unknowns of an epoch, `size` of them."""
     n, out, item = runs.packed.tables.shared, answers(start, 0), np.ascontiguousarray(item)
     count, wanted = len(start), 0 if size is None else len(start)

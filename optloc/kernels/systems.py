@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined
-from optloc.kernels.lanes import Cells
+from optloc.kernels.lanes import LaneCells
 
 # Scaled systems in the memory of a block of lanes.
 
@@ -98,14 +98,14 @@ def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -
 
 
 @compiled
-def step(m: Array, room: Cells, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
+def step(m: Array, room: LaneCells, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
     """Write the damped step from `room.now` into `room.step`, zero where cell `ok` becomes 0.0.
 
     Parameters
     ----------
     m : array (cells, B)
         Memory.
-    room : Cells
+    room : LaneCells
         Where things stand.
     n, local : int
         Numbers of shared and of local unknowns.
@@ -142,7 +142,7 @@ def step(m: Array, room: Cells, n: int, local: int, damping: int, ok: int, lanes
 
 @compiled
 def factor_local(
-    m: Array, room: Cells, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
+    m: Array, room: LaneCells, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
 ) -> None:
     """Factor the damped system of the local unknowns of equations at cell `source`; prepare what couples it."""
     line, half = n + local + 1, room.half
@@ -167,7 +167,7 @@ def factor_local(
 
 
 @compiled
-def eliminate(m: Array, room: Cells, n: int, local: int, lanes: int) -> None:
+def eliminate(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
     """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
     half = room.half
     for a in range(local):
@@ -182,7 +182,7 @@ def eliminate(m: Array, room: Cells, n: int, local: int, lanes: int) -> None:
 
 
 @compiled
-def complete(m: Array, room: Cells, n: int, local: int, lanes: int) -> None:
+def complete(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
     """Write the step of the local unknowns behind that of the shared ones; their system is factored."""
     own = room.step + n
     for a in range(local):

@@ -25,7 +25,7 @@ def starts(counts: Any) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Groups:
+class RowGroups:
     """Groups of correlated rows in the order of their epochs.
 
     Parameters
@@ -47,7 +47,7 @@ class Groups:
     number: Array
 
     @classmethod
-    def sorted(cls, problem: Problem, groups: tuple[Array, ...]) -> Groups:
+    def sorted(cls, problem: Problem, groups: tuple[Array, ...]) -> RowGroups:
         """Return the groups (g, r) of a problem, sorted."""
         rows = np.concatenate([group.ravel() for group in groups])
         size = np.concatenate([np.full(len(group), group.shape[1]) for group in groups])
@@ -107,7 +107,7 @@ class Entries:
 
 
 @dataclass(frozen=True, slots=True)
-class Columns:
+class RowColumns:
     """The unknowns that each group touches: shared ones, then the local ones of its epoch.
 
     Parameters
@@ -122,7 +122,7 @@ class Columns:
     at: Array
 
     @classmethod
-    def of(cls, problem: Problem, groups: Groups, entries: list[Entries]) -> tuple[Columns, list[Array]]:
+    def of(cls, problem: Problem, groups: RowGroups, entries: list[Entries]) -> tuple[RowColumns, list[Array]]:
         """Return the columns, and the place of each entry among those of its group."""
         n, length = problem.layout.n_shared, problem.layout.n_local
         keys = []
@@ -161,7 +161,7 @@ class Order:
     packet_row: Array
 
     @classmethod
-    def of(cls, problem: Problem, groups: Groups, width: int) -> Order:
+    def of(cls, problem: Problem, groups: RowGroups, width: int) -> Order:
         """Return the order for groups whose rows have a number of columns at most."""
         # Wide rows, fewer of them: a packet keeps its numbers in the first cache.
         limit = int(np.clip(_NUMBERS // width, _LEAST, _MOST))
@@ -229,7 +229,7 @@ class Tables(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class CachedTables:
     """Tables, and which of the groups of the whiteners each group is: int array (groups,)."""
 
     tables: Tables
@@ -295,10 +295,10 @@ class Sources:
 # Tables of longer problems are made anew each time: that takes less time than a fix, and no memory that lasts.
 _KEPT_ROWS = 2**13
 # 2**19 lines of six whole numbers are 24 MB; a structure without tables counts as one line.
-_KEPT = Cache["Kept | None"](2**19, lambda kept: 1 if kept is None else len(kept.tables.table))
+_KEPT = Cache["CachedTables | None"](2**19, lambda kept: 1 if kept is None else len(kept.tables.table))
 
 
-def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:
+def tables(problem: Problem, groups: tuple[Array, ...]) -> CachedTables | None:
     """Return the tables of a flat batch of problems, or None where the compiled core does not serve it.
 
     Parameters
@@ -316,7 +316,7 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:
     return _KEPT.find(key, lambda: _tables(problem, groups, sources))
 
 
-def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Kept | None:
+def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> CachedTables | None:
     layout = problem.layout
     if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
         return None
@@ -330,7 +330,7 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ke
         if made is None:
             return None
         found.append(_Kind(links, made, inputs))
-    return _fill(problem, Groups.sorted(problem, groups), found, sources.lookup())
+    return _fill(problem, RowGroups.sorted(problem, groups), found, sources.lookup())
 
 
 def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
@@ -349,12 +349,12 @@ class _Kind:
     inputs: dict[int, Array]
 
 
-def _fill(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -> Kept:
+def _fill(problem: Problem, groups: RowGroups, found: list[_Kind], lookup: Array) -> CachedTables:
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])
     adds = Entries.joined([Entries.terms(kind.links.adds, start) for kind, start in pairs])
-    columns, slots = Columns.of(problem, groups, [feeds, scales, adds])
+    columns, slots = RowColumns.of(problem, groups, [feeds, scales, adds])
     count, tapes = np.diff(columns.at), [kind.trace.tape for kind in found]
     order = Order.of(problem, groups, int(count.max()) + 1)
     inputs = np.concatenate([np.full(k.links.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
@@ -398,7 +398,7 @@ def _fill(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -
         rows=int(order.place.max()) + 1,
         size=int(groups.size.max()),
     )
-    return Kept(tables, groups.number)
+    return CachedTables(tables, groups.number)
 
 
 def _table(*columns: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from optloc.cli import MORE, Asked, Extension, Rows, registry
+from optloc.cli import MORE, Extension, PictureRequest, Rows, registry
 from optloc.lab.commands.reproduce import EXAMPLES, reproduce
 from optloc.lab.commands.study import study
 
@@ -49,7 +49,7 @@ def _folder() -> dict[str, Any]:
     return {"folder": folder, "there": list(available()) if folder else []}
 
 
-def _accuracy(asked: Asked) -> None:
+def _accuracy(asked: PictureRequest) -> None:
     """Errors of a study's methods against the bound."""
     import numpy as np
 

@@ -84,14 +84,14 @@ def inverse_blocks(block: Array, link: Array) -> tuple[Array, Array]:
     return inner, ok
 
 
-class _Parts(NamedTuple):
+class _ChainParts(NamedTuple):
     """Blocks of an inverse on its diagonal, and beside it: those of each block with the next."""
 
     inner: Array
     beside: Array
 
 
-def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool) -> tuple[Array, _Parts, Array]:
+def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool) -> tuple[Array, _ChainParts, Array]:
     """Return solutions, parts of the inverse (empty where they are not wanted), and whether the chain is regular."""
     k, length = block.shape[-3:-1]
     eye = np.broadcast_to(np.eye(length) if inverse else np.zeros((length, 0)), (*block.shape[:-1], length * inverse))
@@ -100,7 +100,7 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
         left = np.diagonal(block, axis1=-2, axis2=-1).min((-1, -2))
         ok = good.all(-1) & (left > _ROUNDING * size)
         inner = np.where(ok[..., None, None, None], both[..., right.shape[-1] :], np.nan)
-        return both[..., : right.shape[-1]], _Parts(inner, link), ok
+        return both[..., : right.shape[-1]], _ChainParts(inner, link), ok
     # an odd block knows those before and after it; the last one of an even number has none after it
     after = np.zeros((*block.shape[:-3], k // 2, length, length))
     after[..., : (k - 1) // 2, :, :] = link[..., 1::2, :, :]
@@ -132,7 +132,7 @@ def _behind(even: Array, count: int) -> Array:
     return out
 
 
-def _inner(parts: _Parts, back: Array, on: Array, own: Array, k: int) -> _Parts:
+def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _ChainParts:
     """Return the parts of the inverse from those of the even blocks: x_odd = own - back x_before - on x_after."""
     m, first = k // 2, parts.inner[..., : k // 2, :, :]
     second, across = _behind(parts.inner, m), np.zeros_like(back)
@@ -145,7 +145,7 @@ def _inner(parts: _Parts, back: Array, on: Array, own: Array, k: int) -> _Parts:
     beside = np.empty((*back.shape[:-3], k - 1, *back.shape[-2:]))
     beside[..., ::2, :, :] = with_before.mT
     beside[..., 1::2, :, :] = with_after[..., : (k - 1) // 2, :, :]
-    return _Parts(inner, beside)
+    return _ChainParts(inner, beside)
 
 
 def _regular(block: Array, right: Array) -> Array:

@@ -192,18 +192,18 @@ def _step(information: Array, vector: Array, damping: Array, free: Array) -> tup
 
 
 @dataclass(frozen=True, slots=True)
-class Minima:
+class DirectionMinima:
     """Minima of the cost over direction and inverse range, the cheapest first: (k, d), (k,), (k,)."""
 
     u: Array
     v: Array
     cost: Array
 
-    def __getitem__(self, items: Array) -> Minima:
-        return Minima(self.u[items], self.v[items], self.cost[items])
+    def __getitem__(self, items: Array) -> DirectionMinima:
+        return DirectionMinima(self.u[items], self.v[items], self.cost[items])
 
 
-def minima_of(view: View, rise: float) -> Minima:
+def minima_of(view: View, rise: float) -> DirectionMinima:
     """Return the minima that cost no more than a rise above the least."""
     d = len(view.centre)
     spot = spread_directions(_TRIED[d], d)
@@ -227,7 +227,7 @@ def _lowest(view: View, u: Array, v: Array, cost: Array) -> tuple[Array, Array, 
     return np.where(better[:, None], there, u), np.where(better, other, v), np.where(better, flat, cost)
 
 
-def _distinct(u: Array, v: Array, cost: Array, rise: float) -> Minima:
+def _distinct(u: Array, v: Array, cost: Array, rise: float) -> DirectionMinima:
     """Return the minima within a rise of the least, each once."""
     order = [int(i) for i in np.argsort(cost, kind="stable") if cost[i] <= cost.min() + rise]
     kept: list[int] = []
@@ -235,7 +235,7 @@ def _distinct(u: Array, v: Array, cost: Array, rise: float) -> Minima:
         alike = [abs(v[i] - v[j]) <= _SAME * (1.0 + v[j]) and u[i] @ u[j] > 1.0 - 0.5 * _SAME**2 for j in kept]
         if not any(alike):
             kept.append(i)
-    return Minima(u[kept], v[kept], cost[kept])
+    return DirectionMinima(u[kept], v[kept], cost[kept])
 
 
 # Edges: where the root of the rise of the cost reaches a goal.
@@ -322,7 +322,7 @@ def _false_position(at: Profile, low: tuple[Array, Array], high: tuple[Array, Ar
     return np.asarray(middle)
 
 
-def ends_of_range(view: View, minima: Minima, least: float, rise: float) -> tuple[float, float]:
+def ends_of_range(view: View, minima: DirectionMinima, least: float, rise: float) -> tuple[float, float]:
     """Return the least and the greatest inverse range, in spreads, at which a direction near minima costs little.
 
     All directions may follow: the profile of the cost over the inverse range.
@@ -409,7 +409,7 @@ def _is_image(view: View, one: Array, other: Array) -> bool:
     return bool(np.abs(image - other).max() < _ALIKE and np.abs(image - one).max() > _ALIKE)
 
 
-def _cone(view: View, minima: Minima, i: int, rises: Array, level: Array) -> Direction | None:
+def _cone(view: View, minima: DirectionMinima, i: int, rises: Array, level: Array) -> Direction | None:
     """Return the cone about a minimum without a range, or None where it is no cone."""
     u, v, least = minima.u[i], minima.v[i], float(minima.cost[0])
     usable, across = rises > minima.cost[i] - least, _principal(view, minima.u[i], minima.v[i])
@@ -486,7 +486,7 @@ def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, f
     return (middle, *ends), (float(np.arcsin(np.clip(own[2], -1.0, 1.0))), low, high)
 
 
-def _ranged(view: View, cone: Direction, minima: Minima, least: float, rise: float) -> Direction:
+def _ranged(view: View, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
     """Return a cone with its range: the inverse ranges of all minima in it."""
     near = minima[minima.cost <= least + rise]
     if not len(near.cost):

@@ -6,7 +6,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.model_checks.elements import Elements
-from optloc.model_checks.variance_components import Fitted, Tested, snooped, tested, without
+from optloc.model_checks.variance_components import Tested, VarianceFit, snooped, tested, without
 
 # Sizes of a test, standard deviations, at which tails are compared: beyond them are 5 %, 1 % and 0.1 % of normal
 # errors.
@@ -23,7 +23,7 @@ _FACTORS = np.exp(0.05 * np.arange(112))
 _TURNS, _NONE = 8, 1.05
 
 
-def tail_factors(made: Elements, found: Fitted) -> Array:
+def tail_factors(made: Elements, found: VarianceFit) -> Array:
     """Return the factor of the standard deviation of each group (g,) with which a Gaussian bounds its tails.
 
     With k times the variance theta of an error, its test t / sqrt(T) has the variance 1 + (k - 1) theta T. The factor
@@ -35,7 +35,7 @@ def tail_factors(made: Elements, found: Fitted) -> Array:
     ----------
     made : Elements
         N linearised problems.
-    found : Fitted
+    found : VarianceFit
         Their variances.
 
     References

@@ -448,7 +448,7 @@ def descend(problem: Problem, x: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
+class ScoreFit:
     """The best of many descents of a flat batch of N problems.
 
     Parameters
@@ -463,7 +463,7 @@ class Fitted:
     cost: Array
 
 
-def fit_anywhere(problem: Problem, more: Array | None = None) -> Fitted:
+def fit_anywhere(problem: Problem, more: Array | None = None) -> ScoreFit:
     """Return the best fit of problems of one position by descents from all around the stations.
 
     Nothing is proven: a search that misses the best place makes an advice be missed, not a wrong one be given.
@@ -492,7 +492,7 @@ def fit_anywhere(problem: Problem, more: Array | None = None) -> Fitted:
     far = np.abs(away).max(-1) > _FLAT * np.reshape(spread, (-1, 1))
     cost = np.where(far, np.inf, cost[..., 0])
     best, rows = cost.argmin(1), np.arange(n)
-    return Fitted(found[rows, best], cost[rows, best])
+    return ScoreFit(found[rows, best], cost[rows, best])
 
 
 def _directions(d: int) -> Array:

@@ -143,7 +143,7 @@ def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre:
     spread = covariance[:, part, part]
     precision, _ = linalg.inverse(spread)
     pull = covariance[:, :, part] @ (precision if not face else np.linalg.pinv(spread))  # of the others by the position
-    look = Look(problem, x, pull, part, face)
+    look = ShapeTest(problem, x, pull, part, face)
     out = np.full((len(x), 2), np.inf)
     position, axes = x[:, part], _axes(spread)
     with np.errstate(all="ignore"):
@@ -162,7 +162,7 @@ _SETTLED = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class ShapeTest:
     """The cost about a batch of fixes, and how the other unknowns follow the position there."""
 
     problem: Problem
@@ -171,9 +171,9 @@ class Look:
     part: slice
     face: Face
 
-    def take(self, items: Array) -> Look:
+    def take(self, items: Array) -> ShapeTest:
         """Return some fixes."""
-        return Look(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
+        return ShapeTest(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
 
     def departs(self, moved: Array, sigmas: Array) -> Array:
         """Return the largest departure (N,) over displacements (N, k, d) of so many standard deviations (N, k)."""
@@ -218,7 +218,7 @@ def _axes(covariance: Array) -> Array:
 _EXACT = 1e-14
 
 
-def _in_inverse_range(look: Look, centre: Array, covariance: Array) -> Array:
+def _in_inverse_range(look: ShapeTest, centre: Array, covariance: Array) -> Array:
     """Return the largest departure (N,) along the principal axes of the inverse-range chart."""
     position = look.x[:, look.part]
     chart = Chart(np.full(len(position), INVERSE_RANGE, dtype=np.int8), position, covariance, centre)

@@ -10,7 +10,7 @@ from optloc.base.records import take
 from optloc.base.types import Array, Polygon
 from optloc.linear.constraints import Level, bounds, exact, is_exact, is_flat, levels, outwards
 from optloc.linear.mirror import one_position
-from optloc.model_checks.shape import AWAY, Look
+from optloc.model_checks.shape import AWAY, ShapeTest
 from optloc.problem.problem import Problem
 from optloc.problem.truncated import Truncated, factor_of
 
@@ -180,7 +180,7 @@ def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Trunca
     spread = covariance[:, part, part]
     pull = covariance[:, :, part] @ np.linalg.pinv(spread, hermitian=True)
     with np.errstate(all="ignore"):
-        return Look(problem, x, pull, part, exact(problem)).departs(moved, np.sqrt(grown))
+        return ShapeTest(problem, x, pull, part, exact(problem)).departs(moved, np.sqrt(grown))
 
 
 def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:

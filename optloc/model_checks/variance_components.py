@@ -67,7 +67,7 @@ _OWN = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
+class VarianceFit:
     """Variance factors of g groups of errors.
 
     Parameters
@@ -99,7 +99,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _FoundLevels:
     """Variances (c,) of classes of errors, their standard errors (c,), gross errors, and the tests without them."""
 
     variance: Array
@@ -108,7 +108,7 @@ class _Found:
     tests: Tested
 
 
-def fit(made: Elements, left: Array, single: Array) -> Fitted:
+def fit(made: Elements, left: Array, single: Array) -> VarianceFit:
     """Return the variance factors of greatest restricted likelihood, kept away from zero.
 
     The likelihood is multiplied by every factor (see `_PENALTY`): a factor of few errors then has no maximum at zero.
@@ -162,7 +162,7 @@ def fit(made: Elements, left: Array, single: Array) -> Fitted:
     def spread(values: Array) -> Array:
         return np.asarray(np.append(values, np.nan)[number[:-1]])
 
-    return Fitted(
+    return VarianceFit(
         np.where(left, 0.0, spread(found.variance[place])),
         spread(np.where(shared, np.nan, found.error[place])),
         spread(low),
@@ -186,7 +186,7 @@ def without_groups(made: Elements, left: Array) -> Elements:
 _SEEN = 2.33
 
 
-def visible(made: Elements, found: Fitted, left: Array) -> Array:
+def visible(made: Elements, found: VarianceFit, left: Array) -> Array:
     """Return which groups (g,) of those left out of a fit the data show: a score test of their factor being zero.
 
     With the information I and scores U of all factors at zero, U_g over the root of I_gg - I_gh I_hh^-1 I_hg is
@@ -196,7 +196,7 @@ def visible(made: Elements, found: Fitted, left: Array) -> Array:
     ----------
     made : Elements
         N linearised problems.
-    found : Fitted
+    found : VarianceFit
         Without these groups.
     left : bool array (g,)
         Which they are.
@@ -219,7 +219,7 @@ def visible(made: Elements, found: Fitted, left: Array) -> Array:
 _TIMES, _RELATIVE = 3.0, 0.25
 
 
-def _determinable(tests: Tested, made: Elements, found: Fitted, left: Array) -> Array:
+def _determinable(tests: Tested, made: Elements, found: VarianceFit, left: Array) -> Array:
     """Return the groups (g,) whose level the data would show if it were a few times the level of the rows."""
     level = _TIMES**2 * float(np.nanmedian(found.variance[~left]))
     share = tests.size[:, : tests.errors] * level
@@ -228,7 +228,7 @@ def _determinable(tests: Tested, made: Elements, found: Fitted, left: Array) -> 
     return np.asarray(information * (2.0 * _RELATIVE) ** 2 > 1.0)
 
 
-def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Array) -> _Found:
+def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Array) -> _FoundLevels:
     """Return the factors of classes of errors `own` (N, q), from log-factors (c,) on; some are held there.
 
     The penalty (c,) is added to their scores.
@@ -253,7 +253,7 @@ def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Ar
         if (np.abs(level - before) <= _SETTLED * sure).all():
             break
     variance = np.exp(level)
-    return _Found(variance, _errors(tests, own, variance, held[:count]), gross, tests)
+    return _FoundLevels(variance, _errors(tests, own, variance, held[:count]), gross, tests)
 
 
 def _coarse(tests: Tested, own: Array, variance: Array) -> Array:
@@ -321,7 +321,7 @@ def _errors(tests: Tested, own: Array, variance: Array, held: Array) -> Array:
     return np.where(told, np.sqrt(1.0 + np.sqrt(spread)) - 1.0, np.inf)
 
 
-def _interval(found: _Found, own: Array, held: Array) -> tuple[Array, Array]:
+def _interval(found: _FoundLevels, own: Array, held: Array) -> tuple[Array, Array]:
     """Return the ends (c,) of the intervals of variance factors.
 
     What is seen of an error is its sum with the error of what the others predict: of variance theta + tau, tau =
@@ -445,7 +445,7 @@ def without(tests: Tested, gross: Array) -> Tested:
     return tests
 
 
-def deviance(made: Elements, found: Fitted) -> float:
+def deviance(made: Elements, found: VarianceFit) -> float:
     """Return twice the negative logarithm of the restricted likelihood; a gross row is a free unknown at a price.
 
     It is the likelihood of K' v, K an orthonormal basis of the complement of J. The basis does not depend on the

@@ -14,7 +14,7 @@ from math import log, tau
 from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.registry import Table
+from optloc.base.registry import Registry
 from optloc.base.units import UNITS
 from optloc.models.medium import Atmosphere as Atmosphere, Layers as Layers, arrival, path, path_rate
 from optloc.models.primitives import (
@@ -374,7 +374,7 @@ def _along_rays(name: str) -> Model:
     )
 
 
-MODELS: Table[Model] = Table("optloc.models", lambda value: isinstance(value, Model), _KINDS, _Unlisted)
+MODELS: Registry[Model] = Registry("optloc.models", lambda value: isinstance(value, Model), _KINDS, _Unlisted)
 
 
 def kind_named(word: str, where: str | None = "kind") -> str:

@@ -341,7 +341,7 @@ def _asinh_over(u: Array, logarithm: _Function) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _FoundRay:
     """Rays that arrive, all (k,): of which pair, sine and cosine of the angle at the top speed, and where they turn."""
 
     index: Array
@@ -426,7 +426,7 @@ def _level(layers: _Layered, across: Array, high: Array, low: Array) -> Array:
     return np.stack([time, 1.0 / c, np.zeros_like(c), np.zeros_like(c)])
 
 
-def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _Found | None:
+def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
     """Return the rays that go up or down all the way: there is one at most."""
     h, c1, c2 = _between(layers, high, low)
     top = _fastest(h, c1, c2)
@@ -448,7 +448,7 @@ def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _Found 
             break
         left, own = left[still], own.take(still)
     cosine = 1.0 / np.sqrt(1.0 + t * t)
-    return _Found(index, legs, t * cosine, cosine, np.zeros(len(index)))
+    return _FoundRay(index, legs, t * cosine, cosine, np.zeros(len(index)))
 
 
 class _Bracket(NamedTuple):
@@ -462,7 +462,7 @@ class _Bracket(NamedTuple):
     turns: Array
 
 
-def _turning(layers: _Layered, across: Array, high: Array, low: Array) -> _Found | None:
+def _turning(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
     """Return the rays that turn once, below both ends or above both."""
     found: list[_Bracket] = []
     # What is above in a table is below in its mirror image.
@@ -479,7 +479,7 @@ def _turning(layers: _Layered, across: Array, high: Array, low: Array) -> _Found
     parts = [part.legs for part in found]
     each = {name: np.concatenate([getattr(one, name) for one in parts], axis=-1) for name in _Legs._fields}
     legs = _Legs(**(each | {"times": parts[0].times}))
-    return _Found(index, legs, *_of_cotangent(_within(legs, across[index], low, high, rising)), turn)
+    return _FoundRay(index, legs, *_of_cotangent(_within(legs, across[index], low, high, rising)), turn)
 
 
 def _turning_in(

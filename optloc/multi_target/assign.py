@@ -15,7 +15,7 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.multi_target.answer import Emitters, Ghost
-from optloc.multi_target.pricing_search import TOLERANCE, Region, Searched, search
+from optloc.multi_target.pricing_search import TOLERANCE, PricedRegion, PricingResult, search
 from optloc.multi_target.set_packing import Prices, cheapest_sets, price_rows
 from optloc.multi_target.sets import (
     Scene,
@@ -115,19 +115,19 @@ def separate(
     )
 
 
-def _region(problem: Problem, given: Sequence[Any] | None) -> Region:
+def _region(problem: Problem, given: Sequence[Any] | None) -> PricedRegion:
     """Return the region given, or one around the stations."""
     if given is None:
         position = problem.stations.position.reshape(-1, problem.dimension)
         lower, upper = position.min(0), position.max(0)
         reach = float((upper - lower).max())
-        return Region(lower - reach, upper + reach)
+        return PricedRegion(lower - reach, upper + reach)
     lower, upper = (np.asarray(corner, dtype=float) for corner in given)
     good = lower.shape == upper.shape == (problem.dimension,) and np.isfinite(lower).all() and np.isfinite(upper).all()
     if not good or not (lower < upper).all():
         advice = f"give two corners of {problem.dimension} finite coordinates, the lower one first"
         raise InvalidProblem(f"a region from {lower} to {upper}", "region", advice)
-    return Region(lower, upper)
+    return PricedRegion(lower, upper)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +156,7 @@ class Solved:
     boxes: int
 
 
-def _solve_epoch(scene: Scene, region: Region, count: int | None, boxes: int) -> Solved:
+def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: int) -> Solved:
     """Return the best assignment: columns are added while the search finds one that is worth its price."""
     # Sets that do not pay by themselves are kept where they may have to be taken, or be listed as ghosts.
     limit = AMBIGUOUS_GAP + (scene.penalty if count is not None else 0.0)
@@ -179,7 +179,7 @@ def _solve_epoch(scene: Scene, region: Region, count: int | None, boxes: int) ->
     return Solved(tuples, taken, prices, cost, min(bound, cost), total)
 
 
-def _fresh_sets(scene: Scene, prices: Prices, found: Searched) -> Tuples:
+def _fresh_sets(scene: Scene, prices: Prices, found: PricingResult) -> Tuples:
     """Return the sets found, and others near their places, that are worth more than their price."""
     if not len(found.places):
         return no_sets(scene)

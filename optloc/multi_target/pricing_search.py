@@ -24,7 +24,7 @@ _SHOWN = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Region:
+class PricedRegion:
     """A box in which emitters are sought.
 
     Parameters
@@ -38,7 +38,7 @@ class Region:
 
 
 @dataclass(frozen=True, slots=True)
-class Searched:
+class PricingResult:
     """What a search found.
 
     Parameters
@@ -60,7 +60,7 @@ class Searched:
     boxes: int
 
 
-def search(scene: Scene, prices: Prices, region: Region, most: int) -> Searched:
+def search(scene: Scene, prices: Prices, region: PricedRegion, most: int) -> PricingResult:
     """Return whether some set of rows has a negative reduced cost.
 
     At a place x the best set of independent rows takes, channel by channel, what is cheapest, so that the reduced cost
@@ -76,7 +76,7 @@ def search(scene: Scene, prices: Prices, region: Region, most: int) -> Searched:
         One epoch.
     prices : Prices
         Of its rows.
-    region : Region
+    region : PricedRegion
         Where emitters are sought.
     most : int
         Boxes looked at before it gives up.
@@ -94,13 +94,13 @@ def search(scene: Scene, prices: Prices, region: Region, most: int) -> Searched:
         value, picks = _cheapest_at(scene, prices, first)
         if value.min() < -TOLERANCE:
             worth = value < -TOLERANCE
-            return Searched(-np.inf, first[worth], picks[worth], boxes)
+            return PricingResult(-np.inf, first[worth], picks[worth], boxes)
         # Given up: the least bound of what is open is the floor, and its places are looked at once more.
         if boxes + 2 * open_.sum() > most:
             lowest = centre[np.argsort(found.low, kind="stable")[:_SHOWN]]
-            return Searched(float(found.low.min()), lowest, _cheapest_at(scene, prices, lowest)[1], boxes)
+            return PricingResult(float(found.low.min()), lowest, _cheapest_at(scene, prices, lowest)[1], boxes)
         centre, half = _halve(centre[open_], half[open_], found.side[open_])
-    return Searched(floor, centre, np.zeros((0, scene.scan.count), dtype=np.int64), boxes)
+    return PricingResult(floor, centre, np.zeros((0, scene.scan.count), dtype=np.int64), boxes)
 
 
 def _cheapest_at(scene: Scene, prices: Prices, x: Array) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         geodetic_to_ecef as geodetic_to_ecef,
     )
     from optloc.base.registry import (
-        Table as Table,
+        Registry as Registry,
         load_plugin as load_plugin,
         plugin_module as plugin_module,
         plugins as plugins,
@@ -75,7 +75,9 @@ if TYPE_CHECKING:
         Block as Block,
         Noise as Noise,
         arrivals as arrivals,
+        dense as dense,
         group as group,
+        independent as independent,
         variances as variances,
         whiten as whiten,
     )

@@ -70,7 +70,7 @@ def with_bias(
         after t seconds it has gone ``sqrt(density * t)``.
     rate_density : float or array (q,), optional
         Of a walk with a rate: density of the noise which that is the sum of, per second cubed. Clocks have both:
-        `optloc.clock_densities` makes them of Allan deviations.
+        `optloc.problem.clock_densities` makes them of Allan deviations.
     knots : int or array (p,), optional
         Of a spline: times in seconds between which it is a cubic polynomial, or how many evenly spaced ones.
 

@@ -67,7 +67,7 @@ def measured(
     Parameters
     ----------
     kind : str
-        A key of `optloc.MODELS`, for instance "tdoa", or one of its aliases.
+        A key of `optloc.models.MODELS`, for instance "tdoa", or one of its aliases.
     z : array (..., m), optional
         Measured values: metres, metres per second, radians or ratios; None to be simulated.
     a, b : int array (m,) or int
@@ -157,7 +157,7 @@ def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> N
         advice = "give covariance, or signal, or sigma, or arrival_sigma, or the last two together"
         raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
     if signal is not None and not isinstance(signal, Signal):
-        raise InvalidProblem(f"it is a {type(signal).__name__}", "signal", "give an optloc.Signal")
+        raise InvalidProblem(f"it is a {type(signal).__name__}", "signal", "give an optloc.problem.Signal")
 
 
 def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:

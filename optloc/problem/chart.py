@@ -32,7 +32,7 @@ TRUNCATED = "truncated"
 Extent = Literal["range", "bearing", "elevation", "height", "x", "y", "z"]
 
 # The region shows what a Gaussian cannot: a function of a higher floor, so the advice names it.
-_ADVICE = "ask `optloc.likelihood_region(problem, fix)` for the region that the data allow"
+_ADVICE = "ask `optloc.uncertainty.likelihood_region(problem, fix)` for the region that the data allow"
 
 
 def distance_and_direction(position: Array, centre: Array) -> tuple[Array, Array]:

@@ -165,7 +165,7 @@ def with_densities(bias: Bias, times: Array, where: str, density: Any, rate_dens
     """
     members = len(bias.members)
     if density is None and rate_density is None:
-        advice = "give density, rate_density or both, for instance by optloc.clock_densities"
+        advice = "give density, rate_density or both, for instance by optloc.problem.clock_densities"
         raise InvalidProblem("a walk needs a spectral density", where, advice)
     columns = []
     for values, name in ((density, "density"), (rate_density, "rate_density")):

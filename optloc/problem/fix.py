@@ -384,7 +384,7 @@ class Fix:
         """Return the `Determined` of a single fix: directions, ranges and curves that the data know in its status.
 
         It is computed when it is read. None where the problem is not at hand, as in batches with many refused fixes:
-        `optloc.determined(problem, fix)` returns it then.
+        `optloc.model_checks.determined(problem, fix)` returns it then.
         """
         return _TELLER[0]().determined_of(self)
 
@@ -499,7 +499,7 @@ class Fix:
         Raises
         ------
         InvalidProblem
-            Where no Gaussian covers: `optloc.likelihood_region` shows what does.
+            Where no Gaussian covers: `optloc.uncertainty.likelihood_region` shows what does.
         """
         return self._gaussian_chart(level).covers(points, level)
 
@@ -516,7 +516,7 @@ class Fix:
         Raises
         ------
         InvalidProblem
-            Where no Gaussian covers: `optloc.likelihood_region` shows what does.
+            Where no Gaussian covers: `optloc.uncertainty.likelihood_region` shows what does.
         """
         return self._gaussian_chart(level).interval(extent, level)
 

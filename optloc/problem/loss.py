@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.registry import Table
+from optloc.base.registry import Registry
 from optloc.base.types import Array
 
 
@@ -245,7 +245,7 @@ _OWN = (
         one_sided=True,
     ),
 )
-LOSSES: Table[Loss] = Table(
+LOSSES: Registry[Loss] = Registry(
     "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN}, _Spelled
 )
 """Losses by name, each a stage of a method: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; Cauchy one-sided.

@@ -40,7 +40,7 @@ def checked(problem: Problem) -> Problem:
         Naming the station, row or argument and what to do.
     """
     if not isinstance(problem.frame, Frame):
-        raise InvalidProblem(f"{problem.frame!r} is not a frame", "frame", "give an optloc.Frame, such as optloc.ECEF")
+        raise InvalidProblem(f"{problem.frame!r} is not a frame", "frame", "give an optloc.Frame")
     if problem.count == 0:
         raise InvalidProblem("there are no measurements", "measurements", "give at least one row")
     _check_stations(problem)

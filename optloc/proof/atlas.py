@@ -23,7 +23,7 @@ from optloc.kernels.jit import compiled, inlined, put, put_rows
 from optloc.proof.nodes.node import Triple, blend, inner, reach, triple, write
 
 
-class Minima(NamedTuple):
+class AtlasMinima(NamedTuple):
     """Known minima and the boxes around them.
 
     Parameters
@@ -57,7 +57,7 @@ class Atlas(NamedTuple):
         Half its side; all stations lie inside.
     dimension : int
         2 or 3.
-    minima : Minima
+    minima : AtlasMinima
         Known minima.
     point, slant : array (3,), (3, 3)
         p at the centre of a box, and its derivative with respect to the coordinates of the piece.
@@ -74,7 +74,7 @@ class Atlas(NamedTuple):
     middle: Array
     radius: float
     dimension: int
-    minima: Minima
+    minima: AtlasMinima
     point: Array
     slant: Array
     scale: Array
@@ -90,7 +90,7 @@ class Atlas(NamedTuple):
 @compiled
 def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
     """Return the pieces around a cube, centre `middle` (3,) and half-width `radius`, with room for `count` minima."""
-    minima = Minima(
+    minima = AtlasMinima(
         np.zeros(count, dtype=np.int64),
         np.zeros((count, 3)),
         np.zeros((count, 3, 3)),
@@ -102,7 +102,7 @@ def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
 
 
 @compiled
-def with_minima(middle: Array, radius: float, dimension: int, minima: Minima) -> Atlas:
+def with_minima(middle: Array, radius: float, dimension: int, minima: AtlasMinima) -> Atlas:
     """Return the pieces around a cube and around known minima."""
     # One array for all vectors and one for all matrices: an atlas is made for every fix.
     vectors, matrices = np.zeros((3, 3)), np.zeros((5, 3, 3))
@@ -125,9 +125,9 @@ def with_minima(middle: Array, radius: float, dimension: int, minima: Minima) ->
 
 
 @compiled
-def first_minima(minima: Minima, count: int) -> Minima:
+def first_minima(minima: AtlasMinima, count: int) -> AtlasMinima:
     """Return the first minima."""
-    return Minima(
+    return AtlasMinima(
         minima.home[:count],
         minima.start[:count],
         minima.axes[:count],
@@ -337,7 +337,7 @@ def _column(m: int, level: int, face: bool, d: int) -> int:
     return m + 1 if m >= level else m
 
 
-class Frame(NamedTuple):
+class AtlasFrame(NamedTuple):
     """Where a box lies, in numbers alone: machine code counts references to every array that it hands on.
 
     Parameters
@@ -364,11 +364,11 @@ class Frame(NamedTuple):
 
 
 @inlined
-def frame_of(atlas: Atlas) -> Frame:
+def frame_of(atlas: Atlas) -> AtlasFrame:
     """Return where the centre that `set_centre` has set lies."""
     slant = (triple(atlas.slant[0], 0), triple(atlas.slant[1], 0), triple(atlas.slant[2], 0))
     point, rise = triple(atlas.point, 0), triple(atlas.scale, 1)
-    return Frame(triple(atlas.middle, 0), atlas.radius, atlas.dimension == 3, point, slant, atlas.scale[0], rise)
+    return AtlasFrame(triple(atlas.middle, 0), atlas.radius, atlas.dimension == 3, point, slant, atlas.scale[0], rise)
 
 
 @compiled
@@ -423,7 +423,7 @@ def clip_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, ha
 
 
 @inlined
-def _station(frame: Frame, data: Array, first: int) -> Triple:
+def _station(frame: AtlasFrame, data: Array, first: int) -> Triple:
     """Return the station a at data[first:first + 3] in the units of the cube."""
     m0, m1, m2 = frame.middle
     per = 1.0 / frame.radius
@@ -432,7 +432,7 @@ def _station(frame: Frame, data: Array, first: int) -> Triple:
 
 
 @inlined
-def set_line(frame: Frame, data: Array, first: int, away: Array, sense: Array) -> None:
+def set_line(frame: AtlasFrame, data: Array, first: int, away: Array, sense: Array) -> None:
     """Write the scaled line p - v a to the station at data[first:first + 3], and its derivative."""
     a0, a1, a2 = _station(frame, data, first)
     write(blend(1.0, frame.point, -frame.scale, (a0, a1, a2)), away)
@@ -443,7 +443,7 @@ def set_line(frame: Frame, data: Array, first: int, away: Array, sense: Array) -
 
 
 @inlined
-def scaled_station(frame: Frame, data: Array) -> tuple[float, float, Triple]:
+def scaled_station(frame: AtlasFrame, data: Array) -> tuple[float, float, Triple]:
     """Return ``|a|`` of a station a, and ``N = -2 a.p + v |a|^2`` with its gradient, a constant."""
     a = _station(frame, data, 0)
     squared = inner(a, a)

@@ -15,7 +15,7 @@ from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.groups import empty_groups
 from optloc.proof.near import OPEN, prove
 from optloc.proof.position_costs import PositionCosts
-from optloc.proof.search_space import LINES, Cost, Known, accuracy_floor, cost_of, empty_box, set_geometry
+from optloc.proof.search_space import LINES, Cost, KnownMinima, accuracy_floor, cost_of, empty_box, set_geometry
 
 # Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
 # what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
@@ -29,7 +29,7 @@ RIVALS = 4
 _AT_LEAST = 5
 
 
-class Asked(NamedTuple):
+class ProofRequest(NamedTuple):
     """What is to be proven of each of n fixes.
 
     Parameters
@@ -51,7 +51,7 @@ class Asked(NamedTuple):
     budget : int array (n,)
         How many boxes each may take.
     planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
-        Planes or a surface to which the claims are limited, see `optloc.proof.search_space.Known`.
+        Planes or a surface to which the claims are limited, see `optloc.proof.search_space.KnownMinima`.
     """
 
     x: Array
@@ -66,12 +66,12 @@ class Asked(NamedTuple):
     planes: Array
     surface: Array
 
-    def take(self, index: Array | slice) -> Asked:
+    def take(self, index: Array | slice) -> ProofRequest:
         """Return what is asked of some of the fixes."""
-        return Asked(*(array[index] for array in self))
+        return ProofRequest(*(array[index] for array in self))
 
 
-class Answered(NamedTuple):
+class ProofResult(NamedTuple):
     """What became of each of n proofs.
 
     Parameters
@@ -103,12 +103,12 @@ class Answered(NamedTuple):
     rivals: Array
     found: Array
 
-    def take(self, index: Array | slice) -> Answered:
+    def take(self, index: Array | slice) -> ProofResult:
         """Return what became of some of the proofs."""
-        return Answered(*(array[index] for array in self))
+        return ProofResult(*(array[index] for array in self))
 
 
-def prove_all(costs: PositionCosts, asked: Asked) -> Answered:
+def prove_all(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     """Return the outcome of the proofs of n fixes of n problems, by their costs.
 
     The first few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
@@ -124,10 +124,10 @@ def prove_all(costs: PositionCosts, asked: Asked) -> Answered:
         parts.append((_prove if last - first > FEW else _prove_few)(costs.take(some), asked.take(some)))
         if last == n:
             break
-    return parts[0] if len(parts) == 1 else Answered(*map(np.concatenate, zip(*parts, strict=True)))
+    return parts[0] if len(parts) == 1 else ProofResult(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _prove_few(costs: PositionCosts, asked: Asked) -> Answered:
+def _prove_few(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     """Return the outcome of a few proofs, begun in plain Python; who needs more begins anew in machine code."""
     n = len(asked.x)
     few = max(_AT_LEAST, FIRST_BOXES // max(n, 1))
@@ -143,7 +143,7 @@ def _prove_few(costs: PositionCosts, asked: Asked) -> Answered:
     return out
 
 
-def _prove_plainly(costs: PositionCosts, asked: Asked, boxes: int) -> Answered:
+def _prove_plainly(costs: PositionCosts, asked: ProofRequest, boxes: int) -> ProofResult:
     with plain():
         return _prove(costs, asked._replace(budget=np.minimum(asked.budget, boxes)))
 
@@ -153,9 +153,9 @@ def lacks_code(count: int) -> bool:
     return enabled() and not usable(_loop, count)
 
 
-def empty_answer(n: int, d: int) -> Answered:
+def empty_answer(n: int, d: int) -> ProofResult:
     """Return what n proofs in d dimensions write into."""
-    return Answered(
+    return ProofResult(
         verdict=np.zeros(n, dtype=np.int64),
         boxes=np.zeros(n, dtype=np.int64),
         bound=np.zeros(n),
@@ -168,18 +168,21 @@ def empty_answer(n: int, d: int) -> Answered:
 
 
 def without_rivals(
-    verdict: Array, boxes: Array, bound: Array, everywhere: Array, asked: Asked, found: Array
-) -> Answered:
+    verdict: Array, boxes: Array, bound: Array, everywhere: Array, asked: ProofRequest, found: Array
+) -> ProofResult:
     """Return the outcome of proofs that try the first gap alone, and begin anew beside every minimum that they meet."""
     n, d = found.shape
     none = np.zeros(n, dtype=np.int64)
-    return Answered(verdict, boxes, bound, everywhere, asked.gaps[:, 0], none, np.full((n, 0, d), np.nan), found)
+    return ProofResult(verdict, boxes, bound, everywhere, asked.gaps[:, 0], none, np.full((n, 0, d), np.nan), found)
 
 
-def _prove(costs: PositionCosts, asked: Asked) -> Answered:
+def _prove(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     n, d = asked.x.shape
     out = empty_answer(n, d)
-    costs, asked = PositionCosts(*(plainly(array) for array in costs)), Asked(*(plainly(array) for array in asked))
+    costs, asked = (
+        PositionCosts(*(plainly(array) for array in costs)),
+        ProofRequest(*(plainly(array) for array in asked)),
+    )
     length = max(_STRETCH[0], min(_STRETCH[1], n // _PARTS))
 
     def stretch(first: int) -> None:
@@ -195,7 +198,7 @@ def _prove(costs: PositionCosts, asked: Asked) -> Answered:
     return out
 
 
-def prove_here(costs: PositionCosts, asked: Asked, out: Answered) -> None:
+def prove_here(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
     """Write what becomes of proofs to arrays, by machine code in the calling thread; see `prove_all`.
 
     All arrays are writable and in C order: nothing is looked at, copied or shared out.
@@ -230,7 +233,7 @@ def plainly(array: Array) -> Array:
 
 
 @compiled
-def _loop(costs: PositionCosts, asked: Asked, out: Answered) -> None:
+def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
     """Prove what is asked of each fix, and write what became of it."""
     # Taken out of the records once: every look into one counts the references of an array.
     kinds, data, K, w = costs.kinds, costs.data, costs.K, costs.w
@@ -252,7 +255,7 @@ def _loop(costs: PositionCosts, asked: Asked, out: Answered) -> None:
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
         x, gaps, eps, found = fixes[i], steps[i], tolerances[i], points[i]
         beside, low, high = (
-            Known(others[i, : known[i]], hidden[i], planes[i], surfaces[i]),
+            KnownMinima(others[i, : known[i]], hidden[i], planes[i], surfaces[i]),
             regions[i, 0],
             regions[i, 1],
         )

@@ -45,7 +45,7 @@ from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import (
     Box,
     Cost,
-    Known,
+    KnownMinima,
     chart_on,
     cost_of,
     curve_box,
@@ -75,13 +75,13 @@ _HALF = 0.5
 _LOOK = 32
 
 
-class Aim(NamedTuple):
+class SearchGoal(NamedTuple):
     """What is looked for.
 
     Parameters
     ----------
     planes, surface : array (e, 3), (0,) or (SURFACE_WIDTH,)
-        To which the minima are limited, see `optloc.proof.search_space.Known`.
+        To which the minima are limited, see `optloc.proof.search_space.KnownMinima`.
     gap : float
         By how much a minimum may cost more than the best.
     reach : float
@@ -101,7 +101,7 @@ class Aim(NamedTuple):
 
 
 @compiled
-def _add(cost: Cost, near: Box, aim: Aim, x: Array, count: int, level: float) -> int:
+def _add(cost: Cost, near: Box, aim: SearchGoal, x: Array, count: int, level: float) -> int:
     """Descend from a place (D,) to a minimum; return how many are known with it, one more if it is new.
 
     `x` is the minimum afterwards; what costs more than a level is none of interest.
@@ -143,7 +143,7 @@ def _add(cost: Cost, near: Box, aim: Aim, x: Array, count: int, level: float) ->
 
 
 @compiled
-def _least(aim: Aim, count: int) -> float:
+def _least(aim: SearchGoal, count: int) -> float:
     """Return the cost of the best minimum."""
     best = inf
     for p in range(count):
@@ -158,7 +158,9 @@ def _is_due(lows: int, low: bool, boxes: int) -> bool:
 
 
 @compiled
-def search_minima(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, region: Array, budget: int) -> tuple[int, int]:
+def search_minima(
+    cost: Cost, box: Box, near: Box, x: Array, aim: SearchGoal, region: Array, budget: int
+) -> tuple[int, int]:
     """Look for minima: all around a surface, over all positions, or between corners.
 
     All positions are searched where the cost stays finite at infinity. Otherwise the corners are an enclosure of the
@@ -197,7 +199,7 @@ def _search(
     space: Space,
     box: Box,
     near: Box,
-    aim: Aim,
+    aim: SearchGoal,
     corners: Array,
     stack: Array,
     size: int,
@@ -309,9 +311,9 @@ def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
 
 
 @compiled
-def _with_known(cost: Cost, space: Space, near: Box, aim: Aim, corners: Array, count: int) -> Space:
+def _with_known(cost: Cost, space: Space, near: Box, aim: SearchGoal, corners: Array, count: int) -> Space:
     """Return search coordinates with the minima that are known, and convex boxes around them."""
-    known = Known(aim.points[:count], 0, aim.planes, aim.surface)
+    known = KnownMinima(aim.points[:count], 0, aim.planes, aim.surface)
     minima, sides, number, _ = known_minima(cost, space.chart, near, known, corners[0], corners[1], 0.0, -inf, False)
     return Space(False, space.atlas, space.chart, minima[:number], sides[:number])
 
@@ -327,7 +329,7 @@ def _push_minimum(cost: Cost, space: Space, near: Box, x: Array, stack: Array, s
     return Space(True, atlas, space.chart, space.minima, space.sides), size
 
 
-class Places(NamedTuple):
+class FoundPlaces(NamedTuple):
     """Where the minima of n costs are looked for.
 
     Parameters
@@ -337,7 +339,7 @@ class Places(NamedTuple):
     region : array (n, 2, d)
         Corners of what is searched where nothing encloses them.
     planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
-        To which the minima are limited, see `optloc.proof.search_space.Known`.
+        To which the minima are limited, see `optloc.proof.search_space.KnownMinima`.
     """
 
     x: Array
@@ -345,19 +347,19 @@ class Places(NamedTuple):
     planes: Array
     surface: Array
 
-    def take(self, i: int) -> Places:
+    def take(self, i: int) -> FoundPlaces:
         """Return the place of one of the costs, without the first axis."""
-        return Places(*(array[i] for array in self))
+        return FoundPlaces(*(array[i] for array in self))
 
 
-def find_minima(costs: PositionCosts, places: Places, gap: float, budget: int, most: int) -> tuple[Array, Array]:
+def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, Array]:
     """Return the minima of n costs that a best-first search meets, from nothing.
 
     Parameters
     ----------
     costs : PositionCosts
         The costs.
-    places : Places
+    places : FoundPlaces
         Where they are looked for.
     gap : float
         By how much the cost of a minimum may exceed that of the best.
@@ -375,7 +377,7 @@ def find_minima(costs: PositionCosts, places: Places, gap: float, budget: int, m
     """
     n, d = places.x.shape
     points, boxes = np.full((n, most, d), np.nan), np.zeros(n, dtype=np.int64)
-    costs, places = PositionCosts(*map(plainly, costs)), Places(*map(plainly, places))
+    costs, places = PositionCosts(*map(plainly, costs)), FoundPlaces(*map(plainly, places))
 
     def search(i: int, budget: int) -> None:
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
@@ -400,12 +402,12 @@ def find_minima(costs: PositionCosts, places: Places, gap: float, budget: int, m
     return points, boxes
 
 
-def _minima_of(costs: PositionCosts, place: Places, gap: float, budget: int, most: int) -> tuple[Array, int]:
+def _minima_of(costs: PositionCosts, place: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, int]:
     """Return the minima (most, d) of one cost, and the boxes that it took; places without their first axis."""
     cost = present_in(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = cube(cost.kinds, cost.data, place.x)
     found, least = np.zeros((most, len(place.x))), np.full(most, inf)
-    aim = Aim(place.planes, place.surface, gap, _AWAY * radius, found, least)
+    aim = SearchGoal(place.planes, place.surface, gap, _AWAY * radius, found, least)
     box, near = empty_box(*cost.K.shape), empty_box(*cost.K.shape)
     _, boxes = search_minima(cost, box, near, place.x, aim, place.region, budget)
     order = np.argsort(least)

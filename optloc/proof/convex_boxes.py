@@ -14,7 +14,7 @@ from optloc.proof.box import J0, cost_at, linearise_rows, rounding
 from optloc.proof.curvature import FAINT, G0, G1, G2, NOISE0, bend_axes, convex, least_of, sum_up
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, size_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE
-from optloc.proof.search_space import HIDDEN_REACH, Box, Chart, Cost, Known, is_convex, widen
+from optloc.proof.search_space import HIDDEN_REACH, Box, Cost, KnownMinima, LocalAxes, is_convex, widen
 
 # Around a fix, in its search coordinates.
 
@@ -26,14 +26,14 @@ _POLISHED = 100.0
 
 
 @inlined
-def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float) -> bool:
+def set_convex(cost: Cost, chart: LocalAxes, box: Box, hull: Array, margin: float) -> bool:
     """Make a box around its centre as large as the cost is found convex on it; return False where it is on none.
 
     Convex over the whole hull in most cases; else the hull is shrunk as a whole.
 
     Parameters
     ----------
-    cost, chart : Cost, Chart
+    cost, chart : Cost, LocalAxes
         The cost and its search coordinates.
     box : Box
         Its centre `at` is a minimum; its half-widths are written.
@@ -67,9 +67,9 @@ def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
 @inlined
 def known_minima(
     cost: Cost,
-    chart: Chart,
+    chart: LocalAxes,
     box: Box,
-    known: Known,
+    known: KnownMinima,
     low: Array,
     high: Array,
     margin: float,
@@ -129,7 +129,7 @@ _ASIDE = 1e5
 
 
 @inlined
-def is_elsewhere(chart: Chart, box: Box, place_of: Array) -> bool:
+def is_elsewhere(chart: LocalAxes, box: Box, place_of: Array) -> bool:
     """Return whether a point (D,) of a surface is not that at its own search coordinates, but behind it."""
     apart = 0.0
     for m in range(place_of.shape[0]):

@@ -42,7 +42,7 @@ from optloc.proof.enclosure import enclose
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW
 from optloc.proof.pieces import SHRUNK, push_faces
-from optloc.proof.search_space import Box, Chart, Cost, chart_at, place
+from optloc.proof.search_space import Box, Cost, LocalAxes, chart_at, place
 from optloc.proof.space import Space, floor_of, set_box, set_place
 
 # Share of its bend that halving a side must leave a box at most, to be preferred to what its slopes say: nodes that are
@@ -119,7 +119,7 @@ def cover(
 
 
 @compiled
-def _push_enclosure(cost: Cost, chart: Chart, box: Box, longest: float, boxes: Array) -> int:
+def _push_enclosure(cost: Cost, chart: LocalAxes, box: Box, longest: float, boxes: Array) -> int:
     """Write a box that holds all residuals shorter than `longest`; return the number of boxes, 0 without one."""
     corners = np.empty((2, 3))
     low, high = corners[0], corners[1]
@@ -244,7 +244,7 @@ def _bound(cost: Cost, space: Space, box: Box) -> None:
 
 
 @compiled
-def _bound_near(cost: Cost, chart: Chart, box: Box) -> None:
+def _bound_near(cost: Cost, chart: LocalAxes, box: Box) -> None:
     place(chart.origin, chart.sense, box.at, box.centre)
     bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
 

@@ -8,7 +8,7 @@ from optloc.kernels.jit import compiled, inlined, put
 from optloc.kernels.systems import inverse, positive_along
 from optloc.proof.curvature import G0, G1, G2
 from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22
-from optloc.proof.search_space import Box, Chart, Cost, blur_at, curve_box, value_at
+from optloc.proof.search_space import Box, Cost, LocalAxes, blur_at, curve_box, value_at
 
 # Steps of a descent: damped Newton needs five to ten from a box near a minimum; beyond forty it creeps along a valley.
 _STEPS = 40
@@ -22,7 +22,7 @@ _SAME_COST = 1e-14
 
 
 @compiled
-def descend(cost: Cost, chart: Chart, box: Box) -> float:
+def descend(cost: Cost, chart: LocalAxes, box: Box) -> float:
     """Move the centre of a box to a minimum of the cost; return the cost there, or infinity where none is reached.
 
     The half-widths become zero, and the tables are those of the point. Newton's Hessian where it is positive definite,

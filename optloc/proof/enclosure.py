@@ -13,7 +13,7 @@ from optloc.proof.box import rounding
 from optloc.proof.groups import LOOSE
 from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
 from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
-from optloc.proof.search_space import Box, Chart, Cost
+from optloc.proof.search_space import Box, Cost, LocalAxes
 
 # Balls that hold all points at which one node lies in an interval.
 
@@ -428,7 +428,7 @@ def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bo
 
 
 @compiled
-def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array) -> bool:
+def enclose(cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, upper: Array) -> bool:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
     Within a group of nodes (`optloc.proof.groups.Groups`) errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
@@ -437,7 +437,7 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
 
     Parameters
     ----------
-    cost, chart : Cost, Chart
+    cost, chart : Cost, LocalAxes
         The cost, and search coordinates around the fix.
     box : Box
         Tables of the fix, of which the values of the nodes and the forces ``K'(K phi - w)`` are read.

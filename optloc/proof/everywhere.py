@@ -78,9 +78,9 @@ from optloc.proof.search_space import (
     COARSEST,
     HIDDEN_REACH,
     Box,
-    Chart,
     Cost,
-    Known,
+    KnownMinima,
+    LocalAxes,
     chart_at,
     empty_box,
     equal_within,
@@ -97,7 +97,7 @@ _LOOKS = 8
 _BENT = 9.0
 
 
-class Work(NamedTuple):
+class GlobalWorkspace(NamedTuple):
     """A cost that stays finite at infinity (`optloc.proof.box.reaches_infinity`), and working memory for its search.
 
     Parameters
@@ -124,7 +124,7 @@ class Work(NamedTuple):
 
 
 @compiled
-def _bound_row(work: Work, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+def _bound_row(work: GlobalWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
     atlas, box, cost, piece = space.atlas, work.box, work.cost, int(stack[row, PIECE])
     if not _take(stack, row, atlas, space.chart, work.corners, box, piece):
         return inf, inf
@@ -143,7 +143,7 @@ def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
 
 
 @inlined
-def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: bool) -> int:
+def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
     cost, atlas, box = work.cost, space.atlas, work.box
     noise = rounding(cost.K, cost.weight, work.floor, box.nodes)
     uncut(box.half, box.cut)
@@ -161,7 +161,7 @@ def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: b
 
 
 @inlined
-def _take(stack: Array, row: int, atlas: Atlas, chart: Chart, corners: Array, box: Box, piece: int) -> bool:
+def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array, box: Box, piece: int) -> bool:
     """Take a box off the stack and set its centre; return False where nothing of it is to be looked at.
 
     What lies beyond the corners, if they are known, is left out.
@@ -221,19 +221,26 @@ def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float
 
 
 @compiled
-def _descend_near(work: Work, chart: Chart) -> float:
+def _descend_near(work: GlobalWorkspace, chart: LocalAxes) -> float:
     return descend(work.cost, chart, work.near)
 
 
 @compiled
 def _set_rival(
-    work: Work, atlas: Atlas, _chart: Chart, i: int, x: Array, value: float, eps: float, _rho: float
+    work: GlobalWorkspace,
+    atlas: Atlas,
+    _chart: LocalAxes,
+    i: int,
+    x: Array,
+    value: float,
+    eps: float,
+    _rho: float,
 ) -> bool:
     return set_minimum(work.cost, work.near, atlas, i, x, value, eps, inf)
 
 
 @compiled
-def _cost_set(work: Work, atlas: Atlas) -> float:
+def _cost_set(work: GlobalWorkspace, atlas: Atlas) -> float:
     bound_pieces(atlas, work.cost.kinds, work.cost.data, work.box.half, work.box.nodes)
     return cost_at(work.cost.K, work.cost.w, work.box.nodes)
 
@@ -263,7 +270,15 @@ _CLOSE = 1e-3
 
 @inlined
 def prove_everywhere(
-    cost: Cost, box: Box, x: Array, beside: Known, gaps: Array, eps: float, budget: int, rivals: Array, found: Array
+    cost: Cost,
+    box: Box,
+    x: Array,
+    beside: KnownMinima,
+    gaps: Array,
+    eps: float,
+    budget: int,
+    rivals: Array,
+    found: Array,
 ) -> tuple[int, int, float, float, int]:
     """Prove that no position costs less than a fix, and that no other minimum has a gap below as much as can be shown.
 
@@ -316,7 +331,15 @@ def _reach_of(cost: Cost, x: Array) -> float:
 
 @compiled
 def prove_atlas(
-    cost: Cost, box: Box, x: Array, beside: Known, gaps: Array, eps: float, budget: int, rivals: Array, found: Array
+    cost: Cost,
+    box: Box,
+    x: Array,
+    beside: KnownMinima,
+    gaps: Array,
+    eps: float,
+    budget: int,
+    rivals: Array,
+    found: Array,
 ) -> tuple[int, int, float, float, int]:
     """Prove the same as `prove_everywhere` with the atlas alone, where `optloc.proof.box.reaches_infinity` holds."""
     chart, _ = chart_at(cost, x, box)
@@ -347,7 +370,7 @@ def prove_atlas(
     for k in range(gaps.shape[0]):
         levels[k] = least + gaps[k] if gaps[k] > 0.0 else least - eps
     q, J = cost.K.shape
-    work = Work(cost, corners, squares, accuracy_floor_far(cost, atlas), empty_box(q, J), empty_box(q, J))
+    work = GlobalWorkspace(cost, corners, squares, accuracy_floor_far(cost, atlas), empty_box(q, J), empty_box(q, J))
     space, stack, whole = in_atlas(atlas, chart), np.empty((CAPACITY, DEPTH)), beside.hidden == 0
     outcome, boxes, bound, shown, met = search_everywhere(
         work, space, stack, push_pieces(stack, atlas), levels, eps, whole, budget, rivals, found

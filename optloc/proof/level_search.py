@@ -21,7 +21,7 @@ from optloc.proof.box import DEPTH, LEAST, PIECE, least_left, reaches
 from optloc.proof.convex_boxes import is_known, widen_core
 from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
 from optloc.proof.pieces import CAPACITY, SPARE, is_listed, is_tiny, keep_rest, push_core, touches_infinity
-from optloc.proof.search_space import Chart
+from optloc.proof.search_space import LocalAxes
 from optloc.proof.space import Space, in_atlas, place_of, set_place
 
 # The test for stationary points is made where the cost at the centre is within so many levels: elsewhere the box is too
@@ -49,13 +49,15 @@ def side_of_rest(work: Any, space: Space, touching: bool, rho: float, sound: boo
 
 
 @compiled
-def descend_near(work: Any, chart: Chart) -> float:
+def descend_near(work: Any, chart: LocalAxes) -> float:
     """Move the box around a position to a minimum; return its cost, or infinity where none is reached."""
     raise NotImplementedError
 
 
 @compiled
-def set_rival(work: Any, atlas: Atlas, chart: Chart, i: int, x: Array, value: float, eps: float, rho: float) -> bool:
+def set_rival(
+    work: Any, atlas: Atlas, chart: LocalAxes, i: int, x: Array, value: float, eps: float, rho: float
+) -> bool:
     """Write a minimum and its surroundings into an atlas, see `optloc.proof.convex_boxes.set_minimum`."""
     raise NotImplementedError
 

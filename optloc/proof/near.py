@@ -44,9 +44,9 @@ from optloc.proof.pieces import push_rest
 from optloc.proof.search_space import (
     COARSEST,
     Box,
-    Chart,
     Cost,
-    Known,
+    KnownMinima,
+    LocalAxes,
     blur_at,
     chart_on,
     curve_along,
@@ -70,7 +70,7 @@ CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 _CAPACITY = 512
 
 
-class Aim(NamedTuple):
+class Goal(NamedTuple):
     """What is to be shown of every box.
 
     Parameters
@@ -100,19 +100,19 @@ class Aim(NamedTuple):
 
 @compiled
 def branch(
-    cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim: Aim, budget: int, stack: Array, size: int
+    cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal, budget: int, stack: Array, size: int
 ) -> tuple[int, int, float]:
     """Look at the boxes of a stack until none is left.
 
     Parameters
     ----------
-    cost, chart : Cost, Chart
+    cost, chart : Cost, LocalAxes
         The cost and its search coordinates.
     box : Box
         Tables; holds the point of the outcomes CHEAPER and ANOTHER in the end.
     minima, sides : array (P, 3)
         Known minima, and half-widths of boxes around them where the cost is convex.
-    aim : Aim
+    aim : Goal
         What is to be shown.
     budget : int
         How many boxes may be looked at.
@@ -189,7 +189,7 @@ def branch(
 
 
 @inlined
-def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Aim, enough: bool) -> bool:
+def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, enough: bool) -> bool:
     """Return whether a box lies where nothing is left to show.
 
     In the convex box of a known minimum there is no second, but a lower point there may be: `enough` says where any of
@@ -202,7 +202,7 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Aim, enou
 
 
 @compiled
-def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim: Aim) -> int:
+def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal) -> int:
     """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER if it is not known, or CLEAR.
 
     The box is the minimum afterwards, or where all is clear what it was, but for its tables.
@@ -251,7 +251,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
 
 
 @compiled
-def lay_or_halve(cost: Cost, chart: Chart, box: Box, stack: Array, size: int) -> int:
+def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int) -> int:
     """Lay a box on a surface, and bound its nodes; return -1, or the size of the stack where that is another box's.
 
     A box of another piece of the surface is dropped, one over which it is no graph is halved across its longer side.
@@ -289,7 +289,7 @@ def prove(
     cost: Cost,
     box: Box,
     x: Array,
-    known: Known,
+    known: KnownMinima,
     kappa: float,
     eps: float,
     budget: int,
@@ -309,7 +309,7 @@ def prove(
         Tables to work with, see `optloc.proof.search_space.empty_box`.
     x : array (D,)
         The fix, polished.
-    known : Known
+    known : KnownMinima
         Other minima that are known, and planes or a surface to which the claim is limited.
     kappa : float
         Gap to prove; 0 proves the value alone.
@@ -377,7 +377,7 @@ def prove(
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     better, whole = _refuting(least, eps, noise), (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
-    aim, stack = Aim(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
+    aim, stack = Goal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, hole, 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
     if outcome == CLEAR and not alone:
@@ -430,7 +430,7 @@ def steepness(slope: tuple[float, float, float], noise: float) -> float:
 
 
 @compiled
-def _laid(cost: Cost, chart: Chart, box: Box) -> tuple[float, float]:
+def _laid(cost: Cost, chart: LocalAxes, box: Box) -> tuple[float, float]:
     """Return the cost of a fix on its surface, infinite off it, and the rounding of its residual; fill the sums."""
     box.at[:], box.half[:] = 0.0, 0.0
     there, noise = value_at(cost, chart, box), 0.0
@@ -442,7 +442,14 @@ def _laid(cost: Cost, chart: Chart, box: Box) -> tuple[float, float]:
 
 @compiled
 def _search_sides(
-    cost: Cost, around: Chart, box: Box, known: Known, aim: Aim, budget: int, boxes: int, stack: Array
+    cost: Cost,
+    around: LocalAxes,
+    box: Box,
+    known: KnownMinima,
+    aim: Goal,
+    budget: int,
+    boxes: int,
+    stack: Array,
 ) -> tuple[int, int]:
     """Search all other pieces of a surface than that of the fix; return the outcome and the boxes with those before."""
     corners, outcome = np.empty((2, 3)), CLEAR
@@ -454,7 +461,7 @@ def _search_sides(
         minima, sides, count, free = known_minima(cost, chart, box, known, low, high, 0.0, aim.value, False)
         if not aim.level > aim.value:
             count = free
-        own = Aim(aim.level, aim.value, aim.better, aim.whole, free, own=0)
+        own = Goal(aim.level, aim.value, aim.better, aim.whole, free, own=0)
         # No hole: the origin of a piece is no minimum.
         size = push_around(stack, 0, low, high, np.zeros(3), 0)
         outcome, more, _ = branch(cost, chart, box, minima[:count], sides[:count], own, budget - boxes, stack, size)
@@ -466,7 +473,7 @@ def _search_sides(
 
 @inlined
 def region_of(
-    cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array
+    cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array
 ) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
     if isnan(lower[0]):

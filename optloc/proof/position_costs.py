@@ -18,7 +18,7 @@ from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.dispatch import NODES, code_of, named, width
 from optloc.proof.nodes.level import linear_numbers
-from optloc.proof.nodes.node import LINEAR, Node, Row
+from optloc.proof.nodes.node import LINEAR, Node, NodeRow
 
 # From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
 
@@ -30,7 +30,7 @@ _DEPENDENT = 1e-14
 
 
 @dataclass(slots=True)
-class Columns:
+class CostColumns:
     """The nodes of a flat batch of problems as they are collected, and the design of the rows over them.
 
     Parameters
@@ -73,7 +73,7 @@ class Columns:
         self.column.append(column)
         self.coefficient.append(coefficient)
 
-    def split(self, group: Array) -> tuple[Columns, Array]:
+    def split(self, group: Array) -> tuple[CostColumns, Array]:
         """Return the same with nodes that rows of one group share, and the group of each node (J,).
 
         Parameters
@@ -81,7 +81,7 @@ class Columns:
         group : int array (m,)
             Group of each row.
         """
-        out, new = Columns(self.problem), dict[tuple[int, int], int]()
+        out, new = CostColumns(self.problem), dict[tuple[int, int], int]()
         for row, column, coefficient in zip(self.row, self.column, self.coefficient, strict=True):
             key = (column, int(group[row]))
             if key not in new:
@@ -110,7 +110,7 @@ def stack_numbers(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
     return out
 
 
-def columns_of(problem: Problem, observed: Array) -> Columns:
+def columns_of(problem: Problem, observed: Array) -> CostColumns:
     """Return the nodes that the rows of a flat batch of problems are sums of.
 
     Parameters
@@ -120,17 +120,17 @@ def columns_of(problem: Problem, observed: Array) -> Columns:
     observed : array (N, m)
         Measurements less everything that is known to be added to them; azimuths are counted from them.
     """
-    made = Columns(problem)
+    made = CostColumns(problem)
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model = MODELS[rows.kind]
         for i in range(rows.count):
-            row = Row(problem, int(rows.a[i]), int(rows.b[i]), int(rows.epoch[i]), observed[:, start + i])
+            row = NodeRow(problem, int(rows.a[i]), int(rows.b[i]), int(rows.epoch[i]), observed[:, start + i])
             for factor, node, station in _terms(model, row):
                 made.touch(start + i, _number_of(made, replace(row, a=station), node), factor)
     return made
 
 
-def _terms(model: Model, row: Row) -> Iterator[tuple[float, str | Node, int]]:
+def _terms(model: Model, row: NodeRow) -> Iterator[tuple[float, str | Node, int]]:
     """Yield what a row is a sum of: factors, nodes, and of which station."""
     nodes = ((1.0, "range"),) if model.ranges is not None else model.nodes
     # What each station measures by itself enters with its sign; other nodes are of the row as a whole.
@@ -139,7 +139,7 @@ def _terms(model: Model, row: Row) -> Iterator[tuple[float, str | Node, int]]:
             yield from ((sign * factor, node, station) for factor, node in nodes)
 
 
-def _number_of(made: Columns, row: Row, node: str | Node) -> int:
+def _number_of(made: CostColumns, row: NodeRow, node: str | Node) -> int:
     """Return the number of a node of one row, which is added unless it is of its station alone, as others are."""
     code, own = code_of(node), named(node)
     if not own.of_station:
@@ -160,7 +160,7 @@ def own_epochs(problem: Problem) -> int:
     return max(int(array.shape[-3]) for array in given)
 
 
-def add_linear(made: Columns, rows: Array, origin: Array | None = None) -> list[int]:
+def add_linear(made: CostColumns, rows: Array, origin: Array | None = None) -> list[int]:
     """Add linear nodes of coefficients (B, q, d), zero at an origin (B, d), and return their numbers."""
     return [made.add(LINEAR, linear_numbers(rows[:, i], origin)) for i in range(rows.shape[1])]
 
@@ -344,7 +344,7 @@ def factors_of_rows(problem: Problem) -> Array:
 def _rows_of(problem: Problem, group: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return kinds and numbers of the nodes, rows over them, measurements (N, q), levels (N,), and groups of nodes."""
     problem = weighed(problem)
-    others = Others.of(problem)
+    others = OtherRows.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
     # Absent rows have weight zero, and any finite value will do.
     usable = (problem.weight > 0.0) & np.isfinite(known)
@@ -430,7 +430,7 @@ def affine_costs(problem: Problem) -> Affine | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Others:
+class OtherRows:
     """Unknowns beside the target's state: how rows contain them (m, n), their precision (B, n, n) and mean (B, n)."""
 
     touch: Array
@@ -438,7 +438,7 @@ class Others:
     mean: Array
 
     @classmethod
-    def of(cls, problem: Problem) -> Others:
+    def of(cls, problem: Problem) -> OtherRows:
         """Return the unknowns of a problem beside the target's state, those of stations apart."""
         size = problem.layout.size
         touch = np.zeros((problem.count, size))
@@ -457,7 +457,7 @@ class Others:
                 mean[:, own] = centre
         return cls(touch, precision, mean)
 
-    def with_stations(self, problem: Problem, made: Columns) -> Others:
+    def with_stations(self, problem: Problem, made: CostColumns) -> OtherRows:
         """Return the unknowns with station errors along the line to the target as their first coordinates."""
         if problem.stations.covariance is None:
             return self
@@ -467,7 +467,7 @@ class Others:
             own = columns(problem.layout, "stations", epoch[row : row + 1])[0]
             # Isotropic, so any axis stands for the line to the target: the first of the station's d.
             touch[row, own[made.station[node] * d]] += coefficient
-        return Others(touch, self.precision, self.mean)
+        return OtherRows(touch, self.precision, self.mean)
 
 
 def _of_rows(problem: Problem, of_model: Callable[[Model], Any]) -> Array:
@@ -480,7 +480,7 @@ def counts_from_measured(problem: Problem) -> Array:
     return _of_rows(problem, lambda model: any(named(node).counts_from_measured for _, node in model.nodes))
 
 
-def _projected(problem: Problem, made: Columns, others: Others, value: Array) -> tuple[Array, Array]:
+def _projected(problem: Problem, made: CostColumns, others: OtherRows, value: Array) -> tuple[Array, Array]:
     """Return whitened rows (B, q, J) over the nodes and measurements (N, q), free of the other unknowns."""
     noise, J = whiten(problem.noise, problem.weight), len(made.kinds)
     used = others.touch.any(0) | others.precision.any((0, 1))
@@ -504,7 +504,7 @@ def _projected(problem: Problem, made: Columns, others: Others, value: Array) ->
     return geometry[..., :J], np.ascontiguousarray(seen[0].T) if shared else seen[..., 0]
 
 
-def position_prior(problem: Problem, made: Columns) -> list[int]:
+def position_prior(problem: Problem, made: CostColumns) -> list[int]:
     """Add the nodes of a Gaussian prior on the position, one for each of its rows, and return their numbers."""
     out: list[int] = []
     for name, mean, precision in prior_parts(problem):
@@ -525,7 +525,7 @@ def _with_rows_of(nodes: list[int], K: Array, w: Array) -> tuple[Array, Array]:
     return K, np.concatenate([w, np.zeros((len(w), len(nodes)))], axis=1)
 
 
-def turned_level(problem: Problem, others: Others, known: Array) -> Array:
+def turned_level(problem: Problem, others: OtherRows, known: Array) -> Array:
     """Return the cost (N,) from which on the sum of an angle and its bias may be off by a turn.
 
     Residuals are wrapped with their bias, nodes without it; a row can differ only where noise and bias together are

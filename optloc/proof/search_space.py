@@ -11,7 +11,7 @@ from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined, put_rows
 from optloc.kernels.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
-from optloc.proof.atlas import Atlas, Minima
+from optloc.proof.atlas import Atlas, AtlasMinima
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, cube, digits, reaches_infinity, rounding
 from optloc.proof.curvature import DETERMINED, FAINT, G0, G1, G2, SUMS, bend_axes, convex, curve_nodes, least_of, sum_up
 from optloc.proof.groups import Groups, empty_groups, set_groups
@@ -76,7 +76,7 @@ HIDDEN_REACH = 5e4
 """How far around a minimum that does not count nothing else does, metres: such minima lie deep in the Earth."""
 
 
-class Known(NamedTuple):
+class KnownMinima(NamedTuple):
     """What is known of a problem beside its fix.
 
     Parameters
@@ -97,7 +97,7 @@ class Known(NamedTuple):
     surface: Array
 
 
-class Chart(NamedTuple):
+class LocalAxes(NamedTuple):
     """Search coordinates s with ``x = origin + sense s``: principal axes of the fix, one unit a standard deviation.
 
     On planes there are fewer of them. On the surface of a height two: the third axis is upward, as
@@ -219,7 +219,7 @@ def empty_box(q: int, J: int) -> Box:
 
 
 @compiled
-def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
+def chart_at(cost: Cost, x: Array, box: Box) -> tuple[LocalAxes, bool]:
     """Return the search coordinates around a fix x (D,), and whether the rows determine them.
 
     The tables of the box are those of the fix afterwards: values of the nodes, forces (`CURVE_WIDTH`), and sums, whose
@@ -229,8 +229,8 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
 
 
 @compiled
-def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> tuple[Chart, bool]:
-    """Return the search coordinates around a fix on planes or a surface (see `Known`), otherwise as `chart_at`."""
+def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> tuple[LocalAxes, bool]:
+    """Return the search coordinates around a fix on planes or a surface, see `KnownMinima`; else of `chart_at`."""
     D = x.shape[0]
     vectors, numbers = np.zeros((2, 3)), np.zeros((3, 3, 3))
     origin, slip, sense, back, gram = vectors[0], vectors[1], numbers[0], numbers[1], numbers[2]
@@ -282,13 +282,13 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         for m in range(3):
             gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
     floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin, LINES)
-    chart = Chart(origin, sense, back, gram, slip, floor, own, False, origin)
+    chart = LocalAxes(origin, sense, back, gram, slip, floor, own, False, origin)
     if own.shape[0] > 0 and reaches_infinity(cost.kinds, cost.K):
         middle, _ = cube(cost.kinds, cost.data, x)
         floor += _length_of_lines(cost, own, middle)
         # Lines from anywhere have fewer digits than those from the fix, which very sharp rows need.
         if digits(cost.K) * floor < _SHARP:
-            chart = Chart(origin, sense, back, gram, slip, floor, own, True, middle)
+            chart = LocalAxes(origin, sense, back, gram, slip, floor, own, True, middle)
     return chart, good
 
 
@@ -303,10 +303,10 @@ def _length_of_lines(cost: Cost, surface: Array, middle: Array) -> float:
 
 
 @compiled
-def without_differences(chart: Chart) -> Chart:
+def without_differences(chart: LocalAxes) -> LocalAxes:
     """Return the same search coordinates, in which ranges are bounded one by one."""
     origin = chart.origin
-    return Chart(origin, chart.sense, chart.back, chart.gram, chart.slip, chart.floor, chart.surface, False, origin)
+    return LocalAxes(origin, chart.sense, chart.back, chart.gram, chart.slip, chart.floor, chart.surface, False, origin)
 
 
 @compiled
@@ -346,7 +346,7 @@ def place(origin: Array, sense: Array, at: Array, centre: Array) -> None:
 
 
 @inlined
-def widen(chart: Chart, centre: Array, half: Array) -> None:
+def widen(chart: LocalAxes, centre: Array, half: Array) -> None:
     """Widen a box by how far rounding may have moved its centre, metres: all that is said of it holds where it is."""
     size = abs(centre[0]) + abs(centre[1]) + abs(centre[2])
     # What is added to the origin may be larger than the sum.
@@ -356,7 +356,7 @@ def widen(chart: Chart, centre: Array, half: Array) -> None:
 
 
 @inlined
-def is_bounded(cost: Cost, chart: Chart, box: Box) -> bool:
+def is_bounded(cost: Cost, chart: LocalAxes, box: Box) -> bool:
     """Bound the nodes over a box; return False where it is so large that a surface is no graph over it."""
     place(chart.origin, chart.sense, box.at, box.centre)
     if chart.surface.shape[0] == 0:
@@ -366,7 +366,7 @@ def is_bounded(cost: Cost, chart: Chart, box: Box) -> bool:
 
 
 @compiled
-def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
+def lay_down(cost: Cost, chart: LocalAxes, box: Box) -> bool:
     """Bound the nodes over a box whose centre is in the plane of its chart along a surface, onto which it is moved."""
     put_rows(chart.sense, box.sense)
     if not lay(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
@@ -384,7 +384,7 @@ def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
 
 
 @inlined
-def _inside_of(cost: Cost, chart: Chart, box: Box) -> Atlas:
+def _inside_of(cost: Cost, chart: LocalAxes, box: Box) -> Atlas:
     """Return the atlas whose inside holds a box on a surface: its cube is as large as the Earth.
 
     It is made of views at each use. A record that a box held would be counted, array by array, in every call.
@@ -392,7 +392,7 @@ def _inside_of(cost: Cost, chart: Chart, box: Box) -> Atlas:
     m = box.inside
     numbers = m[9].reshape(9)
     # nothing reads the minima: they have room of the right kinds
-    minima = Minima(cost.groups.order[0], m[0], m[:1], m[:1], m[0], m[:1])
+    minima = AtlasMinima(cost.groups.order[0], m[0], m[:1], m[:1], m[0], m[:1])
     return Atlas(
         chart.middle,
         LEAST_RADIUS,
@@ -423,7 +423,7 @@ def _set_inside(inside: Atlas, box: Box) -> None:
 
 
 @compiled
-def curve_along(cost: Cost, chart: Chart, box: Box) -> None:
+def curve_along(cost: Cost, chart: LocalAxes, box: Box) -> None:
     """Fill the table of second derivatives along a surface of a box that lies on it."""
     unfold_slopes(box.lean, box.nodes)
     box.half[2] = box.graph[SAG] + box.graph[SLIP]
@@ -437,7 +437,7 @@ def curve_along(cost: Cost, chart: Chart, box: Box) -> None:
 
 
 @inlined
-def curve_at(cost: Cost, chart: Chart, box: Box) -> None:
+def curve_at(cost: Cost, chart: LocalAxes, box: Box) -> None:
     """Bound second derivatives of the nodes over a box whose nodes are bounded."""
     if chart.surface.shape[0] > 0:
         curve_along(cost, chart, box)
@@ -447,7 +447,7 @@ def curve_at(cost: Cost, chart: Chart, box: Box) -> None:
 
 
 @inlined
-def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
+def curve_box(cost: Cost, chart: LocalAxes, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
     curve_at(cost, chart, box)
     noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
@@ -455,13 +455,13 @@ def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
 
 
 @compiled
-def value_at(cost: Cost, chart: Chart, box: Box) -> float:
+def value_at(cost: Cost, chart: LocalAxes, box: Box) -> float:
     """Return f at the centre of a box, infinite where it is off a surface; its first table is filled."""
     return cost_at(cost.K, cost.w, box.nodes) if is_bounded(cost, chart, box) else inf
 
 
 @inlined
-def blur_at(cost: Cost, chart: Chart, box: Box) -> float:
+def blur_at(cost: Cost, chart: LocalAxes, box: Box) -> float:
     """Return a bound of the rounding errors of a residual (its length) at the centre of a box whose nodes are bounded.
 
     On a surface the height, which is worked out from the Earth's centre, is rounded as well.
@@ -493,13 +493,13 @@ def equal_within(eps: float, least: float, noise: float) -> float:
 
 
 @inlined
-def shapes_of(cost: Cost, chart: Chart) -> Array:
+def shapes_of(cost: Cost, chart: LocalAxes) -> Array:
     """Return the codes of the nodes for tests of convexity: along a surface a range is not convex."""
     return cost.kinds if chart.surface.shape[0] == 0 else np.full_like(cost.kinds, ANY)
 
 
 @compiled
-def is_convex(cost: Cost, chart: Chart, box: Box, margin: float) -> bool:
+def is_convex(cost: Cost, chart: LocalAxes, box: Box, margin: float) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` all over a box, whose tables are filled."""
     if not is_bounded(cost, chart, box):
         return False
@@ -508,12 +508,12 @@ def is_convex(cost: Cost, chart: Chart, box: Box, margin: float) -> bool:
 
 
 @compiled
-def turned(cost: Cost, chart: Chart, side: int) -> Chart:
+def turned(cost: Cost, chart: LocalAxes, side: int) -> LocalAxes:
     """Return the search coordinates of another piece of a surface, one unit the Earth's least distance.
 
     Parameters
     ----------
-    cost, chart : Cost, Chart
+    cost, chart : Cost, LocalAxes
         The cost, and the search coordinates around the fix, side 0.
     side : int
         1: the piece opposite to the fix; 2 to 5: those beside it.
@@ -534,4 +534,4 @@ def turned(cost: Cost, chart: Chart, side: int) -> Chart:
     floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin, LINES)
     if chart.differs:
         floor += _length_of_lines(cost, own, chart.middle)
-    return Chart(origin, sense, back, numbers[2], slip, floor, own, chart.differs, chart.middle)
+    return LocalAxes(origin, sense, back, numbers[2], slip, floor, own, chart.differs, chart.middle)

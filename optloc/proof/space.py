@@ -14,7 +14,17 @@ from optloc.proof.convex_boxes import accuracy_floor_far, is_known
 from optloc.proof.near import lay_or_halve
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.pieces import is_left
-from optloc.proof.search_space import LINES, Box, Chart, Cost, accuracy_floor, curve_at, is_bounded, place, widen
+from optloc.proof.search_space import (
+    LINES,
+    Box,
+    Cost,
+    LocalAxes,
+    accuracy_floor,
+    curve_at,
+    is_bounded,
+    place,
+    widen,
+)
 
 
 class Space(NamedTuple):
@@ -26,7 +36,7 @@ class Space(NamedTuple):
         Whether it is the atlas.
     atlas : Atlas
         The pieces, with known minima.
-    chart : Chart
+    chart : LocalAxes
         The search coordinates, along planes or on a piece of a surface.
     minima, sides : array (P, 3)
         Known minima in these, and half-widths of boxes around them on which the cost is convex.
@@ -34,13 +44,13 @@ class Space(NamedTuple):
 
     far: bool
     atlas: Atlas
-    chart: Chart
+    chart: LocalAxes
     minima: Array
     sides: Array
 
 
 @compiled
-def in_atlas(atlas: Atlas, chart: Chart) -> Space:
+def in_atlas(atlas: Atlas, chart: LocalAxes) -> Space:
     """Return an atlas as the space of a search."""
     none = np.empty((0, 3))
     return Space(True, atlas, chart, none, none)

@@ -129,7 +129,9 @@ def live(
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     speed = inf if speed is None else speed
-    asked = Asked(settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq))
+    asked = ServiceOptions(
+        settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq)
+    )
     raise typer.Exit(run_live(file, asked))
 
 
@@ -174,7 +176,9 @@ def serve(
     settings = _settings(wait, late, "two", deadline, part, "ndjson") | {"state": state, "record": record}
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
-    asked = Asked(settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False)
+    asked = ServiceOptions(
+        settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False
+    )
     raise typer.Exit(run_live(file, asked))
 
 
@@ -197,16 +201,16 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
     """Return how tracks are made, as arguments of `optloc.service.stream.Settings`."""
     if (model, name, noise, gap) == ("cv", "iekf", None, None):
         return {"track": track}
-    from optloc.cli import Wanted, dynamics_of, rules
+    from optloc.cli import TrackOptions, dynamics_of, rules
     from optloc.service.tracks import Following
     from optloc.tracking import Rules, filter_of
 
-    dynamics = dynamics_of(Wanted(model, noise=noise))
+    dynamics = dynamics_of(TrackOptions(model, noise=noise))
     return {"track": track, "following": Following(dynamics, filter_of(name), rules(Rules().gate, gap))}
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ServiceOptions:
     """What the options of the command say.
 
     Parameters
@@ -243,7 +247,7 @@ class Asked:
     stdout: bool = True
 
 
-def run_live(file: Path, asked: Asked) -> int:
+def run_live(file: Path, asked: ServiceOptions) -> int:
     """Run a stream until its source ends or a signal comes, and return the exit code."""
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
@@ -277,7 +281,7 @@ def run_live(file: Path, asked: Asked) -> int:
     return code
 
 
-def _open(asked: Asked, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
+def _open(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
     """Open the sources that are none of files, and return what is said of them."""
     from optloc.service import serve as requests
     from optloc.service.sources import mqtt, zeromq
@@ -297,7 +301,7 @@ def _open(asked: Asked, stream: Stream, adapter: Adapter | None, stops: ExitStac
     return said
 
 
-def _read(asked: Asked, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
+def _read(asked: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
     """Read a recording or standard input in a thread of its own, if that is wanted."""
     from optloc.service.recording import replay
     from optloc.service.stream import read_lines

@@ -16,7 +16,7 @@ from optloc.problem import Array, InvalidProblem, Status
 from optloc.service.answers import Record, fix_records, proof_records, unproven, unsolved
 from optloc.service.events import Event
 from optloc.service.metrics import Metrics
-from optloc.service.site import Ready, Row, Site
+from optloc.service.site import Ready, Site, SiteRow
 from optloc.service.tracks import Following, Scan, Tracks
 
 LOG = logging.getLogger("optloc.service")
@@ -34,7 +34,7 @@ Emit = Callable[[Event, Record, bool], None]
 """Takes an event, what is answered, and whether that is its last answer."""
 
 
-class Group(NamedTuple):
+class EventGroup(NamedTuple):
     """Events of a batch that have the same rows: one prepared problem, and their measurements (n, m)."""
 
     ready: Ready
@@ -184,11 +184,11 @@ class Engine:
 
     # Batches.
 
-    def _groups(self, events: Iterable[Event]) -> list[Group]:
+    def _groups(self, events: Iterable[Event]) -> list[EventGroup]:
         """Return events by their rows; those whose rows make no problem are answered at once."""
-        found: dict[tuple[tuple[int, ...], tuple[Row, ...]], list[Event]] = {}
+        found: dict[tuple[tuple[int, ...], tuple[SiteRow, ...]], list[Event]] = {}
         everything = tuple(range(len(self.site.rows)))
-        names: dict[tuple[Any, ...], tuple[Row, ...]] = {everything: self.site.rows}
+        names: dict[tuple[Any, ...], tuple[SiteRow, ...]] = {everything: self.site.rows}
         for event in events:
             keys = tuple(event.rows)
             if event.sigmas or keys not in names:
@@ -202,7 +202,7 @@ class Engine:
             found.setdefault((tuple(sorted(event.times)), rows), []).append(event)
         return [group for key, some in found.items() for group in self._group(key, some)]
 
-    def _group(self, key: tuple[tuple[int, ...], tuple[Row, ...]], events: list[Event]) -> list[Group]:
+    def _group(self, key: tuple[tuple[int, ...], tuple[SiteRow, ...]], events: list[Event]) -> list[EventGroup]:
         heard, rows = key
         now = self._clock()
         self._metrics.hear((self.site.stations[i] for i in heard), now)
@@ -220,16 +220,16 @@ class Engine:
         # differences of integers: a float of seconds since 1970 would resolve no more than 70 m
         arrivals = np.array([_since_first(event, heard) for event in events], dtype=float).reshape(len(events), -1)
         values = np.array([list(event.rows.values()) for event in events], dtype=float).reshape(len(events), -1)
-        return [Group(ready, events, ready.si(arrivals, values))]
+        return [EventGroup(ready, events, ready.si(arrivals, values))]
 
-    def _fixed(self, group: Group, phase: str | None) -> list[Record]:
+    def _fixed(self, group: EventGroup, phase: str | None) -> list[Record]:
         """Return the answers of the first phase."""
         try:
             return fix_records(group.ready.fast(group.z), group.events, phase)
         except Exception as error:  # noqa: BLE001  # a stream goes on, whatever one event brings to light
             return self._failed(group, error)
 
-    def _failed(self, group: Group, error: Exception) -> list[Record]:
+    def _failed(self, group: EventGroup, error: Exception) -> list[Record]:
         if not isinstance(error, InvalidProblem):
             LOG.error("events from %s on failed", group.events[0].name, exc_info=error)
         why = str(error) if isinstance(error, InvalidProblem) else f"{type(error).__name__}: {error}"
@@ -282,7 +282,7 @@ class Engine:
             for group in _grouped([item for item in taken if not item.done]):
                 self._conclude(group, {item.event.name: item for item in taken})
 
-    def _conclude(self, group: Group, items: dict[str, Pending]) -> None:
+    def _conclude(self, group: EventGroup, items: dict[str, Pending]) -> None:
         """Prove the fixes of some events, and answer those that are still waited for."""
         whose = [items[event.name] for event in group.events]
         try:
@@ -303,7 +303,7 @@ class Engine:
             self._answer(event, record, last=True)
 
 
-def _order(key: int | Row) -> tuple[int, tuple[str, ...]]:
+def _order(key: int | SiteRow) -> tuple[int, tuple[str, ...]]:
     """Return the place of a row among those of an event: as in the template, what is not listed behind."""
     return (key, ()) if isinstance(key, int) else (1 << 30, key[2:5])
 
@@ -314,16 +314,16 @@ def _since_first(event: Event, heard: Sequence[int]) -> list[int]:
     return [times[i] - first for i in heard]
 
 
-def _pairs(group: Group) -> list[tuple[Event, Array]]:
+def _pairs(group: EventGroup) -> list[tuple[Event, Array]]:
     return list(zip(group.events, group.z, strict=True))
 
 
-def _grouped(items: Sequence[Pending]) -> list[Group]:
+def _grouped(items: Sequence[Pending]) -> list[EventGroup]:
     """Return proofs by their problems."""
     found: dict[int, list[Pending]] = {}
     for item in items:
         found.setdefault(id(item.ready), []).append(item)
     return [
-        Group(some[0].ready, [item.event for item in some], np.stack([item.z for item in some]))
+        EventGroup(some[0].ready, [item.event for item in some], np.stack([item.z for item in some]))
         for some in found.values()
     ]

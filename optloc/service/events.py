@@ -13,7 +13,7 @@ from zlib import crc32
 from optloc.files import has_controls
 from optloc.problem import LARGEST, InvalidProblem, nearest
 from optloc.service.metrics import Metrics
-from optloc.service.site import Row, Site, UnknownName
+from optloc.service.site import Site, SiteRow, UnknownName
 
 # One line.
 
@@ -34,7 +34,7 @@ _DECIMAL = re.compile(r"([+-]?)(\d{1,25})(?:\.(\d{1,40}))?")
 # Picoseconds of thirty thousand years: no clock of any epoch shows more.
 _LATEST = 10**24
 
-Key = int | Row
+Key = int | SiteRow
 """A row of an event: its number in the template, or what the template does not list."""
 
 

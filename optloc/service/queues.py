@@ -58,7 +58,7 @@ class Ticket:
         self._done(list(self._records.values()))
 
 
-class Line(NamedTuple):
+class QueuedLine(NamedTuple):
     """A line as it was read.
 
     Parameters
@@ -98,13 +98,13 @@ class Inbox:
     """
 
     def __init__(self, most: int = WAITING) -> None:
-        self._most, self._lines, self._changed = most, deque[Line](), Condition()
+        self._most, self._lines, self._changed = most, deque[QueuedLine](), Condition()
         self.closed = self._woken = False
 
     def __len__(self) -> int:
         return len(self._lines)
 
-    def put(self, lines: Sequence[Line]) -> None:
+    def put(self, lines: Sequence[QueuedLine]) -> None:
         """Take lines; the caller waits while there are too many. None are taken any more once the stream ends."""
         with self._changed:
             for first in range(0, len(lines), BATCH):
@@ -114,7 +114,7 @@ class Inbox:
                 self._lines.extend(lines[first : first + BATCH])
                 self._changed.notify_all()
 
-    def offer(self, lines: Sequence[Line]) -> bool:
+    def offer(self, lines: Sequence[QueuedLine]) -> bool:
         """Take lines if there is room for all of them, and return whether there was."""
         with self._changed:
             if self.closed or len(self._lines) + len(lines) > self._most:
@@ -123,7 +123,7 @@ class Inbox:
             self._changed.notify_all()
             return True
 
-    def push(self, line: Line) -> int:
+    def push(self, line: QueuedLine) -> int:
         """Take a line in any case, and return how many of the oldest were dropped for it."""
         with self._changed:
             dropped = 0
@@ -134,7 +134,7 @@ class Inbox:
             self._changed.notify_all()
             return dropped
 
-    def take(self, most: int, seconds: float) -> list[Line] | None:
+    def take(self, most: int, seconds: float) -> list[QueuedLine] | None:
         """Return the next lines, none where none comes within some seconds; None where none will come."""
         with self._changed:
             self._changed.wait_for(lambda: self._lines or self.closed or self._woken, max(seconds, 0.0))

@@ -12,7 +12,7 @@ import numpy as np
 
 from optloc.files import Draft, draft, read_bytes
 from optloc.models import MODELS
-from optloc.service.queues import Line
+from optloc.service.queues import QueuedLine
 from optloc.service.stream import Stream
 
 # Lines that are handed on at once where nobody waits for the clock.
@@ -98,7 +98,7 @@ def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: 
         What complaints call them.
     """
     began, first, when, never = stream.clock(), np.nan, 0.0, Event()
-    waiting: list[Line] = []
+    waiting: list[QueuedLine] = []
     for number, (received, data) in enumerate(recording, 1):
         first = received if np.isnan(first) else first
         left = 0.0 if np.isnan(received) else (received - first) / speed - (stream.clock() - began)
@@ -111,6 +111,6 @@ def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: 
         if stream.inbox.closed:
             return
         when = when if np.isnan(received) else received
-        waiting.append(Line(data, number, source, stream.clock(), when))
+        waiting.append(QueuedLine(data, number, source, stream.clock(), when))
     stream.inbox.put(waiting)
     stream.close()

@@ -55,7 +55,7 @@ class UnknownName(InvalidProblem):
     whole: bool = True
 
 
-class Row(NamedTuple):
+class SiteRow(NamedTuple):
     """A row as an event names it.
 
     Parameters
@@ -154,7 +154,7 @@ class Site:
         Rows of each ``[[measurements]]``.
     places : mapping of str to Table
         Of known targets.
-    rows : tuple of Row
+    rows : tuple of SiteRow
         The template of an event, in the order of the file.
     stations : tuple of str
         Names of the stations.
@@ -182,7 +182,7 @@ class Site:
     station_table: Table
     tables: tuple[Table, ...]
     places: dict[str | None, Table]
-    rows: tuple[Row, ...]
+    rows: tuple[SiteRow, ...]
     stations: tuple[str, ...]
     position: Array
     frame: Frame
@@ -193,7 +193,7 @@ class Site:
     index: dict[tuple[str, str, str], int]
     number: dict[str, int]
 
-    def find(self, kind: str, a: str, b: str) -> int | Row:
+    def find(self, kind: str, a: str, b: str) -> int | SiteRow:
         """Return the row that an event names by kind and stations: its number in the template, or what is not listed.
 
         Raises
@@ -219,24 +219,24 @@ class Site:
                 raise UnknownName(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
         if a == b and count > 1:
             raise InvalidProblem(f"{kind} names station {a!r} twice", "b", "name two stations")
-        return Row(alike[0].section, -1, kind, a, b)
+        return SiteRow(alike[0].section, -1, kind, a, b)
 
-    def row(self, key: int | Row) -> Row:
+    def row(self, key: int | SiteRow) -> SiteRow:
         """Return a row by what an event calls it."""
         return self.rows[key] if isinstance(key, int) else key
 
-    def name_of(self, key: int | Row) -> str:
+    def name_of(self, key: int | SiteRow) -> str:
         """Return what people call a row."""
         return self.row(key).name
 
-    def ready(self, heard: tuple[int, ...], rows: tuple[Row, ...]) -> Ready | None:
+    def ready(self, heard: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
         """Return the problem of some arrivals and rows, prepared; None where they make no row.
 
         Parameters
         ----------
         heard : tuple of int
             Stations that have an arrival, ascending.
-        rows : tuple of Row
+        rows : tuple of SiteRow
             Rows that come as values.
 
         Raises
@@ -246,7 +246,7 @@ class Site:
         """
         return _READY.find((self, heard, rows), lambda: self._prepare(heard, rows))
 
-    def between(self, heard: tuple[int, ...]) -> tuple[Row, ...]:
+    def between(self, heard: tuple[int, ...]) -> tuple[SiteRow, ...]:
         """Return the rows that arrivals at some stations make.
 
         Those of the template whose stations are there; where they do not link all of them, a difference to the first
@@ -259,17 +259,17 @@ class Site:
         section, kind = self.rows[self.arriving[0]].section, self.rows[self.arriving[0]].kind
         if kind == "toa":
             listed = {row.a for row in kept}
-            return (*kept, *(Row(section, -1, kind, name) for name in names if name not in listed))
+            return (*kept, *(SiteRow(section, -1, kind, name) for name in names if name not in listed))
         group = {name: name for name in names}
         for row in kept:
             group = {name: group[row.b] if g == group[row.a] else g for name, g in group.items()}
         for name in names[1:]:
             if group[name] != group[names[0]]:
-                kept.append(Row(section, -1, kind, name, names[0]))
+                kept.append(SiteRow(section, -1, kind, name, names[0]))
                 group = {other: group[names[0]] if g == group[name] else g for other, g in group.items()}
         return tuple(kept)
 
-    def _prepare(self, heard: tuple[int, ...], rows: tuple[Row, ...]) -> Ready | None:
+    def _prepare(self, heard: tuple[int, ...], rows: tuple[SiteRow, ...]) -> Ready | None:
         timed = self.between(heard)
         if not (timed or rows):
             return None
@@ -291,7 +291,7 @@ class Site:
         full = fast if self.method == FAST else prepare(bare, self.method)
         return Ready(fast, full, problem.count, row, first, second, tuple(stated), self.speed * 1e-12)
 
-    def _draft(self, rows: tuple[Row, ...]) -> tuple[Draft, list[list[int]]]:
+    def _draft(self, rows: tuple[SiteRow, ...]) -> tuple[Draft, list[list[int]]]:
         """Return the problem of some rows, and which of them each row of its tables is, -1 for none."""
         sections, tables, order = [], [], []
         for i, (section, table) in enumerate(zip(self.file.measurements, self.tables, strict=True)):
@@ -315,7 +315,7 @@ class Site:
         return draft, order
 
 
-def _table(table: Table, kinds: bool, rows: Sequence[Row], present: Sequence[bool]) -> Table:
+def _table(table: Table, kinds: bool, rows: Sequence[SiteRow], present: Sequence[bool]) -> Table:
     """Return the rows of an event as a table like that of the site."""
     columns: dict[str, Array] = {}
     if kinds:
@@ -334,7 +334,7 @@ def _table(table: Table, kinds: bool, rows: Sequence[Row], present: Sequence[boo
     return Table(table.source, columns, len(rows))
 
 
-def _own(given: Array | None, key: str, row: Row, source: str) -> float:
+def _own(given: Array | None, key: str, row: SiteRow, source: str) -> float:
     """Return the standard deviation, weight or correction of a row."""
     if key == "sigma" and row.sigma is not None:
         return row.sigma
@@ -401,9 +401,9 @@ def _check(draft: Draft, source: str) -> None:
             raise InvalidProblem("a stream takes no decibels of ratios", where, "send ratios, in the unit '1'")
 
 
-def _template(draft: Draft, source: str) -> tuple[Row, ...]:
+def _template(draft: Draft, source: str) -> tuple[SiteRow, ...]:
     """Return what different rows there are, in the order of the file."""
-    found: dict[tuple[int, str, str, str], Row] = {}
+    found: dict[tuple[int, str, str, str], SiteRow] = {}
     for i, (section, table) in enumerate(zip(draft.file.measurements, draft.tables, strict=True)):
         kinds = [section.kind] * table.count if section.kind is not None else table.labels("kind").tolist()
         ends = [
@@ -416,5 +416,5 @@ def _template(draft: Draft, source: str) -> tuple[Row, ...]:
             if key in found and draft.loaded.problem.epochs == 1:
                 what = f"{found[key].name} stands twice"
                 raise InvalidProblem(what, join(source, f"[[measurements]] {i + 1}"), "a stream tells rows by these")
-            found.setdefault(key, Row(i, at, *key[1:]))
+            found.setdefault(key, SiteRow(i, at, *key[1:]))
     return tuple(found.values())

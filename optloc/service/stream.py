@@ -13,7 +13,7 @@ from time import monotonic
 import numpy as np
 
 from optloc.engine import enabled, simulate
-from optloc.files import Growing, access, write_text
+from optloc.files import GrowingFile, access, write_text
 from optloc.problem import InvalidProblem
 from optloc.service import events as of_events
 from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
@@ -21,7 +21,7 @@ from optloc.service.checkpoint import restore, state_of
 from optloc.service.engine import BATCH, Engine
 from optloc.service.events import LINE, Events, parse
 from optloc.service.metrics import Metrics
-from optloc.service.queues import Inbox, Line, Outbox, Ticket
+from optloc.service.queues import Inbox, Outbox, QueuedLine, Ticket
 from optloc.service.site import Site, UnknownName, read_site
 from optloc.service.tracks import Following, Tracks
 
@@ -135,7 +135,7 @@ class Stream:
         # first of all files: a checkpoint that is refused leaves no other one behind
         if settings.state is not None and settings.state.exists():
             restore(settings.state, self._events, self._time())
-        self._record = None if settings.record is None else Growing(settings.record)
+        self._record = None if settings.record is None else GrowingFile(settings.record)
         self._recorded = bytearray()
         self._reload = False
         self._next_state, self._next_health = clock() + settings.every, clock() + settings.health
@@ -172,10 +172,10 @@ class Stream:
         ticket: Ticket | None = None,
         *,
         track: bool | None = None,
-    ) -> list[Line]:
-        """Return what was read just now as lines, numbered from `first`; `track` as of `Line`."""
+    ) -> list[QueuedLine]:
+        """Return what was read just now as lines, numbered from `first`; `track` as of `QueuedLine`."""
         now, when = self.clock(), self._time()
-        return [Line(each, first + i, source, now, when, ticket, track) for i, each in enumerate(data)]
+        return [QueuedLine(each, first + i, source, now, when, ticket, track) for i, each in enumerate(data)]
 
     @property
     def tracks(self) -> Tracks:
@@ -270,7 +270,7 @@ class Stream:
         self._checkpoint()
         self._write_record(last=True)
 
-    def _read(self, line: Line) -> None:
+    def _read(self, line: QueuedLine) -> None:
         counts, ticket = self.metrics.counts, line.ticket
         data = line.data.strip()
         refused = None

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from optloc.show.formats.marks import Mark as Mark, Other as Other, mark_of as mark_of
     from optloc.show.map import Canvas as Canvas
     from optloc.show.page import (
-        Part as Part,
+        PagePart as PagePart,
         fix_page as fix_page,
         live_page as live_page,
         map_element as map_element,

@@ -77,7 +77,7 @@ def with_sigma(value: float, sigma: float, unit: str) -> str:
 # In words: one sheet of a fix, and those of its biases, of what was left out and of its alternatives.
 
 
-class Sheet(NamedTuple):
+class FixSheet(NamedTuple):
     """A table of text: a title, the names of its columns (empty for rows of a label and what it says), its rows."""
 
     title: str
@@ -85,7 +85,7 @@ class Sheet(NamedTuple):
     rows: Sequence[tuple[str, ...]]
 
 
-def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Sheet:
+def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> FixSheet:
     """Return what a single fix says of itself, a label and a text in each row; the first row is its status.
 
     Parameters
@@ -124,7 +124,7 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> Shee
     if hasattr(fix.certificate, "proof"):
         told.append(("certificate", f"{fix.certificate.proof}: {fix.certificate.reason}"))
     told.append(("stages", " → ".join(stage.name for stage in fix.stages) or "none"))
-    return Sheet(title, (), told)
+    return FixSheet(title, (), told)
 
 
 def _held(active: Active) -> str:
@@ -206,7 +206,7 @@ def _extents(fix: Fix) -> list[tuple[str, str]]:
     if fix.chart.kind == CARTESIAN:
         return _coordinates(fix) if fix.chart.cut_off else []
     if fix.chart.kind != INVERSE_RANGE:
-        return [("95 % region", "curved: the numbers behind ± do not cover; optloc.likelihood_region does")]
+        return [("95 % region", "curved: the numbers behind ± do not cover; optloc.uncertainty.likelihood_region does")]
     low, high = (float(end) for end in fix.interval("range"))
     far = f"to {high:.4g} m" if np.isfinite(high) else "or more, to infinity"
     told = [("95 % range", f"{low:.4g} m {far}, from the middle of the stations")]
@@ -235,7 +235,7 @@ def _chi_square(fix: Fix) -> str:
 
 def bias_sheet(
     fix: Fix, seen: Observability | None = None, unit_of: Callable[[str, str], tuple[str, float]] | None = None
-) -> Sheet | None:
+) -> FixSheet | None:
     """Return the biases of a single fix as a sheet; None where there is none.
 
     Parameters
@@ -262,10 +262,10 @@ def bias_sheet(
             rows.append((row["name"], "true", with_sigma(*speed, "m/s").strip(), ""))
     if len(records) > _BIASES:
         rows.append(("...", f"{len(records) - _BIASES} more", "--json prints all", ""))
-    return Sheet("Biases", ("name", "member", "estimate", "from data"), rows)
+    return FixSheet("Biases", ("name", "member", "estimate", "from data"), rows)
 
 
-def suspect_sheet(fix: Fix) -> Sheet | None:
+def suspect_sheet(fix: Fix) -> FixSheet | None:
     """Return what explains the data of a single fix that contradict each other; None where they agree."""
     found = explanations_of(fix)
     if not found:
@@ -280,7 +280,7 @@ def suspect_sheet(fix: Fix) -> Sheet | None:
             rows.append(("", f"and {len(explanation.suspects) - _SUSPECTS} more", "", "", ""))
     if len(found) > _EXPLANATIONS:
         rows.append(("", f"and {len(found) - _EXPLANATIONS} more explanations", "", "", ""))
-    return Sheet(title, ("#", "suspect", "error", "p with", "p without"), rows)
+    return FixSheet(title, ("#", "suspect", "error", "p with", "p without"), rows)
 
 
 def _error(suspect: Suspect) -> str:
@@ -294,7 +294,7 @@ def as_p(value: float) -> str:
     return "-" if np.isnan(value) else f"{value:.2g}"
 
 
-def alternative_sheet(fix: Fix) -> Sheet | None:
+def alternative_sheet(fix: Fix) -> FixSheet | None:
     """Return the other positions that the data of a single fix allow; None where there is none."""
     found = np.isfinite(fix.alternatives.gap)
     if not found.any():
@@ -305,10 +305,10 @@ def alternative_sheet(fix: Fix) -> Sheet | None:
         # Two positions of a pair of targets at the most.
         point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
         rows.append((str(i + 1), point, f"{gap:.4g}" if gap >= _NO_GAP else "0", f"{doubt:.2g}"))
-    return Sheet("Alternatives", ("#", "position, m", "cost gap", "probability"), rows)
+    return FixSheet("Alternatives", ("#", "position, m", "cost gap", "probability"), rows)
 
 
-def count_sheet(columns: Columns, title: str) -> Sheet:
+def count_sheet(columns: Columns, title: str) -> FixSheet:
     """Return how many fixes have which status, and how good these are."""
     # One number for the error of a position: the root of the trace of its covariance.
     sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
@@ -321,7 +321,7 @@ def count_sheet(columns: Columns, title: str) -> Sheet:
     head = ("status", "fixes", "median sigma, m", "95 % of sigmas, m", "median p")
     alone = int(np.asarray(columns["unchecked"], dtype=bool).sum())
     more = f", {alone if alone < len(columns['status']) else 'all'} with {UNCHECKED}" if alone else ""
-    return Sheet(f"{title}{len(columns['status'])} fixes{more}", head, rows)
+    return FixSheet(f"{title}{len(columns['status'])} fixes{more}", head, rows)
 
 
 def _quantile(values: Array, share: float) -> str:
@@ -332,10 +332,10 @@ def _quantile(values: Array, share: float) -> str:
 # A fix by itself, as its methods answer.
 
 
-def sheets_of(fix: Fix) -> list[Sheet]:
+def sheets_of(fix: Fix) -> list[FixSheet]:
     """Return all that a fix says; of a batch how many have which status."""
     if fix.shape:
-        return [count_sheet(fix_columns(fix), "")] if fix.code.size else [Sheet("0 fixes", (), [])]
+        return [count_sheet(fix_columns(fix), "")] if fix.code.size else [FixSheet("0 fixes", (), [])]
     found = (fix_sheet(fix), bias_sheet(fix), suspect_sheet(fix), alternative_sheet(fix))
     return [sheet for sheet in found if sheet is not None]
 
@@ -345,7 +345,7 @@ def text_of(fix: Fix) -> str:
     return "\n".join(line for sheet in sheets_of(fix) for line in _lines(sheet))
 
 
-def _lines(sheet: Sheet) -> Iterable[str]:
+def _lines(sheet: FixSheet) -> Iterable[str]:
     """Yield the lines of a sheet: columns that are as wide as their longest cell, the last one wrapped."""
     rows = [[visible(cell) for cell in row] for row in [*([sheet.head] if sheet.head else []), *sheet.rows]]
     if sheet.title:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class PagePart:
     """A section of a page; what is empty is left out, the rest stands in this order.
 
     Parameters
@@ -96,7 +96,7 @@ class Part:
 
 def write_page(
     title: str,
-    parts: Sequence[Part],
+    parts: Sequence[PagePart],
     *,
     opening: Sequence[str] = (),
     facts: str = "",
@@ -109,7 +109,7 @@ def write_page(
     ----------
     title : str
         Of the page.
-    parts : sequence of Part
+    parts : sequence of PagePart
         Its sections; where there are several, links to them stand at the top.
     opening : sequence of str
         Paragraphs above them.
@@ -221,7 +221,7 @@ def live_page(problem: Problem, title: str) -> str:
     text = "Stations (white) and the latest fixes (blue; orange where the status is not ok). Point at a mark."
     canvas = map_canvas(plane, "map-1", title, layers, {}, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
-    return write_page(title, [Part("map", "Map", maps=[canvas], note=note)], live=True)
+    return write_page(title, [PagePart("map", "Map", maps=[canvas], note=note)], live=True)
 
 
 def map_page(found: BoundMap, title: str) -> str:
@@ -234,7 +234,7 @@ def map_page(found: BoundMap, title: str) -> str:
     """
     _on_earth(found.geodetic)
     text = "Root of the trace of the Cramer-Rao bound of the position, in metres. Shores: Natural Earth."
-    part = Part("map", "Bound of the position error", text, maps=[map_element(found, "map-1", title)])
+    part = PagePart("map", "Bound of the position error", text, maps=[map_element(found, "map-1", title)])
     return write_page(title, [part])
 
 
@@ -270,7 +270,7 @@ def _page(
         text = text.replace("holds 95 %.", "holds 95 % (dotted: an ellipse that does not).")
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
-    return write_page(title, [Part("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])
+    return write_page(title, [PagePart("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])
 
 
 def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:

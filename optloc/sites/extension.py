@@ -19,8 +19,8 @@ from optloc.cli import (
     FailOne,
     Force,
     Json,
+    KernelPart,
     Outside,
-    Part,
     PlacementMap,
     PlaceOfInterest,
     ProblemPath,
@@ -61,9 +61,9 @@ def place(
 
     FILE is a selection file (choice, candidates, targets), or a problem file, whose stations are the candidates.
     """
-    from optloc.sites.commands.place import Wanted, run_place
+    from optloc.sites.commands.place import PlaceOptions, run_place
 
-    wanted = Wanted(choose, budget_, criterion, worst, fail_one, gap, time, at, rows, draws)
+    wanted = PlaceOptions(choose, budget_, criterion, worst, fail_one, gap, time, at, rows, draws)
     raise typer.Exit(run_place(file, wanted, plot=plot, out=out, as_json=as_json, quiet=quiet))
 
 
@@ -72,12 +72,12 @@ def _commands(app: typer.Typer) -> None:
     app.command(rich_help_panel=ANSWERS, epilog=example(*NETWORKS))(calibrate)
 
 
-def _kernels() -> Mapping[str, Part]:
+def _kernels() -> Mapping[str, KernelPart]:
     entries = (
         *(f"optloc.sites.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
         "optloc.sites.placement.completions.exhaust",
     )
-    return {"placements": Part("placements of stations", "optloc.sites.placement", (_place,), entries)}
+    return {"placements": KernelPart("placements of stations", "optloc.sites.placement", (_place,), entries)}
 
 
 def _place() -> None:

@@ -82,7 +82,7 @@ def _is_near(problem: Problem, pool: Pool) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _FoundSides:
     """Minima of N problems over the place in the plane and q, the cheapest first.
 
     Parameters
@@ -99,12 +99,12 @@ class _Found:
     cost: Array
     on_plane: Array
 
-    def take(self, items: Array) -> _Found:
+    def take(self, items: Array) -> _FoundSides:
         """Return some entries."""
-        return _Found(self.x[items], self.cost[items], self.on_plane[items])
+        return _FoundSides(self.x[items], self.cost[items], self.on_plane[items])
 
 
-def _minima(across: Across, pool: Pool) -> _Found:
+def _minima(across: Across, pool: Pool) -> _FoundSides:
     """Return the minima that steps in q reach from all candidates of a pool."""
     item, slot = pool.occupied
     each, shape = across.take(item), pool.x.shape[:2]
@@ -120,7 +120,7 @@ def _minima(across: Across, pool: Pool) -> _Found:
     x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
     keep = _distinct(across, x, cost)
     x, cost = np.where(keep[..., None], x, np.nan), np.where(keep, cost, np.inf)
-    return _Found(x, cost, on_plane)
+    return _FoundSides(x, cost, on_plane)
 
 
 def _distinct(across: Across, x: Array, cost: Array) -> Array:
@@ -142,7 +142,7 @@ def _distinct(across: Across, x: Array, cost: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Sides:
-    """Minima on both sides of the plane: two slots for each of `_Found`, the likelier side first.
+    """Minima on both sides of the plane: two slots for each of `_FoundSides`, the likelier side first.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ class _Sides:
         return _Sides(self.x[items], self.cost[items], self.on_plane[items])
 
 
-def _sides(problem: Problem, across: Across, found: _Found) -> _Sides:
+def _sides(problem: Problem, across: Across, found: _FoundSides) -> _Sides:
     """Return the minima that constraints admit, in space."""
     count, slots, size = found.x.shape
     x, cost = np.full((count, 2 * slots, size), np.nan), np.full((count, 2 * slots), np.inf)
@@ -186,13 +186,13 @@ def _sides(problem: Problem, across: Across, found: _Found) -> _Sides:
     return _Sides(x, cost, ~off[:, 0])
 
 
-def _is_joined(found: _Found, sides: _Sides) -> Array:
+def _is_joined(found: _FoundSides, sides: _Sides) -> Array:
     """Return a mask (N,): both sides of the plane are one region."""
     both = np.isfinite(sides.cost[:, :2]).all(1) | sides.on_plane
     return np.asarray(both & (found.on_plane - found.cost[:, 0] <= JOINED))
 
 
-def _as_pool(problem: Problem, across: Across, own: Pool, found: _Found, sides: _Sides) -> Pool:
+def _as_pool(problem: Problem, across: Across, own: Pool, found: _FoundSides, sides: _Sides) -> Pool:
     """Return minima on both sides of the plane as a settled pool, together with minima on constraints."""
     x, cost = sides.x, sides.cost
     joined = _is_joined(found, sides)
@@ -221,7 +221,7 @@ def _held(across: Across, own: Pool, least: Array) -> Array:
         return np.asarray((own.face > 0) & near & (w > across.least[:, None]))
 
 
-def _curvature(problem: Problem, across: Across, found: _Found, x: Array, joined: Array) -> Curvature:
+def _curvature(problem: Problem, across: Across, found: _FoundSides, x: Array, joined: Array) -> Curvature:
     """Return the curvature at minima x (N, size): of a joined region with the second moment of both sides about it."""
     with np.errstate(all="ignore"):
         at = measure_curvature(problem, equations_at(problem, x), x, np.zeros(len(x), dtype=int))

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from optloc.base.registry import Table
+from optloc.base.registry import Registry
 from optloc.base.types import Array
 from optloc.linear.mirror import one_position
 from optloc.problem.fix import Fix
@@ -271,6 +271,8 @@ _PROGRAMS: dict[str, Formulation] = {
     ),
 }
 
-FORMULATIONS: Table[Formulation] = Table("optloc.formulations", lambda value: isinstance(value, Formulation), _PROGRAMS)
+FORMULATIONS: Registry[Formulation] = Registry(
+    "optloc.formulations", lambda value: isinstance(value, Formulation), _PROGRAMS
+)
 """Formulations by name: add one with one file and one entry, or from another package with an entry point of
 ``optloc.formulations``."""

@@ -11,7 +11,7 @@ import numpy as np
 from formulations.backend import Choice, Ending, Kind, counting, recording, using
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.records import take
-from optloc.base.registry import Table
+from optloc.base.registry import Registry
 from optloc.base.types import Array, Certificate, Status
 from optloc.engine.plan import plan_of
 from optloc.problem.claims import GLOBAL, REGION, Claims, claim
@@ -39,17 +39,17 @@ __all__ = [
     "METHODS",
     "SOLVERS",
     "Choice",
-    "Entry",
     "Formulation",
     "Kind",
     "Method",
+    "SolverEntry",
     "counting",
     "using",
 ]
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class SolverEntry:
     """A solver stage.
 
     Parameters
@@ -119,15 +119,15 @@ def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
     return claim(Certificate(proof, text, f"{name.removesuffix('s')} relaxation", bound, cost - bound))
 
 
-def _start(stage: Solver, summary: str, *, batched: bool = False) -> Entry:
-    return Entry(None, summary, "start", stage, batched)
+def _start(stage: Solver, summary: str, *, batched: bool = False) -> SolverEntry:
+    return SolverEntry(None, summary, "start", stage, batched)
 
 
-def _refinement(stage: Solver, summary: str, *, batched: bool = False) -> Entry:
-    return Entry(None, summary, "refinement", stage, batched)
+def _refinement(stage: Solver, summary: str, *, batched: bool = False) -> SolverEntry:
+    return SolverEntry(None, summary, "refinement", stage, batched)
 
 
-_STAGES: dict[str, Entry] = {
+_STAGES: dict[str, SolverEntry] = {
     "gtrs": _start(stages.gtrs, "minimiser of the weighted squared-range problem: the cheapest start", batched=True),
     "roots": _start(stages.roots, "every stationary point of the squared-range problem", batched=True),
     "sdp": _start(stages.start_with("sdp"), "Shor's semidefinite relaxation of the squared-range problem (Clarabel)"),
@@ -162,15 +162,15 @@ _STAGES: dict[str, Entry] = {
 }
 
 
-class _Derived(dict[str, Entry]):
+class _Derived(dict[str, SolverEntry]):
     """Stages of what other tables hold, also of losses that are made of what their name says."""
 
-    def __missing__(self, name: str) -> Entry:
+    def __missing__(self, name: str) -> SolverEntry:
         loss = LOSSES[name]
         return _start(Robust(loss, states=True), loss.summary)
 
 
-def _derive() -> Mapping[str, Entry]:
+def _derive() -> Mapping[str, SolverEntry]:
     """Return the stages that follow from other tables: of each loss, and of each start of a formulation."""
     out = _Derived({name: _start(Robust(loss, states=True), loss.summary) for name, loss in LOSSES.items()})
     for formulation in FORMULATIONS.values():
@@ -179,7 +179,9 @@ def _derive() -> Mapping[str, Entry]:
     return out
 
 
-SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, Entry), _STAGES, _derive)
+SOLVERS: Registry[SolverEntry] = Registry(
+    "optloc.solvers", lambda value: isinstance(value, SolverEntry), _STAGES, _derive
+)
 
 # Beginnings of methods for which there is a stage that does the same in one.
 SHORTCUTS: Mapping[tuple[str, ...], Quick] = {("gtrs", "lsr"): Quick()}
@@ -233,7 +235,7 @@ class Method:
             method = method.then
 
     @property
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[SolverEntry]:
         """Return what its words name, those of all branches."""
         return [SOLVERS[word] for branch in self.branches for word in branch.words]
 

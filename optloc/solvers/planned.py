@@ -14,7 +14,7 @@ from optloc.base.records import take
 from optloc.base.types import Array, Motion, Status
 from optloc.engine.memory import COST_OF_FIX, COST_OF_RIVAL, KAPPA, Answer
 from optloc.engine.plan import LIMIT, TOLERANCE, Load, Plan, key_of, plan_of
-from optloc.kernels.damping import Rules
+from optloc.kernels.damping import StopRules
 from optloc.kernels.jit import enabled
 from optloc.kernels.pack import PackedRuns, fold, folding, pack_runs
 from optloc.kernels.sums import equations_at, serves
@@ -245,7 +245,7 @@ class RunPlan:
         packed, item = self.runs.packed, np.arange(count)
         observed = packed.numbers._replace(observed=np.require(z - self.correction, requirements=["C", "W"]))
         runs = self.runs._replace(packed=packed._replace(numbers=observed))
-        done, found = fixed_runs(runs, item, start, Rules(TOLERANCE, LIMIT), problem.dimension)
+        done, found = fixed_runs(runs, item, start, StopRules(TOLERANCE, LIMIT), problem.dimension)
         curvature = Curvature(found.covariance, found.information, found.regular, found.weakest, local=found.local)
         good = (done.status == Status.OK) & np.isfinite(done.cost) & found.regular & (found.weakest >= WEAK)
         plain = answer.settled.reshape(count, -1).all(1) & good

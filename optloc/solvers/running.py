@@ -153,7 +153,7 @@ def _step(problem: Problem, sums: Normal, at: Array) -> tuple[Array, Array, Arra
 
 
 @dataclass(frozen=True, slots=True)
-class Growing:
+class GrowingRun:
     """Estimates after the first epochs of a run.
 
     Parameters
@@ -183,7 +183,7 @@ class Growing:
         return self.x[:, part], np.sqrt(np.diagonal(self.cov, axis1=-2, axis2=-1)[:, part])
 
 
-def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = None) -> Growing:
+def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = None) -> GrowingRun:
     """Return the maximum-likelihood estimate after the first epochs of a run, refined from that of the whole run.
 
     Parameters
@@ -217,7 +217,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
         spread, ok = covariance(done.equations)
         if ok[0] and done.status[0] == Status.OK:
             x[i], cov[i] = done.x[0, :n], spread[0]
-    return Growing(chosen, problem.times[chosen - 1], x, cov, problem.layout)
+    return GrowingRun(chosen, problem.times[chosen - 1], x, cov, problem.layout)
 
 
 def _space_counts(epochs: int) -> Array:

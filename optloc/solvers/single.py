@@ -22,7 +22,7 @@ from optloc.base.errors import NUMERICAL
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band, Certificate, Status, first_status
 from optloc.engine.admission import levels_of
-from optloc.engine.memory import Answer, Found
+from optloc.engine.memory import Answer, EngineResult
 from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
 from optloc.kernels.jit import usable
@@ -35,7 +35,7 @@ from optloc.problem.claims import Claims, alike, claim
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_here
+from optloc.proof.batch import ProofRequest, ProofResult, empty_answer, lacks_code, prove_here
 from optloc.proof.near import OTHER, UNIQUE
 from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
 from optloc.proof.scope import is_run, is_scaled, unsupported
@@ -50,7 +50,7 @@ from optloc.solvers.certificates.branch_and_bound import (
     gaps_below,
     sentence,
 )
-from optloc.solvers.certificates.out_of_reach import Edges, Scratch, are_out_of_reach, edges_of, scratch
+from optloc.solvers.certificates.out_of_reach import Edges, ReachWorkspace, are_out_of_reach, edges_of, scratch
 from optloc.solvers.certificates.position_cost import agrees, surfaces_of
 from optloc.solvers.coplanar import APART
 from optloc.solvers.inequalities import Sight, sights
@@ -94,7 +94,7 @@ _ROOMS = 4
 
 
 @dataclass(slots=True)
-class _Room:
+class _SingleWorkspace:
     """What a thread writes into while it works on n problems, and what all their fixes share.
 
     Parameters
@@ -105,7 +105,7 @@ class _Room:
         Fields of `optloc.engine.memory.Answer`, without position and covariance.
     costs : PositionCosts
         With the whitened measurements; empty without a proof.
-    asked, answered : Asked, Answered
+    asked, answered : ProofRequest, ProofResult
         Of the proofs.
     centre : array (..., d)
         Of the charts.
@@ -115,7 +115,7 @@ class _Room:
         Constraints that hold fixes: none.
     alone : Alternatives
         Other minima: none.
-    beside : Scratch, optional
+    beside : ReachWorkspace, optional
         Of the proofs that bounds are out of reach.
     kept : dict
         Fields of a fix that are the same for all measurements; nobody can write into them.
@@ -126,13 +126,13 @@ class _Room:
     z: Array
     found: tuple[Array, ...]
     costs: PositionCosts
-    asked: Asked
-    answered: Answered
+    asked: ProofRequest
+    answered: ProofResult
     centre: Array
     claims: Claims
     nothing: Array
     alone: Alternatives
-    beside: Scratch | None
+    beside: ReachWorkspace | None
     kept: dict[str, Any]
     checked: bool = False
 
@@ -152,7 +152,7 @@ class Single:
     map : Affine, optional
         Of the costs of the proof; None for methods without one.
     planes, surface : array (1, e, 3), array (1, 0) or (1, SURFACE_WIDTH)
-        To which proofs are limited, see `optloc.proof.batch.Asked`.
+        To which proofs are limited, see `optloc.proof.batch.ProofRequest`.
     upward : int, optional
         Which of what holds fixes is the height whose gradient is the surface's upward axis.
     edges : Edges, optional
@@ -214,7 +214,7 @@ class Single:
             room.z[:, self.absent] = 0.0
         answer = Answer(np.empty((n, size)), np.empty((n, shared, shared)), *room.found)
         steps = kernel(*self.load[:2], room.z, self.load.place, TOLERANCE, LIMIT, False, answer)
-        found = [Found(*numbers) for numbers in answer.number.tolist()]
+        found = [EngineResult(*numbers) for numbers in answer.number.tolist()]
         for one in found:
             # on Earth the sight of satellites says which of two that cost the same is meant
             tied = self.plan.frame.geodetic and one.rival_cost - one.cost <= equal_cost(one.cost)
@@ -251,7 +251,7 @@ class Single:
         variance = (answer.covariance[:, :d, :d] @ normal) @ normal
         return not bool((w * w > APART * APART * variance).all())
 
-    def _proves(self, affine: Affine, answer: Answer, found: list[Found], room: _Room) -> bool:
+    def _proves(self, affine: Affine, answer: Answer, found: list[EngineResult], room: _SingleWorkspace) -> bool:
         """Return whether all there is to prove is proven of all positions; bounds and boxes are in the room."""
         asked, answered, d = room.asked, room.answered, self.load.place.shape[-1]
         asked.known.fill(0)
@@ -280,7 +280,7 @@ class Single:
                 return False
         return True
 
-    def _pass_hidden(self, room: _Room, x: Array, i: int) -> None:
+    def _pass_hidden(self, room: _SingleWorkspace, x: Array, i: int) -> None:
         """Prove a fix x (size,), number i, again without the minima behind the Earth that its proof meets."""
         one, d = slice(i, i + 1), room.asked.x.shape[-1]
         costs, asked, answered = room.costs.take(one), room.asked.take(one), room.answered.take(one)
@@ -298,7 +298,7 @@ class Single:
             prove_here(costs, asked, answered)
         answered.boxes[0] += boxes
 
-    def _is_inside(self, edges: Edges, answer: Answer, room: _Room) -> bool:
+    def _is_inside(self, edges: Edges, answer: Answer, room: _SingleWorkspace) -> bool:
         """Return whether nothing on a bound costs as little as what the proofs are about."""
         assert room.beside is not None
         if (answer.rival_cost < np.inf).any():  # what is low about a rival may reach elsewhere
@@ -308,7 +308,7 @@ class Single:
         numbers = (x, cov, answer.cost, answer.quantity, answer.normal)
         return are_out_of_reach(edges, room.beside, room.costs, *numbers)
 
-    def _agrees(self, fix: Fix, room: _Room) -> bool:
+    def _agrees(self, fix: Fix, room: _SingleWorkspace) -> bool:
         """Return whether the position costs are the problem's own, at the first fixes of a thread and beside them."""
         many = self.problem.with_rows(z=room.z.copy())
         return self.map is None or bool(agrees(many, fix.flat(), room.costs).all())
@@ -317,9 +317,9 @@ class Single:
         self,
         shape: tuple[int, ...],
         answer: Any,
-        found: list[Found],
+        found: list[EngineResult],
         stages: tuple[Stage, ...],
-        room: _Room,
+        room: _SingleWorkspace,
     ) -> Fix | None:
         """Return the fixes with their verdicts, or None where more stands against one than words without numbers."""
         marks, kinds, gaps = [], [], []
@@ -363,7 +363,7 @@ class Single:
             **room.kept,
         )
 
-    def _inflations(self, answer: Any, marks: list[int], room: _Room) -> dict[int, float]:
+    def _inflations(self, answer: Any, marks: list[int], room: _SingleWorkspace) -> dict[int, float]:
         """Return the inflations of curved fixes, by number, whose 95 % figures hold when measurements are repeated."""
         items = [i for i, mark in enumerate(marks) if mark == Status.CURVED.mark]
         if not items or not self.repeatable:
@@ -372,9 +372,9 @@ class Single:
         found = repeat(many, answer.x[items], answer.covariance[items])
         return {i: float(one[2]) for i, one, good in zip(items, found, holds(found), strict=True) if good}
 
-    def _room(self, shape: tuple[int, ...]) -> _Room:
+    def _room(self, shape: tuple[int, ...]) -> _SingleWorkspace:
         """Return the arrays of this thread for so many problems."""
-        rooms: dict[tuple[int, ...], _Room] | None = getattr(self.own, "rooms", None)
+        rooms: dict[tuple[int, ...], _SingleWorkspace] | None = getattr(self.own, "rooms", None)
         if rooms is None:
             rooms = self.own.rooms = {}
         if shape not in rooms:
@@ -383,14 +383,14 @@ class Single:
             rooms[shape] = self._make_room(shape)
         return rooms[shape]
 
-    def _make_room(self, shape: tuple[int, ...]) -> _Room:
+    def _make_room(self, shape: tuple[int, ...]) -> _SingleWorkspace:
         n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.load.place.shape[-1], self.problem.count
         found = tuple(blank_answer(n, *self.plan.widths))[2:]
         affine = self.map
         none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0)), np.empty((n, 0)), np.empty(n)
         costs = PositionCosts(*none) if affine is None else affine.room(n)
         nowhere = np.full((n, 2, d), np.nan)
-        asked = Asked(
+        asked = ProofRequest(
             x=np.empty((n, d)),
             others=np.zeros((n, 1 + HIDDEN, d)),  # another image, and what the Earth hides
             known=np.zeros(n, dtype=np.int64),
@@ -418,7 +418,7 @@ class Single:
         nothing = np.broadcast_to(_NOTHING, shape)
         z, answered = np.empty((n, m)), empty_answer(n, d)
         beside = None if affine is None or self.edges is None else scratch(affine, self.edges, n, d)
-        return _Room(z, found, costs, asked, answered, centre, claims, nothing, alone, beside, kept)
+        return _SingleWorkspace(z, found, costs, asked, answered, centre, claims, nothing, alone, beside, kept)
 
 
 def _reasons(listed: Array, shape: tuple[int, ...]) -> Array:
@@ -436,7 +436,7 @@ def _rivals(answer: Answer, shape: tuple[int, ...]) -> Alternatives:
     return Alternatives(x.reshape(*shape, 1, -1), gap.reshape(*shape, 1))
 
 
-class _Told(NamedTuple):
+class _SingleNotes(NamedTuple):
     """What is said of fixes (...): their statuses, reasons, marks and kinds of chart; nobody can write into them."""
 
     code: Array
@@ -448,7 +448,7 @@ class _Told(NamedTuple):
 @lru_cache(maxsize=256)  # few things are said of plain fixes
 def _told(
     marks: tuple[int, ...], kinds: tuple[int, ...], gaps: tuple[str, ...], shape: tuple[int, ...]
-) -> _Told | None:
+) -> _SingleNotes | None:
     code = [Status(int(one)) for one in first_status(np.array(marks))]
     curved = [kind if status == Status.CURVED else None for status, kind in zip(code, kinds, strict=True)]
     said = [
@@ -458,7 +458,7 @@ def _told(
     if None in said:
         return None
     told = zip((code, said, marks, kinds), (np.int8, object, np.int32, np.int8), strict=True)
-    out = _Told(*(np.array(values, dtype=kind).reshape(shape) for values, kind in told))
+    out = _SingleNotes(*(np.array(values, dtype=kind).reshape(shape) for values, kind in told))
     for array in out:
         array.setflags(write=False)
     return out

@@ -89,7 +89,7 @@ class RowWise:
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
+class _SparsePart:
     """Rows of one kind: coefficients of x, of |x|^2 and of others by their column, right side, error at a point."""
 
     x: Array
@@ -158,7 +158,7 @@ def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
 
 def _lift_ranges(
     problem: Problem, block: Rows, start: int, origin: Array, scale: Array, pairs: list[int], first: int
-) -> _Part | None:
+) -> _SparsePart | None:
     model, form = MODELS[block.kind], MODELS[block.kind].ranges
     if form is None:
         return None
@@ -186,7 +186,7 @@ def _lift_ranges(
         away = np.maximum(1.0, np.abs(m)) if point is None else np.sqrt(((point[:, None] - a) ** 2).sum(-1))
         return np.asarray(2.0 * np.maximum(np.where(np.isfinite(away), away, 1.0), _NEAR) * sigma)
 
-    return _Part(x, square, others, right + m**2, error)
+    return _SparsePart(x, square, others, right + m**2, error)
 
 
 def _centre(m: Array, block: Rows) -> Array:
@@ -200,7 +200,7 @@ def _centre(m: Array, block: Rows) -> Array:
     return out
 
 
-def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> _Part | None:
+def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> _SparsePart | None:
     lifted = lift_rows(problem, block, start, None, to)
     if lifted is None:
         return None
@@ -208,7 +208,7 @@ def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> 
     def error(point: Array | None) -> Array:
         return np.asarray(np.maximum(np.abs(lifted.factor(point)), _NEAR) * lifted.sigma)
 
-    return _Part(lifted.row[..., :-1], lifted.row[..., -1], (), lifted.right, error)
+    return _SparsePart(lifted.row[..., :-1], lifted.row[..., -1], (), lifted.right, error)
 
 
 # The programmes, and the test of what they accuse.

@@ -20,7 +20,7 @@ from optloc.model_checks.elements import (
 )
 from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.model_checks.overbound import tail_factors
-from optloc.model_checks.variance_components import Fitted, Tested, fit, tested, total, visible, without
+from optloc.model_checks.variance_components import Tested, VarianceFit, fit, tested, total, visible, without
 from optloc.problem.arrival_times import as_arrivals
 from optloc.problem.epochs import tied
 from optloc.problem.fix import Fix
@@ -271,7 +271,7 @@ def levels_of(made: Elements, by: By, common: By | None = None, *, tails: bool =
     return replace(_report(made, by, *fitted(made, common), tails=tails), common=common)
 
 
-def fitted(made: Elements, shared_by: By | None) -> tuple[Fitted, Array]:
+def fitted(made: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
     """Return the variance factors of groups, and the errors in common (g,) without evidence."""
     from threadpoolctl import threadpool_limits
 
@@ -297,7 +297,7 @@ def _with_their_like(shown: Array, common: Array, by: By | None) -> Array:
     return shown if by == "kind" else common & shown.any()
 
 
-def _report(made: Elements, by: By, found: Fitted, none: Array, *, tails: bool) -> NoiseLevels:
+def _report(made: Elements, by: By, found: VarianceFit, none: Array, *, tails: bool) -> NoiseLevels:
     """Return the levels of all groups with errors, from a fit and the groups (g,) without evidence."""
     size = len(made.names)
     count, gross = total(made.of_effect, size), total(made.of_effect, size, found.gross)
@@ -352,7 +352,7 @@ def _ratio(tests: Tested) -> float:
 _SCARCE = 2.0
 
 
-def _sentences(names: Array, found: Fitted, redundancy: Array, none: Array) -> tuple[str, ...]:
+def _sentences(names: Array, found: VarianceFit, redundancy: Array, none: Array) -> tuple[str, ...]:
     """Return what the data do not tell."""
     said = []
     if found.shared.any():

@@ -12,7 +12,7 @@ from optloc.base.types import Array
 from optloc.linear.constraints import is_exact
 from optloc.model_checks.elements import By, Elements, batch_of, common_name, elements, ends_of, kinds_of
 from optloc.model_checks.score import descend
-from optloc.model_checks.variance_components import Fitted, Tested, cleaned, deviance, tested
+from optloc.model_checks.variance_components import Tested, VarianceFit, cleaned, deviance, tested
 from optloc.problem.epochs import separable, tied
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -167,7 +167,7 @@ class _Candidate:
 
     tried: Tried
     made: Elements
-    fit: Fitted
+    fit: VarianceFit
     absent: Array
 
     @property

@@ -25,11 +25,16 @@ if TYPE_CHECKING:
     )
     from optloc.tracking.entry import Entry as Entry, Rules as Rules
     from optloc.tracking.measurement_space import lines as lines, simplified as simplified
+    from optloc.tracking.named_models import (
+        MOTIONS as MOTIONS,
+        MotionModel as MotionModel,
+        motion_named as motion_named,
+    )
     from optloc.tracking.run import Follower as Follower, collected as collected, tracked as tracked
     from optloc.tracking.several_models import imm as imm, parallel as parallel, resized as resized
     from optloc.tracking.several_targets import (
-        Candidates as Candidates,
         Missing as Missing,
+        RowCandidates as RowCandidates,
         alone as alone,
         associated as associated,
     )

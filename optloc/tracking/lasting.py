@@ -69,7 +69,7 @@ _RIDGE = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
-class _Rows:
+class _LastingRows:
     """Rows that were used, linearised: H (m, n), residuals and scans (m,), R (m, m), lasting errors D (j, m, q)."""
 
     H: Array
@@ -79,7 +79,7 @@ class _Rows:
     D: Array
 
     @classmethod
-    def of(cls, part: Problem, at: Array, cov: Array | None) -> _Rows:
+    def of(cls, part: Problem, at: Array, cov: Array | None) -> _LastingRows:
         """Return the rows of scans at a state that pass the gate; without a covariance, of residuals after a fit."""
         linear = linearise(part, at, ())
         R = noises.dense(weighed(part, at).noise, np.arange(part.count))
@@ -89,7 +89,7 @@ class _Rows:
         return cls(linear.shared[used], linear.residual[used], part.epoch[used], R[np.ix_(used, used)], D)
 
     @classmethod
-    def written(cls, rows: ScanRows, item: int, memory: Array, n: int, stations: int) -> _Rows:
+    def written(cls, rows: ScanRows, item: int, memory: Array, n: int, stations: int) -> _LastingRows:
         """Return the rows of a scan as machine code wrote them to a memory, see `optloc.kernels.filter`."""
         m = rows.z.shape[2]
         line = memory[len(memory) - m * (n + 2) :].reshape(m, n + 2)
@@ -154,7 +154,7 @@ class _Recursion:
         wide = cov + max(self.excess, 0.0) * self.white + self.size * self.lasting[self.best]
         return np.asarray(0.5 * (wide + wide.T))
 
-    def begin(self, rows: _Rows, cov: Array) -> None:
+    def begin(self, rows: _LastingRows, cov: Array) -> None:
         """Take the fix of a stretch of scans, with the covariance (n, n) of its state."""
         self.reset(cov)
         self.scans = 0
@@ -164,7 +164,7 @@ class _Recursion:
             except NUMERICAL:
                 self.reset(cov)
 
-    def _test_start(self, rows: _Rows, cov: Array) -> None:
+    def _test_start(self, rows: _LastingRows, cov: Array) -> None:
         H, R, D = rows.H, rows.R, rows.D
         gain = _solved(R, H @ cov).T
         left = np.eye(len(R)) - H @ gain
@@ -187,7 +187,7 @@ class _Recursion:
         self.lasting = F @ self.lasting @ F.T
         self.cross = self.phi * (F @ self.cross)
 
-    def take(self, rows: _Rows, F: Array, cov: Array) -> None:
+    def take(self, rows: _LastingRows, F: Array, cov: Array) -> None:
         """Take a scan with the predicted covariance (n, n), after its prediction."""
         self.scans += 1
         self._widen(rows.D.shape[-1])
@@ -286,7 +286,7 @@ def _whitening(cov: Array, other: Array | None = None) -> Array:
 class _Start:
     """A start as it was taken: rows, covariance, and the sums of scores before it."""
 
-    rows: _Rows
+    rows: _LastingRows
     cov: Array
     info: Array
     score: Array
@@ -340,7 +340,7 @@ class LastingErrors:
             At the last of them.
         """
         found = self._found or _Recursion(len(state.mean))
-        rows = _Rows.of(stretch, state.mean, None)
+        rows = _LastingRows.of(stretch, state.mean, None)
         self._start = _Start(rows, state.cov, found.info, found.score)
         self._recent.clear()
         self._memory[:] = 0.0
@@ -400,10 +400,12 @@ def _go_on(found: _Recursion, taken: Taken, dynamics: Dynamics, memory: Array | 
     mean, cov = F @ before.mean + drive, F @ before.cov @ F.T + Q
     found.step(F)
     if memory is not None and written is not None:
-        rows: _Rows | None = _Rows.written(written, scans.item[k], memory, len(mean), problem.stations.places.shape[-2])
+        rows: _LastingRows | None = _LastingRows.written(
+            written, scans.item[k], memory, len(mean), problem.stations.places.shape[-2]
+        )
     else:
         scan = scan_at(problem, k, dynamics.order)
-        rows = _Rows.of(scan, mean, cov) if scan.rows else None
+        rows = _LastingRows.of(scan, mean, cov) if scan.rows else None
     if rows is None or not len(rows.residual):
         found.before = None
         return

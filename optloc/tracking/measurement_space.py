@@ -243,7 +243,7 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     home = _receiver(flat)
     apart = by_epoch(replace(flat, motions=(Motion(0, "epoch"),))).flat()
     size, epochs = flat.batch_shape[0], problem.epochs
-    state = _State(np.full((size, 3), np.nan), np.full((size, 3, 3), np.nan), np.zeros(size), np.zeros(size))
+    state = _SpaceState(np.full((size, 3), np.nan), np.full((size, 3, 3), np.nan), np.zeros(size), np.zeros(size))
     steps = []
     for k in range(epochs):
         scan = apart.take(np.arange(k, size * epochs, epochs))
@@ -263,7 +263,7 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class _SpaceState:
     """Range, azimuth and elevation (N, 3), their covariance, the recursion's own weight P (N,), and epochs used."""
 
     value: Array
@@ -289,8 +289,8 @@ def _receiver(problem: Problem) -> int:
     return found[0]
 
 
-def _choose(mask: Array, one: _State, other: _State) -> _State:
-    return _State(
+def _choose(mask: Array, one: _SpaceState, other: _SpaceState) -> _SpaceState:
+    return _SpaceState(
         np.where(mask[:, None], one.value, other.value),
         np.where(mask[:, None, None], one.cov, other.cov),
         np.where(mask, one.P, other.P),
@@ -319,7 +319,7 @@ def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array,
     return at, axes, linear.residual[:, order], (H[:, :1] @ axes)[:, 0]
 
 
-def _advance(state: _State, scan: Problem, home: int, floor: float) -> _State:
+def _advance(state: _SpaceState, scan: Problem, home: int, floor: float) -> _SpaceState:
     """Return the state after one more scan: a step of the angles, and one of the range by what the path says beyond."""
     _, _, residual, slopes = _linearise_at(state.value, scan, home)
     x, across = slopes[:, 0], slopes[:, 1:]
@@ -339,10 +339,10 @@ def _advance(state: _State, scan: Problem, home: int, floor: float) -> _State:
     B[:, 0, 1:] = -gain[:, None] * across * share[:, None]
     R = noises.dense(scan.noise, np.array(_rows(scan)))
     cov = A @ state.cov @ np.swapaxes(A, -1, -2) + B @ R @ np.swapaxes(B, -1, -2)
-    return _State(value, cov, state.P - optimal * x * state.P, state.count + 1.0)
+    return _SpaceState(value, cov, state.P - optimal * x * state.P, state.count + 1.0)
 
 
-def _restart(stretch: Problem, scan: Problem, home: int) -> _State:
+def _restart(stretch: Problem, scan: Problem, home: int) -> _SpaceState:
     """Return the state of the mean measurement of a stretch, solved in closed form and refined."""
     track = lines(stretch, 0)
     start, used = track.last, (track.count > 0).sum(-1)
@@ -356,7 +356,7 @@ def _restart(stretch: Problem, scan: Problem, home: int) -> _State:
     outward = np.concatenate([(away / r[:, None])[:, None], linear.shared[:, order]], axis=1)
     cov = outward @ start.cov @ np.swapaxes(outward, -1, -2)
     good = np.asarray(np.isfinite(start.mean).all(-1))
-    return _State(np.where(good[:, None], value, np.nan), cov, 1.0 / np.maximum(used, 1), used.astype(float))
+    return _SpaceState(np.where(good[:, None], value, np.nan), cov, 1.0 / np.maximum(used, 1), used.astype(float))
 
 
 def _bistatic_track(problem: Problem, steps: list[tuple[Array, Array, Array, Array]]) -> Track:

@@ -26,8 +26,10 @@ from optloc.problem.epochs import cut, joined
 from optloc.problem.problem import Problem
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.tracking.condition import Condition
+from optloc.tracking.differences import differences
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.named_models import motion_named
 from optloc.tracking.rivals import Rival, remaining
 from optloc.tracking.scan_rows import Scans
 from optloc.tracking.start import Beginning, Fit, Undecided, begin, out_of_sight, reach, with_height_rows
@@ -47,6 +49,46 @@ from optloc.tracking.updates import Filter, Update, Updated, filter_of, innovati
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
 Screen = tuple[float, float, float]
+
+
+def track(
+    problem: Problem,
+    model: Dynamics | str = "cv",
+    update: Update | str = "iekf",
+    *,
+    start: State | None = None,
+    rules: Rules | None = None,
+) -> Track:
+    """Return the track of one target through a run, without a first guess.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run of one target: epochs with times.
+    model : Dynamics or str
+        Model of motion, or its name: "cv", "ca", "static", "singer", "csm"; see ``optloc list motions``.
+    update : callable or str
+        A filter, or its name; see ``optloc list trackers``.
+    start : State, optional
+        Known state at or before the first scan.
+    rules : Rules, optional
+        When rows are left out and tracks begin anew.
+
+    Returns
+    -------
+    Track
+        State [p, v, a] after each scan, its covariance and status. `Track.states` returns another order.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown model or filter, times that do not increase, a run of several targets, and a start that does not
+        fit. Several targets are separated by `optloc.tracking.alone`.
+    """
+    dynamics = motion_named(model) if isinstance(model, str) else model
+    run = differences(problem) if problem.emitting else problem
+    entries = list(tracked(run, dynamics, update, start=start, rules=rules))
+    return collected(entries, problem.dimension)
 
 
 def tracked(
@@ -91,7 +133,7 @@ def tracked(
     rules = rules or Rules()
     course = Condition.of(start, float(problem.times[0]) if start is None else start.time, rules)
     course.fresh = start is not None
-    return _Run.of(cleaned, broken, dynamics, rule, rules).entries(course)
+    return _TrackRun.of(cleaned, broken, dynamics, rule, rules).entries(course)
 
 
 def collected(entries: Sequence[Entry], dimension: int) -> Track:
@@ -109,7 +151,7 @@ def collected(entries: Sequence[Entry], dimension: int) -> Track:
 
 
 @dataclass(frozen=True, slots=True)
-class _Run:
+class _TrackRun:
     """One run, or a stretch of it, with its rules.
 
     Parameters
@@ -138,7 +180,7 @@ class _Run:
     near: float
 
     @classmethod
-    def of(cls, problem: Problem, broken: Array, dynamics: Dynamics, rule: Update, rules: Rules) -> _Run:
+    def of(cls, problem: Problem, broken: Array, dynamics: Dynamics, rule: Update, rules: Rules) -> _TrackRun:
         """Return a run whose rows (m,) are `broken` where they are not finite."""
         bad = np.bincount(problem.epoch[broken], minlength=problem.epochs).tolist()
         problem = with_height_rows(problem)
@@ -360,7 +402,7 @@ class Follower:
             self._waiting, self.last = run, time
             return []
         cleaned, broken = _clean(reduce(joined, run))
-        stretch = _Run.of(cleaned, broken, self._dynamics, self._rule, self._rules)
+        stretch = _TrackRun.of(cleaned, broken, self._dynamics, self._rule, self._rules)
         course = self._course or Condition.of(None, float(run[0].times[0]), self._rules)
         done: list[Entry] = []
         self._needed = 1

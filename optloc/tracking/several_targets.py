@@ -42,7 +42,7 @@ class Associated:
 
 
 def associated(
-    given: Candidates,
+    given: RowCandidates,
     start: State,
     dynamics: Dynamics,
     rule: Associate,
@@ -54,7 +54,7 @@ def associated(
 
     Parameters
     ----------
-    given : Candidates
+    given : RowCandidates
         Measurements; scans not later than the start are left out.
     start : State
         All targets (..., t).
@@ -108,7 +108,7 @@ def associated(
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class RowCandidates:
     """What may belong to one of several targets.
 
     Parameters
@@ -129,7 +129,7 @@ class Candidates:
             yield time, scan, self.z[..., self.channels.epoch == k, :]
 
 
-def candidates(problem: Problem) -> Candidates:
+def candidates(problem: Problem) -> RowCandidates:
     """Return the rows of a run as candidates: rows of one kind, epoch and pair of stations are one channel.
 
     Known corrections are taken off.
@@ -161,10 +161,10 @@ def candidates(problem: Problem) -> Candidates:
         rows.append(_row(block, kept))
         start += block.count
     made = replace(problem, rows=tuple(rows), motions=problem.motions[:1])
-    return _check(Candidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
+    return _check(RowCandidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
 
 
-def _check(given: Candidates) -> Candidates:
+def _check(given: RowCandidates) -> RowCandidates:
     """Return candidates that fit their channels, known corrections taken off; raise InvalidProblem for others."""
     if given.channels.batch_shape != ():
         advice = "track runs with stations or noise of their own one by one"
@@ -176,7 +176,7 @@ def _check(given: Candidates) -> Candidates:
     if not correction.any():
         return given
     rows = tuple(replace(block, correction=np.zeros(block.count)) for block in given.channels.rows)
-    return Candidates(replace(given.channels, rows=rows), given.z - correction[:, None])
+    return RowCandidates(replace(given.channels, rows=rows), given.z - correction[:, None])
 
 
 def channels_of(problem: Problem) -> tuple[Array, list[Array]]:

@@ -289,7 +289,7 @@ class _Stretch:
     @property
     def clean(self) -> bool:
         """Return whether a filter may begin with it."""
-        # With less redundancy than that other rows might be the wrong ones, see `optloc.suspects`.
+        # With less redundancy than that other rows might be the wrong ones, see `optloc.solvers.suspects`.
         sure = not self.left_out or int(self.fix.dof) > self.left_out
         return sure and self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
 

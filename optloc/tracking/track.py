@@ -14,6 +14,7 @@ from optloc.kernels.filter import CODE, GENERAL, Move
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.problem.state_order import in_order
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.scan_rows import Scans
 from optloc.tracking.updates import Filter, Update, Updated, filter_of, read
@@ -86,6 +87,23 @@ class Track:
         if self.mean.shape[-1] < 2 * self.dimension:
             raise InvalidProblem("the state has no velocity", "velocity", "track with a moving model")
         return self.mean[..., self.dimension : 2 * self.dimension]
+
+    def states(self, order: str) -> tuple[Array, Array]:
+        """Return states (..., k, m) and covariances (..., k, m, m) with their components in another order.
+
+        Parameters
+        ----------
+        order : str
+            Names of components, such as "x vx y vy". The order of `mean` is x y z vx vy vz ax ay az.
+
+        Raises
+        ------
+        InvalidProblem
+            For a component that the state does not have.
+        """
+        mean, cov = in_order(order, self.dimension, self.mean, self.cov)
+        assert cov is not None
+        return mean, cov
 
     @property
     def last(self) -> State:
@@ -339,7 +357,7 @@ def check_trackable(problem: Problem) -> None:
         advice = "learn it first, then `with_known_bias`"
         raise InvalidProblem(f"the bias {problem.biases[0].name!r} is unknown", "track", advice)
     if problem.emitting:
-        raise InvalidProblem("emission times are unknown", "track", "use differences: `optloc.reduce` makes them")
+        raise InvalidProblem("emission times are unknown", "track", "take differences with `optloc.engine.reduce`")
     if problem.stations.unknown_for:
         raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
 

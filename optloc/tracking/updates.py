@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.registry import Table
+from optloc.base.registry import Registry
 from optloc.base.types import Array
 from optloc.kernels.filter import (
     CODE,
@@ -143,7 +143,9 @@ mgekf = Filter("the modified-gain extended Kalman filter", Filtering(MGEKF))
 mvekf = Filter("the modified-covariance extended Kalman filter: linearised after the step", Filtering(MVEKF))
 """The modified-covariance extended Kalman filter."""
 
-UPDATES: Table[Update] = Table("optloc.trackers", callable, {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf})
+UPDATES: Registry[Update] = Registry(
+    "optloc.trackers", callable, {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf}
+)
 """Filters by name: add one function and one line, or from another package an entry point of ``optloc.trackers``."""
 
 
@@ -195,7 +197,7 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     update : callable or str
         A filter, or its name in `UPDATES`.
     loss : Loss or str
-        A loss, or its name in `optloc.LOSSES`.
+        A loss, or its name in `optloc.problem.LOSSES`.
 
     Raises
     ------

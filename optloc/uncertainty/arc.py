@@ -15,7 +15,7 @@ from optloc.model_checks.shape import cost_at_infinity
 from optloc.problem.chart import CARTESIAN, basis, jacobian
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty.region import RegionSurface
 
 # Corrections across the curve, in its standard deviations, below which the next step is longer and above which it is
 # tried again; a step that changes the cost by more is tried again too: a circle takes 300 nodes, an arc 40.
@@ -41,7 +41,7 @@ class Arc:
 
     Parameters
     ----------
-    surface : Surface
+    surface : RegionSurface
         The cost, and the fix.
     far : bool
         Whether it is traced in the inverse-range chart, because the data do not exclude infinity; else in metres.
@@ -55,7 +55,7 @@ class Arc:
         Whether the last node is the first one again.
     """
 
-    surface: Surface
+    surface: RegionSurface
     far: bool
     node: Array
     cost: Array
@@ -165,10 +165,10 @@ def trace_arc(problem: Problem, fix: Fix) -> Arc:
     Steps along the axis of least information, corrected by Gauss-Newton across it, until the cost is 25 above that of
     the fix or the curve comes back.
     """
-    return trace_from(Surface.of(problem, fix))
+    return trace_from(RegionSurface.of(problem, fix))
 
 
-def trace_from(surface: Surface) -> Arc:
+def trace_from(surface: RegionSurface) -> Arc:
     """Return the curve through the fix of a surface, see `trace_arc`."""
     endless = cost_at_infinity(surface.problem, surface.x)[0] <= surface.least + _END
     far = bool(endless and surface.kind != CARTESIAN and surface.chart.distance > 0.0)
@@ -208,7 +208,7 @@ class _Node:
 class _Valley:
     """The cost in the coordinates in which a curve is traced."""
 
-    surface: Surface
+    surface: RegionSurface
     far: bool
 
     def look(self, z: Array) -> tuple[float, Array, Array]:

@@ -21,7 +21,7 @@ from optloc.problem.chart import CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.uncertainty.contour import Polygon, area, trace, trace_nodes
-from optloc.uncertainty.region import Surface, likelihood_region, passes
+from optloc.uncertainty.region import RegionSurface, likelihood_region, passes
 
 # Cells that hold a region, by dimension: where the contour is looked for.
 _CELLS = {2: 400, 3: 3000}
@@ -96,7 +96,7 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
         return _held(problem, fix, plane, level)
     try:
         if int(fix.chart.kind) == INVERSE_RANGE:
-            surface, cells = Surface.of(problem, fix), _far_cells(fix.chart, level)
+            surface, cells = RegionSurface.of(problem, fix), _far_cells(fix.chart, level)
         else:
             region = likelihood_region(problem, fix, level, boxes=_CELLS[problem.dimension])
             if region.cells is None:
@@ -109,7 +109,7 @@ def outline_of(problem: Problem, fix: Fix, plane: Array, level: float = 0.95) ->
     return _free(surface, cells, plane, level)
 
 
-def _free(surface: Surface, cells: Array, plane: Array, level: float) -> Outline | None:
+def _free(surface: RegionSurface, cells: Array, plane: Array, level: float) -> Outline | None:
     """Return the outline of a region that cells (m, v, d) hold."""
     q, centre = quantile(level, 2), (surface.chart.centre - surface.position) @ plane.T
     reach = FAR * float(surface.chart.distance)
@@ -124,7 +124,7 @@ def _free(surface: Surface, cells: Array, plane: Array, level: float) -> Outline
     return Outline(tuple(polygons), bool(far > _AT_EDGE * reach)) if polygons else None
 
 
-def _profile(surface: Surface, cells: Array, plane: Array) -> Callable[[Array], Array]:
+def _profile(surface: RegionSurface, cells: Array, plane: Array) -> Callable[[Array], Array]:
     """Return what maps points (n, 2) of a plane to the least cost (n,) over the coordinate that is not seen."""
     if plane.shape[1] == 2:
         return lambda points: surface.cost(surface.position + points @ plane)
@@ -152,7 +152,7 @@ def _profile(surface: Surface, cells: Array, plane: Array) -> Callable[[Array], 
     return least_cost
 
 
-def _least_along(surface: Surface, base: Array, normal: Array, low: Array, high: Array) -> Array:
+def _least_along(surface: RegionSurface, base: Array, normal: Array, low: Array, high: Array) -> Array:
     """Return the least costs (n,) along lines from points (n, d) about the fix, between two ends (n,) of each."""
 
     def at(t: Array) -> tuple[Array, Array, Array]:

@@ -14,7 +14,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.problem.truncated import Truncated
 from optloc.uncertainty.arc import Arc, student, trace_from
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty.region import RegionSurface
 
 Belief = Literal["jeffreys", "flat"]
 
@@ -108,7 +108,7 @@ def samples(
     problem : Problem
         The problem of the fix: one static position.
     fix : Fix
-        A single fix; its alternatives are left out, see `optloc.mixture`.
+        A single fix; its alternatives are left out, see `optloc.uncertainty.mixture`.
     n : int
         How many samples; powers of two are spread most evenly.
     seed : int
@@ -135,13 +135,13 @@ def samples(
         raise InvalidProblem(
             "a flat prior has no end, and the samples hang on where it is cut", "prior", "say `within` how many metres"
         )
-    surface = Surface.of(problem, fix)
+    surface = RegionSurface.of(problem, fix)
     if surface.kind == CURVED:
         return along(trace_from(surface), n, seed, within)
     return around(surface, n, seed, prior, within)
 
 
-def around(surface: Surface, n: int, seed: int, prior: str = "jeffreys", within: float | None = None) -> Samples:
+def around(surface: RegionSurface, n: int, seed: int, prior: str = "jeffreys", within: float | None = None) -> Samples:
     """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`."""
     chart, inverse = surface.chart, surface.kind == INVERSE_RANGE
     if chart.truncated is not None and chart.cut_off:
@@ -164,7 +164,9 @@ def around(surface: Surface, n: int, seed: int, prior: str = "jeffreys", within:
     return weighed(position, np.where(good, log_weight, -np.inf), prior, within, not inverse or within is not None)
 
 
-def _within_bounds(surface: Surface, law: Truncated, n: int, seed: int, prior: str, within: float | None) -> Samples:
+def _within_bounds(
+    surface: RegionSurface, law: Truncated, n: int, seed: int, prior: str, within: float | None
+) -> Samples:
     """Return samples of a fix whose law bounds cut off: drawn from the law, weighed by the cost."""
     away, excess = law.draw(n, seed)
     position, centre = surface.position + away, surface.chart.centre
@@ -275,10 +277,10 @@ def mixture(problem: Problem, fix: Fix, k: int = _SLICES, seed: int = 0) -> Mixt
     """
     if k < 1:
         raise InvalidProblem(f"{k} slices are none", "k", "4 are enough")
-    parts = [(1.0, _slices(Surface.of(problem, fix), k, seed))]
+    parts = [(1.0, _slices(RegionSurface.of(problem, fix), k, seed))]
     for x, gap in zip(fix.alternatives.x, fix.alternatives.gap, strict=True):
         if gap < _NEGLIGIBLE and np.isfinite(x).all():
-            parts.append((float(np.exp(-0.5 * max(gap, 0.0))), _slices(Surface.at(problem, fix, x), k, seed)))
+            parts.append((float(np.exp(-0.5 * max(gap, 0.0))), _slices(RegionSurface.at(problem, fix, x), k, seed)))
     weight = np.concatenate([size * part.weight for size, part in parts])
     return Mixture(
         weight / weight.sum(),
@@ -287,7 +289,7 @@ def mixture(problem: Problem, fix: Fix, k: int = _SLICES, seed: int = 0) -> Mixt
     )
 
 
-def _slices(surface: Surface, k: int, seed: int) -> Mixture:
+def _slices(surface: RegionSurface, k: int, seed: int) -> Mixture:
     """Return the Gaussians of one minimum; their weights sum to one."""
     chart = surface.chart
     if surface.kind == CARTESIAN:

@@ -92,7 +92,7 @@ class Region:
     ----------
     level : float
         Probability that it contains the target.
-    surface : Surface
+    surface : RegionSurface
         The cost over the position, and the fix.
     threshold : float
         Highest cost inside.
@@ -112,7 +112,7 @@ class Region:
     """
 
     level: float
-    surface: Surface
+    surface: RegionSurface
     threshold: float
     points: Array
     cells: Cells | None
@@ -192,7 +192,7 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
     likelihood-ratio region (S. S. Wilks, 1938). It covers as promised where no Gaussian does, because curvature of the
     coordinates does not change it.
     """
-    surface = Surface.of(problem, fix)
+    surface = RegionSurface.of(problem, fix)
     threshold = surface.least + quantile(level, len(surface.position))
     points = boundary(surface, threshold)
     cells, reaches, reason = _cover(surface, threshold, boxes)
@@ -203,7 +203,7 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
 # The outside: certified cells.
 
 
-def _cover(surface: Surface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
+def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
     """Return cells that hold the region, whether they found it open, or why there are none."""
     why = unsupported(surface.problem) or crowded(surface.problem)
     if why:
@@ -242,7 +242,7 @@ _HALVINGS = 50
 _NEAR_INFINITY = 1e-6
 
 
-def boundary(surface: Surface, threshold: float) -> Array:
+def boundary(surface: RegionSurface, threshold: float) -> Array:
     """Return where rays from the fix first leave the region of lower cost, (k, d); NaN where they never do."""
     rays = directions(len(surface.position))
     q = np.sqrt(threshold - surface.least)
@@ -282,11 +282,11 @@ def _axes(chart: Chart) -> tuple[Array, Array]:
     return chart.mean if inverse else chart.position, vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _points(surface: Surface, at: Array) -> Array:
+def _points(surface: RegionSurface, at: Array) -> Array:
     return surface.chart.to_position(at) if surface.kind == INVERSE_RANGE else at
 
 
-def _limit(surface: Surface, steps: Array) -> Array:
+def _limit(surface: RegionSurface, steps: Array) -> Array:
     """Return how far each ray (k, d) may go (k,)."""
     if surface.kind != INVERSE_RANGE:
         return np.full(len(steps), np.inf)
@@ -301,7 +301,7 @@ _PART = 2**13
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class RegionSurface:
     """The cost ``f(x)`` of one problem over the position, and the fix on it.
 
     Parameters
@@ -322,7 +322,7 @@ class Surface:
     least: float
 
     @classmethod
-    def of(cls, problem: Problem, fix: Fix) -> Surface:
+    def of(cls, problem: Problem, fix: Fix) -> RegionSurface:
         """Return the surface of a single fix of one position that stays; raise InvalidProblem for others."""
         _check(problem, fix)
         if not np.isfinite(fix.position).all() or not np.isfinite(fix.covariance()).all():
@@ -333,7 +333,7 @@ class Surface:
         return replace(surface, chart=replace(surface.chart, truncated=law))
 
     @classmethod
-    def at(cls, problem: Problem, fix: Fix, x: Array) -> Surface:
+    def at(cls, problem: Problem, fix: Fix, x: Array) -> RegionSurface:
         """Return the surface of another minimum x (size,) of the problem of a single fix."""
         _check(problem, fix)
         flat = problem.flat().with_rows(weight=fix.weights[None])
@@ -343,7 +343,7 @@ class Surface:
         return cls._about(problem, fix, x, cov[0], None)
 
     @classmethod
-    def _about(cls, problem: Problem, fix: Fix, x: Array, cov: Array, kind: int | None) -> Surface:
+    def _about(cls, problem: Problem, fix: Fix, x: Array, cov: Array, kind: int | None) -> RegionSurface:
         """Return the surface of a minimum with a covariance of the shared unknowns."""
         flat, x = problem.flat().with_rows(weight=fix.weights[None]), x[None]
         slot, _ = problem.layout.find("position")

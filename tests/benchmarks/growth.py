@@ -14,8 +14,9 @@ from monte_carlo.layouts import SEED
 from runs import DELAYS, FIXED, drawn, estimated, run
 from scipy.optimize import least_squares
 
-from optloc import Fix, Problem, Running, solve
+from optloc import Fix, Problem, solve
 from optloc.problem.epochs import cut
+from optloc.solvers import Running
 
 EPOCHS = (1000, 2500, 5000, 10_000)
 FLIGHT = 600.0

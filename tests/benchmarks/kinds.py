@@ -408,7 +408,7 @@ def pair(z: Array) -> Problem:
 def satellites(z: Array) -> Problem:
     """Return differences of three satellites for an emitter on the ellipsoid."""
     rows = measured("tdoa", z, a=[1, 2], b=0, arrival_sigma=SATELLITE_SIGMA)
-    return assemble(SATELLITES, rows, frame=optloc.ECEF, constraints=[constraints.height(exactly=0.0)])
+    return assemble(SATELLITES, rows, frame=optloc.problem.ECEF, constraints=[constraints.height(exactly=0.0)])
 
 
 MOVING = (

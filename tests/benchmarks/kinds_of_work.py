@@ -20,7 +20,7 @@ from scipy.sparse import csr_matrix
 import optloc
 from optloc import Motion, Problem, assemble, measured, with_bias
 from optloc.cli.fix import run_fix
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
 from optloc.sites.calibration import calibrate, network_of
 from optloc.tracking import State, polynomial
 from optloc.tracking.scan_rows import Scans
@@ -363,7 +363,7 @@ def table_case(folder: Path) -> Case:
     stations.write_text("name,x,y,z\n" + "".join(places), encoding="utf-8")
     lines = (f"{i}," + ",".join(f"{value:.13f}" for value in row) + "\n" for i, row in enumerate(times))
     table.write_text("event," + ",".join(f"{name}_s" for name in "ABCDEF") + "\n" + "".join(lines), encoding="utf-8")
-    options = Told(stations=stations, sigma=f"{1e9 * CLOCK:g} ns", what="arrivals")
+    options = ColumnHints(stations=stations, sigma=f"{1e9 * CLOCK:g} ns", what="arrivals")
 
     def ready(method: str) -> list[Call]:
         out = folder / f"{next(number)}.csv"

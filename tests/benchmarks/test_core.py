@@ -10,7 +10,7 @@ from benchmarks.speed import SCENES, batch
 from monte_carlo.tables import write
 from runs import drawn, estimated, run, truth
 
-from optloc.kernels.damping import Rules
+from optloc.kernels.damping import StopRules
 from optloc.kernels.jit import enabled
 from optloc.kernels.least_squares import refine
 from optloc.kernels.pack import pack
@@ -54,8 +54,8 @@ def iteration(scene):
     problem, start = array(scene)
     ours, item = ready(problem), np.arange(len(start))
     out = answers(start)
-    refine_block(ours, item, 0, len(start), Rules(), out)
-    seconds = quickest(lambda: refine_block(ours, item, 0, len(start), Rules(), answers(start)))
+    refine_block(ours, item, 0, len(start), StopRules(), out)
+    seconds = quickest(lambda: refine_block(ours, item, 0, len(start), StopRules(), answers(start)))
     count = int(out.iterations.sum()) + len(start)
     return 1e6 * seconds / count, 1e6 * seconds / len(start)
 
@@ -72,7 +72,7 @@ def single(scene):
     """Microseconds of one small fix, the call from Python included."""
     problem, start = array(scene)
     ours, item = ready(problem), np.arange(1)
-    return 1e6 * quickest(lambda: refine_block(ours, item, 0, 1, Rules(), answers(start[:1])), 200)
+    return 1e6 * quickest(lambda: refine_block(ours, item, 0, 1, StopRules(), answers(start[:1])), 200)
 
 
 def registration(eliminated):
@@ -83,8 +83,8 @@ def registration(eliminated):
     ours, item = ready(problem), np.arange(RUNS)
     kept = 0 if eliminated else None
     out = answers(start, kept)
-    refine_block(ours, item, 0, RUNS, Rules(), out)
-    seconds = quickest(lambda: refine_block(ours, item, 0, RUNS, Rules(), answers(start, kept)), 3)
+    refine_block(ours, item, 0, RUNS, StopRules(), out)
+    seconds = quickest(lambda: refine_block(ours, item, 0, RUNS, StopRules(), answers(start, kept)), 3)
     each = 1e6 * seconds / (int(out.iterations.sum()) + RUNS)
     return each, each / problem.count
 

@@ -10,7 +10,7 @@ from benchmarks.scenes import Scene
 from benchmarks.with_general import STEPS
 from benchmarks.with_optloc import problem_of
 
-from optloc import gauss_newton
+from optloc.engine import gauss_newton
 
 jax.config.update("jax_enable_x64", True)
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from optloc import ECEF, InvalidProblem, Motion, assemble, crlb, measured
+from optloc import InvalidProblem, Motion, assemble, crlb, measured
 from optloc.cli.crlb import courses, reliability_json, vector
 from optloc.model_checks.evidence import Reliability
+from optloc.problem import ECEF
 
 PLACES = np.array([[0.0, 0.0], [900.0, 0.0], [0.0, 900.0], [900.0, 1000.0]])
 

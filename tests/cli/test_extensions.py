@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 import typer
 
-from optloc.cli.extensions import NEIGHBOURS, Part, extensions
+from optloc.cli.extensions import NEIGHBOURS, KernelPart, extensions
 from optloc.cli.listing import lists
 
 
@@ -26,4 +26,4 @@ def test_neighbours_do_not_replace_each_other():
 def test_a_part_misses_the_kernels_that_are_not_on_disk(monkeypatch):
     monkeypatch.setattr("optloc.kernels.jit.named", lambda name: name)
     monkeypatch.setattr("optloc.kernels.kept.is_kept", lambda kernel: kernel == "here")
-    assert Part("a part", "optloc", (), ("here", "gone")).missing() == ["gone"]
+    assert KernelPart("a part", "optloc", (), ("here", "gone")).missing() == ["gone"]

@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from optloc import Status, by_epoch, solve
+from optloc import Status, solve
 from optloc.cli.file_fixes import fix_file, fixes_json, results_of
 from optloc.cli.options import shipped_problems
 from optloc.cli.output import dumps
 from optloc.files import read
+from optloc.problem import by_epoch
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from optloc import MODELS, InvalidProblem
+from optloc import InvalidProblem
 from optloc.cli.listing import describe, lists, registry, run_list
+from optloc.models import MODELS
 
 
 @dataclass

@@ -3,13 +3,13 @@
 import pytest
 
 from optloc import InvalidProblem
-from optloc.cli.extensions import Asked
+from optloc.cli.extensions import PictureRequest
 from optloc.cli.options import shipped_problems
 from optloc.cli.pictures import _PICTURES, _solve_one, pictures, run_plot
 
 
 def asked(tmp_path, name="p.svg", epoch=None):
-    return Asked(shipped_problems()["demo"], tmp_path / name, "auto", epoch)
+    return PictureRequest(shipped_problems()["demo"], tmp_path / name, "auto", epoch)
 
 
 def test_every_picture_has_a_summary_and_neighbours_replace_none():
@@ -34,8 +34,8 @@ def test_the_picture_asked_for_is_drawn_to_its_file(tmp_path, monkeypatch, capsy
 
 
 def test_an_epoch_is_chosen_by_its_label(tmp_path):
-    _, fix, title = _solve_one(Asked(shipped_problems()["run"], tmp_path / "p.svg", "auto", None))
+    _, fix, title = _solve_one(PictureRequest(shipped_problems()["run"], tmp_path / "p.svg", "auto", None))
     assert len(fix) == 1
     assert "epoch" in title
     with pytest.raises(InvalidProblem, match="no epoch 'never'"):
-        _solve_one(Asked(shipped_problems()["run"], tmp_path / "p.svg", "auto", "never"))
+        _solve_one(PictureRequest(shipped_problems()["run"], tmp_path / "p.svg", "auto", "never"))

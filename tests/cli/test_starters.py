@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import ECEF, MODELS, Model, Status, by_epoch, solve
+from optloc import Status, solve
 from optloc.cli import app
 from optloc.cli.starters import starters
 from optloc.files import read
+from optloc.models import MODELS, Model
 from optloc.models.primitives import distance
+from optloc.problem import ECEF, by_epoch
 from optloc.problem.epochs import separable
 
 RUN = CliRunner()

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from data.windows import quantiles, report
 
-from optloc import Fix, Noise, Problem, Status, predict, solve, with_bias, with_known_bias
+from optloc import Fix, Problem, Status, solve, with_bias
+from optloc.engine import predict
+from optloc.problem import Noise, with_known_bias
 from optloc.problem.noise import Block
 
 ROUNDS = 6

@@ -9,8 +9,9 @@ from data.reference import law, listed
 from data.windows import quantiles, report
 from verdicts import alone
 
-from optloc import Atmosphere, Status, solve
+from optloc import Status, solve
 from optloc.lab.datasets import adsb
+from optloc.models import Atmosphere
 
 pytestmark = pytest.mark.data
 

@@ -6,8 +6,9 @@ from data.registration import part
 from data.windows import report
 from scipy.stats import spearmanr
 
-from optloc import health, solve
+from optloc import solve
 from optloc.lab.datasets import adsb
+from optloc.station_health import health
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 

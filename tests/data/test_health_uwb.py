@@ -5,8 +5,8 @@ import pytest
 from data.registration import part
 from data.windows import report
 
-from optloc import health
 from optloc.lab.datasets import uwb
+from optloc.station_health import health
 
 pytestmark = pytest.mark.data
 

@@ -7,9 +7,11 @@ import pytest
 from data.windows import report, statuses
 from often import few
 
-from optloc import Motion, Problem, Status, assemble, by_epoch, measured, noise_levels, solve, with_noise_levels
+from optloc import Motion, Problem, Status, assemble, measured, solve
 from optloc.lab.datasets import mrclam, starloc, uwb
 from optloc.lab.datasets.reading import Window
+from optloc.problem import by_epoch
+from optloc.station_health import noise_levels, with_noise_levels
 
 pytestmark = pytest.mark.data
 

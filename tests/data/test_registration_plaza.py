@@ -5,9 +5,10 @@ import pytest
 from data.registration import calibrating, corrected, fixed, learnt, lines, not_beaten, part
 from data.windows import report
 
-from optloc import Status, by_epoch, solve, with_bias
+from optloc import Status, solve, with_bias
 from optloc.bounds.rank import observability
 from optloc.lab.datasets import plaza
+from optloc.problem import by_epoch
 
 pytestmark = pytest.mark.data
 

@@ -10,9 +10,10 @@ from data.registration import calibrating, corrected, fixed, learnt, lines, part
 from data.windows import report
 from often import few
 
-from optloc import by_epoch, with_bias
+from optloc import with_bias
 from optloc.bounds.rank import observability
 from optloc.lab.datasets import uwb
+from optloc.problem import by_epoch
 
 pytestmark = pytest.mark.data
 

@@ -7,9 +7,12 @@ import pytest
 from data.windows import quantiles, report, statuses
 from verdicts import alone
 
-from optloc import Prior, predict, rejected, solve
+from optloc import solve
+from optloc.engine import predict
 from optloc.lab.datasets import starloc
+from optloc.problem import Prior
 from optloc.problem.noise import independent
+from optloc.solvers import rejected
 
 pytestmark = pytest.mark.data
 

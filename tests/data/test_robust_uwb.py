@@ -7,8 +7,10 @@ import pytest
 from data.windows import quantiles, report, statuses
 from verdicts import alone
 
-from optloc import by_epoch, rejected, solve
+from optloc import solve
 from optloc.lab.datasets import uwb
+from optloc.problem import by_epoch
+from optloc.solvers import rejected
 
 pytestmark = pytest.mark.data
 

@@ -6,8 +6,8 @@ from data.reference import horizontal
 from data.windows import report
 from often import few
 
-from optloc import ECEF
 from optloc.lab.datasets import gnss
+from optloc.problem import ECEF
 from optloc.tracking import UPDATES, collected, polynomial, tracked
 
 pytestmark = pytest.mark.data

@@ -8,7 +8,7 @@ from data.reference import Reference, centred, descend, ecef, horizontal
 from optloc.lab.datasets.adsb import ARRIVAL, HEIGHT, Heard
 from optloc.lab.datasets.gnss import SIGMA, Receptions
 from optloc.lab.datasets.mrclam import Sightings, sigmas
-from optloc.lab.datasets.starloc import SIGMA as BEARING, Groups
+from optloc.lab.datasets.starloc import SIGMA as BEARING, MarkGroups
 
 RADIUS = 6.4e6
 
@@ -94,7 +94,7 @@ def mrclam(data: Sightings, kinds: tuple[str, ...]) -> Reference:
     return Reference(*descend(residual, data.truth, 1e-5))
 
 
-def starloc(data: Groups) -> Reference:
+def starloc(data: MarkGroups) -> Reference:
     """Return the minima of groups of bearings in the camera's axes."""
 
     def residual(x: np.ndarray) -> np.ndarray:

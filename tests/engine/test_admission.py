@@ -81,7 +81,7 @@ def test_the_earth_hides_what_arrays_say_it_does():
     x = rng.standard_normal((80, 3))
     x *= WGS84_A / np.sqrt((x**2).sum(-1, keepdims=True))
     r = np.sqrt(((stations - x[:, None]) ** 2).sum(-1))
-    problem = assemble(stations, measured("range", r, a=np.arange(5), sigma=10.0), frame=optloc.ECEF).flat()
+    problem = assemble(stations, measured("range", r, a=np.arange(5), sigma=10.0), frame=optloc.problem.ECEF).flat()
     plan = plan_of(problem)
     found, _ = plan.run(plan.load(problem), problem.z, start=x)
     hidden = is_hidden(problem, x)

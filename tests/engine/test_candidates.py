@@ -52,13 +52,13 @@ def satellites(rng, told):
     place *= (WGS84_A + rng.uniform(5e5, 2e6)) / np.sqrt((place**2).sum(-1, keepdims=True))
     height = rng.uniform(-100.0, 9e3)
     below = up + 0.1 * rng.standard_normal(3)
-    lat, lon, _ = optloc.ECEF.to_geodetic(WGS84_A * below / np.sqrt(below @ below))
-    truth = optloc.ECEF.from_geodetic(lat, lon, height)
+    lat, lon, _ = optloc.problem.ECEF.to_geodetic(WGS84_A * below / np.sqrt(below @ below))
+    truth = optloc.problem.ECEF.from_geodetic(lat, lon, height)
     rows = [measured("tdoa", a=[1, 2], b=0, arrival_sigma=rng.uniform(1.0, 100.0))]
     held = {"constraints": constraints.height(exactly=height)}
     if told:
         rows, held = [*rows, measured("height", [height], sigma=20.0)], {}
-    problem = assemble(place, *rows, frame=optloc.ECEF, **held)
+    problem = assemble(place, *rows, frame=optloc.problem.ECEF, **held)
     return simulate(problem, truth, int(rng.integers(1 << 30))), truth
 
 

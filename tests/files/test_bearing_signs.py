@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, health, locate, solve, with_bias, with_known_bias
+from optloc import InvalidProblem, locate, solve, with_bias
 from optloc.base.frames import CARTESIAN, ECEF, Frame
 from optloc.cli import app
 from optloc.files import from_table, load, read
 from optloc.files.declination import declinations
 from optloc.files.writer import write_measured
+from optloc.problem import with_known_bias
+from optloc.station_health import health
 
 RUN = CliRunner()
 # Two compasses that read 4 deg too little: magnetic north is 4 deg east of north.

@@ -9,11 +9,12 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from optloc import MODELS, InvalidProblem, solve
+from optloc import InvalidProblem, solve
 from optloc.cli import app
 from optloc.files.columns import any_unit, role_of, roles, sigma_kind, stem
 from optloc.files.convert import understood
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
+from optloc.models import MODELS
 
 RUN = CliRunner()
 SITES = {
@@ -44,7 +45,7 @@ def read(folder, text, name="t.csv", **told):
     told.setdefault("stations", folder / "sites.csv")
     if not told["stations"].exists():
         sites(folder)
-    return understood(path, Told(**{"sigma": "10 cm", **told}))
+    return understood(path, ColumnHints(**{"sigma": "10 cm", **told}))
 
 
 def fixed(made):

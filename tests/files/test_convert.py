@@ -7,13 +7,14 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, Status, by_epoch, solve
+from optloc import InvalidProblem, Status, solve
 from optloc.base.frames import ECEF, Frame
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.cli import app
 from optloc.files import read
 from optloc.files.convert import convert
 from optloc.lab import datasets
+from optloc.problem import by_epoch
 
 RUN = CliRunner()
 SITES = {"A": (11.00, 47.00, 500.0), "B": (11.10, 47.02, 620.0), "C": (11.05, 47.10, 560.0), "D": (10.95, 47.08, 900.0)}

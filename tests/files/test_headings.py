@@ -14,8 +14,8 @@ from optloc.files import load
 from optloc.files.cells import Decimals
 from optloc.files.convert import convert, understood
 from optloc.files.headings import from_bow, heading_of, stations_turned
-from optloc.files.readings import BOW, COMPASS, Readings, Told, sort_named
-from optloc.files.roles import Places, Roles
+from optloc.files.readings import BOW, COMPASS, ColumnHints, Readings, sort_named
+from optloc.files.roles import ColumnPlaces, Roles
 from optloc.files.table import of_rows
 
 RUN = CliRunner()
@@ -44,7 +44,7 @@ def drive(
 
 
 def fixed(path, **options):
-    return solve(understood(path, Told(**{"sigma": "1 deg", "still": True} | options)).read().problem)
+    return solve(understood(path, ColumnHints(**{"sigma": "1 deg", "still": True} | options)).read().problem)
 
 
 def off(fix):
@@ -70,7 +70,7 @@ def test_headings_are_added_whatever_they_are_called(heading, unit, tmp_path):
 def test_a_stated_convention_leaves_the_heading_out(tmp_path):
     path = drive(tmp_path, relative=False)
     assert off(fixed(path, azimuth="north-clockwise")) < 0.1
-    added = [float(z) for z in understood(path, Told(sigma="1 deg", still=True)).sections[0].columns["z"]]
+    added = [float(z) for z in understood(path, ColumnHints(sigma="1 deg", still=True)).sections[0].columns["z"]]
     apart = [z - true_bearing(lat, lon) - course for z, (lat, lon, course) in zip(added, COURSE, strict=True)]
     assert np.cos(np.radians(apart)) == pytest.approx([1.0] * len(COURSE))
     told = RUN.invoke(app, ["convert", str(path), "--sigma", "1 deg", "--azimuth", "north-clockwise", "--still"])
@@ -84,7 +84,7 @@ def test_a_stated_convention_leaves_the_heading_out(tmp_path):
 def test_other_angles_of_a_vehicle_are_no_headings_unless_named(column, tmp_path):
     path = drive(tmp_path, column)
     with pytest.raises(InvalidProblem, match="no column looks like the heading"):
-        understood(path, Told(sigma="1 deg", still=True, azimuth="bow-clockwise"))
+        understood(path, ColumnHints(sigma="1 deg", still=True, azimuth="bow-clockwise"))
     assert off(fixed(path, columns={"heading": column})) < 0.1
     assert off(fixed(path, columns={"heading": column}, azimuth="bow-clockwise")) < 0.1
 
@@ -102,7 +102,7 @@ def test_a_declination_is_added_to_magnetic_headings(tmp_path):
     convert(path, out, sigma="1 deg", still=True, declination="5.5 deg")
     assert 'declination = "5.5 deg"' in out.read_text()
     assert off(solve(load(out))) < 0.1
-    by_date = understood(path, Told(sigma="1 deg", still=True, declination="2026-06-01")).read()
+    by_date = understood(path, ColumnHints(sigma="1 deg", still=True, declination="2026-06-01")).read()
     assert "magnetic declination +5." in by_date.azimuths or "magnetic declination +4." in by_date.azimuths
     assert off(solve(by_date.problem)) < 60.0
 
@@ -137,7 +137,7 @@ def test_small_headings_without_a_unit_are_asked_for(tmp_path):
     path.write_text("lat,lon,heading,bearing_deg\n59.9,10.7,1.0,30\n59.8,10.75,2.0,20\n")
     with pytest.raises(InvalidProblem, match=r"the unit of the column 'heading' is not known; call it heading_deg"):
         fixed(path)
-    found = understood(path, Told(sigma="1 deg", still=True, unit="deg")).sections[0]
+    found = understood(path, ColumnHints(sigma="1 deg", still=True, unit="deg")).sections[0]
     assert found.columns["z"].texts() == ["31.0", "22.0"]
 
 
@@ -158,14 +158,14 @@ def test_stations_of_a_table_may_have_headings(tmp_path):
         rows.append(f"S{k},{lat},{lon},{course}")
     path.write_text("\n".join(lines) + "\n")
     sites.write_text("\n".join(rows) + "\n")
-    made = understood(path, Told(sigma="1 deg", stations=sites))
+    made = understood(path, ColumnHints(sigma="1 deg", stations=sites))
     assert off(solve(made.read().problem)) < 0.1
     assert "bearings are taken from the headings of the stations" in made.notes[0]
     sites.write_text("\n".join(rows).replace(",65.0", ",") + "\n")
     with pytest.raises(InvalidProblem, match="station 'S2' has no heading"):
-        understood(path, Told(sigma="1 deg", stations=sites))
+        understood(path, ColumnHints(sigma="1 deg", stations=sites))
     path.write_text(path.read_text().replace("bearing_deg", "range_m"))
-    assert "heading_deg" not in understood(path, Told(sigma="1 m", stations=sites)).places.columns
+    assert "heading_deg" not in understood(path, ColumnHints(sigma="1 m", stations=sites)).places.columns
 
 
 def test_json_and_range_beside_the_bearing(tmp_path):
@@ -190,21 +190,21 @@ def test_headings_are_added_within_a_turn():
     roles = Roles.of(
         of_rows([{"bearing": 350, "heading_deg": "20.5"}, {"bearing": 30, "heading_deg": 0}], "t.csv", {}), {}
     )
-    assert heading_of(bearings(), roles, Told(azimuth=BOW)) == "heading_deg"
-    assert heading_of(bearings(), roles, Told(azimuth=COMPASS)) is None
-    found = from_bow(bearings(), roles, "heading_deg", Told())
+    assert heading_of(bearings(), roles, ColumnHints(azimuth=BOW)) == "heading_deg"
+    assert heading_of(bearings(), roles, ColumnHints(azimuth=COMPASS)) is None
+    found = from_bow(bearings(), roles, "heading_deg", ColumnHints())
     assert found.values.tolist() == [Decimal("10.5"), Decimal(30)]
     assert (found.azimuth, found.heading) == (COMPASS, "heading_deg")
 
 
 def test_stations_that_measure_bearings_have_a_heading():
     columns = {"name": np.array(["A", "B"], dtype=object), "heading_deg": np.array([5.0, np.nan])}
-    place = Places(columns, "cartesian")
+    place = ColumnPlaces(columns, "cartesian")
     with pytest.raises(InvalidProblem, match="station 'B' has no heading"):
         stations_turned(place, [bearings()])
     kept, note = stations_turned(place, [bearings("range")])
     assert ("heading_deg" in kept.columns, note) == (False, "")
-    sure = Places(columns | {"heading_deg": np.array([5.0, 7.0])}, "cartesian")
+    sure = ColumnPlaces(columns | {"heading_deg": np.array([5.0, 7.0])}, "cartesian")
     with pytest.raises(InvalidProblem, match="are both given"):
         stations_turned(sure, [bearings(heading="heading_deg")])
     assert stations_turned(sure, [bearings()])[0].columns["heading_deg"].tolist() == [5.0, 7.0]

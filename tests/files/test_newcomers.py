@@ -23,7 +23,7 @@ TAG = np.array([3.0, 2.0])
 
 
 def place(lat, lon, height=0.0):
-    return optloc.ECEF.from_geodetic(np.radians(lat), np.radians(lon), height)
+    return optloc.problem.ECEF.from_geodetic(np.radians(lat), np.radians(lon), height)
 
 
 def delays(noise=5.0, seed=1):

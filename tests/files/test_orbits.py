@@ -261,7 +261,7 @@ def test_names_and_times_that_do_not_fit(tle, tmp_path):
     with pytest.raises(InvalidProblem, match="the elements of 'LEO 1' are 12514 days from 1970-01-01"):
         satellites(tle, [0.0, 1.0], ["LEO 1"])
     with pytest.raises(InvalidProblem, match="bytes of text"):
-        satellites(tle, seconds(0.0), budget=optloc.Budget(text=10))
+        satellites(tle, seconds(0.0), budget=optloc.files.Budget(text=10))
 
 
 # The table of stations that a problem file names.

@@ -4,9 +4,9 @@ from decimal import Decimal
 
 import pytest
 
-from optloc import MODELS, InvalidProblem
+from optloc import InvalidProblem
 from optloc.files.readings import (
-    Told,
+    ColumnHints,
     in_unit,
     marks_of,
     named_columns,
@@ -16,6 +16,7 @@ from optloc.files.readings import (
     without,
 )
 from optloc.files.table import of_rows
+from optloc.models import MODELS
 
 
 def test_columns_of_receivers_name_one_station_or_two_and_no_other_word():
@@ -39,11 +40,11 @@ def test_units_are_converted_with_all_digits():
 
 
 def test_marks_of_missing_values_are_numbers_or_none():
-    assert marks_of(Told()) is None
-    assert marks_of(Told(missing="none")) == frozenset()
-    assert marks_of(Told(missing="-1, 9999")) == {Decimal(-1), Decimal(9999)}
+    assert marks_of(ColumnHints()) is None
+    assert marks_of(ColumnHints(missing="none")) == frozenset()
+    assert marks_of(ColumnHints(missing="-1, 9999")) == {Decimal(-1), Decimal(9999)}
     with pytest.raises(InvalidProblem, match="no list of numbers"):
-        marks_of(Told(missing="zero"))
+        marks_of(ColumnHints(missing="zero"))
 
 
 def test_sigmas_of_several_kinds_are_told_apart():

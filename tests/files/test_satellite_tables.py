@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, by_epoch, solve
+from optloc import InvalidProblem, solve
 from optloc.base.frames import ECEF
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.cli import app
 from optloc.files import load
 from optloc.files.convert import convert, understood
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
 from optloc.files.roles import Roles
 from optloc.files.satellite_tables import pseudoranges, write_satellites
 from optloc.files.table import of_rows
+from optloc.problem import by_epoch
 
 RUN = CliRunner()
 RATE = 7.2921151467e-5
@@ -75,12 +76,14 @@ def test_places_at_transmission_are_turned(lat, lon, clocks, unit, far, tmp_path
     at = receiver(lat, lon)
     sent = table(tmp_path, at, clocks=clocks, unit=unit, far=far)
     there = table(tmp_path, at, clocks=clocks, unit=unit, far=far, sent=False, name="there.csv")
-    found, right = (understood(path, Told(sigma="1 m", turned=path == there)).read().problem for path in (sent, there))
+    found, right = (
+        understood(path, ColumnHints(sigma="1 m", turned=path == there)).read().problem for path in (sent, there)
+    )
     # The turned places are those at reception to less than a millimetre.
     assert np.abs(found.stations.position - right.stations.position).max() < 1e-4
     assert miss(found, at) < 1e-3
     if far > 2e7 and lat < 60.0:
-        unturned = understood(sent, Told(sigma="1 m", turned=True)).read().problem
+        unturned = understood(sent, ColumnHints(sigma="1 m", turned=True)).read().problem
         assert miss(unturned, at) > 10.0
 
 
@@ -110,7 +113,7 @@ def test_epochs_in_any_order_and_with_few_satellites(tmp_path):
     few = [line for line in lines if not line.startswith("2,") or line.split(",")[1] in ("G00", "G01", "G02")]
     shuffled = [few[i] for i in np.random.default_rng(5).permutation(len(few))]
     path.write_text("\n".join([head, *shuffled]) + "\n")
-    loaded = understood(path, Told(sigma="1 m")).read()
+    loaded = understood(path, ColumnHints(sigma="1 m")).read()
     fix = solve(by_epoch(loaded.problem))
     good = [k for k, label in enumerate(loaded.epochs) if label != "2"]
     assert np.linalg.norm(fix.position - at, axis=-1)[good].max() < 1e-3
@@ -129,15 +132,15 @@ def test_too_few_satellites_are_not_turned(tmp_path):
     at = receiver(48.2, 16.4)
     path = table(tmp_path, at, count=2)
     with pytest.raises(InvalidProblem, match=r"gnss.csv: no epoch has 3 satellites.*cannot be turned.*say --turned"):
-        understood(path, Told(sigma="1 m"))
-    assert understood(path, Told(sigma="1 m", turned=True)).read().problem.count == 2
+        understood(path, ColumnHints(sigma="1 m"))
+    assert understood(path, ColumnHints(sigma="1 m", turned=True)).read().problem.count == 2
 
 
 def test_turned_is_refused_where_there_are_no_satellites(tmp_path):
     path = tmp_path / "ranges.csv"
     path.write_text("lat,lon,range_m\n59.9,10.7,100\n59.91,10.7,900\n59.9,10.71,700\n")
     with pytest.raises(InvalidProblem, match="--turned: the table has no satellites"):
-        understood(path, Told(sigma="1 m", turned=True))
+        understood(path, ColumnHints(sigma="1 m", turned=True))
 
 
 def sent(**change):
@@ -150,7 +153,7 @@ def sent(**change):
 
 
 def test_pseudoranges_are_arrivals_at_satellites_that_move(tmp_path):
-    found = pseudoranges(tmp_path / "t.csv", sent(), Told(sigma="2 m", turned=True))
+    found = pseudoranges(tmp_path / "t.csv", sent(), ColumnHints(sigma="2 m", turned=True))
     (section,) = found.sections
     assert (section.kind, section.unit, section.sigma) == ("toa", "km", "2 m")
     assert section.columns["z"].tolist() == [2e4, 2e4]
@@ -167,7 +170,7 @@ def test_pseudoranges_are_arrivals_at_satellites_that_move(tmp_path):
 )
 def test_satellites_twice_or_within_the_earth_are_refused(change, words, tmp_path):
     with pytest.raises(InvalidProblem, match=words):
-        pseudoranges(tmp_path / "t.csv", sent(**change), Told(sigma="2 m", turned=True))
+        pseudoranges(tmp_path / "t.csv", sent(**change), ColumnHints(sigma="2 m", turned=True))
 
 
 def test_orbits_are_wanted_at_times(tmp_path):

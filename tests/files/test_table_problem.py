@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from optloc.files import read
-from optloc.files.roles import Places
+from optloc.files.roles import ColumnPlaces
 from optloc.files.table_problem import Section, TableProblem, no_sigma
 
 PLACES = {
@@ -18,7 +18,9 @@ ROWS = {"a": np.array(["A", "B", "C"], dtype=object), "z": np.array([5.0, 6.0, 7
 
 def made(source):
     section = Section("range", ROWS, "km", "10 m", "ranges")
-    return TableProblem(source, (section,), Places(PLACES, "cartesian", "km"), (("range", "3 readings"),), ("a note",))
+    return TableProblem(
+        source, (section,), ColumnPlaces(PLACES, "cartesian", "km"), (("range", "3 readings"),), ("a note",)
+    )
 
 
 def test_what_is_written_is_what_is_read(tmp_path):

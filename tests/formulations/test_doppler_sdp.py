@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from formulations import doppler_sdp
-from formulations.doppler_sdp import Scene, blocks, doppler, doppler_problem, normal_points
+from formulations.doppler_sdp import DopplerScene, blocks, doppler, doppler_problem, normal_points
 from formulations.range_height import Ellipsoid, ellipsoid
 
 EARTH = 6371e3
@@ -114,7 +114,7 @@ def test_any_source_is_a_rank_one_point_at_its_own_cost(d, surface):
     rows, source = mixed(rng, d, surface)
     white = np.linalg.inv(np.linalg.cholesky(np.diag(rows.sigma**2) + 0.003 * rows.sigma[:, None] * rows.sigma))
     arguments = (rows.place, rows.speed, rows.z, white, rows.ranges, rows.rates, rows.design, surface)
-    scene = Scene.of(*arguments)
+    scene = DopplerScene.of(*arguments)
     assert scene.shape.second
     assert (scene.shape.swaps()[:, 0] < 0).any()
     problem = doppler_problem(scene.shape)
@@ -276,7 +276,7 @@ def test_what_cannot_be_started_is_nan(monkeypatch):
         still = Rows(place, speed, rows.ranges, rows.rates)
         still.z = np.array([1.0, 2.0, -3.0])
         assert still.start().point.shape == (5, 2)
-    plain = doppler_sdp._relaxation(Scene.of(*_arguments(rows)).shape, "CLARABEL")
+    plain = doppler_sdp._relaxation(DopplerScene.of(*_arguments(rows)).shape, "CLARABEL")
 
     def lost(values, **more):
         answer = type(plain).solve(plain, values, **more)

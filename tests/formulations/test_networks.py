@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from often import few
 
-from formulations.low_rank_network import LowRank, Pulses, Stations, fit_low_rank, orthonormal, random_stations
+from formulations.low_rank_network import LowRank, Pulses, StationFactors, fit_low_rank, orthonormal, random_stations
 from formulations.metric_upgrade import unknowns, upgrade
 
 
@@ -52,7 +52,9 @@ def test_both_sides_upgrade_to_the_same_network():
     v = -2.0 * np.linalg.solve(turn, (pulses - move).T).T
     alpha = ((stations - move) ** 2).sum(axis=1)
     beta = ((pulses - move) ** 2).sum(axis=1) - o**2
-    fit = LowRank(Stations(alpha[None], u[None], np.zeros((1, 12))), Pulses(beta[None], v[None], o[None]), np.zeros(1))
+    fit = LowRank(
+        StationFactors(alpha[None], u[None], np.zeros((1, 12))), Pulses(beta[None], v[None], o[None]), np.zeros(1)
+    )
     found, places, _ = upgrade(fit)
     i, k = np.tril_indices(12, -1)
     truth = np.linalg.norm(stations[i] - stations[k], axis=1)

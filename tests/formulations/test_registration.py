@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from runs import DELAYS, FIXED, MOVING, PLACES, SPATIAL, SPEEDS
 
-from formulations.registration import Course, candidates
+from formulations.registration import RegistrationCourse, candidates
 
 UNIT = 1e5
 
@@ -22,7 +22,7 @@ def course(epochs, *, places=PLACES, state=FIXED, sigma=None, noise=0.0, seed=0,
     s = len(places) - 1
     offset = ranges[:, 1:] - ranges[:, :1] + bias[:s] + error[..., 1:] - error[..., :1]
     whiten = np.linalg.inv(np.linalg.cholesky((np.eye(s) + 1.0) * (sigma or 1.0) ** 2))
-    return Course(
+    return RegistrationCourse(
         time / span,
         station[None] / UNIT,
         offset / UNIT,
@@ -90,7 +90,7 @@ def test_the_plane_case_works_in_two_dimensions():
     offset = (ranges[:, 1:] - ranges[:, :1] + np.array([20.0, -10.0, 5.0]))[None]
     eye = np.broadcast_to(np.eye(3), (1, 25, 3, 3))
     free = np.full(3, np.inf)
-    problem = Course(
+    problem = RegistrationCourse(
         time / span, station[None] / UNIT, offset / UNIT, np.ones(3), eye, eye[:, :1] * UNIT, np.zeros(3), free
     )
     state, bias = candidates(problem)

@@ -11,7 +11,7 @@ from often import few
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
-from formulations.registration_sdp import PRICES, Windows, _parameters, registration, registration_problem
+from formulations.registration_sdp import PRICES, RegistrationWindows, _parameters, registration, registration_problem
 
 # Four stations that fly side by side and two pairs that cross: coplanar at every moment.
 STATION = 1e3 * np.array([[0, 0, 10], [-15, 0, 10], [15, 0, 10], [-5, 30, 0], [5, 30, 0]])
@@ -152,7 +152,7 @@ def test_blocks_of_windows_are_the_whole_lift(moving):
     target = np.array([[200e3, 300e3, 5e3], [-100.0, 0.0, 0.0]])[: 1 + moving]
     one = run(np.random.default_rng(3), 3.0, target=target)
     station, z, whiten, time = one.windows(4)
-    data = Windows.of(station, z, whiten, one.sigma, None, 0.0, time if moving else None)
+    data = RegistrationWindows.of(station, z, whiten, one.sigma, None, 0.0, time if moving else None)
     for price in (10.0, 0.3):
         (found,) = one.start(4, prices=(price,))
         weight = np.kron(data.power.T @ data.power / 4, np.eye(3))
@@ -171,7 +171,7 @@ def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clock
         scene["target"] = np.stack([scene["target"], 100 * rng.normal(size=dimension)])
     one = run(rng, 3.0, bias=bias, design=design, **scene)
     station, z, whiten, time = one.windows(4)
-    data = Windows.of(station, z, whiten, one.sigma, design, 10.0, time if moving else None)
+    data = RegistrationWindows.of(station, z, whiten, one.sigma, design, 10.0, time if moving else None)
     problem = registration_problem(4, 5, dimension, int(moving), len(bias))
     target = one.truth + 0.1 * one.truth * rng.normal(size=one.truth.shape)
     y, near, left_over = lifted(data, target, bias)
@@ -230,7 +230,7 @@ def test_paper_geometry_starts_near_and_ends_in_the_truths_minimum(noise, prices
 def test_it_is_a_relaxation_and_far_from_tight():
     one = run(np.random.default_rng(1), 3.0)
     station, z, whiten, _time = one.windows(5)
-    data = Windows.of(station, z, whiten, one.sigma, None, 0.0, None)
+    data = RegistrationWindows.of(station, z, whiten, one.sigma, None, 0.0, None)
     truth, fitted = (((p - data.origin) / data.scale).ravel() for p in (one.truth, refined(one, one.truth, BIAS)[1]))
     found = one.start()
     for start in found:
@@ -354,7 +354,7 @@ def test_how_far_from_tight():
             shares, misfits, ratios, errors, seconds = [], [], [], [], []
             for one in runs:
                 station, z, whiten, _ = one.windows(windows)
-                data = Windows.of(station, z, whiten, one.sigma, None, 0.0, None)
+                data = RegistrationWindows.of(station, z, whiten, one.sigma, None, 0.0, None)
                 began = perf_counter()
                 (found,) = one.start(windows, prices=(price,))
                 seconds.append(perf_counter() - began)

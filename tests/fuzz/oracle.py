@@ -132,7 +132,7 @@ def problem_of(own, epoch):
         moves = own.velocity[epoch if len(own.velocity) > 1 else 0]
         velocity = np.array([[[0.0] * place.shape[-1] if rate is None else rate for rate in moves]])
     kind, origin = own.frame
-    frame = optloc.CARTESIAN if kind == "cartesian" else optloc.ECEF
+    frame = optloc.problem.CARTESIAN if kind == "cartesian" else optloc.problem.ECEF
     if kind == "enu":
         frame = optloc.Frame.enu(lat_deg=origin[0], lon_deg=origin[1], height=origin[2])
     parts = []

@@ -8,13 +8,15 @@ from cases import CASES, STATIONS, TARGET, kitchen_sink, random_vector
 from runs import drawn, estimated, run, truth
 from test_normal import regular_sink
 
-from optloc import MODELS, Motion, Prior, assemble, measured, simulate, station_array
+from optloc import Motion, assemble, measured, simulate, station_array
 from optloc.kernels import sums as hooks
 from optloc.kernels.equations import normal_at
 from optloc.kernels.pack import pack
 from optloc.kernels.sums import equations_at, summed
 from optloc.linear.normal import linearise, normal, whitener_at, with_priors
+from optloc.models import MODELS
 from optloc.models.primitives import distance
+from optloc.problem import Prior
 
 COUNT = 4
 

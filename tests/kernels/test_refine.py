@@ -9,12 +9,13 @@ from cases import CASES, STATIONS, TARGET, random_vector
 from runs import drawn, estimated, run, truth
 from test_normal import regular_sink
 
-from optloc import Bias, Motion, Prior, assemble, measured, simulate, station_array
+from optloc import Motion, assemble, measured, simulate, station_array
 from optloc.base.linalg import inverse
 from optloc.base.types import Status
 from optloc.kernels.damping import judge, judge_lane
 from optloc.kernels.jit import enabled
 from optloc.linear.normal import marginal
+from optloc.problem import Bias, Prior
 
 hooks = import_module("optloc.kernels.least_squares")
 choice = import_module("optloc.kernels.least_squares")

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from runs import drawn, estimated, run, truth
 
-from optloc import Motion, Prior, Status, assemble, measured, solve, with_bias
+from optloc import Motion, Status, assemble, measured, solve, with_bias
 from optloc.base import linalg
 from optloc.kernels.jit import enabled
 from optloc.kernels.least_squares import refine
 from optloc.kernels.pack import fold, folding, pack_runs
 from optloc.linear.normal import linearise, local_covariance, marginal, normal, whitener_at, with_priors
+from optloc.problem import Prior
 from optloc.solvers import planned
 
 SENSORS = 1e3 * np.array([[0.0, 0.0], [10.0, 1.0], [9.0, 9.0], [1.0, 10.0], [5.0, 4.0]])
@@ -96,13 +97,13 @@ def test_answers_are_those_of_numpy(name, monkeypatch):
 
 
 def test_covariances_are_those_of_the_normal_equations():
-    from optloc.kernels.damping import Rules
+    from optloc.kernels.damping import StopRules
     from optloc.kernels.runs import fixed_runs, sums_of_runs
 
     problem = free(70, trials=2)[0].flat()
     x, item = solve(problem, "gtrs+lsr").x, np.arange(2)
     runs = pack_runs(problem, whitener_at(problem, x))
-    done, found = fixed_runs(runs, item, x, Rules(), 2)
+    done, found = fixed_runs(runs, item, x, StopRules(), 2)
     equations = sums_of_runs(runs, done.x, item, priors=True)
     shared, _ = linalg.inverse(marginal(equations)[0])
     assert found.regular.all()

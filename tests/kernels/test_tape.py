@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from cases import CASES, kitchen_sink, random_vector
 
-from optloc import MODELS
 from optloc.kernels.trace import OPERATIONS, Recorder, Symbol, evaluate, operate, tape, trace
 from optloc.linear.evaluate import block_links, given, points
+from optloc.models import MODELS
 from optloc.models.primitives import Jet, namespace
 
 SINKS = {f"sink-{d}d-{span}": kitchen_sink(d, span) for d in (2, 3) for span in ("epoch", "run")}

@@ -86,7 +86,7 @@ def test_the_interval_of_the_distance_ends_where_the_profile_of_the_cost_is_high
         scene = draw(seed, late=late, far=0.4 if seed % 2 else 0.0)
         problem = scene.problem()
         fix = optloc.solve(problem)
-        low, high = optloc.distance_from_plane(problem, fix)
+        low, high = optloc.model_checks.distance_from_plane(problem, fix)
         least = scene.least()
         assert low == 0.0 or scene.profile(low**2) - least == pytest.approx(JOINED, abs=0.1)
         assert scene.profile(high**2) - least == pytest.approx(JOINED, abs=0.1)
@@ -132,7 +132,7 @@ def test_stations_in_space_have_no_distance_from_a_plane() -> None:
     heights = np.arange(len(scene.stations)) ** 2.0
     problem = replace(scene, stations=scene.stations + heights[:, None] * (0, 0, 1)).problem()
     with pytest.raises(InvalidProblem, match="no plane fit alike"):
-        optloc.distance_from_plane(problem, optloc.solve(problem))
+        optloc.model_checks.distance_from_plane(problem, optloc.solve(problem))
 
 
 @pytest.mark.full
@@ -145,7 +145,7 @@ def test_the_interval_of_the_distance_holds_the_truth(late: bool, far: float) ->
         problem = scene.problem()
         fix = optloc.solve(problem)
         told[fix.status.label] += 1
-        low, high = optloc.distance_from_plane(problem, fix)
+        low, high = optloc.model_checks.distance_from_plane(problem, fix)
         inside += low <= scene.target[2] <= high
     assert not told["stalled"] + told["max iterations"]
     # a count that is less is one in ten thousand under the promise of 95 %

@@ -68,7 +68,7 @@ def test_far_sources_are_in_the_cones_and_beyond_the_least_range():
         places = (SQUARE, SIX, TRIANGLE)[k % 3]
         u, distance, sigma = far_target(rng, places)
         problem = differences(places, places.mean(0) + distance * u, sigma, rng)
-        found = optloc.determined(problem, blank(problem))
+        found = optloc.model_checks.determined(problem, blank(problem))
         assert found.directions
         own = [one for one in found.directions if one.covers(u)]
         inside += bool(own)
@@ -90,7 +90,7 @@ def test_the_edge_of_a_cone_costs_what_it_should(places, seed):
     rng = np.random.default_rng(seed)
     u, distance, sigma = far_target(rng, places)
     problem = differences(places, places.mean(0) + distance * u, sigma, rng)
-    found = optloc.determined(problem, blank(problem)).directions
+    found = optloc.model_checks.determined(problem, blank(problem)).directions
     size = np.linalg.norm(places - places.mean(0), axis=1).max()
     cost = cost_of(places, problem.z[0] if problem.z.ndim > 1 else problem.z, sigma)
 
@@ -109,7 +109,7 @@ def test_the_edge_of_a_cone_costs_what_it_should(places, seed):
 def test_a_flat_array_has_mirror_images():
     rng = np.random.default_rng(7)
     problem = differences(SQUARE, np.array([8.0, -6.0, -3.0]), 3e-4, rng)
-    found = optloc.determined(problem, blank(problem))
+    found = optloc.model_checks.determined(problem, blank(problem))
     assert len(found.directions) == 2
     one, two = (each.vector for each in found.directions)
     np.testing.assert_allclose(one * [1, 1, -1], two, atol=1e-4)
@@ -134,7 +134,10 @@ def test_it_does_not_depend_on_the_position_of_the_fix():
     problem = differences(SIX, np.array([40.0, 5.0, 9.0]), 2e-4, np.random.default_rng(3))
     fix = optloc.solve(problem)
     moved = dataclasses.replace(fix, x=fix.x + 3.0, cov=np.full_like(fix.cov, np.nan))
-    one, two = optloc.determined(problem, fix).directions, optloc.determined(problem, moved).directions
+    one, two = (
+        optloc.model_checks.determined(problem, fix).directions,
+        optloc.model_checks.determined(problem, moved).directions,
+    )
     np.testing.assert_array_equal(one[0].outline, two[0].outline)
     assert one[0].range == two[0].range
 
@@ -142,14 +145,14 @@ def test_it_does_not_depend_on_the_position_of_the_fix():
 def test_a_bearing_is_a_ray():
     places = np.array([[3.0, 4.0], [90.0, 0.0]])
     problem = optloc.assemble(places, optloc.measured("azimuth", [0.7], a=[0], sigma=0.01))
-    found = optloc.determined(problem, optloc.solve(problem))
+    found = optloc.model_checks.determined(problem, optloc.solve(problem))
     (one,) = found.directions
     np.testing.assert_allclose(found.origin, [3.0, 4.0])
     np.testing.assert_allclose(one.azimuth, 0.7 + 0.01 * np.array([0.0, -1.95996, 1.95996]), atol=2e-4)
     assert one.range[1:] == (0.0, np.inf)
     rows = [optloc.measured(kind, [z], a=[0], sigma=0.01) for kind, z in (("azimuth", 0.7), ("elevation", 0.3))]
     problem = optloc.assemble(np.array([[3.0, 4.0, 5.0]]), *rows)
-    (one,) = optloc.determined(problem, optloc.solve(problem)).directions
+    (one,) = optloc.model_checks.determined(problem, optloc.solve(problem)).directions
     np.testing.assert_allclose(one.elevation, 0.3 + 0.01 * np.array([0.0, -1.95996, 1.95996]), atol=2e-4)
     np.testing.assert_allclose(
         one.half_angles, 0.01 * np.sqrt(chi2.ppf(0.95, 2)) * np.array([1, np.cos(0.3)]), rtol=0.02
@@ -181,7 +184,7 @@ def test_one_measurement_in_the_plane_is_a_curve(kind, z, length):
 def test_a_difference_longer_than_its_baseline_is_a_ray():
     places = np.array([[0.0, 0.0], [10.0, 0.0]])
     problem = optloc.assemble(places, optloc.measured("tdoa", [10.05], a=[0], b=[1], sigma=0.1))
-    curve = optloc.determined(problem, optloc.solve(problem)).curve
+    curve = optloc.model_checks.determined(problem, optloc.solve(problem)).curve
     np.testing.assert_allclose(curve, [[10.0, 0.0], [110.0, 0.0]])
 
 
@@ -193,7 +196,7 @@ def test_stations_on_a_line_leave_a_circle():
     a = np.arange(1, 6)
     rows = optloc.measured("tdoa", measured[1:] - measured[0], a=a, b=0 * a, arrival_sigma=sigma)
     problem = optloc.assemble(s[:, None] * axis, rows)
-    found = optloc.determined(problem, optloc.solve(problem))
+    found = optloc.model_checks.determined(problem, optloc.solve(problem))
     angle, along, away = found.quantities
     # the same from a grid over place and distance
     white = np.linalg.inv(np.linalg.cholesky(sigma**2 * (np.eye(5) + 1.0)))
@@ -219,7 +222,7 @@ def test_stations_in_a_plane_leave_a_place_and_a_distance():
     assert fix.status is Status.AMBIGUOUS
     numbers = {one.name: one for one in fix.determined.quantities}
     far = numbers["distance from plane"]
-    np.testing.assert_allclose([far.low, far.high], optloc.distance_from_plane(problem, fix), rtol=1e-2)
+    np.testing.assert_allclose([far.low, far.high], optloc.model_checks.distance_from_plane(problem, fix), rtol=1e-2)
     assert numbers["x"].low < 4.0 < numbers["x"].high
     np.testing.assert_allclose([numbers["x"].value, numbers["y"].value], fix.position[:2], atol=1e-4)
     assert "95 % distance from plane" in str(fix)
@@ -274,7 +277,7 @@ def test_a_batch_computes_nothing_and_keeps_few_problems():
     with pytest.raises(optloc.InvalidProblem, match="shape"):
         _ = fixes.determined
     with pytest.raises(optloc.InvalidProblem, match="several"):
-        optloc.determined(problem.with_rows(z=np.stack(good)), fixes)
+        optloc.model_checks.determined(problem.with_rows(z=np.stack(good)), fixes)
     again = pickle.loads(pickle.dumps(fixes[6]))
     assert again.determined.directions[0].range == fixes[6].determined.directions[0].range
     many = optloc.solve(problem.with_rows(z=np.stack(far * 6)))
@@ -309,6 +312,6 @@ def test_a_fix_among_fixes_with_more_rows_has_its_own_rows():
     problem = differences(SIX, 90.0 * np.array([1.0, 0.4, 0.2]), 1e-3, np.random.default_rng(3))
     fix = optloc.solve(problem)
     padded = dataclasses.replace(fix, weights=np.concatenate([fix.weights, np.zeros(2)]))
-    one, other = (optloc.determined(problem, each).directions for each in (fix, padded))
+    one, other = (optloc.model_checks.determined(problem, each).directions for each in (fix, padded))
     assert len(one) == len(other) > 0
     np.testing.assert_array_equal(one[0].vector, other[0].vector)

@@ -119,13 +119,13 @@ def test_epochs_here_and_there_are_a_run_of_their_own(shipped):
     drawn = optloc.simulate(shipped, TRUTH, 2)
     ahead = cut(drawn, 3, 9)
     same = thinned(drawn, np.arange(3, 9))
-    np.testing.assert_array_equal(optloc.predict(same, TRUTH), optloc.predict(ahead, TRUTH))
+    np.testing.assert_array_equal(optloc.engine.predict(same, TRUTH), optloc.engine.predict(ahead, TRUTH))
     np.testing.assert_array_equal(same.z, ahead.z)
     every = thinned(drawn, np.arange(0, 200, 10))
     np.testing.assert_array_equal(every.times, drawn.times[::10])
     x = optloc.solve(drawn, "searched").x
-    whole = optloc.predict(drawn, x).reshape(200, -1)
-    np.testing.assert_allclose(optloc.predict(every, x), whole[::10].ravel())
+    whole = optloc.engine.predict(drawn, x).reshape(200, -1)
+    np.testing.assert_allclose(optloc.engine.predict(every, x), whole[::10].ravel())
 
 
 def test_an_error_has_the_name_that_is_shown(shipped):

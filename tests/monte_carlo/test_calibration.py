@@ -12,7 +12,8 @@ from calibration_scenes import DEGENERATE, HALL, degenerate, distances, hall, re
 from monte_carlo.tables import FOLDER, code_digest, ledger
 from scipy.stats import chi2
 
-from optloc import Status, calibrate, network_of
+from optloc import Status, calibrate
+from optloc.sites.calibration import network_of
 from optloc.sites.calibration.calibrated import refuted_blocks, spans
 from optloc.sites.calibration.gauge import determined
 from optloc.sites.calibration.likelihood import likelihood

@@ -9,8 +9,9 @@ from monte_carlo.tables import ledger
 from proof.doppler import FAMILIES, SEED, Scenes, Trial, scenes_of
 from scipy.stats import chi2
 
-from optloc import ECEF, Fix, Status, crlb, solve
+from optloc import Fix, Status, crlb, solve
 from optloc.kernels.jit import enabled
+from optloc.problem import ECEF
 from optloc.solvers.policy import LISTED_GAP
 
 SLACK, SAME = 1e-5, 1e-2

@@ -12,8 +12,9 @@ from robust_cases import MILLIRADIANS, SIGMA, Spoilt, solve_apart, spoilt
 from scipy.stats import beta, binom, chi2, ncx2, poisson
 from verdict.test_gate import digest
 
-from optloc import Fix, Status, reliability, solve
+from optloc import Fix, Status, solve
 from optloc.kernels.least_squares import refine
+from optloc.model_checks import reliability
 from optloc.model_checks.groups import ROW_PRICE as PRICE
 from optloc.solvers.policy import AMBIGUOUS_GAP
 

@@ -9,8 +9,9 @@ from often import few
 from robust_cases import least_squares, nees, rmse, spoilt
 from verdicts import alone
 
-from optloc import rejected, solve
+from optloc import solve
 from optloc.problem.loss import LOSSES
+from optloc.solvers import rejected
 
 DEFAULT, FULL = 40, 400
 # Name: kind, stations, wrong rows, their size in sigma, whether they are late.

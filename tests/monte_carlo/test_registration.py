@@ -11,7 +11,7 @@ from monte_carlo.test_consistency import band
 from runs import run, truth
 
 from optloc import Status
-from optloc.lab.papers.registration import PRINTED, Setting, rms, truth as printed_truth, wander
+from optloc.lab.papers.registration import PRINTED, RegistrationSetting, rms, truth as printed_truth, wander
 
 FULL, JOINT, GAUSSIAN = 2000, 2000, 500
 PRIOR, WIDTH = 200.0, 20.0
@@ -170,7 +170,7 @@ def test_gain_ratios_and_differences_together(name, book):
 
 @pytest.mark.full
 def test_the_recursion_diverges_where_no_guess_is_needed(book):
-    setting = Setting(PRINTED, GAUSSIAN, SEED, 1)
+    setting = RegistrationSetting(PRINTED, GAUSSIAN, SEED, 1)
     drawn, bound = setting.draw(600), setting.bound(600)
     (plain,) = wander(setting, drawn, (600,), (bound,), width=WIDTH)
     lost, size = int(plain.lost.sum()), rms(bound)

@@ -8,7 +8,7 @@ from multi_target.brute import every_set
 from multi_target.scenes import AZIMUTHS, RING, drawn
 
 import optloc
-from optloc.multi_target.pricing_search import TOLERANCE, Region, search
+from optloc.multi_target.pricing_search import TOLERANCE, PricedRegion, search
 from optloc.multi_target.set_packing import Prices
 from optloc.multi_target.sets import of_picks, refine_sets as refined, scenes
 
@@ -23,7 +23,7 @@ def test_the_floor_of_a_search_is_below_every_set(kind, seed):
     by_row = np.zeros(drawn_scene.problem.count)
     by_row[scene.row[scene.row >= 0]] = price[scene.row >= 0]
     reduced = cost + np.where(picks >= 0, by_row[picks], 0.0).sum(-1)
-    found = search(scene, Prices(price, 0.0), Region(np.full(2, -30e3), np.full(2, 30e3)), 200_000)
+    found = search(scene, Prices(price, 0.0), PricedRegion(np.full(2, -30e3), np.full(2, 30e3)), 200_000)
     if reduced.min() < -TOLERANCE:
         assert len(found.places)  # it must not miss what pays
         assert found.floor < reduced.min() + 1e-6
@@ -43,6 +43,6 @@ def test_the_floor_holds_for_correlated_rows_too(seed):
     cost = np.min([refined(scene, picks, start)[0].cost for start in grid], axis=0)
     price = np.random.default_rng(seed).uniform(4.0, 12.0, scene.z.shape)
     reduced = cost + of_picks(price, picks).sum(-1)
-    found = search(scene, Prices(price, 0.0), Region(np.full(2, -30e3), np.full(2, 30e3)), 5_000)
+    found = search(scene, Prices(price, 0.0), PricedRegion(np.full(2, -30e3), np.full(2, 30e3)), 5_000)
     assert found.floor <= max(reduced.min(), -TOLERANCE) + 1e-6
     assert len(found.places) or reduced.min() > -TOLERANCE

@@ -233,7 +233,7 @@ def test_a_mixture_of_optloc_is_one_of_the_host():
     problem = optloc.assemble(STATIONS, optloc.measured("tdoa", a=PAIRS[:, 0], b=PAIRS[:, 1], arrival_sigma=SIGMA))
     problem = optloc.simulate(problem, TRUTH[PLACE, 0], 1)
     fix = optloc.solve(problem)
-    found, own = mixture_state(problem, fix, PLACE, prior(), ZERO), optloc.mixture(problem, fix)
+    found, own = mixture_state(problem, fix, PLACE, prior(), ZERO), optloc.uncertainty.mixture(problem, fix)
     assert isinstance(found, GaussianMixture)
     assert len(found) == len(own.weight)
     assert sum(float(one.weight) for one in found) == pytest.approx(1.0)
@@ -273,7 +273,7 @@ def test_two_targets_in_clutter_are_two_tracks_by_bounded_work(clutter, seed, mo
     solve = initiator.solve
 
     def counted(left):
-        calls.append(chains.Work(left))
+        calls.append(chains.ChainWork(left))
         return calls[-1]
 
     monkeypatch.setattr(initiator, "Work", counted)

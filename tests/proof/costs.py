@@ -6,14 +6,14 @@ import numpy as np
 
 from optloc.proof.nodes.dispatch import NODES
 from optloc.proof.nodes.node import LINEAR, RANGE
-from optloc.proof.search_space import Known
+from optloc.proof.search_space import KnownMinima
 
 Array = np.ndarray
 
 
 def beside(points, d=3, hidden=0):
     """Return other minima (P, d) as a proof wants them."""
-    return Known(np.array(points, dtype=float).reshape(-1, d), hidden, np.zeros((0, 3)), np.zeros(0))
+    return KnownMinima(np.array(points, dtype=float).reshape(-1, d), hidden, np.zeros((0, 3)), np.zeros(0))
 
 
 def down_from(kappa):

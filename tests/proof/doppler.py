@@ -13,8 +13,9 @@ from proof.layouts import SEED
 from scipy.ndimage import minimum_filter
 from scipy.optimize import least_squares
 
-from optloc import ECEF, Frame, Problem, Stations, assemble, measured, with_bias
+from optloc import Frame, Problem, Stations, assemble, measured, with_bias
 from optloc.linear.constraints import height
+from optloc.problem import ECEF
 
 Array = np.ndarray
 Rng = np.random.Generator

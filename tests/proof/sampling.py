@@ -3,9 +3,8 @@
 import numpy as np
 from proof.costs import WIDTH
 
-from optloc import MODELS
 from optloc.kernels.jit import enabled
-from optloc.models import Point, range_rate
+from optloc.models import MODELS, Point, range_rate
 from optloc.proof.nodes.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
 from optloc.proof.nodes.level import bound_height, curve_height
 from optloc.proof.nodes.log_range import bound_logarithm, curve_logarithm

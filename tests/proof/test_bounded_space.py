@@ -6,7 +6,8 @@ from proof.independent import Trial
 from proof.layouts import BY_NAME, rows
 from scipy.optimize import least_squares
 
-from optloc import ECEF, Frame, assemble, measured, solve
+from optloc import Frame, assemble, measured, solve
+from optloc.problem import ECEF
 
 EARTH = Frame("ecef")
 # Latitude, longitude (degrees) and height of four receivers around London.

@@ -20,7 +20,7 @@ from optloc.proof.everywhere import leaves, prove_everywhere
 from optloc.proof.near import UNIQUE, VALUE
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, SLOPE0
-from optloc.proof.search_space import Chart, chart_at, cost_of, curve_box, empty_box, value_at
+from optloc.proof.search_space import LocalAxes, chart_at, cost_of, curve_box, empty_box, value_at
 
 CODES = {"range": RANGE, "linear": LINEAR, "azimuth": AZIMUTH, "elevation": ELEVATION, "groa": RATIO, "height": HEIGHT}
 NEAR = {2: ("range", "linear", "azimuth", "groa"), 3: tuple(CODES)}
@@ -126,7 +126,7 @@ def some_box(rng, made):
     box = empty_box(len(made.K), len(made.names))
     box.half[:d] = 10.0 ** rng.uniform(-2.0, 0.3, d)
     floor = 2.0 * (np.abs(x).sum() + np.abs(made.data[:, :6]).sum()) * np.abs(made.K).sum()
-    return Chart(x, sense, back, sense.T @ sense, np.zeros(3), floor, np.zeros(0), False, x), box
+    return LocalAxes(x, sense, back, sense.T @ sense, np.zeros(3), floor, np.zeros(0), False, x), box
 
 
 def some_point(rng, half):

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from optloc import Status, assemble, measured, solve
 from optloc.kernels.jit import enabled
 from optloc.proof.atlas import atlas_of
-from optloc.proof.batch import Asked, prove_all
+from optloc.proof.batch import ProofRequest, prove_all
 from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.convex_boxes import set_minimum
 from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
@@ -221,7 +221,7 @@ def shown(problems, minima, gaps, budget):
     data, K, w = (np.stack(arrays) for arrays in list(zip(*problems, strict=True))[1:])
     (n, d), none = x.shape, np.zeros(len(x), dtype=np.int64)
     nowhere = np.full((n, 2, d), np.nan)
-    asked = Asked(
+    asked = ProofRequest(
         x,
         np.zeros((n, 0, d)),
         none,

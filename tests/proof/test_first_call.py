@@ -89,7 +89,9 @@ def test_who_ran_out_of_few_boxes_goes_on(monkeypatch):
     monkeypatch.setattr(batch, "enabled", lambda: True)
     monkeypatch.setattr(batch, "usable", lambda kernel, count: True)
     n = 3
-    asked = batch.Asked(*(np.zeros((n, 2)) for _ in batch.Asked._fields))._replace(budget=np.array([3000, 3000, 60]))
+    asked = batch.ProofRequest(*(np.zeros((n, 2)) for _ in batch.ProofRequest._fields))._replace(
+        budget=np.array([3000, 3000, 60])
+    )
     costs = batch.PositionCosts(
         np.zeros(1, np.int64), np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), np.zeros((n, 1)), np.zeros(n)
     )

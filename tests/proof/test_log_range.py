@@ -5,8 +5,7 @@ import pytest
 from proof.costs import WIDTH
 from proof.sampling import bounded, changes, curved, differences, numbers, remainders, samples, value
 
-from optloc import MODELS
-from optloc.models import Point
+from optloc.models import MODELS, Point
 from optloc.proof.box import bound_nodes, least_residual, linearise_rows
 from optloc.proof.nodes.node import LOG_RANGE, RATIO
 from optloc.proof.search_space import empty_box

@@ -7,9 +7,11 @@ import pytest
 from cases import CASES, STATIONS, TARGET, pairs, stations
 from proof.plain import cost_of
 
-from optloc import MODELS, Motion, Prior, Stations, assemble, measured, simulate, with_bias
+from optloc import Motion, Stations, assemble, measured, simulate, with_bias
 from optloc.base.types import Bias
 from optloc.kernels.sums import equations_at
+from optloc.models import MODELS
+from optloc.problem import Prior
 from optloc.proof.position_costs import position_costs
 from optloc.proof.scope import unsupported
 

@@ -10,11 +10,12 @@ from scales import scales
 from scipy.optimize import least_squares, minimize, nnls
 from waves import air
 
-from optloc import Prior, assemble, measured, solve, with_bias
+from optloc import assemble, measured, solve, with_bias
 from optloc.base.types import Bias
 from optloc.kernels.jit import enabled
 from optloc.model_checks.scaled_rows import runs_backwards
 from optloc.model_checks.shape import cost_at_infinity
+from optloc.problem import Prior
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled
 from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_rows, is_positive
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, scaled_costs

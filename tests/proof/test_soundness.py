@@ -9,7 +9,7 @@ from proof.layouts import BY_NAME, CELLS, rows
 
 from optloc import assemble, solve
 from optloc.kernels.jit import enabled
-from optloc.proof.batch import Asked, prove_all
+from optloc.proof.batch import ProofRequest, prove_all
 from optloc.proof.near import UNIQUE, VALUE
 from optloc.proof.position_costs import position_costs
 
@@ -53,7 +53,7 @@ def verdicts(problem, item, x, kappa: float, budget: int = 300):
     cost = np.array([Trial(problem, i).cost(at) for i, at in zip(item, x, strict=True)])
     nowhere = np.full((n, 2, d), np.nan)
     reach = 1e5 * np.stack([-np.ones((n, d)), np.ones((n, d))], axis=1)
-    asked = Asked(
+    asked = ProofRequest(
         x,
         np.zeros((n, 0, d)),
         np.zeros(n, dtype=np.int64),

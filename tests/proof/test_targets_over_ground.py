@@ -8,10 +8,11 @@ from descent import levenberg
 from often import few
 from proof.sampling import many
 
-from optloc import Frame, Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve
+from optloc import Frame, Motion, Status, assemble, certify, constraints, measured, simulate, solve
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import exact, levels, restore
 from optloc.models.course import carry
+from optloc.problem import Prior
 from optloc.proof.runs.ground import (
     Ground,
     axes_at,
@@ -31,7 +32,7 @@ from optloc.proof.runs.ground import (
 from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import has_no_minimum, hessian_of_state, is_convex, least_length, set_lines, sum_up
-from optloc.proof.runs.states import Axes, cost_of_state, put, set_bends, set_box, table_of
+from optloc.proof.runs.states import StateAxes, cost_of_state, put, set_bends, set_box, table_of
 from optloc.proof.scope import unsupported
 from optloc.solvers.certificates.position_cost import state_columns
 
@@ -188,14 +189,14 @@ def boxes(rng: np.random.Generator, count: int):
         off = 10.0 ** rng.uniform(0.0, 4.5)
         turn = np.diag([1.0, 1.0, 0.01, 0.01]) @ rng.normal(size=(4, 4))
         origin = state_on(course.ground, truth[:6]) + off * np.array([1.0, 1.0, 0.01, 0.01]) * rng.normal(size=4)
-        axes = Axes(origin, np.ascontiguousarray(turn), np.linalg.inv(turn), np.zeros((2, 4)))
+        axes = StateAxes(origin, np.ascontiguousarray(turn), np.linalg.inv(turn), np.zeros((2, 4)))
         table = table_of(course)
         put(table, np.zeros(4), 10.0 ** rng.uniform(-1.0, 4.0) * rng.uniform(0.1, 1.0, 4))
         set_box(course, axes, table)
         yield course, axes, table
 
 
-def inside(rng: np.random.Generator, axes: Axes, table, count: int) -> Array:
+def inside(rng: np.random.Generator, axes: StateAxes, table, count: int) -> Array:
     """Return states (count, 4) of a box, many of them at its faces and corners."""
     s = np.clip(rng.uniform(-1.5, 1.5, (count, 4)), -1.0, 1.0) * table.half
     return axes.origin + s @ axes.turn.T

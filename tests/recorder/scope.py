@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from cases import CASES, Case, dense_covariance
 
-from optloc import METHODS, SOLVERS, Problem, simulate
+from optloc import Problem, simulate
+from optloc.solvers import METHODS, SOLVERS
 
 # The size of the wrong measurement: every method with suspects must notice it, and no angle of the cases wraps.
 GROSS_SIGMAS = 40.0

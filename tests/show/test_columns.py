@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from show.ranging import ENU, ranged
 
-from optloc import ECEF
 from optloc.base.records import join
+from optloc.problem import ECEF
 from optloc.show.columns import (
     covariance_columns,
     fix_columns,

@@ -60,7 +60,7 @@ def test_lines_of_position_meet_their_rows(demo):
     for name, line in lines:
         row = [f"tdoa {problem.stations.names[a]} – Lake" for a in problem.rows[0].a].index(name)
         x = problem.frame.from_geodetic(*np.radians(line.T[::-1]), np.full(len(line), fix.geodetic[2]))
-        assert np.abs(optloc.predict(problem, x)[:, row] - problem.z[row]).max() < 30.0
+        assert np.abs(optloc.engine.predict(problem, x)[:, row] - problem.z[row]).max() < 30.0
 
 
 def test_a_pass_has_its_ground_track_on_the_map():
@@ -78,7 +78,7 @@ def test_a_pass_has_its_ground_track_on_the_map():
     over = np.array([[np.cos(turn), np.sin(turn), 0.0] for turn in np.radians([178.0, 181.0, 184.0])]) * 7e6
     stations = optloc.station_array(over[:, None], ("high",), velocity=np.ones((3, 1, 3)))
     rows = optloc.measured("range_rate", np.zeros(3), a=[0, 0, 0], epoch=[0, 1, 2], sigma=1.0)
-    ((_, line),) = ground_tracks(optloc.assemble(stations, rows, times=[0.0, 1.0, 2.0], frame=optloc.ECEF))
+    ((_, line),) = ground_tracks(optloc.assemble(stations, rows, times=[0.0, 1.0, 2.0], frame=optloc.problem.ECEF))
     np.testing.assert_allclose(line, [[178.0, 0.0], [181.0, 0.0], [184.0, 0.0]], atol=1e-9)
 
 
@@ -140,10 +140,10 @@ def test_an_ellipse_that_does_not_cover_is_dotted_on_the_map(monkeypatch):
     """Of many curved fixes no region is enclosed, which takes a tenth of a second each: here from the first on."""
     monkeypatch.setattr("optloc.show.pictures.outlines._MOST", 0)
     lat, lon = np.radians([47.812, 47.751, 47.79]), np.radians([11.183, 11.148, 11.31])
-    stations = optloc.station_array(optloc.ECEF.from_geodetic(lat, lon, np.array([612.0, 640.0, 842.0])), "ABC")
+    stations = optloc.station_array(optloc.problem.ECEF.from_geodetic(lat, lon, np.array([612.0, 640.0, 842.0])), "ABC")
     rows = optloc.measured("range", np.array([9000.0, 12300.0, 1500.0]), a=[0, 1, 2], sigma=800.0)
     problem = optloc.assemble(
-        stations, rows, frame=optloc.ECEF, constraints=(optloc.constraints.height(exactly=700.0),)
+        stations, rows, frame=optloc.problem.ECEF, constraints=(optloc.constraints.height(exactly=700.0),)
     )
     fix = optloc.solve(problem)
     assert fixed_spots(problem, [fix], []).local.all()

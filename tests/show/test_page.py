@@ -8,16 +8,16 @@ import pytest
 from show.ranging import ranged
 
 from optloc import InvalidProblem
-from optloc.show.page import Part, _limits, _turn, fix_page, write_page
+from optloc.show.page import PagePart, _limits, _turn, fix_page, write_page
 from optloc.show.sheet import Sheet, TextTable
 
 
 def test_a_page_loads_nothing_and_escapes_what_it_shows():
     shown = TextTable("t", "", ("name", "value"), (("<script>alert(1)</script>", "2"),))
-    page = write_page("a <title>", [Part("one", "Part & more", tables=[Sheet(pd.DataFrame(), shown)])])
+    page = write_page("a <title>", [PagePart("one", "PagePart & more", tables=[Sheet(pd.DataFrame(), shown)])])
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "<script>alert(1)" not in page
-    assert "Part &amp; more" in page
+    assert "PagePart &amp; more" in page
     assert not re.findall(r'(?:src|href)="(?:https?:)?//', page)
 
 

@@ -19,7 +19,7 @@ from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import begin, read_frame
 from optloc.show.drawing import marks as looks_of, panel, svg_text
 from optloc.show.map import Canvas, Curve, Label
-from optloc.show.page import Part, write_page
+from optloc.show.page import PagePart, write_page
 from optloc.show.sheet import Sheet, TextTable
 
 RUN = CliRunner()
@@ -137,7 +137,7 @@ def test_every_text_of_a_page_is_escaped():
     marks = [Curve("dot", "M0 0h0", tell=bad), Label("name", 0.0, 0.0, bad)]
     canvas = Canvas("map-1", bad, {"stations": marks}, bad, "0 0 1 1", "", {"text": bad})
     sheet = Sheet(None, TextTable("t", bad, (bad,), ((bad,),), bad))
-    part = Part("p", bad, bad, tables=[sheet], maps=[canvas], headings=True, folded=[sheet], source=bad, note=bad)
+    part = PagePart("p", bad, bad, tables=[sheet], maps=[canvas], headings=True, folded=[sheet], source=bad, note=bad)
     page = write_page(bad, [part, part], opening=[bad], facts=bad, methods=looks_of([bad]).values())
     assert "<script>alert" not in page
     assert page.count("{{ 7 * 7 }}") == page.count("alert(1)") > 15

@@ -10,9 +10,11 @@ from scipy.stats import exponnorm, norm
 from station_health.rings import FREE, RING
 from typer.testing import CliRunner
 
-from optloc import LOSSES, InvalidProblem, assemble, common_level, late_signals, measured, solve
+from optloc import InvalidProblem, assemble, measured, solve
 from optloc.cli import app
 from optloc.model_checks.elements import batch_of
+from optloc.problem import LOSSES
+from optloc.station_health import common_level, late_signals
 
 STATED = 10.0
 

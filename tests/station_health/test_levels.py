@@ -10,13 +10,15 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from station_health.rings import FREE, RING, SIGMA, ranged
 
-from optloc import InvalidProblem, assemble, linearise, measured, noise_levels, solve, with_noise_levels
+from optloc import InvalidProblem, assemble, measured, solve
+from optloc.engine import linearise
 from optloc.kernels.sums import equations_at
 from optloc.model_checks import variance_components as rules
 from optloc.model_checks.elements import batch_of, elements
 from optloc.model_checks.score import descend
 from optloc.problem.epochs import by_epoch
 from optloc.problem.noise import Block, Noise, variances
+from optloc.station_health import noise_levels, with_noise_levels
 from optloc.station_health.levels import levels_of
 from optloc.station_health.structure import with_estimated_noise
 

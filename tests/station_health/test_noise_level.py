@@ -8,11 +8,12 @@ from often import few
 from station_health.rings import FREE, RING, ranged
 from station_health.test_stations import RUN, written
 
-from optloc import assemble, common_level, measured, solve
+from optloc import assemble, measured, solve
 from optloc.cli import app
 from optloc.model_checks.elements import batch_of
 from optloc.model_checks.noise_level import common_level_at
 from optloc.model_checks.score import descend
+from optloc.station_health import common_level
 
 STATED = 10.0
 

@@ -10,11 +10,15 @@ from often import few
 from station_health.rings import FREE, RING, SIGMA, ranged
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, assemble, by_epoch, health, measured, predict, reliability, solve, with_noise_levels
+from optloc import InvalidProblem, assemble, measured, solve
 from optloc.cli import app
+from optloc.engine import predict
 from optloc.files import read
+from optloc.model_checks import reliability
+from optloc.problem import by_epoch
 from optloc.show.pictures import save
 from optloc.show.pictures.residuals import plot_health
+from optloc.station_health import health, with_noise_levels
 from optloc.station_health.stations import _sentences
 
 RUN = CliRunner()

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from optloc import InvalidProblem, assemble, measured, noise_structure, solve
+from optloc import InvalidProblem, assemble, measured, solve
 from optloc.base.types import Motion, Status
 from optloc.model_checks.elements import batch_of, elements
 from optloc.model_checks.variance_components import deviance
+from optloc.station_health import noise_structure
 from optloc.station_health.levels import fitted
 from optloc.station_health.structure import with_estimated_noise
 

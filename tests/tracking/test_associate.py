@@ -10,12 +10,12 @@ from scipy.stats import chi2
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Motion, Status
-from optloc.lab.papers.kinematic import Scenario, draw, start_from_fix, strip_labels
+from optloc.lab.papers.kinematic import KinematicScenario, draw, start_from_fix, strip_labels
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
 from optloc.tracking import State, followed, gated, polynomial
 from optloc.tracking.associate import Clutter, assigned, joint, nearest, scored
-from optloc.tracking.several_targets import Candidates, associated, candidates
+from optloc.tracking.several_targets import RowCandidates, associated, candidates
 from optloc.tracking.track import scans
 from optloc.tracking.updates import innovation
 
@@ -251,14 +251,14 @@ def test_known_corrections_are_taken_off():
     start = State(0.0, state.mean, state.cov)
     plain, moved = (
         associated(given, start, polynomial(0, 10.0), joint(CLUTTER)).track.mean
-        for given in (Candidates(run, z), Candidates(other, z + 50.0 * np.arange(9)[:, None]))
+        for given in (RowCandidates(run, z), RowCandidates(other, z + 50.0 * np.arange(9)[:, None]))
     )
     assert moved == pytest.approx(plain, rel=1e-12)
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    scene = Scenario()
+    scene = KinematicScenario()
     own = draw(scene, scene.course(1), 4, (31,))
     return own, strip_labels(own, 0.7, 2.0, (32,))
 
@@ -303,15 +303,15 @@ def test_runs_may_share_their_targets(drawn):
     z = given.z.copy()
     z[:, 3:6] = np.nan  # nothing at all in the first scan
     rule = assigned(Clutter(0.7, 1e-5))
-    made = associated(Candidates(given.channels, z), one, polynomial(1), rule)
+    made = associated(RowCandidates(given.channels, z), one, polynomial(1), rule)
     assert made.track.mean.shape == (4, 3, 20, 4)
-    alone = associated(Candidates(given.channels, z[2]), one, polynomial(1), rule)
+    alone = associated(RowCandidates(given.channels, z[2]), one, polynomial(1), rule)
     assert made.track.mean[2] == pytest.approx(alone.track.mean, rel=1e-9)
 
 
 def test_scans_of_which_nothing_is_taken_say_why(drawn):
     own, given = drawn
-    empty = Candidates(given.channels, np.full((4, 63, 1), np.nan))
+    empty = RowCandidates(given.channels, np.full((4, 63, 1), np.nan))
     lone = associated(empty, start_from_fix(own, 1), polynomial(1), joint(CLUTTER))
     assert (lone.track.code == Status.TOO_FEW_ROWS).all()
     shut = associated(given, start_from_fix(own, 1), polynomial(1), nearest(1e-12))
@@ -339,8 +339,8 @@ def test_what_does_not_fit_is_refused(drawn):
         (lambda: associated(given, lone, polynomial(1), nearest()), "axis of targets"),
         (lambda: associated(given, state, polynomial(2), nearest()), "a state of 4 numbers"),
         (lambda: associated(given, state, polynomial(1), nearest(), "kf"), "unknown filter"),
-        (lambda: associated(Candidates(given.channels, given.z[:, 3:]), state, polynomial(1), nearest()), "shape"),
-        (lambda: associated(Candidates(own.runs, given.z), state, polynomial(1), nearest()), "batch"),
+        (lambda: associated(RowCandidates(given.channels, given.z[:, 3:]), state, polynomial(1), nearest()), "shape"),
+        (lambda: associated(RowCandidates(own.runs, given.z), state, polynomial(1), nearest()), "batch"),
         (lambda: nearest(0.0), "gate"),
         (lambda: gated("ekf", -1.0), "gate"),
     ):

@@ -9,7 +9,7 @@ from verdicts import alone
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Motion, Status
-from optloc.lab.papers.kinematic import Scenario, draw, start_from_fix
+from optloc.lab.papers.kinematic import KinematicScenario, draw, start_from_fix
 from optloc.problem.epochs import cut
 from optloc.tracking import State, followed, polynomial
 from optloc.tracking.several_models import parallel, resized, softmax
@@ -65,7 +65,7 @@ def plain(tau, order, noise=0.0):
 
 @pytest.fixture(scope="module")
 def drawn():
-    scene = Scenario()
+    scene = KinematicScenario()
     return {order: draw(scene, scene.course(order), 2, (11, order)) for order in (0, 1, 2)}
 
 

@@ -128,7 +128,7 @@ def test_the_recursion_is_the_covariance_of_simulated_errors():
     for k in range(scans):
         cov = cov + Q
         found.step(F)
-        rows = lasting._Rows(H, np.zeros(1), np.full(1, k), np.eye(1), np.ones((len(found.phi), 1, 1)))
+        rows = lasting._LastingRows(H, np.zeros(1), np.full(1, k), np.eye(1), np.ones((len(found.phi), 1, 1)))
         found.take(rows, F, cov)
         error = error + np.sqrt(Q) * rng.standard_normal(n)
         gain = cov[0, 0] / (cov[0, 0] + 1.0)
@@ -156,7 +156,7 @@ def test_the_screen_in_machine_code_is_a_score():
         found = scans.filtered(
             k, state.mean, state.cov, ekf.how._replace(d=2), move_of(state, dynamics, float(k), 2), memory=memory
         )
-        rows = lasting._Rows.of(scan_at(problem, k, 1), ahead.mean, 1e6 * np.eye(4))
+        rows = lasting._LastingRows.of(scan_at(problem, k, 1), ahead.mean, 1e6 * np.eye(4))
         S = rows.H @ ahead.cov @ rows.H.T + rows.R
         score = rows.D[0].T @ np.linalg.solve(S, rows.residual)
         total, variance = 0.98 * total, 0.98 * variance
@@ -164,7 +164,7 @@ def test_the_screen_in_machine_code_is_a_score():
             seen = rows.D[0] @ before
             total, variance = total + score @ before, variance + seen @ np.linalg.solve(S, seen)
         before, state = score, State(float(k), found.mean, found.cov)
-        written = lasting._Rows.written(scans.rows[k], scans.item[k], memory, 4, len(STATIONS))
+        written = lasting._LastingRows.written(scans.rows[k], scans.item[k], memory, 4, len(STATIONS))
         for name in ("H", "residual", "R", "D"):
             np.testing.assert_allclose(getattr(written, name), getattr(rows, name), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(memory[:2], [total, variance], rtol=1e-6, atol=1e-9)

@@ -7,8 +7,9 @@ import pytest
 from often import few
 from verdicts import alone
 
-from optloc import InvalidProblem, Motion, assemble, crlb, linearise, measured, simulate, solve
+from optloc import InvalidProblem, Motion, assemble, crlb, measured, simulate, solve
 from optloc.base.types import Stations, Status
+from optloc.engine import linearise
 from optloc.linear.constraints import box
 from optloc.solvers.starts.angles import course_starts
 from optloc.tracking.measurement_space import lines, simplified

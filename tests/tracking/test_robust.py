@@ -6,8 +6,9 @@ from often import few
 from robust_cases import wild_run
 from scipy.optimize import minimize
 
-from optloc import LOSSES, InvalidProblem, Motion, assemble, measured, simulate
+from optloc import InvalidProblem, Motion, assemble, measured, simulate
 from optloc.linear.evaluate import predict
+from optloc.problem import LOSSES
 from optloc.tracking import Rules, State, collected, polynomial, reweighted, tracked
 from optloc.tracking.updates import iekf
 

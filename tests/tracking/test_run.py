@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from often import few
 
-from optloc import ECEF, InvalidProblem, Motion, Status, assemble, measured, station_array
+from optloc import InvalidProblem, Motion, Status, assemble, measured, station_array
 from optloc.linear.constraints import box, height
+from optloc.problem import ECEF
 from optloc.tracking import Rules, State, collected, current_statistical, followed, polynomial, singer, tracked
 from optloc.tracking.several_targets import alone
 
@@ -410,10 +411,10 @@ def test_other_equalities_are_refused():
 def test_pictures_of_tracks_in_space_and_on_earth(tmp_path):
     pytest.importorskip("matplotlib")
     from optloc.show.pictures import plot_tracks, save
-    from optloc.show.pictures.track import Drawn
+    from optloc.show.pictures.track import PlottedTrack
 
     for name, problem in (("space", run(np.arange(15.0), wild=(6,))), ("earth", earth(12)[0])):
-        figure = plot_tracks([Drawn(name, problem, tuple(tracked(problem, polynomial(1, 0.1))))], title=name)
+        figure = plot_tracks([PlottedTrack(name, problem, tuple(tracked(problem, polynomial(1, 0.1))))], title=name)
         panels = [axes for axes in figure.axes if axes.get_visible()]
         assert [axes.get_ylabel() for axes in panels][1:] == [
             f"{'up' if name == 'earth' else 'z'} (m)",

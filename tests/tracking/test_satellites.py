@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from often import few
 
-from optloc import ECEF, InvalidProblem, Motion, assemble, measured, simulate, solve, station_array, with_bias
+from optloc import InvalidProblem, Motion, assemble, measured, simulate, solve, station_array, with_bias
 from optloc.base.frames import ecef_to_geodetic, geodetic_to_ecef
 from optloc.base.types import Status
 from optloc.linear.constraints import height as known_height
+from optloc.problem import ECEF
 from optloc.problem.epochs import cut
 from optloc.tracking import followed, polynomial
 from optloc.tracking.constants import begun_with_constants, followed_with_constants

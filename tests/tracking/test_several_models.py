@@ -5,7 +5,7 @@ import pytest
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Status
-from optloc.lab.papers.kinematic import FILTERS, Scenario, draw, score_track
+from optloc.lab.papers.kinematic import FILTERS, KinematicScenario, draw, score_track
 from optloc.tracking import UPDATES, State, polynomial, predicted
 from optloc.tracking.several_models import imm, mixed, moments, parallel, resized
 from optloc.tracking.track import scans
@@ -16,7 +16,7 @@ MODELS = (polynomial(0), polynomial(1, 50.0), polynomial(2, 20.0))
 
 @pytest.fixture(scope="module")
 def drawn():
-    scene = Scenario()
+    scene = KinematicScenario()
     return draw(scene, scene.course(2, since=22.5), 3, (21,))
 
 
@@ -137,7 +137,7 @@ def test_a_model_that_loses_the_state_gets_no_weight(drawn):
 
 
 def test_a_target_that_begins_to_accelerate_is_followed():
-    scene = Scenario()
+    scene = KinematicScenario()
     late = draw(scene, scene.course(2, since=22.5), 60, (22,))
     errors = {f.name: f.run(late).mean for f in FILTERS}
     best = errors[FILTERS[4].name]

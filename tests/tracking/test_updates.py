@@ -118,8 +118,8 @@ def test_the_iterated_filter_ends_at_the_maximum_a_posteriori_point():
     ((_, scan),) = scans(run, 1)
     done = UPDATES["iekf"](scan, state.mean, state.cov)
     priors = (
-        optloc.Prior("position", state.mean[:3], state.cov[:3, :3]),
-        optloc.Prior("velocity", state.mean[3:], state.cov[3:, 3:]),
+        optloc.problem.Prior("position", state.mean[:3], state.cov[:3, :3]),
+        optloc.problem.Prior("velocity", state.mean[3:], state.cov[3:, 3:]),
     )
     fix = optloc.solve(replace(scan, priors=priors), "lsr", start=state.mean)
     np.testing.assert_allclose(done.mean, fix.x, atol=1e-3)

@@ -17,7 +17,7 @@ from optloc.show.map import fixed_spots
 from optloc.show.pictures import plot_fixes
 from optloc.show.pictures.outlines import outlines_of
 from optloc.uncertainty.contour import holds
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty.region import RegionSurface
 
 DEMOS = Path(optloc.__file__).parent / "scenarios"
 
@@ -74,7 +74,7 @@ def test_the_outline_in_the_plane_is_the_contour_of_the_cost(name, item):
     (outline,) = found
     # a cost of its own
     S, z = problem.stations.position.reshape(-1, 2), problem.z
-    inverse = np.linalg.inv(optloc.noise.dense(problem.noise, np.arange(problem.count)).reshape((problem.count,) * 2))
+    inverse = np.linalg.inv(optloc.problem.dense(problem.noise, np.arange(problem.count)).reshape((problem.count,) * 2))
 
     def cost(points):
         away = points[:, None] - S
@@ -109,7 +109,7 @@ def test_an_ambiguous_fix_has_two_parts_of_their_own_sizes():
     assert len(outline.polygons) == 2
     assert not outline.cut
     S, z = problem.stations.position.reshape(-1, 2), problem.rows[0].z
-    inverse = np.linalg.inv(optloc.noise.dense(problem.noise, np.arange(2)))
+    inverse = np.linalg.inv(optloc.problem.dense(problem.noise, np.arange(2)))
 
     def value(points):
         r = np.linalg.norm(points[:, None] + fix.position - S, axis=-1)
@@ -130,7 +130,7 @@ def test_in_space_the_coordinate_that_is_not_seen_is_at_its_best(name, view):
     problem, _, fix = fixed(name, 0)
     plane = np.eye(3)[list(view)]
     (outline,) = regions(problem, fix, plane)
-    surface, hidden = Surface.of(problem, fix), np.cross(*plane)
+    surface, hidden = RegionSurface.of(problem, fix), np.cross(*plane)
     rng = np.random.default_rng(3)
     around = np.concatenate(outline.lines)
     spread = np.sqrt(hidden @ fix.covariance() @ hidden)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from optloc import accuracy
+from optloc.uncertainty import accuracy
 from optloc.uncertainty.radii import probability, radius
 
 

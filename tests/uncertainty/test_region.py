@@ -6,10 +6,11 @@ from often import few
 from uncertainty.scenes import CASES, fixed
 
 import optloc
-from optloc import InvalidProblem, assemble, likelihood_region, measured
+from optloc import InvalidProblem, assemble, measured
 from optloc.problem.chart import INVERSE_RANGE, jacobian, quantile
+from optloc.uncertainty import likelihood_region
 from optloc.uncertainty.arc import trace_from
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty.region import RegionSurface
 
 HELD = ("tdoa 2 5 30", "tdoa 2 5 300", "tdoa 3 6 0", "azel 4 300", "aoa 3 50 10", "plane 50 400", "line", "r2")
 
@@ -67,7 +68,7 @@ def covered(names, n):
         for item in range(n):
             problem, truth, fix = fixed(name, item)
             if np.isfinite(fix.cov).all():
-                surface = Surface.of(problem, fix)
+                surface = RegionSurface.of(problem, fix)
                 inside.append(float(surface.cost(truth) - surface.least) <= quantile(0.95, len(truth)))
     return np.mean(inside), len(inside)
 
@@ -128,7 +129,9 @@ def test_where_infinity_is_within_the_region_is_a_cone():
 
 
 def test_of_a_gaussian_it_is_the_ellipse():
-    prior = optloc.Prior("position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]]))
+    prior = optloc.problem.Prior(
+        "position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]])
+    )
     stations = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3]])
     weak = assemble(stations, measured("range", np.full(3, 5e3), a=np.arange(3), sigma=1e7), priors=(prior,))
     fix = optloc.solve(weak)
@@ -184,7 +187,7 @@ def profiled_at_ends(names, n):
             problem, _, fix = fixed(name, item)
             if not np.isfinite(fix.cov).all() or fix.chart.name != "inverse range":
                 continue
-            surface, chart = Surface.of(problem, fix), fix.chart
+            surface, chart = RegionSurface.of(problem, fix), fix.chart
             for end in fix.interval("range"):
                 if np.isfinite(end):
                     y = np.append(np.zeros(len(fix.position) - 1), chart.distance / end)

@@ -5,14 +5,17 @@ import pytest
 from uncertainty.scenes import fixed
 
 import optloc
-from optloc import InvalidProblem, assemble, measured, mixture, samples, trace_arc
+from optloc import InvalidProblem, assemble, measured
 from optloc.problem.chart import CURVED, INVERSE_RANGE
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty import mixture, samples, trace_arc
+from optloc.uncertainty.region import RegionSurface
 
 
 def gaussian():
     """Return a problem whose rows say nothing beside a prior."""
-    prior = optloc.Prior("position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]]))
+    prior = optloc.problem.Prior(
+        "position", mean=np.array([1e3, 2e3]), covariance=np.array([[400.0, 150.0], [150.0, 100.0]])
+    )
     stations = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3]])
     problem = assemble(stations, measured("range", np.full(3, 5e3), a=np.arange(3), sigma=1e7), priors=(prior,))
     return problem, prior
@@ -32,7 +35,7 @@ def test_samples_of_a_gaussian_have_its_moments():
 def test_samples_of_a_far_emitter_are_those_of_the_integral(prior):
     """Against a sum over a grid in the chart: the share of the probability nearer than some ranges."""
     problem, _, fix = fixed("tdoa 2 5 100", 0)
-    surface, reach = Surface.of(problem, fix), 400e3
+    surface, reach = RegionSurface.of(problem, fix), 400e3
     assert surface.kind == INVERSE_RANGE
     sigma = np.sqrt(np.diag(surface.chart.spread))
     p = np.linspace(-6, 6, 201) * sigma[0]
@@ -124,7 +127,7 @@ def along_arcs(name, n):
     share, beside = [], []
     for item in range(n):
         problem, truth, fix = fixed(name, item)
-        if Surface.of(problem, fix).kind == CURVED:
+        if RegionSurface.of(problem, fix).kind == CURVED:
             found = trace_arc(problem, fix).locate(truth[None])
             share.append(found[0][0])
             beside.append(found[1][0])

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from optloc import Frame, Motion, Prior, Problem, Stations, assemble, constraints, measured, with_bias
+from optloc import Frame, Motion, Problem, Stations, assemble, constraints, measured, with_bias
 from optloc.linear.constraints import exact, restore
 from optloc.linear.evaluate import predict
 from optloc.models import MODELS
+from optloc.problem import Prior
 from optloc.problem.noise import variances
 
 Array = np.ndarray

@@ -7,9 +7,10 @@ import pytest
 from often import few
 from verdict.exact import COUNT, draw
 
-from optloc import ECEF, Frame, Motion, Status, assemble, certify, constraints, measured, solve
+from optloc import Frame, Motion, Status, assemble, certify, constraints, measured, solve
 from optloc.kernels.jit import enabled
 from optloc.linear.evaluate import predict
+from optloc.problem import ECEF
 from optloc.proof.near import COARSE
 from optloc.solvers.certificates.branch_and_bound import FINE
 from optloc.solvers.certificates.position_cost import eliminate_nuisance, prove
@@ -161,10 +162,10 @@ def test_a_question_that_rounding_cannot_answer_has_a_verdict_of_its_own():
         ),
         np.array([3e6, 4e6]),
     ).flat()
-    from optloc.proof.batch import Asked
+    from optloc.proof.batch import ProofRequest
 
     one, none = np.zeros(1, dtype=np.int64), np.full((1, 2, 2), np.nan)
-    asked = Asked(
+    asked = ProofRequest(
         x=np.array([[3e6, 4e6]]),
         others=np.zeros((1, 0, 2)),
         known=one,

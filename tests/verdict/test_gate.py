@@ -14,7 +14,8 @@ from verdict.scenes import draw
 from verdict.search import Judgement, judge
 
 import optloc
-from optloc import LOSSES, Status, solve
+from optloc import Status, solve
+from optloc.problem import LOSSES
 
 SCENES, FEW = 24, 2
 IN_FULL = {"auto": 1000}  # scenes a seed, of ten; 100 of every other method

@@ -17,8 +17,8 @@ from rich.table import Table
 from optloc.cli import (
     STOPPED,
     Budget,
+    CommandGroup,
     Force,
-    Group,
     Json,
     Outside,
     Quiet,
@@ -40,7 +40,7 @@ _DIFFERS = 3.0
 _MOST_JOBS = 1024
 
 study = typer.Typer(
-    cls=Group,
+    cls=CommandGroup,
     no_args_is_help=True,
     rich_markup_mode="rich",
     epilog=example("optloc list studies", "optloc study run divergence --out divergence"),

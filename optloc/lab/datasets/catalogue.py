@@ -43,7 +43,7 @@ class Dataset:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class DatasetEntry:
     """A line of the table: the folder, what is said of it, and its files with their SHA-256."""
 
     folder: str
@@ -59,7 +59,7 @@ class Entry:
 
 # SHA-256 of the files that the numbers of the documentation were made from.
 _ENTRIES = {
-    "uwb": Entry(
+    "uwb": DatasetEntry(
         "util_uwb_tdoa",
         "Indoor UWB range differences of a quadrotor in a hall of 7 x 8 x 3.5 m with eight anchors; six flights, with "
         "and without obstacles. Truth: motion capture, millimetres.",
@@ -73,7 +73,7 @@ _ENTRIES = {
             "truth.csv": "33a769190cc4103768f34fe7f4c3fcdbef0e43071dcb2fcd9e65eeff2605f39b",
         },
     ),
-    "adsb": Entry(
+    "adsb": DatasetEntry(
         "locards_adsb",
         "Arrival times of 763 messages of airliners, each heard by five of 27 receivers 9 to 322 km away, with the "
         "aircraft's height. Truth: the aircraft's own report, tens of metres.",
@@ -86,7 +86,7 @@ _ENTRIES = {
             "truth.csv": "8fae66dc3449377316b7837ab7e6b35754e969fa4006ed1eb151b9ff4ae9012a",
         },
     ),
-    "gnss": Entry(
+    "gnss": DatasetEntry(
         "gnss_static",
         "Pseudoranges of GPS, Galileo and QZSS to two fixed antennas in Japan. Truth: surveyed, centimetres.",
         "K078: github.com/hirokawa/cssrlib-data; N176: github.com/taroz/MatRTKLIB",
@@ -96,7 +96,7 @@ _ENTRIES = {
             "truth.csv": "6e816bd029bcd40a3a3898eee2efd3844f752a472d612fb51c565863d1929f68",
         },
     ),
-    "mrclam": Entry(
+    "mrclam": DatasetEntry(
         "mrclam_aoa2d",
         "Bearings and ranges between a robot and 15 landmarks in the plane, 0.9 to 10 m. Truth: motion capture.",
         "Leung, Halpern, Barfoot, Liu: International Journal of Robotics Research 30(8), 2011, by way of "
@@ -108,7 +108,7 @@ _ENTRIES = {
             "truth.csv": "66ff5b65253ff23b29e6d9e82db70a9726881f30630f775b0abc8e924dd87a19",
         },
     ),
-    "plaza": Entry(
+    "plaza": DatasetEntry(
         "plaza_range",
         "Radio ranges of 5 to 75 m between a mower and four beacons on a plaza, 7 % too long. Truth: GPS, centimetres.",
         "Djugash: Geolocation with range, CMU range-only data sets, by way of github.com/borglab/gtsam",
@@ -119,7 +119,7 @@ _ENTRIES = {
             "truth.csv": "52d7fda0aca2ebf3fd20bc70679c78f490fa63d3927b20914562a81f7bfdef2a",
         },
     ),
-    "starloc": Entry(
+    "starloc": DatasetEntry(
         "starloc_aoa",
         "Azimuths and elevations of markers in a room, by a moving camera whose mount is turned by 0.7 or 9.6 deg. "
         "Truth: motion capture, centimetres.",
@@ -133,7 +133,7 @@ _ENTRIES = {
         },
     ),
 }
-ENTRIES: Mapping[str, Entry] = MappingProxyType(_ENTRIES)
+ENTRIES: Mapping[str, DatasetEntry] = MappingProxyType(_ENTRIES)
 
 NAMES = tuple(_ENTRIES)
 """Names of all data sets that optloc can read."""

@@ -29,7 +29,7 @@ _QUATERNION = ["qx", "qy", "qz", "qw"]
 
 
 @dataclass(frozen=True, slots=True)
-class Groups:
+class MarkGroups:
     """Camera places (n, 6, 3) and axes (n, 6, 3, 3; rows are its axes in the room), angles (n, 6, 2), truth (n, 3).
 
     `rate` (n, 6) is how fast the camera turns, radians a second.
@@ -53,7 +53,7 @@ class Groups:
         ]
         return assemble(stations, *rows, motions=(Motion(known=self.truth[:, None, None]) if known else Motion(),))
 
-    def turned(self, turn: Array) -> Groups:
+    def turned(self, turn: Array) -> MarkGroups:
         """Return the groups with the camera's axes turned by a rotation vector (3,) of its mount, radians.
 
         The same rotation as optloc's boresight, made by another library: the unit quaternion along (1, turn / 2).
@@ -65,19 +65,19 @@ class Groups:
 
 
 @dataclass(frozen=True, slots=True)
-class Bearings:
+class CameraBearings:
     """One run: all bearings of the markers that are left in, in the order of time, and the camera's poses by frame."""
 
     poses: pd.DataFrame
     rows: pd.DataFrame
     markers: pd.DataFrame
 
-    def half(self, number: int) -> Bearings:
+    def half(self, number: int) -> CameraBearings:
         """Return every other frame, from the first (0) or the second (1) on."""
         frames = np.unique(self.rows["frame"])[number::2]
         return replace(self, rows=self.rows[self.rows["frame"].isin(frames)])
 
-    def often(self) -> Bearings:
+    def often(self) -> CameraBearings:
         """Return the markers that were seen at least six times."""
         counts = self.rows["tag"].value_counts()
         return replace(self, rows=self.rows[self.rows["tag"].isin(counts.index[counts >= SIZE])])
@@ -104,7 +104,7 @@ class Bearings:
             motions=tuple(Motion() for _ in tags),
         )
 
-    def groups(self, count: int, seed: int) -> Groups:
+    def groups(self, count: int, seed: int) -> MarkGroups:
         """Return groups of six random bearings of a marker."""
         rng = np.random.default_rng(seed)
         counts = self.rows["tag"].value_counts().sort_index()
@@ -114,7 +114,7 @@ class Bearings:
         members = np.stack([rng.choice(np.flatnonzero(self.rows["tag"] == tag), SIZE, replace=False) for tag in tags])
         pose = self.poses.loc[self.rows["frame"].to_numpy()[members].ravel()]
         rate = pose["rate"].to_numpy().reshape(count, SIZE)
-        return Groups(
+        return MarkGroups(
             places(pose).reshape(count, SIZE, 3),
             _axes(pose).reshape(count, SIZE, 3, 3),
             self.rows[["az_rad", "el_rad"]].to_numpy()[members],
@@ -146,7 +146,7 @@ def dataset(
     return found.problem(), found.truth
 
 
-def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...] = ()) -> Bearings:
+def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...] = ()) -> CameraBearings:
     """Return one run, with the attitude of the mount by design ("nom") or calibrated ("cal"), without some markers."""
     tables = [table(folder, file) for file in ("stations", "truth", "measurements")]
     choose(name, tables[0]["run"].unique(), "run")
@@ -154,10 +154,10 @@ def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...]
     stations, truth, rows = (found[found["run"] == name] for found in tables)
     poses = stations.set_index("frame").sort_index()
     poses = poses.rename(columns={f"{attitude}_{c}": c for c in ("x_m", "y_m", "z_m", *_QUATERNION)})
-    return Bearings(poses.assign(rate=_rate(poses)), rows[~rows["tag"].isin(without)], truth.set_index("tag"))
+    return CameraBearings(poses.assign(rate=_rate(poses)), rows[~rows["tag"].isin(without)], truth.set_index("tag"))
 
 
-def load(folder: Path, name: str, attitude: str, groups: int, seed: int) -> Groups:
+def load(folder: Path, name: str, attitude: str, groups: int, seed: int) -> MarkGroups:
     """Return groups of one run, with the attitude of the mount by design ("nom") or calibrated ("cal")."""
     return read_run(folder, name, attitude).groups(groups, seed)
 

@@ -35,7 +35,7 @@ TIME_CONSTANT = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class AnglesScenario:
     """Two stations that stay, and a target whose states are written down.
 
     Parameters
@@ -87,15 +87,15 @@ def _states(*parts: tuple[Array, Array, Array]) -> Array:
     return np.concatenate([np.stack(part, axis=1)[i > 0 :] for i, part in enumerate(parts)])
 
 
-def _straight() -> Scenario:
+def _straight() -> AnglesScenario:
     # Printed: 2 m/s and 0.2 m/s² for 50 s. The direction is not.
     t, still = np.arange(51.0)[:, None], np.zeros((51, 2))
     ahead = np.array([1.0, 0.0])
     states = _states(((2.0 * t + 0.1 * t**2) * ahead, (2.0 + 0.2 * t) * ahead, still + 0.2 * ahead))
-    return Scenario("simulation 1", _BASE, states, _FINE, (50,))
+    return AnglesScenario("simulation 1", _BASE, states, _FINE, (50,))
 
 
-def _winding() -> Scenario:
+def _winding() -> AnglesScenario:
     # Printed: x = 2t, y = 10 sin(5πt/180). A complex wave holds sine and cosine of value and derivatives.
     t, rate = np.arange(51.0), np.pi / 36.0
     wave, zero = np.exp(1j * rate * t), np.zeros(51)
@@ -107,10 +107,10 @@ def _winding() -> Scenario:
             (zero, -10.0 * rate**2 * wave.imag),
         )
     ]
-    return Scenario("simulation 2", _BASE, _states((parts[0], parts[1], parts[2])), _FINE, (50,))
+    return AnglesScenario("simulation 2", _BASE, _states((parts[0], parts[1], parts[2])), _FINE, (50,))
 
 
-def fly_circle(name: str, slow: float, fast: float, rate: float, seconds: tuple[int, int, int]) -> Scenario:
+def fly_circle(name: str, slow: float, fast: float, rate: float, seconds: tuple[int, int, int]) -> AnglesScenario:
     """Return simulation 3: straight, in a circle, straight.
 
     Parameters
@@ -141,7 +141,7 @@ def fly_circle(name: str, slow: float, fast: float, rate: float, seconds: tuple[
         (circle[-1] + slow * three * ahead, slow * ahead + 0.0 * three, 0.0 * three * ahead),
     )
     ends = np.cumsum(seconds)
-    return Scenario(name, _WIDE, states, 5e-3, (int(ends[0]), int(ends[1]), int(ends[2])))
+    return AnglesScenario(name, _WIDE, states, 5e-3, (int(ends[0]), int(ends[1]), int(ends[2])))
 
 
 # Printed, but for the place of the second station of simulation 3: the text gives the same one for both.
@@ -187,12 +187,12 @@ the circle, 74 m/s^2."""
 
 
 @dataclass(frozen=True, slots=True)
-class Draw:
+class AnglesDraw:
     """Trials of a simulation.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : AnglesScenario
         What is simulated.
     problem : Problem
         Its run, measured (trials,) times.
@@ -202,28 +202,28 @@ class Draw:
         ``() -> Generator`` of the starts, the same at each call.
     """
 
-    scenario: Scenario
+    scenario: AnglesScenario
     problem: Problem
     trials: int
     rng: Callable[[], np.random.Generator]
 
 
-def draw(scenario: Scenario, trials: int, seed: int, key: int) -> Draw:
+def draw(scenario: AnglesScenario, trials: int, seed: int, key: int) -> AnglesDraw:
     """Return trials of a simulation that depend on seed and key alone."""
     one, two = np.random.SeedSequence(seed, spawn_key=(key,)).spawn(2)
     truth = scenario.states[1:, 0].ravel()
     problem = simulate(scenario.problem(), truth, one, trials=trials)
-    return Draw(scenario, problem, trials, lambda: np.random.default_rng(two))
+    return AnglesDraw(scenario, problem, trials, lambda: np.random.default_rng(two))
 
 
-def start_at_truth(drawn: Draw, sigmas: Sigmas, *, known: int = 3) -> State:
+def start_at_truth(drawn: AnglesDraw, sigmas: Sigmas, *, known: int = 3) -> State:
     """Return starts at t = 0 that are the truth, but for derivatives from `known` on, which are zero."""
     d, mean = drawn.scenario.dimension, drawn.scenario.truth[0].copy()
     mean[known * d :] = 0.0
     return _repeated(mean, _diagonal(sigmas, d), drawn.trials)
 
 
-def scatter_starts(drawn: Draw, sigmas: Sigmas) -> State:
+def scatter_starts(drawn: AnglesDraw, sigmas: Sigmas) -> State:
     """Return starts at t = 0 drawn around the truth with the covariance that they claim."""
     d = drawn.scenario.dimension
     state = _repeated(drawn.scenario.truth[0], _diagonal(sigmas, d), drawn.trials)
@@ -231,14 +231,14 @@ def scatter_starts(drawn: Draw, sigmas: Sigmas) -> State:
     return replace(state, mean=state.mean + error)
 
 
-def fit_start(drawn: Draw, epochs: int, order: int = 2) -> State:
+def fit_start(drawn: AnglesDraw, epochs: int, order: int = 2) -> State:
     """Return the states after some epochs, fitted to them without a guess."""
     fix = fitted(cut(drawn.problem, 0, epochs), order)
     mean, cov = fix.gaussian()
     return State(float(epochs), np.asarray(mean), np.asarray(cov))
 
 
-def first_fix(drawn: Draw, speed: float, rate: float) -> State:
+def first_fix(drawn: AnglesDraw, speed: float, rate: float) -> State:
     """Return the fix of the first epoch, with velocity and acceleration zero of given standard deviations."""
     d = drawn.scenario.dimension
     fix = solve(replace(cut(drawn.problem, 0, 1), motions=(Motion(),)))
@@ -248,7 +248,7 @@ def first_fix(drawn: Draw, speed: float, rate: float) -> State:
     return State(1.0, np.concatenate([fix.position, np.zeros((drawn.trials, 2 * d))], axis=-1), cov)
 
 
-def fixes(drawn: Draw) -> tuple[Array, Array]:
+def fixes(drawn: AnglesDraw) -> tuple[Array, Array]:
     """Return the fix (trials, k, d) of every epoch by itself, and its covariance (trials, k, d, d)."""
     # Named, not left to "auto": every epoch of every trial is then solved in one way.
     fix = solve(drawn.problem, "wiv+lsr")
@@ -286,7 +286,7 @@ def fixed_variance(limit: float) -> Dynamics:
     return singer(TIME_CONSTANT, float(np.sqrt((4.0 - np.pi) / np.pi)) * limit)
 
 
-def errors(drawn: Draw, track: Track | Array) -> Array:
+def errors(drawn: AnglesDraw, track: Track | Array) -> Array:
     """Return the errors (trials, q, 3, d) of position, velocity and acceleration at the last q epochs."""
     mean = track.mean if isinstance(track, Track) else track
     true = drawn.scenario.states[-mean.shape[1] :]
@@ -298,23 +298,23 @@ def rms(error: Array, axes: tuple[int, ...] = (0, 1)) -> Array:
     return np.asarray(np.sqrt((error**2).sum(-1).mean(axes)))
 
 
-def distances(drawn: Draw, track: Track) -> Array:
+def distances(drawn: AnglesDraw, track: Track) -> Array:
     """Return the distances (trials,) of the last states from the truth, metres."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(np.sqrt((errors(drawn, track)[:, -1, 0] ** 2).sum(-1)))
 
 
-def share_lost(drawn: Draw, track: Track) -> float:
+def share_lost(drawn: AnglesDraw, track: Track) -> float:
     """Return the share of tracks that end further than `LOST` from the truth, or nowhere."""
     return float((~(distances(drawn, track) < LOST)).mean())  # so that NaN counts as lost
 
 
-def track_all(drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Track:
+def track_all(drawn: AnglesDraw, start: State, dynamics: Dynamics, update: str = "ekf") -> Track:
     """Return the tracks of all trials."""
     return followed(drawn.problem, start, dynamics, update)
 
 
-def bound(scenario: Scenario, start: State, dynamics: Dynamics) -> Array:
+def bound(scenario: AnglesScenario, start: State, dynamics: Dynamics) -> Array:
     """Return the posterior bound (q, 3) of the root mean square error of position, velocity and acceleration."""
     # About the truth, with the covariance of the start that all trials share.
     alone = State(start.time, scenario.truth[int(start.time)], start.cov[0])
@@ -323,7 +323,7 @@ def bound(scenario: Scenario, start: State, dynamics: Dynamics) -> Array:
     return np.asarray(np.sqrt(variance.sum(-1)))
 
 
-def snapshot_bound(scenario: Scenario) -> Array:
+def snapshot_bound(scenario: AnglesScenario) -> Array:
     """Return the bound (k,) of the position error of every epoch by itself, metres."""
     cov = crlb(by_epoch(scenario.problem()), scenario.states[1:, 0])
     return np.asarray(np.sqrt(np.trace(cov, axis1=-2, axis2=-1)))
@@ -385,7 +385,7 @@ PLACE = np.array([-10e3, 50e3, 10e3])
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
+class SimulatedRays:
     """Fixes of a target that stays.
 
     Parameters
@@ -413,7 +413,7 @@ def whole_track_bound() -> Array:
     return np.asarray(np.sqrt(np.diagonal(crlb(run, STRAIGHT.truth[-1])).reshape(3, -1).sum(-1)))
 
 
-def run_wholes(drawn: Draw, tick: Tick) -> list[tuple[str, Array]]:
+def run_wholes(drawn: AnglesDraw, tick: Tick) -> list[tuple[str, Array]]:
     """Return errors (3,) at the end of simulation 1 of fits to the whole track, and of the filter."""
     run = replace(drawn.problem, motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
     exact, unit = STRAIGHT.truth[-1], np.array([1.0, 1.0, 2.0])[:, None]  # the last coefficient is half of a
@@ -430,7 +430,7 @@ def run_wholes(drawn: Draw, tick: Tick) -> list[tuple[str, Array]]:
     return out
 
 
-def run_rays(count: int, seed: int, key: int, tick: Tick) -> list[Rays]:
+def run_rays(count: int, seed: int, key: int, tick: Tick) -> list[SimulatedRays]:
     """Return fixes of a target that stays, from few stations and from many."""
     out = []
     # Noise of 0.02 and 0.05 rad is four and ten times that of simulation 3: the bias of plain fixes grows with it.
@@ -442,7 +442,7 @@ def run_rays(count: int, seed: int, key: int, tick: Tick) -> list[Rays]:
         fixes = [c[:, 0] for c in (found.plain, found.weighted, found.instrumental)]
         fixes.append(solve(drawn, "searched").position)  # proofs of a hundred rows would be most of the time
         least = float(np.sqrt(np.trace(crlb(run, PLACE))))
-        out.append(Rays(stations, sigma, least, tuple(_bias(each - PLACE) for each in fixes)))
+        out.append(SimulatedRays(stations, sigma, least, tuple(_bias(each - PLACE) for each in fixes)))
         tick()
     return out
 

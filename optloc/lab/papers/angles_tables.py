@@ -18,9 +18,9 @@ from optloc.lab.papers.angles import (
     TIME_CONSTANT,
     WINDING,
     WINDING_START,
-    Draw,
-    Rays,
-    Scenario,
+    AnglesDraw,
+    AnglesScenario,
+    SimulatedRays,
     bound,
     distances,
     draw,
@@ -86,7 +86,7 @@ _CLOSE = (0.1, 0.2)
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class ErrorCurve:
     """Errors against time.
 
     Parameters
@@ -108,31 +108,31 @@ class Curve:
         inside = (self.seconds > first) & (self.seconds <= (np.inf if last is None else last))
         return np.asarray(np.sqrt((self.error[inside] ** 2).mean(0)))
 
-    def phases(self, scenario: Scenario) -> list[float]:
+    def phases(self, scenario: AnglesScenario) -> list[float]:
         """Return the root mean square position error of each phase; the first `SETTLED` seconds do not count."""
         first = (SETTLED, *scenario.phases[:-1])
         return [float(self.total(a, b)[0]) for a, b in zip(first, scenario.phases, strict=True)]
 
 
-def track_curve(label: str, drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Curve:
+def track_curve(label: str, drawn: AnglesDraw, start: State, dynamics: Dynamics, update: str = "ekf") -> ErrorCurve:
     """Return the errors of the tracks from a start."""
     return score_curve(label, drawn, track_all(drawn, start, dynamics, update).mean)
 
 
-def score_curve(label: str, drawn: Draw, mean: Array) -> Curve:
+def score_curve(label: str, drawn: AnglesDraw, mean: Array) -> ErrorCurve:
     """Return the errors of states (trials, q, n) at the last q epochs."""
     error = rms(errors(drawn, mean), (0,))
     last = drawn.scenario.epochs
-    return Curve(label, np.arange(last - len(error) + 1.0, last + 1.0), error)
+    return ErrorCurve(label, np.arange(last - len(error) + 1.0, last + 1.0), error)
 
 
-def bound_curve(label: str, scenario: Scenario, start: State, dynamics: Dynamics) -> Curve:
+def bound_curve(label: str, scenario: AnglesScenario, start: State, dynamics: Dynamics) -> ErrorCurve:
     """Return the posterior bound from a start."""
     least = bound(scenario, start, dynamics)
-    return Curve(label, np.arange(start.time + 1.0, scenario.epochs + 1.0), least)
+    return ErrorCurve(label, np.arange(start.time + 1.0, scenario.epochs + 1.0), least)
 
 
-def run_straight(drawn: Draw, tick: Tick) -> list[Curve]:
+def run_straight(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
     """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
     # a_max is not printed: 150, 10 and one and a half times the acceleration of the target.
     start, out = start_at_truth(drawn, STRAIGHT_START, known=2), []
@@ -146,7 +146,7 @@ def run_straight(drawn: Draw, tick: Tick) -> list[Curve]:
     return out
 
 
-def run_winding(drawn: Draw, tick: Tick) -> list[Curve]:
+def run_winding(drawn: AnglesDraw, tick: Tick) -> list[ErrorCurve]:
     """Return simulation 2: started at rest, and by a fit of the first three epochs."""
     # a_max is not printed: with 30 m/s² and this start the printed errors come out within 15 %.
     model = current_statistical(TIME_CONSTANT, 30.0)
@@ -160,7 +160,7 @@ def run_winding(drawn: Draw, tick: Tick) -> list[Curve]:
     return out
 
 
-def run_circles(drawn: Draw, tick: Tick) -> dict[float, list[Curve]]:
+def run_circles(drawn: AnglesDraw, tick: Tick) -> dict[float, list[ErrorCurve]]:
     """Return the repaired simulation 3 by limit: three filters and the bound."""
     start, out = first_fix(drawn, *CIRCLE_START), {}
     places = fixes(drawn)
@@ -178,12 +178,12 @@ def run_circles(drawn: Draw, tick: Tick) -> dict[float, list[Curve]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class TableReading:
     """Position errors and bounds of the phases of simulation 3 as printed.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : AnglesScenario
         One of `READINGS`.
     limit : float
         Largest acceleration of the model.
@@ -191,13 +191,13 @@ class Reading:
         Metres, by phase.
     """
 
-    scenario: Scenario
+    scenario: AnglesScenario
     limit: float
     error: list[float]
     bound: list[float]
 
 
-def run_readings(count: int, seed: int, key: int, tick: Tick) -> list[Reading]:
+def run_readings(count: int, seed: int, key: int, tick: Tick) -> list[TableReading]:
     """Return simulation 3 as printed."""
     out = []
     for i, scenario in enumerate(READINGS):
@@ -207,17 +207,17 @@ def run_readings(count: int, seed: int, key: int, tick: Tick) -> list[Reading]:
             found = track_curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
             tick()
             least = bound_curve("", scenario, start, fixed_variance(limit))
-            out.append(Reading(scenario, limit, found.phases(scenario), least.phases(scenario)))
+            out.append(TableReading(scenario, limit, found.phases(scenario), least.phases(scenario)))
             tick()
     return out
 
 
-def run_snapshot() -> Curve:
+def run_snapshot() -> ErrorCurve:
     """Return the bound of every second of the repaired simulation 3 by itself, whose last two columns are NaN."""
     least = snapshot_bound(REPAIRED)
     error = np.full((len(least), 3), np.nan)
     error[:, 0] = least
-    return Curve("snapshot", np.arange(1.0, len(least) + 1.0), error)
+    return ErrorCurve("snapshot", np.arange(1.0, len(least) + 1.0), error)
 
 
 Lost = dict[tuple[float, float], dict[str, float]]
@@ -226,7 +226,7 @@ Lost = dict[tuple[float, float], dict[str, float]]
 The first is zero for a start by a fit of the first epochs."""
 
 
-def run_starts(drawn: Draw, tick: Tick) -> Lost:
+def run_starts(drawn: AnglesDraw, tick: Tick) -> Lost:
     """Return who is lost from starts on the line through the stations, and from a fit of three epochs."""
     out: Lost = {}
     fit = fit_start(drawn, 3)
@@ -239,7 +239,7 @@ def run_starts(drawn: Draw, tick: Tick) -> Lost:
     return out
 
 
-def run_clamps(drawn: Draw, tick: Tick) -> dict[str, float]:
+def run_clamps(drawn: AnglesDraw, tick: Tick) -> dict[str, float]:
     """Return the share of lost tracks with the variance as published and clamped, from 3 m and with a_max 0.3."""
     # 0.3 leaves 0.1 m/s² above the target's acceleration: from starts 0.2 m/s² wide estimates cross the limit.
     start = scatter_starts(drawn, (3.0, *_CLOSE))
@@ -251,7 +251,7 @@ def run_clamps(drawn: Draw, tick: Tick) -> dict[str, float]:
     return found
 
 
-def run_ends(drawn: Draw, tick: Tick) -> dict[str, Array]:
+def run_ends(drawn: AnglesDraw, tick: Tick) -> dict[str, Array]:
     """Return the distances (trials,) from the truth at the end of simulation 1, by start and filter."""
     model = current_statistical(TIME_CONSTANT, 30.0)
     start = scatter_starts(drawn, (1.0, *_CLOSE))
@@ -283,13 +283,13 @@ def _row(values: Iterable[float]) -> tuple[str, ...]:
     return tuple(map(short, values))
 
 
-def table_straight(curves: Sequence[Curve]) -> TextTable:
+def table_straight(curves: Sequence[ErrorCurve]) -> TextTable:
     """Return the errors of simulation 1 over the whole track."""
     lines = [("printed", *_row(PRINTED_STRAIGHT)), *((c.label, *_row(c.total())) for c in curves)]
     return tabulate("simulation-1", ("", *_PARTS), lines)
 
 
-def table_winding(curves: Sequence[Curve]) -> TextTable:
+def table_winding(curves: Sequence[ErrorCurve]) -> TextTable:
     """Return the errors of simulation 2, over the whole track and without its first ten seconds."""
     lines = [("0 to 50 s", "printed", *_row(PRINTED_WINDING))]
     for first in (0, 10):
@@ -297,7 +297,7 @@ def table_winding(curves: Sequence[Curve]) -> TextTable:
     return tabulate("simulation-2", ("scored", "", *_PARTS), lines)
 
 
-def table_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> TextTable:
+def table_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCurve) -> TextTable:
     """Return the position errors of the repaired simulation 3."""
     lines = [(ABSENT, "bound of every second by itself", *_row(snapshot.phases(REPAIRED)))]
     for limit, curves in found.items():
@@ -305,7 +305,7 @@ def table_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> Te
     return tabulate("simulation-3", ("a_max", "", "straight", "circle", "straight again"), lines)
 
 
-def table_readings(found: Sequence[Reading]) -> TextTable:
+def table_readings(found: Sequence[TableReading]) -> TextTable:
     """Return the position errors of simulation 3 as printed."""
     lines = []
     for each in found:
@@ -336,7 +336,7 @@ def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> TextTable:
     return tabulate("whole-track", ("", *_PARTS), lines)
 
 
-def table_rays(found: Sequence[Rays]) -> TextTable:
+def table_rays(found: Sequence[SimulatedRays]) -> TextTable:
     """Return bias and error of fixes of a target that stays."""
     names = ("plain", "weighted", "instrumental", "maximum likelihood")
     lines = [
@@ -354,12 +354,12 @@ Style = tuple[str, str, str]
 """Label, colour and line style of a curve."""
 
 
-def three_parts(curves: Mapping[Style, Curve], values: Sequence[float]) -> Figure:
+def three_parts(curves: Mapping[Style, ErrorCurve], values: Sequence[float]) -> Figure:
     """Return errors of position, velocity and acceleration against time, one panel for each.
 
     Parameters
     ----------
-    curves : mapping of (label, colour, line) to Curve
+    curves : mapping of (label, colour, line) to ErrorCurve
         What is drawn.
     values : sequence of three float
         Printed errors over the whole track.
@@ -375,7 +375,7 @@ def three_parts(curves: Mapping[Style, Curve], values: Sequence[float]) -> Figur
     return figure
 
 
-def figure_straight(curves: Sequence[Curve]) -> Figure:
+def figure_straight(curves: Sequence[ErrorCurve]) -> Figure:
     """Return figures 1 to 3: simulation 1."""
     by = {c.label: c for c in curves}
     return three_parts(
@@ -390,13 +390,13 @@ def figure_straight(curves: Sequence[Curve]) -> Figure:
     )
 
 
-def figure_winding(curves: Sequence[Curve]) -> Figure:
+def figure_winding(curves: Sequence[ErrorCurve]) -> Figure:
     """Return figures 4 to 6: simulation 2."""
     looks = ((Ink.RED, "-"), (Ink.BLUE, "-"), (Ink.BLACK, "--"))
     return three_parts({(c.label, *look): c for c, look in zip(curves, looks, strict=True)}, PRINTED_WINDING)
 
 
-def figure_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> Figure:
+def figure_circles(found: Mapping[float, Sequence[ErrorCurve]], snapshot: ErrorCurve) -> Figure:
     """Return figure 7: position errors of the repaired simulation 3, one panel for each limit."""
     figure = canvas(13.0, 4.6)
     axes = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
@@ -448,7 +448,7 @@ _TICKS = 31  # calls of `tick` below
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class AnglesSample:
     """How much is drawn.
 
     Parameters
@@ -470,10 +470,10 @@ class Sample:
 
 
 # Quick: a minute or two. Full: as many trials as the counts of lost tracks need to be known to a per cent.
-_SIZES: dict[Size, Sample] = {"quick": Sample(200, 200, 60, 10), "full": Sample(1000, 1000, 400, 100)}
+_SIZES: dict[Size, AnglesSample] = {"quick": AnglesSample(200, 200, 60, 10), "full": AnglesSample(1000, 1000, 400, 100)}
 
 
-def _run(sample: Sample, seed: int, tick: Tick) -> Report:
+def _run(sample: AnglesSample, seed: int, tick: Tick) -> Report:
     one = draw(STRAIGHT, sample.trials, seed, 0)
     straight = run_straight(one, tick)
     wholes = run_wholes(one, tick)

@@ -512,7 +512,7 @@ _AZIMUTHS = (0.05, 0.2, 0.5, 1.0, 1.446, 2.0, 2.6, 3.1)  # from the illuminator 
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class BistaticSample:
     """How much is drawn.
 
     Parameters
@@ -532,10 +532,10 @@ class Sample:
 
 
 # Quick: half a minute; the slow target is dear, for its record is solved as a whole. Full: errors within two per cent.
-_SIZES: dict[Size, Sample] = {"quick": Sample(1000, 150, 200), "full": Sample(2000, 1000, 2000)}
+_SIZES: dict[Size, BistaticSample] = {"quick": BistaticSample(1000, 150, 200), "full": BistaticSample(2000, 1000, 2000)}
 
 
-def _run(sample: Sample, seed: int, tick: Tick) -> Report:
+def _run(sample: BistaticSample, seed: int, tick: Tick) -> Report:
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 

@@ -16,10 +16,10 @@ from optloc.problem import SPEED_OF_LIGHT, Array, Motion, Prior, Problem, assemb
 from optloc.solvers import solve
 from optloc.tracking import (
     Associate,
-    Candidates,
     Clutter,
     Dynamics,
     Missing,
+    RowCandidates,
     State,
     Track,
     Update,
@@ -51,7 +51,7 @@ def _star(radius: float) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class KinematicScenario:
     """Stations and targets in the plane; the first station is the reference.
 
     The paper gives targets, speeds, accelerations and the number of steps; the rest was chosen, see the text of the
@@ -116,12 +116,12 @@ class Scenario:
 
 
 @dataclass(frozen=True, slots=True)
-class Draw:
+class KinematicDraw:
     """Measurements of all targets.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : KinematicScenario
         The scene.
     truth : array (t, k, 6)
         States of the targets.
@@ -131,7 +131,7 @@ class Draw:
         Positions (n, t) that the first epoch gives.
     """
 
-    scenario: Scenario
+    scenario: KinematicScenario
     truth: Array
     runs: Problem
     fix: State
@@ -142,15 +142,15 @@ class Draw:
         return self.truth[:, 1:, :2]
 
 
-def draw(scenario: Scenario, truth: Array, trials: int, key: tuple[int, ...]) -> Draw:
+def draw(scenario: KinematicScenario, truth: Array, trials: int, key: tuple[int, ...]) -> KinematicDraw:
     """Return measurements of targets, and the fix of the first epoch, without a guess.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : KinematicScenario
         The scene.
     truth : array (t, k, 6)
-        See `Scenario.course`.
+        See `KinematicScenario.course`.
     trials : int
         Independent trials n.
     key : tuple of int
@@ -161,15 +161,15 @@ def draw(scenario: Scenario, truth: Array, trials: int, key: tuple[int, ...]) ->
     # Drawn along the course; a tracker takes scan by scan, each of a target that stands.
     runs = replace(runs, motions=(Motion(0),))
     first = solve(cut(runs, 0, 1))
-    return Draw(scenario, truth, runs, State(float(scenario.times[0]), first.position, first.covariance()))
+    return KinematicDraw(scenario, truth, runs, State(float(scenario.times[0]), first.position, first.covariance()))
 
 
-def strip_labels(drawn: Draw, detection: float, false: float, key: tuple[int, ...]) -> Candidates:
+def strip_labels(drawn: KinematicDraw, detection: float, false: float, key: tuple[int, ...]) -> RowCandidates:
     """Return the rows of all targets without their names, some lost, among false ones.
 
     Parameters
     ----------
-    drawn : Draw
+    drawn : KinematicDraw
         Measurements.
     detection : float
         Probability that a row is seen.
@@ -187,10 +187,10 @@ def strip_labels(drawn: Draw, detection: float, false: float, key: tuple[int, ..
     more = rng.uniform(-reach, reach, (*seen.shape[:-1], int(count.max(initial=0))))
     more = np.where(np.arange(more.shape[-1]) < count, more, np.nan)
     channels = replace(drawn.scenario.problem(), motions=(Motion(0),))
-    return Candidates(channels, np.concatenate([seen, more], axis=-1))
+    return RowCandidates(channels, np.concatenate([seen, more], axis=-1))
 
 
-def baseline(scenario: Scenario) -> float:
+def baseline(scenario: KinematicScenario) -> float:
     """Return the longest distance of a station from the reference, metres: the largest possible range difference."""
     return float(np.linalg.norm(scenario.stations - scenario.stations[0], axis=-1).max())
 
@@ -200,7 +200,7 @@ LOST = 10e3
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class KinematicScore:
     """Errors of many tracks.
 
     Parameters
@@ -241,31 +241,31 @@ class Score:
         return float((self.error[..., -1] > LOST).mean())
 
 
-def score(drawn: Draw, position: Array, cov: Array | None = None) -> Score:
+def score(drawn: KinematicDraw, position: Array, cov: Array | None = None) -> KinematicScore:
     """Return the errors of positions (n, t, k, 2) behind the first epoch, with their covariances where known."""
     away = position - drawn.position
     nees = np.full(away.shape[:-1], np.nan)
     if cov is not None:
         nees = (away * np.linalg.solve(cov, away[..., None])[..., 0]).sum(-1)
-    return Score(np.linalg.norm(away, axis=-1), nees)
+    return KinematicScore(np.linalg.norm(away, axis=-1), nees)
 
 
-def start_from_fix(drawn: Draw, order: int) -> State:
+def start_from_fix(drawn: KinematicDraw, order: int) -> State:
     """Return the state of the first epoch: the fix, and priors of what it does not see."""
     return resized(drawn.fix, order, 2, speed=drawn.scenario.speed, rate=drawn.scenario.rate)
 
 
-def track_all(drawn: Draw, dynamics: Dynamics, update: Update | str = "ekf") -> Track:
+def track_all(drawn: KinematicDraw, dynamics: Dynamics, update: Update | str = "ekf") -> Track:
     """Return the tracks of all runs by one model."""
     return followed(drawn.runs, start_from_fix(drawn, dynamics.order), dynamics, update)
 
 
-def score_track(drawn: Draw, track: Track) -> Score:
+def score_track(drawn: KinematicDraw, track: Track) -> KinematicScore:
     """Return the errors of tracks."""
     return score(drawn, track.position, track.cov[..., :2, :2])
 
 
-def fixes(drawn: Draw) -> Score:
+def fixes(drawn: KinematicDraw) -> KinematicScore:
     """Return the errors of fixes of single epochs, each without a guess and without the others.
 
     The first epoch is left out, as it is with tracks.
@@ -274,7 +274,7 @@ def fixes(drawn: Draw) -> Score:
     return score(drawn, found.position[..., 1:, :], found.covariance()[..., 1:, :, :])
 
 
-def batch(drawn: Draw, order: int) -> Score:
+def batch(drawn: KinematicDraw, order: int) -> KinematicScore:
     """Return the errors at the last epoch of maximum-likelihood estimates of whole runs, without a guess."""
     sizes = {"velocity": drawn.scenario.speed, "acceleration": drawn.scenario.rate}
     priors = [Prior(name, np.zeros(2), size**2 * np.eye(2)) for name, size in list(sizes.items())[:order]]
@@ -285,10 +285,10 @@ def batch(drawn: Draw, order: int) -> Score:
     away = found.x @ ahead.T - drawn.position[:, -1]
     cov = ahead @ found.cov @ ahead.T
     nees = (away * np.linalg.solve(cov, away[..., None])[..., 0]).sum(-1)
-    return Score(np.linalg.norm(away, axis=-1)[..., None], nees[..., None])
+    return KinematicScore(np.linalg.norm(away, axis=-1)[..., None], nees[..., None])
 
 
-def bounds(scenario: Scenario, truth: Array, order: int) -> Array:
+def bounds(scenario: KinematicScenario, truth: Array, order: int) -> Array:
     """Return the posterior Cramer-Rao bound of the position (t, k, 2, 2), that of the first fix included."""
     made = replace(scenario.problem(), motions=(Motion(0),))
     first = crlb(cut(made, 0, 1), truth[:, 0, :2])
@@ -328,7 +328,7 @@ def theory(order: int, steps: int) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Filter:
+class PaperFilter:
     """A way from measurements to positions.
 
     Parameters
@@ -345,7 +345,7 @@ class Filter:
     models: tuple[Dynamics, ...]
     switch: float = 0.0
 
-    def run(self, drawn: Draw) -> Score:
+    def run(self, drawn: KinematicDraw) -> KinematicScore:
         """Return the errors of a draw."""
         scene = drawn.scenario
         if len(self.models) == 1:
@@ -364,11 +364,11 @@ PLAIN = tuple(polynomial(order) for order in (0, 1, 2))
 """Static, uniform and accelerated, without process noise."""
 
 FILTERS = (
-    Filter("CV, Q = 0 (paper)", PLAIN[1:2]),
-    Filter("CV, sd(a) = 0.1 km/s²", (polynomial(1, 100.0),)),
-    Filter("CA, Q = 0 (paper)", PLAIN[2:]),
-    Filter("best of static, CV, CA by likelihood", PLAIN),
-    Filter("IMM of CV and CA with sd(jerk) = 0.05 km/s³", (polynomial(1), polynomial(2, 50.0)), 0.05),
+    PaperFilter("CV, Q = 0 (paper)", PLAIN[1:2]),
+    PaperFilter("CV, sd(a) = 0.1 km/s²", (polynomial(1, 100.0),)),
+    PaperFilter("CA, Q = 0 (paper)", PLAIN[2:]),
+    PaperFilter("best of static, CV, CA by likelihood", PLAIN),
+    PaperFilter("IMM of CV and CA with sd(jerk) = 0.05 km/s³", (polynomial(1), polynomial(2, 50.0)), 0.05),
 )
 """What is tried against a motion that is not the model's; 0.1 km/s² is the acceleration that comes."""
 
@@ -398,17 +398,17 @@ class Association:
 
     Parameters
     ----------
-    drawn : Draw
+    drawn : KinematicDraw
         The truth, and labelled measurements.
-    scores : dict of str to Score
+    scores : dict of str to KinematicScore
         By rule.
     """
 
-    drawn: Draw
-    scores: dict[str, Score]
+    drawn: KinematicDraw
+    scores: dict[str, KinematicScore]
 
 
-def rules(scenario: Scenario, detection: float, false: float) -> tuple[Rule, ...]:
+def rules(scenario: KinematicScenario, detection: float, false: float) -> tuple[Rule, ...]:
     """Return the rules that are compared."""
     # False rows are uniform over range differences from minus to plus the longest baseline.
     known = Clutter(detection, false / (2.0 * baseline(scenario)))
@@ -423,13 +423,18 @@ def rules(scenario: Scenario, detection: float, false: float) -> tuple[Rule, ...
 # Seen with 0.7, and two false rows for three true ones, tell the rules apart: the nearest row loses half of the uniform
 # targets, whole sets a few per cent.
 def association(
-    scenario: Scenario, order: int, trials: int, key: tuple[int, ...], detection: float = 0.7, false: float = 2.0
+    scenario: KinematicScenario,
+    order: int,
+    trials: int,
+    key: tuple[int, ...],
+    detection: float = 0.7,
+    false: float = 2.0,
 ) -> Association:
     """Return the errors of every rule on the same unlabelled rows.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : KinematicScenario
         The scene.
     order : 0 or 1
         Motion of the targets and model of the filter.

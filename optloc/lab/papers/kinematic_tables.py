@@ -16,9 +16,9 @@ from optloc.lab.papers.kinematic import (
     ORDERS,
     PLAIN,
     Association,
-    Draw,
-    Scenario,
-    Score,
+    KinematicDraw,
+    KinematicScenario,
+    KinematicScore,
     association,
     batch,
     bounds,
@@ -56,14 +56,14 @@ SECONDS = {"static": 0.402, "CV on CV": 0.444, "CV on CA": 0.467, "CA on CA": 0.
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class TableLine:
     """One line of table 1.
 
     Parameters
     ----------
     name : str
         Algorithm and motion.
-    score : Score
+    score : KinematicScore
         Errors.
     bound : float or None
         Bound of the mean error, metres; None where the model is wrong.
@@ -74,7 +74,7 @@ class Line:
     """
 
     name: str
-    score: Score
+    score: KinematicScore
     bound: float | None
     seconds: float
     key: str | None = None
@@ -88,7 +88,7 @@ def km(value: float) -> str:
     return f"{size:.3f}" if size < 100.0 else f"{size:.3g}" if size < 1000.0 else f"{size:.0f}"
 
 
-def table_errors(lines: Sequence[Line]) -> TextTable:
+def table_errors(lines: Sequence[TableLine]) -> TextTable:
     """Return table 1 of the paper."""
     header = ("algorithm on motion", "printed", "reproduced", "standard error", "bound", "printed ms", "ms")
     rows = []
@@ -100,7 +100,7 @@ def table_errors(lines: Sequence[Line]) -> TextTable:
     return tabulate("table-1", header, rows)
 
 
-def table_ratios(fix: Score, matched: Mapping[str, Score], steps: int) -> TextTable:
+def table_ratios(fix: KinematicScore, matched: Mapping[str, KinematicScore], steps: int) -> TextTable:
     """Return what is left of table 1 when its noise is divided out."""
     rows = []
     for name, score in matched.items():
@@ -109,7 +109,7 @@ def table_ratios(fix: Score, matched: Mapping[str, Score], steps: int) -> TextTa
     return tabulate("ratios", ("", "printed", "reproduced", "theory"), rows)
 
 
-def table_efficiency(drawn: Mapping[str, Draw]) -> TextTable:
+def table_efficiency(drawn: Mapping[str, KinematicDraw]) -> TextTable:
     """Return last-step errors of filter, iterated filter and batch beside the bound."""
     rows = []
     for name in ("CV", "CA"):
@@ -123,7 +123,7 @@ def table_efficiency(drawn: Mapping[str, Draw]) -> TextTable:
     return tabulate("efficiency", header, rows)
 
 
-def table_models(found: Mapping[str, Sequence[Score]]) -> TextTable:
+def table_models(found: Mapping[str, Sequence[KinematicScore]]) -> TextTable:
     """Return mean errors of filters on several motions."""
     header = ("filter", "CV", "CA", f"CV, CA from step {_HALFWAY}")
     return tabulate("models", header, [(name, *(km(each.mean) for each in scores)) for name, scores in found.items()])
@@ -150,7 +150,10 @@ def _size(value: float) -> str:
 
 
 def table_equations(
-    seed: int, drawn: Mapping[str, Draw], matched: Mapping[str, Score], tests: Mapping[str, Association]
+    seed: int,
+    drawn: Mapping[str, KinematicDraw],
+    matched: Mapping[str, KinematicScore],
+    tests: Mapping[str, Association],
 ) -> TextTable:
     """Return what the printed equations do beside their corrected form."""
     # One row for each equation of the list on the page that can be run.
@@ -172,7 +175,7 @@ def table_equations(
     return tabulate("equations", ("equation", "measured", "as printed", "corrected"), rows)
 
 
-def _steps_of_a_fix(seed: int, drawn: Draw) -> Iterator[tuple[str, str, str, str]]:
+def _steps_of_a_fix(seed: int, drawn: KinematicDraw) -> Iterator[tuple[str, str, str, str]]:
     """Yield how many runs of the linearised fix arrive, with the printed and with the right sign."""
     one = cut(drawn.runs, 0, 1)
     fix, inside = solve(one).position, np.array([1e3, 1e3])
@@ -191,16 +194,16 @@ def _steps_of_a_fix(seed: int, drawn: Draw) -> Iterator[tuple[str, str, str, str
 _COLOURS = (Ink.BLUE, Ink.RED, Ink.GREEN, Ink.PINK)
 
 
-def figure_scene(drawn: Draw, position: Array, score: Score, bound: Array | None) -> Figure:
+def figure_scene(drawn: KinematicDraw, position: Array, score: KinematicScore, bound: Array | None) -> Figure:
     """Return one run in the plane, and the mean error of each target against the step.
 
     Parameters
     ----------
-    drawn : Draw
+    drawn : KinematicDraw
         The truth.
     position : array (n, t, k, 2)
         Estimates.
-    score : Score
+    score : KinematicScore
         Their errors.
     bound : array (t, k, 2, 2), optional
         Covariance bound at the same steps.
@@ -252,12 +255,12 @@ def figure_models(found: Mapping[str, Array], names: Sequence[str]) -> Figure:
     return figure
 
 
-def figure_losses(found: Mapping[str, Score]) -> Figure:
+def figure_losses(found: Mapping[str, KinematicScore]) -> Figure:
     """Return the share of tracks that are far from the truth against the step.
 
     Parameters
     ----------
-    found : mapping of str to Score
+    found : mapping of str to KinematicScore
         By rule.
     """
     figure = canvas(7.0, 4.6)
@@ -286,7 +289,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class KinematicSample:
     """How much is drawn.
 
     Parameters
@@ -302,12 +305,12 @@ class Sample:
 
 
 # Both know the mean errors to one per cent or better; the paper has 100 runs. Association is what takes the time.
-_SIZES: dict[Size, Sample] = {"quick": Sample(500, 300), "full": Sample(2000, 1000)}
+_SIZES: dict[Size, KinematicSample] = {"quick": KinematicSample(500, 300), "full": KinematicSample(2000, 1000)}
 _WORK = 11  # calls of `tick` below
 
 
-def _run(sample: Sample, seed: int, tick: Tick) -> Report:
-    scene = Scenario()
+def _run(sample: KinematicSample, seed: int, tick: Tick) -> Report:
+    scene = KinematicScenario()
 
     def done(value: T) -> T:
         tick()
@@ -346,16 +349,16 @@ def _timed(work: Callable[[], T], runs: int) -> tuple[T, float]:
     return made, (perf_counter() - before) / runs
 
 
-def _scenes(drawn: Mapping[str, Draw]) -> tuple[list[Line], dict[str, Figure]]:
+def _scenes(drawn: Mapping[str, KinematicDraw]) -> tuple[list[TableLine], dict[str, Figure]]:
     """Return the lines of table 1, and figures 2 to 4."""
     # Times are shares of a batch: what one run costs among many, without the overhead of calls.
     still = drawn["static"]
     scene, runs = still.scenario, len(still.runs.z)
     first, seconds = _timed(partial(fixes, still), runs * scene.steps)
     limit = bounds(scene, still.truth, 0)
-    lines = [Line("one fix on static", first, _mean(limit[:, :1]), seconds, "static")]
+    lines = [TableLine("one fix on static", first, _mean(limit[:, :1]), seconds, "static")]
     track, seconds = _timed(partial(track_all, still, PLAIN[0]), runs)
-    lines.append(Line("static, 20 updates, on static", score_track(still, track), _mean(limit[:, 1:]), seconds))
+    lines.append(TableLine("static, 20 updates, on static", score_track(still, track), _mean(limit[:, 1:]), seconds))
     figures = {}
     for number, (model, motion) in enumerate((("CV", "CV"), ("CV", "CA"), ("CA", "CA")), 2):
         own, order = drawn[motion], ORDERS[model]
@@ -363,7 +366,7 @@ def _scenes(drawn: Mapping[str, Draw]) -> tuple[list[Line], dict[str, Figure]]:
         score = score_track(own, track)
         bound = bounds(scene, own.truth, order)[:, 1:] if model == motion else None
         name = f"{model} on {motion}"
-        lines.append(Line(name, score, None if bound is None else _mean(bound), seconds, name))
+        lines.append(TableLine(name, score, None if bound is None else _mean(bound), seconds, name))
         figures[f"figure-{number}"] = figure_scene(own, track.position, score, bound)
     return lines, figures
 
@@ -372,7 +375,7 @@ def _mean(cov: Array) -> float:
     return float(mean_error(cov).mean())
 
 
-def _sides(drawn: Draw, right: int) -> tuple[Array, Array]:
+def _sides(drawn: KinematicDraw, right: int) -> tuple[Array, Array]:
     """Return how often the right model (k,) is chosen, and the mean probability of each (k, q)."""
     scene = drawn.scenario
     made = parallel(drawn.runs, drawn.fix, PLAIN, speed=scene.speed, rate=scene.rate, update="ekf")

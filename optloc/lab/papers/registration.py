@@ -46,7 +46,7 @@ _SHAPES: dict[Shape, tuple[float, float]] = {"full": (1.0, 1.0), "half": (0.5, 0
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class RegistrationScenario:
     """Stations that fly straight, one target, and the systematic errors of their channels.
 
     The first station is the reference of every difference and ratio.
@@ -99,7 +99,7 @@ def _fleet(*rows: tuple[float, ...]) -> tuple[Array, Array]:
     return 1e3 * table[:, :3], table[:, 3:]
 
 
-PRINTED = Scenario(
+PRINTED = RegistrationScenario(
     *_fleet(
         (0, 0, 10, 0, 300, 0),
         (-15, 0, 10, 0, 300, 0),
@@ -114,7 +114,7 @@ PRINTED = Scenario(
 MOVING = replace(PRINTED, target=np.array([200e3, 300e3, 5e3]), course=np.array([-100.0, 0.0, 0.0]))
 """The same stations and the target of section 4.4, which flies straight."""
 
-SPATIAL = Scenario(
+SPATIAL = RegistrationScenario(
     *_fleet(
         (0, 0, 10, 0, 300, 0),
         (-15, 0, 6, -20, 290, 0),
@@ -128,7 +128,7 @@ SPATIAL = Scenario(
 
 
 def problem(
-    scenario: Scenario,
+    scenario: RegistrationScenario,
     epochs: int,
     *,
     sigma: float | None = None,
@@ -141,7 +141,7 @@ def problem(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : RegistrationScenario
         Stations and target.
     epochs : int
         Number of epochs K.
@@ -186,7 +186,7 @@ def problem(
     return made if gain_sigma is None else with_bias(made, "gain", per="pair", kind="groa")
 
 
-def truth(scenario: Scenario, problem: Problem) -> Array:
+def truth(scenario: RegistrationScenario, problem: Problem) -> Array:
     """Return the true parameter vector (size,) of a problem of a scene."""
     values = {
         "position": scenario.target,
@@ -202,12 +202,12 @@ FAR = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class RegistrationSetting:
     """What is drawn.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : RegistrationScenario
         Stations and target.
     trials : int
         Independent draws.
@@ -219,7 +219,7 @@ class Setting:
         As `problem` takes them.
     """
 
-    scenario: Scenario
+    scenario: RegistrationScenario
     trials: int
     seed: int
     key: int
@@ -272,7 +272,7 @@ class Setting:
         return np.random.SeedSequence(self.seed, spawn_key=(self.key, purpose))
 
 
-def one_shot(scenario: Scenario = PRINTED, *, sigma: float | None = None, shape: Shape = "full") -> Array:
+def one_shot(scenario: RegistrationScenario = PRINTED, *, sigma: float | None = None, shape: Shape = "full") -> Array:
     """Return the paper's sigma0, metres: the bound of each coordinate (3,) from the first epoch with known biases."""
     still = replace(scenario, course=None)
     made = problem(still, 1, sigma=sigma, prior=1e-6, shape=shape)  # a micrometre: the biases are known
@@ -285,7 +285,7 @@ def rms(bound: Array) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class RegistrationScore:
     """Estimates of one kind of all trials, against the truth.
 
     Parameters
@@ -311,13 +311,13 @@ class Score:
         return float(self.lost.mean())
 
 
-def score(estimate: Array, exact: Array, bound: Array) -> Score:
+def score(estimate: Array, exact: Array, bound: Array) -> RegistrationScore:
     """Return the score of estimates (trials, n) of a truth (n,) with a bound (n, n)."""
     error = estimate - exact
     with np.errstate(invalid="ignore", over="ignore"):
         # Not "further", so that NaN is far too.
         far = ~((error[:, :3] ** 2).sum(-1) < (FAR * rms(bound)) ** 2)
-    return Score(error, far | ~np.isfinite(error).all(-1))
+    return RegistrationScore(error, far | ~np.isfinite(error).all(-1))
 
 
 def branch(fix: Fix, exact: Array) -> Array:
@@ -333,14 +333,14 @@ def branch(fix: Fix, exact: Array) -> Array:
 
 
 def wander(
-    setting: Setting,
+    setting: RegistrationSetting,
     drawn: Problem,
     epochs: Sequence[int],
     bounds: Sequence[Array] | Array,
     *,
     width: float = 1.0,
     first: int = FIRST,
-) -> tuple[Score, ...]:
+) -> tuple[RegistrationScore, ...]:
     """Return the scores of the paper's recursion after some numbers of epochs, whose bounds are given.
 
     Parameters
@@ -366,7 +366,7 @@ _SAME = 1.0  # metres: without noise the truth is found to far less, and an imag
 
 
 @dataclass(frozen=True, slots=True)
-class Ghost:
+class GhostSolution:
     """Another minimum of the cost of noise-free measurements.
 
     Parameters
@@ -387,7 +387,7 @@ class Ghost:
         return 0.5 * erfc(sqrt(self.gap) / 2.0 / sqrt(2.0))
 
 
-def mirror(scenario: Scenario) -> tuple[Array, Array]:
+def mirror(scenario: RegistrationScenario) -> tuple[Array, Array]:
     """Return place at t = 0 and velocity, (3,) each, of the target's image in the plane of the stations.
 
     The plane is the one that fits the stations best at t = 0, and moves with their mean velocity.
@@ -400,12 +400,14 @@ def mirror(scenario: Scenario) -> tuple[Array, Array]:
     return place, course - 2.0 * ((course - drift) @ normal) * normal
 
 
-def ghost(scenario: Scenario, epochs: int, *, sigma: float | None = None, station_sigma: float = 1.0) -> Ghost | None:
+def ghost(
+    scenario: RegistrationScenario, epochs: int, *, sigma: float | None = None, station_sigma: float = 1.0
+) -> GhostSolution | None:
     """Return the minimum to which the mirror image of the target leads, or None where that is the truth.
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : RegistrationScenario
         Stations and target.
     epochs : int
         Number of epochs.
@@ -424,14 +426,14 @@ def ghost(scenario: Scenario, epochs: int, *, sigma: float | None = None, statio
     fix = solve(made.with_rows(z=predict(made, exact)), "lsr", start=start)
     if np.linalg.norm(fix.x[:3] - exact[:3]) < _SAME:
         return None
-    return Ghost(fix.x, float(fix.cost))
+    return GhostSolution(fix.x, float(fix.cost))
 
 
 # The problem file ``registration.toml`` that is shipped with optloc: stations that span space, ten minutes.
 
 NAMES = ("R1", "R2", "R3", "R4", "R5")
 DELAYS = (100.0, -133.0, 167.0, -100.0)
-"""Nanoseconds by which the clocks of R2 to R5 are late: 30, -40, 50 and -30 m, the biases of `Scenario`."""
+"""Nanoseconds by which the clocks of R2 to R5 are late: 30, -40, 50 and -30 m, the biases of `RegistrationScenario`."""
 
 # Ten minutes in a file of a dozen kilobytes, and the noise of the paper: nanoseconds, metres.
 _EPOCHS, _INTERVAL, _SEED = 200, 3.0, 20170502

@@ -15,9 +15,9 @@ from optloc.lab.papers.registration import (
     NANOSECOND,
     PRINTED,
     SPATIAL,
-    Scenario,
-    Score,
-    Setting,
+    RegistrationScenario,
+    RegistrationScore,
+    RegistrationSetting,
     Shape,
     branch,
     ghost,
@@ -110,15 +110,15 @@ class History:
 
     Parameters
     ----------
-    setting : Setting
+    setting : RegistrationSetting
         What was drawn.
     epochs : tuple of int
         Numbers of epochs.
     bounds : array (t, n, n)
         Cramer-Rao bound at each.
-    plain : tuple of Score
+    plain : tuple of RegistrationScore
         The paper's recursion on the same data.
-    found : tuple of Score
+    found : tuple of RegistrationScore
         The fix without a guess.
     ambiguous : tuple of float
         Share of fixes that say that the data allow another place.
@@ -126,21 +126,21 @@ class History:
         Share of fixes that are lost though nothing speaks against their place.
     """
 
-    setting: Setting
+    setting: RegistrationSetting
     epochs: tuple[int, ...]
     bounds: Array
-    plain: tuple[Score, ...]
-    found: tuple[Score, ...]
+    plain: tuple[RegistrationScore, ...]
+    found: tuple[RegistrationScore, ...]
     ambiguous: tuple[float, ...]
     silent: tuple[float, ...]
 
 
-def run_history(setting: Setting, epochs: Sequence[int], tick: Tick, *, first: int = FIRST) -> History:
+def run_history(setting: RegistrationSetting, epochs: Sequence[int], tick: Tick, *, first: int = FIRST) -> History:
     """Return the scores of both routes on the same data.
 
     Parameters
     ----------
-    setting : Setting
+    setting : RegistrationSetting
         What is drawn.
     epochs : sequence of int
         Numbers of epochs to look at.
@@ -172,7 +172,7 @@ _CHANNELS = ("r21", "r31", "r41", "r51", "g21", "g31", "g41", "g51")
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class TableCase:
     """One column of table 3 or 4.
 
     Parameters
@@ -185,7 +185,7 @@ class Case:
         Noise of an arrival, metres.
     bound : float
         Cramer-Rao bound of the position, metres.
-    plain, found : Score
+    plain, found : RegistrationScore
         The paper's recursion, and the fix without a guess on the same data.
     image : float
         Share of the recursions that ended at the image of the target in the plane of the stations.
@@ -195,8 +195,8 @@ class Case:
     epochs: int
     sigma: float
     bound: float
-    plain: Score
-    found: Score
+    plain: RegistrationScore
+    found: RegistrationScore
     image: float
 
 
@@ -246,7 +246,7 @@ def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]
     return tabulate(name, header, lines)
 
 
-def _mean(score: Score, n: int, exact: Array) -> Array:
+def _mean(score: RegistrationScore, n: int, exact: Array) -> Array:
     """Return the accuracy of the mean over all trials that are not lost; empty where there are none."""
     if score.lost.all():
         return np.zeros(0)
@@ -254,7 +254,7 @@ def _mean(score: Score, n: int, exact: Array) -> Array:
     return accuracy(error, exact[n : n + len(error)])
 
 
-def _single(score: Score, n: int, exact: Array) -> Array:
+def _single(score: RegistrationScore, n: int, exact: Array) -> Array:
     """Return the accuracy of the root mean square error of one run."""
     error = score.error[~score.lost, n:]
     return accuracy(np.sqrt((error**2).mean(0)), exact[n:]) if len(error) else np.zeros(0)
@@ -290,7 +290,7 @@ def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[s
 _COMPARED = ("recursion", "optloc", "bound", "recursion lost", "ended at the image", "optloc lost")
 
 
-def table_starts(cases: Sequence[Case]) -> TextTable:
+def table_starts(cases: Sequence[TableCase]) -> TextTable:
     """Return table 3: the width of the initial error."""
     lines = []
     for case in cases:
@@ -299,14 +299,14 @@ def table_starts(cases: Sequence[Case]) -> TextTable:
     return tabulate("table-3", ("n", "printed error", "printed bound", "printed divergence", *_COMPARED), lines)
 
 
-def table_noises(cases: Sequence[Case], sure: Sequence[Score], later: Sequence[float]) -> TextTable:
+def table_noises(cases: Sequence[TableCase], sure: Sequence[RegistrationScore], later: Sequence[float]) -> TextTable:
     """Return table 4: the noise.
 
     Parameters
     ----------
-    cases : sequence of Case
+    cases : sequence of TableCase
         One for each noise.
-    sure : sequence of Score
+    sure : sequence of RegistrationScore
         The recursion on the same data, started at the truth itself.
     later : sequence of float
         Bounds after 700 epochs, metres.
@@ -324,7 +324,7 @@ def table_noises(cases: Sequence[Case], sure: Sequence[Score], later: Sequence[f
     return tabulate("table-4", header, lines)
 
 
-def _compared(case: Case) -> tuple[str, ...]:
+def _compared(case: TableCase) -> tuple[str, ...]:
     lengths = (case.plain.rmse, case.found.rmse, case.bound)
     shares = (case.plain.share, case.image, case.found.share)
     return (*(metres(v) for v in lengths), *(percent(v) for v in shares))
@@ -430,7 +430,7 @@ def table_gains() -> TextTable:
     return tabulate("gains", ("standard deviation of a ratio", "bound, m"), lines)
 
 
-def table_scenes(cases: Mapping[str, Case]) -> TextTable:
+def table_scenes(cases: Mapping[str, TableCase]) -> TextTable:
     """Return what the printed stations and those that span space make of the same target."""
     lines = []
     for (name, case), scenario in zip(cases.items(), (PRINTED, SPATIAL), strict=True):
@@ -446,14 +446,14 @@ def table_scenes(cases: Mapping[str, Case]) -> TextTable:
     return tabulate("scenes", header, lines)
 
 
-def flatness(scenario: Scenario, epochs: int) -> float:
+def flatness(scenario: RegistrationScenario, epochs: int) -> float:
     """Return the least root mean square distance of the stations from their best plane over a run, metres."""
     track = scenario.track(epochs)
     values = np.linalg.svd(track - track.mean(1, keepdims=True), compute_uv=False)
     return float(values[:, -1].min() / np.sqrt(track.shape[1]))
 
 
-def separation(scenario: Scenario, epochs: int) -> float:
+def separation(scenario: RegistrationScenario, epochs: int) -> float:
     """Return the least distance of two stations over a run, metres."""
     track: Array = scenario.track(epochs)
     first, second = np.triu_indices(track.shape[1], 1)
@@ -469,7 +469,7 @@ _NEAR = 5e3  # metres within which a trial is at the image: after 600 s that lie
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class RegistrationSample:
     """How much is drawn.
 
     Parameters
@@ -492,30 +492,38 @@ class Sample:
 
 
 # Full: the 200 trials of the paper, and 500 where failures of a few per cent are counted.
-_SIZES: dict[Size, Sample] = {
-    "quick": Sample(30, 60, (150, 200, 300, 400, 600), (300, 400, 550, 600, 700)),
-    "full": Sample(200, 500, tuple(range(150, 701, 50)), tuple(range(250, 801, 50))),
+_SIZES: dict[Size, RegistrationSample] = {
+    "quick": RegistrationSample(30, 60, (150, 200, 300, 400, 600), (300, 400, 550, 600, 700)),
+    "full": RegistrationSample(200, 500, tuple(range(150, 701, 50)), tuple(range(250, 801, 50))),
 }
 
 
-def _work(sample: Sample) -> int:
+def _work(sample: RegistrationSample) -> int:
     histories = 4 * len(sample.fixed) + len(sample.moving) + 5
     return histories + len(INITIAL) + 2 * len(NOISE) + 1
 
 
-def _run(sample: Sample, seed: int, tick: Tick) -> Report:
+def _run(sample: RegistrationSample, seed: int, tick: Tick) -> Report:
     fixed = {
-        name: run_history(Setting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick)
+        name: run_history(
+            RegistrationSetting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick
+        )
         for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)))
     }
-    moving = {"1 m": run_history(Setting(MOVING, sample.trials, seed, 2), sample.moving, tick, first=_MOVING_FIRST)}
+    moving = {
+        "1 m": run_history(
+            RegistrationSetting(MOVING, sample.trials, seed, 2), sample.moving, tick, first=_MOVING_FIRST
+        )
+    }
     joint = {
-        name: run_history(Setting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick)
+        name: run_history(RegistrationSetting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick)
         for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)), 3)
     }
-    starts = _starts(Setting(PRINTED, sample.many, seed, 5), sample.last, tick)
-    noisy = [Setting(PRINTED, sample.many, seed, 6 + i, (ns - 10) * NANOSECOND) for i, ns in enumerate(NOISE)]
-    spatial = _case(Setting(SPATIAL, sample.many, seed, 10), sample.last, _WIDEST, tick)
+    starts = _starts(RegistrationSetting(PRINTED, sample.many, seed, 5), sample.last, tick)
+    noisy = [
+        RegistrationSetting(PRINTED, sample.many, seed, 6 + i, (ns - 10) * NANOSECOND) for i, ns in enumerate(NOISE)
+    ]
+    spatial = _case(RegistrationSetting(SPATIAL, sample.many, seed, 10), sample.last, _WIDEST, tick)
     tables = (
         table_biases("table-2", fixed["1 m"], ACCURACY_FIXED),
         table_biases("table-5", moving["1 m"], ACCURACY_MOVING),
@@ -538,17 +546,17 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     return typeset("registration", sample, seed, tables, figures)
 
 
-def _case(setting: Setting, epochs: int, width: float, tick: Tick, label: float = 0.0) -> Case:
+def _case(setting: RegistrationSetting, epochs: int, width: float, tick: Tick, label: float = 0.0) -> TableCase:
     """Return both routes on the same draw."""
     drawn, bound = setting.draw(epochs), setting.bound(epochs)
     (plain,) = wander(setting, drawn, (epochs,), (bound,), width=width)
     found = score(solve(drawn, _METHOD).x, truth(setting.scenario, drawn), bound)
     tick()
     sigma, image = setting.sigma or setting.scenario.sigma, _at_image(setting, epochs, plain)
-    return Case(label or width, epochs, sigma, rms(bound), plain, found, image)
+    return TableCase(label or width, epochs, sigma, rms(bound), plain, found, image)
 
 
-def _at_image(setting: Setting, epochs: int, plain: Score) -> float:
+def _at_image(setting: RegistrationSetting, epochs: int, plain: RegistrationScore) -> float:
     """Return the share of trials that ended at the second minimum of the scene."""
     image = ghost(setting.scenario, epochs, sigma=setting.sigma)
     if image is None:
@@ -558,7 +566,7 @@ def _at_image(setting: Setting, epochs: int, plain: Score) -> float:
     return float((plain.lost & (apart < _NEAR)).mean())
 
 
-def _starts(setting: Setting, epochs: int, tick: Tick) -> list[Case]:
+def _starts(setting: RegistrationSetting, epochs: int, tick: Tick) -> list[TableCase]:
     """Return table 3: one draw, and the recursion from starts of growing width."""
     drawn, bound = setting.draw(epochs), setting.bound(epochs)
     found = score(solve(drawn, _METHOD).x, truth(setting.scenario, drawn), bound)
@@ -566,15 +574,15 @@ def _starts(setting: Setting, epochs: int, tick: Tick) -> list[Case]:
     for width in INITIAL:
         (plain,) = wander(setting, drawn, (epochs,), (bound,), width=float(width))
         image = _at_image(setting, epochs, plain)
-        cases.append(Case(float(width), epochs, setting.scenario.sigma, rms(bound), plain, found, image))
+        cases.append(TableCase(float(width), epochs, setting.scenario.sigma, rms(bound), plain, found, image))
         tick()
     return cases
 
 
-def _noises(settings: Sequence[Setting], epochs: int, tick: Tick) -> TextTable:
+def _noises(settings: Sequence[RegistrationSetting], epochs: int, tick: Tick) -> TextTable:
     """Return table 4, whose labels are 10 ns too large; the recursion is started at the truth itself as well."""
-    cases: list[Case] = []
-    sure: list[Score] = []
+    cases: list[TableCase] = []
+    sure: list[RegistrationScore] = []
     for setting, printed in zip(settings, NOISE, strict=True):
         cases.append(_case(setting, epochs, 1.0, tick, printed))
         sure += wander(setting, setting.draw(epochs), (epochs,), (setting.bound(epochs),), width=0.0)

@@ -161,7 +161,7 @@ _DISTANCE = 100e3
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class SatelliteRun:
     """Position errors of the trials of one filter.
 
     Parameters
@@ -194,10 +194,10 @@ def root_trace(cov: Array) -> Array:
     return np.asarray(np.sqrt(np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)))
 
 
-def score(track: Track, exact: Array) -> Run:
+def score(track: Track, exact: Array) -> SatelliteRun:
     """Return the errors of a track whose last scans are those of true states (epochs, 6)."""
     at = exact[len(exact) - len(track.times) :, :3]
-    return Run(track.position, np.linalg.norm(track.position - at, axis=-1), root_trace(track.cov))
+    return SatelliteRun(track.position, np.linalg.norm(track.position - at, axis=-1), root_trace(track.cov))
 
 
 def from_fixes(drawn: Problem) -> State:
@@ -214,7 +214,7 @@ def prior(at: Array, satellites: Array = SATELLITES) -> Array:
     return np.block([[one, one], [one, 2.0 * one]])
 
 
-def run_fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, Run], Array]:
+def run_fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, SatelliteRun], Array]:
     """Return all filters started by the first two fixes, and the posterior bound (steps,), metres."""
     exact = truth(steps + 2)
     drawn = simulate(problem(steps + 2), exact[0], sequence, trials)
@@ -224,7 +224,9 @@ def run_fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tupl
     return found, root_trace(bound)
 
 
-def run_wild(width: float, steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, Run], Array]:
+def run_wild(
+    width: float, steps: int, trials: int, sequence: np.random.SeedSequence
+) -> tuple[dict[str, SatelliteRun], Array]:
     """Return all filters from starts that are wrong by `width` metres in each coordinate, and the posterior bound.
 
     The same data are tracked from the first two fixes as well, by the filter "quartic + ekf".
@@ -243,7 +245,7 @@ def run_wild(width: float, steps: int, trials: int, sequence: np.random.SeedSequ
     return found, root_trace(bound)
 
 
-def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence) -> tuple[Run, Array]:
+def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence) -> tuple[SatelliteRun, Array]:
     """Return the IEKF with satellites (epochs, 3, 3) that move, from the first two fixes, and the posterior bound."""
     exact = truth(len(satellites))
     drawn = simulate(problem(len(satellites), satellites=satellites), exact[0], sequence, trials)
@@ -253,7 +255,7 @@ def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence)
     return score(followed(drawn, start, dynamics(), "iekf"), exact), root_trace(bound)
 
 
-def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Run]:
+def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, SatelliteRun]:
     """Return the IEKF on the same sea-level target with several kinds of height, by what the filter takes it for."""
     exact, epochs = truth(steps + 2, surface_course()), steps + 2
     keys = sequence.spawn(5)
@@ -276,7 +278,7 @@ def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> di
     return out
 
 
-def run_climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> Run:
+def run_climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> SatelliteRun:
     """Return the IEKF on the target as printed, which climbs, while its height is said to be zero within 500 m."""
     exact, (draws, errors) = truth(steps + 2), sequence.spawn(2)
     drawn = simulate(problem(steps + 2), exact[0], draws, trials)
@@ -344,7 +346,7 @@ def metres(value: float) -> str:
     return f"{value:.1f}" if value < 1e3 else f"{value:.0f}"
 
 
-def table_fixed(found: Mapping[str, Run], bound: Array) -> TextTable:
+def table_fixed(found: Mapping[str, SatelliteRun], bound: Array) -> TextTable:
     """Return the filters started by fixes; the bound is (steps,), metres."""
     steps = [step for step in _STEPS if step <= len(bound)]
     plain = found["ekf"].position
@@ -359,7 +361,7 @@ def table_fixed(found: Mapping[str, Run], bound: Array) -> TextTable:
     return tabulate("fixed", header, lines)
 
 
-def table_relative(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> TextTable:
+def table_relative(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
     """Return what the paper's figure shows, in its unit: mean errors over 100 km, by start and filter."""
     longest = max(len(bound) for _, bound in panels.values())
     steps = [step for step in _STEPS if step <= longest]
@@ -373,7 +375,7 @@ def table_relative(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Tex
     return tabulate("relative", ("start", "filter", *(f"step {step}" for step in steps)), lines)
 
 
-def table_starts(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> TextTable:
+def table_starts(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
     """Return the filters after starts that are far off, by the standard deviation of each coordinate, metres."""
     lines = []
     for width, (runs, bound) in found.items():
@@ -386,7 +388,7 @@ def table_starts(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Text
     return tabulate("starts", header, lines)
 
 
-def table_pairs(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> TextTable:
+def table_pairs(found: Mapping[float, tuple[Mapping[str, SatelliteRun], Array]]) -> TextTable:
     """Return in how many runs the modified covariance did better than its rivals at the end."""
     lines = []
     for width, (runs, _) in found.items():
@@ -396,7 +398,7 @@ def table_pairs(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> TextT
     return tabulate("pairs", ("start error", "better than EKF", "better than IEKF", "better than MGEKF"), lines)
 
 
-def table_heights(found: Mapping[str, Run]) -> TextTable:
+def table_heights(found: Mapping[str, SatelliteRun]) -> TextTable:
     """Return errors and claims of the IEKF from fixes, by what is known of the height."""
     steps = [step for step in _STEPS_HEIGHT if step <= len(next(iter(found.values())).rms)]
     lines = [
@@ -406,7 +408,7 @@ def table_heights(found: Mapping[str, Run]) -> TextTable:
     return tabulate("heights", ("height", *(f"step {step}: rms (claimed), m" for step in steps)), lines)
 
 
-def table_moving(found: Mapping[str, tuple[Run, Array]], still: Array) -> TextTable:
+def table_moving(found: Mapping[str, tuple[SatelliteRun, Array]], still: Array) -> TextTable:
     """Return errors and bounds with satellites that fly, by heading, beside the bound (steps,) of those that stay."""
     steps = [step for step in _STEPS_MOVING if step <= len(still)]
     lines = [("as printed: they stay", *(f"{ABSENT} ({metres(still[s - 1])})" for s in steps))]
@@ -448,12 +450,12 @@ _STYLE = {
 _STYLE_HEIGHT = ((Ink.BLUE, 1.8), (Ink.GREEN, 1.8), (Ink.SKY, 1.8), (Ink.RED, 4.0), (Ink.PINK, 1.6), (Ink.BLACK, 1.8))
 
 
-def figure_filters(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Figure:
+def figure_filters(panels: Mapping[str, tuple[Mapping[str, SatelliteRun], Array]]) -> Figure:
     """Return root mean square errors and the posterior bound against steps, one panel for each start.
 
     Parameters
     ----------
-    panels : mapping of str to (mapping of str to Run, array (steps,))
+    panels : mapping of str to (mapping of str to SatelliteRun, array (steps,))
         Filters and bound by title.
     """
     figure = canvas(0.6 + 6.0 * len(panels), 8.8)
@@ -474,7 +476,7 @@ def figure_filters(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Fig
     return figure
 
 
-def figure_heights(found: Mapping[str, Run]) -> Figure:
+def figure_heights(found: Mapping[str, SatelliteRun]) -> Figure:
     """Return errors, and what the filter claims of them (dotted), against steps, by what is known of the height."""
     figure = canvas(8.0, 5.2)
     ax = figure.subplots()
@@ -502,7 +504,7 @@ _PANEL = 100e3
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class SatellitesSample:
     """How much is drawn.
 
     Parameters
@@ -525,10 +527,10 @@ class Sample:
 
 
 # Quick: root mean squares within five per cent, in about a minute. Full: within two.
-_SIZES: dict[Size, Sample] = {"quick": Sample(200, 100), "full": Sample(2000, 1000)}
+_SIZES: dict[Size, SatellitesSample] = {"quick": SatellitesSample(200, 100), "full": SatellitesSample(2000, 1000)}
 
 
-def _run(sample: Sample, seed: int, tick: Tick) -> Report:
+def _run(sample: SatellitesSample, seed: int, tick: Tick) -> Report:
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 

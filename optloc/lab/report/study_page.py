@@ -17,7 +17,7 @@ from optloc.lab.report.sheets import latex, sheets
 from optloc.lab.study import summary
 from optloc.lab.study.design import StudyDesign
 from optloc.lab.study.draws import Case, draw
-from optloc.lab.study.folder import Manifest, design_of_manifest, read_frame, read_manifest, references
+from optloc.lab.study.folder import StudyManifest, design_of_manifest, read_frame, read_manifest, references
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import Profiles, profiles
 from optloc.lab.study.summary import case_label, noise_text
@@ -26,7 +26,7 @@ from optloc.show import (
     Canvas,
     Drawing,
     Look,
-    Part,
+    PagePart,
     Picture,
     Sheet,
     figure_class,
@@ -124,10 +124,10 @@ _DPI = 200
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _StudyContent:
     """What a report is made of; profiles are those of methods that do not begin at the truth, None without a fix."""
 
-    manifest: Manifest
+    manifest: StudyManifest
     frame: pd.DataFrame
     cells: pd.DataFrame
     looks: dict[str, Look]
@@ -143,7 +143,7 @@ class _Section:
     name: str
     title: str
     text: str
-    make: Callable[[_Found], list[Picture]]
+    make: Callable[[_StudyContent], list[Picture]]
     lines: bool = True
     wide: bool = False
     tables: tuple[str, ...] = ()
@@ -182,7 +182,7 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
     claim(target)
     with together():
         files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
-        parts = [Part("ranking", "Ranking", tables=[found.sheets["ranking"]])]
+        parts = [PagePart("ranking", "Ranking", tables=[found.sheets["ranking"]])]
         for section in _SECTIONS:
             say(section.title.lower())
             pictures = section.make(found)
@@ -195,12 +195,12 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
             parts.append(part)
             files += more
         source = found.manifest.text
-        parts.append(Part("made", "How it was made", tables=[found.sheets["machine"]], source=source))
+        parts.append(PagePart("made", "How it was made", tables=[found.sheets["machine"]], source=source))
         write_text(target, _page(found, parts))
     return [target, *files]
 
 
-def _found(folder: Path) -> _Found:
+def _found(folder: Path) -> _StudyContent:
     manifest = read_manifest(folder)
     rows = read_frame(folder, [*summary.COLUMNS])
     if not len(rows):
@@ -219,10 +219,10 @@ def _found(folder: Path) -> _Found:
     profiled = profiles(rivals) if some else None
     tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order, profiled)}
     places = [] if design is None else list(scenario_maps(design, frame))
-    return _Found(manifest, frame, cells, marks(order), tables, places, profiled)
+    return _StudyContent(manifest, frame, cells, marks(order), tables, places, profiled)
 
 
-def _page(found: _Found, parts: list[Part]) -> str:
+def _page(found: _StudyContent, parts: list[PagePart]) -> str:
     m, rows = found.manifest, len(found.frame)
     state = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, and what follows may change"
     trials = found.frame[["data", "trial"]].drop_duplicates()
@@ -234,11 +234,11 @@ def _page(found: _Found, parts: list[Part]) -> str:
     return write_page(m.title or m.name, parts, opening=opening, facts=facts, methods=found.looks.values())
 
 
-def _part(section: _Section, found: _Found, pictures: list[Picture]) -> Part:
+def _part(section: _Section, found: _StudyContent, pictures: list[Picture]) -> PagePart:
     folded = [found.sheets[name] for name in section.tables]
     # Before the files are written: these get a legend of their own.
     drawings = [inline(picture) for picture in pictures]
-    return Part(section.name, section.title, section.text, drawings=drawings, wide=section.wide, folded=folded)
+    return PagePart(section.name, section.title, section.text, drawings=drawings, wide=section.wide, folded=folded)
 
 
 def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
@@ -269,7 +269,7 @@ def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
     return path
 
 
-def _maps(place: Path, found: _Found) -> tuple[Part, list[Path]]:
+def _maps(place: Path, found: _StudyContent) -> tuple[PagePart, list[Path]]:
     """Return the maps of a page, which move where they are on Earth, and the files of their pictures."""
     text = (
         "Bound of the position error (root of its trace) at the height of the middle trial, over the place of the "
@@ -284,18 +284,18 @@ def _maps(place: Path, found: _Found) -> tuple[Part, list[Path]]:
         trials = (one.truths, one.off)
         maps.append(map_element(one.found, name, one.title, trials) if one.found.geodetic else inline(picture))
         files += _figure_files(place, picture, legend=False)
-    return Part("maps", "Where the bound is small", text, maps=maps, headings=True), files
+    return PagePart("maps", "Where the bound is small", text, maps=maps, headings=True), files
 
 
-def _of_cells(make: Callable[..., object], found: _Found) -> list[Picture]:
+def _of_cells(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
     return list(make(found.cells, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _of_rows(make: Callable[..., object], found: _Found) -> list[Picture]:
+def _of_rows(make: Callable[..., object], found: _StudyContent) -> list[Picture]:
     return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _profiles(found: _Found) -> list[Picture]:
+def _profiles(found: _StudyContent) -> list[Picture]:
     return [] if found.profiles is None else list(drawn.profiles(found.profiles, found.looks))
 
 

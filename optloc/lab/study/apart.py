@@ -20,7 +20,7 @@ from threading import Lock, Thread
 from typing import IO, Any, NoReturn
 
 from optloc.lab.study.design import Chunk
-from optloc.lab.study.trial import DIED, LATE, Lost, Part, compute
+from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, compute
 from optloc.problem import InvalidProblem, load_plugin, plugins
 
 # Seconds: to begin, half of one where a processor is free; without a task, after which it ends, as nobody tells a
@@ -112,7 +112,7 @@ def _send(file: IO[bytes], message: object) -> None:
     file.flush()
 
 
-class Pool:
+class WorkerPool:
     """Processes apart: begun when they are needed, and others where they died.
 
     Parameters
@@ -126,7 +126,7 @@ class Pool:
         self._all: set[Apart] = set()
         self._idle: list[Apart] = []
 
-    def compute(self, chunk: Chunk, seconds: float, names: Sequence[str] | None = None) -> Part | Lost:
+    def compute(self, chunk: Chunk, seconds: float, names: Sequence[str] | None = None) -> TrialPart | Lost:
         """Return the part of a chunk, computed in a process apart, or what came of it in so many seconds.
 
         Parameters
@@ -152,7 +152,7 @@ class Pool:
             found = apart.ask(pickle.dumps(message), seconds)
             if isinstance(found, InvalidProblem):
                 raise found
-            if isinstance(found, Part) and (found.key, len(found.table)) == (chunk.key, chunk.count):
+            if isinstance(found, TrialPart) and (found.key, len(found.table)) == (chunk.key, chunk.count):
                 return found
             # A process without memory, or one that answers something else, is of no use to others.
             apart.end()

@@ -28,11 +28,11 @@ from optloc.engine import (
     vectors,
     weighed,
 )
-from optloc.lab.study.draws import Drawn
-from optloc.lab.study.networks import Found, Networks, each, from_truth, refined
+from optloc.lab.study.draws import DrawnCase
+from optloc.lab.study.networks import NetworkResult, Networks, each, from_truth, refined
 from optloc.models import MODELS
-from optloc.problem import Array, Fix, InvalidProblem, Problem, Stage, Status, Table, tied, whiten, window
-from optloc.sites.calibration.likelihood import Estimate, likelihood
+from optloc.problem import Array, Fix, InvalidProblem, Problem, Registry, Stage, Status, tied, whiten, window
+from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.rounds import starts_of
 from optloc.solvers import given, judge, judge_points, offer, spread_of
@@ -47,7 +47,7 @@ _EVALUATIONS = 200
 """Evaluations of SciPy at most, ten times what a start that leads somewhere takes (8 to 20 in shipped studies)."""
 
 
-def start_of(kind: str, width: float, drawn: Drawn) -> Array:
+def start_of(kind: str, width: float, drawn: DrawnCase) -> Array:
     """Return the starting vectors (n, size) of a guess: "truth", "centre" of the stations, or "box" around it.
 
     The centre is taken a tenth of the stations' spread off at random, lest it fall on a station, where ranges have no
@@ -59,7 +59,7 @@ def start_of(kind: str, width: float, drawn: Drawn) -> Array:
         Which guess.
     width : float
         Width of the box, metres.
-    drawn : Drawn
+    drawn : DrawnCase
         The trials; the places in the box are theirs, whatever the method.
     """
     if kind == "truth":
@@ -310,12 +310,12 @@ def _linear(one: Problem, scale: float) -> tuple[Array, Array]:
 # Networks: from random places, and from the convex start.
 
 
-def at_random(count: int) -> Callable[[Network, int], Found]:
+def at_random(count: int) -> Callable[[Network, int], NetworkResult]:
     """Return what refines so many networks of random places, all in the spread that the arrivals tell."""
     return lambda network, seed: refined(network, starts_of(likelihood(network), seed).random(count))
 
 
-def by_nuclear_norm(network: Network, seed: int) -> Found:
+def by_nuclear_norm(network: Network, seed: int) -> NetworkResult:
     """Return what the times of emission of least truncated nuclear norm lead to; nothing where it does not apply.
 
     References
@@ -334,11 +334,13 @@ def by_nuclear_norm(network: Network, seed: int) -> Found:
         if np.isfinite(found.value):
             stations, pulses, which = upgrade(affine_network(z, found.offset, d))
             emission = np.repeat((begun.shift + begun.spread * found.offset)[None], len(which), axis=0)
-            starts = Estimate(begun.spread * stations, np.zeros((len(which), m)), begun.spread * pulses, emission)
+            starts = NetworkEstimate(
+                begun.spread * stations, np.zeros((len(which), m)), begun.spread * pulses, emission
+            )
     return refined(network, starts)
 
 
-def only_networks(drawn: Drawn, start: Array) -> Fix:
+def only_networks(drawn: DrawnCase, start: Array) -> Fix:
     """Stand for the fixes of a baseline that has none."""
     raise InvalidProblem("this baseline serves networks alone", "baseline", "give [[network]] tables")
 
@@ -368,17 +370,17 @@ class Baseline:
         ``Networks -> tuple of Found``, where it finds networks, too.
     """
 
-    run: Callable[[Drawn, Array], Fix]
+    run: Callable[[DrawnCase, Array], Fix]
     summary: str
     guess: bool = True
     slow: bool = False
     reference: bool = False
     method: str = ""
-    networks: Callable[[Networks], tuple[Found, ...]] | None = None
+    networks: Callable[[Networks], tuple[NetworkResult, ...]] | None = None
 
 
-def _iterate(method: str) -> Callable[[Drawn, Array], Fix]:
-    def run(drawn: Drawn, start: Array) -> Fix:
+def _iterate(method: str) -> Callable[[DrawnCase, Array], Fix]:
+    def run(drawn: DrawnCase, start: Array) -> Fix:
         from optloc.solvers import solve
 
         return solve(drawn.problem, method, start=start)
@@ -386,11 +388,11 @@ def _iterate(method: str) -> Callable[[Drawn, Array], Fix]:
     return run
 
 
-def _truth(drawn: Drawn, start: Array) -> Fix:
+def _truth(drawn: DrawnCase, start: Array) -> Fix:
     return _iterate("lsr")(drawn, drawn.truth)
 
 
-def _printed(drawn: Drawn, start: Array) -> Fix:
+def _printed(drawn: DrawnCase, start: Array) -> Fix:
     """Return the undamped iteration with the residual's sign as the paper prints it."""
     from optloc.lab.papers.kinematic import taylor
 
@@ -400,12 +402,12 @@ def _printed(drawn: Drawn, start: Array) -> Fix:
     return given(drawn.problem, x)
 
 
-def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[Drawn, Array], Fix]:
+def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[DrawnCase, Array], Fix]:
     """Return the method of a paper; it claims whatever it arrives at."""
     return lambda drawn, start: claim(drawn.problem, start, steps(drawn.problem, start))
 
 
-def _network(summary: str, refine: Callable[[Network, int], Found]) -> Baseline:
+def _network(summary: str, refine: Callable[[Network, int], NetworkResult]) -> Baseline:
     return Baseline(only_networks, summary, guess=False, slow=True, networks=each(refine))
 
 
@@ -451,5 +453,5 @@ _OWN = {
     "ten-random": _network("networks: the best of least squares from ten networks of random places", at_random(10)),
 }
 
-BASELINES: Table[Baseline] = Table("optloc.baselines", lambda value: isinstance(value, Baseline), _OWN)
+BASELINES: Registry[Baseline] = Registry("optloc.baselines", lambda value: isinstance(value, Baseline), _OWN)
 """Baselines by name."""

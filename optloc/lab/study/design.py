@@ -23,7 +23,7 @@ import numpy as np
 from optloc.files import conform, join, kind_model, parse_toml, read, read_text, within
 from optloc.lab.study.document import Level, NetworkTable, ScenarioTable, StudyFile, sigma_of
 from optloc.lab.study.draws import Case, add_flaws, check_truth, metres, place_stations
-from optloc.lab.study.methods import Method, methods_of
+from optloc.lab.study.methods import StudyMethod, methods_of
 from optloc.lab.study.networks import NetworkCase, check_network, noise_of
 from optloc.models import MODELS
 from optloc.problem import (
@@ -62,12 +62,12 @@ class Cell:
     ----------
     case : Case or NetworkCase
         Geometry, truth, noise.
-    method : Method
+    method : StudyMethod
         What solves it.
     """
 
     case: Case | NetworkCase
-    method: Method
+    method: StudyMethod
 
     @property
     def key(self) -> str:
@@ -176,7 +176,7 @@ _CASES, _PARTS = 10_000, 1_000_000
 
 
 def design_of(
-    file: Path, *, trials: int | None = None, seed: int | None = None, more: Sequence[Method] = ()
+    file: Path, *, trials: int | None = None, seed: int | None = None, more: Sequence[StudyMethod] = ()
 ) -> StudyDesign:
     """Return the design of a study file, or of a shipped study by its name.
 
@@ -186,7 +186,7 @@ def design_of(
         A TOML file with ``format = 1``.
     trials, seed : int, optional
         In the place of those of the file; `trials` also in that of single scenarios.
-    more : sequence of Method
+    more : sequence of StudyMethod
         Methods beside those of the file.
 
     Raises
@@ -211,7 +211,7 @@ def design_of_text(
     *,
     trials: int | None = None,
     seed: int | None = None,
-    more: Sequence[Method] = (),
+    more: Sequence[StudyMethod] = (),
 ) -> StudyDesign:
     """Return the design of the text of a study file; `folder` is where its problem files are."""
     study = conform(StudyFile, parse_toml(text, source), source)
@@ -245,7 +245,7 @@ def design_of_text(
     )
 
 
-def _one_kind(study: StudyFile, methods: list[Method]) -> None:
+def _one_kind(study: StudyFile, methods: list[StudyMethod]) -> None:
     """Refuse studies of nothing, of scenarios and networks at once, and methods that do not serve what is studied."""
     if bool(study.scenario) == bool(study.network):
         what = "there are both scenarios and networks" if study.scenario else "there is nothing to study"

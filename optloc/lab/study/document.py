@@ -23,7 +23,7 @@ Name = Annotated[str, Field(min_length=1, max_length=120)]
 
 # Limits of counts catch slips before hours are spent: more stations than any array has, more trials than the nine
 # digits of a part's name can number.
-class _Table(BaseModel):
+class _DesignTable(BaseModel):
     """A table of the file; keys that it does not know are refused."""
 
     # Strict: a number in quotes is text with a unit, and a misspelt key must not be a default in silence.
@@ -32,7 +32,7 @@ class _Table(BaseModel):
     )
 
 
-class LayoutTable(_Table):
+class LayoutTable(_DesignTable):
     """Stations placed by rule, and who measures what; lengths are amounts."""
 
     stations: int = Field(default=6, ge=1, le=1000)
@@ -56,7 +56,7 @@ class LayoutTable(_Table):
     """Standard deviation of each coordinate of the stations' positions, drawn anew in every trial; None: exact."""
 
 
-class TruthTable(_Table):
+class TruthTable(_DesignTable):
     """Where the target is; lengths are amounts."""
 
     kind: Literal["fixed", "box", "shell", "hull", "area"]
@@ -86,7 +86,7 @@ class TruthTable(_Table):
     """Velocity of a moving target, in the place of `speed`."""
 
 
-class OutlierTable(_Table):
+class OutlierTable(_DesignTable):
     """Gross errors of single stations."""
 
     share: float = Field(gt=0.0, le=1.0)
@@ -97,7 +97,7 @@ class OutlierTable(_Table):
     """Whether stations are off in one direction only, as blocked paths make arrivals late; by default in either."""
 
 
-class ErrorTable(_Table):
+class ErrorTable(_DesignTable):
     """What the measurements suffer and no method is told."""
 
     offset: Amount | dict[str, Amount] | None = None
@@ -106,7 +106,7 @@ class ErrorTable(_Table):
     """Gross errors of a share of the stations."""
 
 
-class ScenarioTable(_Table):
+class ScenarioTable(_DesignTable):
     """A geometry, a truth and its noise levels."""
 
     name: Name
@@ -131,7 +131,7 @@ class ScenarioTable(_Table):
     """Number of trials, in the place of the study's."""
 
 
-class NetworkTable(_Table):
+class NetworkTable(_DesignTable):
     """Stations, clocks and pulses that are unknown together, drawn anew in every trial; lengths are amounts."""
 
     name: Name
@@ -164,7 +164,7 @@ class NetworkTable(_Table):
     """Number of trials, in the place of the study's."""
 
 
-class MethodTable(_Table):
+class MethodTable(_DesignTable):
     """How the problems are solved. A list in `method`, `baseline` or `solver` stands for one method each."""
 
     name: Name | None = None
@@ -187,7 +187,7 @@ class MethodTable(_Table):
     """Trials of one task; by default so many that it takes seconds."""
 
 
-class StudyFile(_Table):
+class StudyFile(_DesignTable):
     """A study file, format 1."""
 
     format: Literal[1]

@@ -93,7 +93,7 @@ class Case:
         sizes = {"dimension": problem.dimension, "stations": problem.stations.count, "rows": problem.count}
         return {"kinds": "+".join(rows.kind for rows in problem.rows), **sizes, "epochs": problem.epochs}
 
-    def draw(self, first: int, count: int) -> Drawn:
+    def draw(self, first: int, count: int) -> DrawnCase:
         """Return trials `first` to ``first + count``."""
         return draw(self, first, count)
 
@@ -106,7 +106,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class DrawnCase:
     """Trials of a case.
 
     Parameters
@@ -135,7 +135,7 @@ class Drawn:
     bad: Array
     position: str = "position"
 
-    def part(self, first: int, count: int) -> Drawn:
+    def part(self, first: int, count: int) -> DrawnCase:
         """Return some of the trials."""
         kept = slice(first, first + count)
         return replace(
@@ -150,7 +150,7 @@ def block_size(case: Case) -> int:
     return int(np.clip(_NUMBERS // case.numbers, 1, _MOST))
 
 
-def draw(case: Case, first: int, count: int) -> Drawn:
+def draw(case: Case, first: int, count: int) -> DrawnCase:
     """Return trials `first` to ``first + count`` of a case; they do not depend on what else is drawn.
 
     Parameters
@@ -171,7 +171,7 @@ def draw(case: Case, first: int, count: int) -> Drawn:
     digests = [_digest(case, part) for part in parts]
     of = [trial // size - blocks[0] for trial in range(first, first + count)]
     seed, digest = (tuple(texts[block] for block in of) for texts in (names, digests))
-    return Drawn(problem.with_rows(z=z), truth, wild, seed, digest, bad, case.state[0])
+    return DrawnCase(problem.with_rows(z=z), truth, wild, seed, digest, bad, case.state[0])
 
 
 def _digest(case: Case, block: tuple[Array, ...]) -> str:

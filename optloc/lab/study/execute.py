@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, filterwarnings, warn
 
-from optloc.lab.study.apart import Pool
+from optloc.lab.study.apart import WorkerPool
 from optloc.lab.study.design import Chunk, StudyDesign, workers
 from optloc.lab.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
-from optloc.lab.study.trial import DIED, LATE, Lost, Part, join_parts, part_of_lost
+from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, join_parts, part_of_lost
 from optloc.problem import InvalidProblem, nearest, plugins
 
 CONNECT = 10.0
@@ -112,7 +112,7 @@ def run_design(
         return progress(folder)
 
 
-def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
+def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[TrialPart]:
     """Yield the parts of chunks as they are finished.
 
     A chunk whose process died is computed again in another. If that dies too, or where a chunk is over its time, halves
@@ -133,7 +133,7 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
     work = _Work(chunks, by.limit)
     if not work.left:
         return
-    with EXECUTORS[by.name].begin(by) as begun, closing(Pool(1)) as here:
+    with EXECUTORS[by.name].begin(by) as begun, closing(WorkerPool(1)) as here:
         while work.left:
             try:
                 for found in _parallel(work.hand_out(), begun):
@@ -144,7 +144,7 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
                     yield from work.take(here.compute(task.chunk, by.limit))
 
 
-def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[Part | Lost]:
+def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[TrialPart | Lost]:
     from joblib import Parallel, delayed, parallel_config
 
     with parallel_config(**begun.options), catch_warnings():
@@ -188,7 +188,7 @@ class _Work:
         self.left = deque(_Task(chunk, chunk) for chunk in chunks)
         self._limit = limit
         self.out: dict[str, _Task] = {}
-        self._parts: dict[str, list[Part]] = {}
+        self._parts: dict[str, list[TrialPart]] = {}
         self._cost: dict[str, float] = {}
         self._given_up: dict[str, Lost] = {}
 
@@ -199,7 +199,7 @@ class _Work:
             self.out[task.chunk.key] = task
             yield task.chunk, self._seconds(task)
 
-    def take(self, found: Part | Lost) -> Iterator[Part]:
+    def take(self, found: TrialPart | Lost) -> Iterator[TrialPart]:
         """Yield the part of a chunk of the design where it is complete with what was found."""
         task = self.out.pop(found.key)
         part = self._judge(task, found) if isinstance(found, Lost) else found
@@ -212,7 +212,7 @@ class _Work:
             # Names of parts are in the order of their trials.
             yield part if len(parts) == 1 else join_parts(task.whole, sorted(parts, key=lambda some: some.key))
 
-    def _judge(self, task: _Task, lost: Lost) -> Part | None:
+    def _judge(self, task: _Task, lost: Lost) -> TrialPart | None:
         """Return the part of a task that was lost, or None and have it tried again, whole or in halves."""
         chunk, cell = task.chunk, task.chunk.cell.key
         if cell not in self._given_up:
@@ -259,17 +259,17 @@ class Begun:
     """
 
     options: dict[str, Any]
-    work: Callable[[Chunk, float], Part | Lost]
+    work: Callable[[Chunk, float], TrialPart | Lost]
     deaths: tuple[type[BaseException], ...] = ()
     streams: bool = True
 
 
 @cache
-def _pool() -> Pool:
-    return Pool(workers())
+def _pool() -> WorkerPool:
+    return WorkerPool(workers())
 
 
-def beside(names: Sequence[str], chunk: Chunk, seconds: float) -> Part | Lost:
+def beside(names: Sequence[str], chunk: Chunk, seconds: float) -> TrialPart | Lost:
     """Compute a chunk beside a worker of a cluster, with the plugins of the process that runs the study."""
     return _pool().compute(chunk, seconds, names)
 
@@ -278,7 +278,7 @@ def beside(names: Sequence[str], chunk: Chunk, seconds: float) -> Part | Lost:
 def _processes(by: Executor) -> Iterator[Begun]:
     jobs = by.jobs or workers()
     # Its workers are threads: each waits for a process apart.
-    with closing(Pool(jobs)) as pool:
+    with closing(WorkerPool(jobs)) as pool:
         yield Begun({"backend": "threading", "n_jobs": jobs}, pool.compute)
 
 
@@ -353,7 +353,7 @@ def _unreachable(by: Executor, error: BaseException) -> InvalidProblem:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ExecutorEntry:
     """A way to compute.
 
     Parameters
@@ -371,9 +371,9 @@ class Entry:
     scheduler: bool = False
 
 
-EXECUTORS: dict[str, Entry] = {
-    "processes": Entry(_processes, "processes of this machine; the default"),
-    "dask": Entry(_dask, "a Dask cluster that exists (--scheduler), or a local one", scheduler=True),
-    "ray": Entry(_ray, "a Ray cluster that exists (--scheduler), or a local one", scheduler=True),
+EXECUTORS: dict[str, ExecutorEntry] = {
+    "processes": ExecutorEntry(_processes, "processes of this machine; the default"),
+    "dask": ExecutorEntry(_dask, "a Dask cluster that exists (--scheduler), or a local one", scheduler=True),
+    "ray": ExecutorEntry(_ray, "a Ray cluster that exists (--scheduler), or a local one", scheduler=True),
 }
 """Executors by name."""

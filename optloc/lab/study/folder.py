@@ -18,7 +18,7 @@ from optloc.files import json_of, read_bytes, written
 from optloc.lab.study.baselines import BASELINES
 from optloc.lab.study.design import StudyDesign, design_of_text
 from optloc.lab.study.methods import version_of
-from optloc.lab.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
+from optloc.lab.study.trial import COLUMNS, FAILED, GAP, TrialPart, arrow_schema, machine, versions
 from optloc.problem import InvalidProblem, Status
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ EXPLAINED = (*FAILED, Status.NUMERICAL.label, Status.UNAVAILABLE.label)
 
 
 @dataclass(frozen=True, slots=True)
-class Manifest:
+class StudyManifest:
     """What an output folder holds.
 
     Parameters
@@ -89,10 +89,10 @@ class Manifest:
         return sum(self.chunks.values())
 
 
-def manifest_of(design: StudyDesign) -> Manifest:
+def manifest_of(design: StudyDesign) -> StudyManifest:
     """Return the manifest of a design that is about to begin."""
     study = design.study
-    return Manifest(
+    return StudyManifest(
         study.name,
         study.title or "",
         study.note or "",
@@ -111,7 +111,7 @@ def manifest_of(design: StudyDesign) -> Manifest:
     )
 
 
-def joined(found: Manifest, wanted: Manifest) -> Manifest | None:
+def joined(found: StudyManifest, wanted: StudyManifest) -> StudyManifest | None:
     """Return the manifest of a folder that gets the methods of a design, too; None where the data are others.
 
     What was computed stays, but for methods that the design has by the same name: those are as the design says now.
@@ -124,7 +124,7 @@ def joined(found: Manifest, wanted: Manifest) -> Manifest | None:
     return replace(found, chunks=chunks | wanted.chunks, methods=kept | wanted.methods)
 
 
-def read_manifest(folder: Path) -> Manifest:
+def read_manifest(folder: Path) -> StudyManifest:
     """Return the manifest of an output folder; raise InvalidProblem where it is none."""
     from pydantic import TypeAdapter, ValidationError
 
@@ -140,12 +140,12 @@ def read_manifest(folder: Path) -> Manifest:
     if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
         raise InvalidProblem("the manifest is of another format", str(path), "write to another folder")
     try:
-        return TypeAdapter(Manifest).validate_python(data)
+        return TypeAdapter(StudyManifest).validate_python(data)
     except ValidationError:
         raise InvalidProblem("the manifest is incomplete", str(path), "write to another folder") from None
 
 
-def design_of_manifest(manifest: Manifest) -> StudyDesign | None:
+def design_of_manifest(manifest: StudyManifest) -> StudyDesign | None:
     """Return the design of a study from its manifest, None where a problem file cannot be read any more."""
     try:
         return design_of_text(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
@@ -160,7 +160,7 @@ def references(design: StudyDesign | None) -> set[str]:
     return known | ({cell.method.name for cell in design.cells if cell.method.reference} if design else set())
 
 
-def begin(design: StudyDesign, folder: Path) -> Manifest:
+def begin(design: StudyDesign, folder: Path) -> StudyManifest:
     """Return the manifest of a folder for a design, written where it is new; call it while the folder is `locked`.
 
     A folder of the same data by other methods gets those of the design, too: see `joined`.
@@ -188,7 +188,7 @@ def begin(design: StudyDesign, folder: Path) -> Manifest:
     except OSError as error:
         raise _unwritable(folder, error) from None
     if found != before:
-        data = {"format": FORMAT, **{name: getattr(found, name) for name in Manifest.__slots__}}
+        data = {"format": FORMAT, **{name: getattr(found, name) for name in StudyManifest.__slots__}}
         content = json.dumps(data, indent=1).encode()
         if before is None:
             _write(folder / MANIFEST, content)
@@ -229,7 +229,7 @@ def _clean(folder: Path) -> None:
         scratch.unlink(missing_ok=True)
 
 
-def store(folder: Path, part: Part) -> None:
+def store(folder: Path, part: TrialPart) -> None:
     """Write a part; raise InvalidProblem where that fails."""
     import pyarrow as pa
     from pyarrow import parquet
@@ -282,14 +282,14 @@ def _is_part(found: Any, columns: Sequence[str] | None) -> bool:
     return all(found.get_field_index(name) >= 0 and found.field(name).type == wanted.field(name).type for name in names)
 
 
-def finished_parts(folder: Path, manifest: Manifest, say: Callable[[str], None]) -> dict[str, Path]:
+def finished_parts(folder: Path, manifest: StudyManifest, say: Callable[[str], None]) -> dict[str, Path]:
     """Return the part files of finished chunks.
 
     Parameters
     ----------
     folder : Path
         Of the study.
-    manifest : Manifest
+    manifest : StudyManifest
         Of the folder.
     say : callable
         Hears a sentence about every part that was damaged; it is removed.
@@ -402,7 +402,7 @@ class Progress:
 
     Parameters
     ----------
-    manifest : Manifest
+    manifest : StudyManifest
         Of its folder.
     done, chunks : int
         Finished chunks, and those of the design.
@@ -417,7 +417,7 @@ class Progress:
         of a method that does not start such rows.
     """
 
-    manifest: Manifest
+    manifest: StudyManifest
     done: int
     chunks: int
     rows: int

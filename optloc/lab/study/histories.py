@@ -19,9 +19,9 @@ import numpy as np
 from optloc.engine import depends_on_place, equations_at, refine
 from optloc.files import read
 from optloc.lab.study.baselines import Baseline, heard, start_of
-from optloc.lab.study.draws import Case, Drawn, draw
+from optloc.lab.study.draws import Case, DrawnCase, draw
 from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest
-from optloc.lab.study.methods import SETTINGS, Method, added
+from optloc.lab.study.methods import SETTINGS, StudyMethod, added
 from optloc.lab.study.minimizers import baseline_of
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import check_accuracy
@@ -31,8 +31,8 @@ from optloc.solvers import (
     FORMULATIONS,
     SOLVERS,
     Choice,
-    Method as Pipeline,
     Pool,
+    StudyMethod as Pipeline,
     begin,
     counting,
     shortcut,
@@ -55,7 +55,7 @@ _EACH, _FARTHER = 30, 1.1
 _DAMPED, _PLAIN = 100, 50
 
 
-class Way(NamedTuple):
+class ConvergenceTrace(NamedTuple):
     """The way of a method on one trial, point by point.
 
     Parameters
@@ -72,16 +72,16 @@ class Way(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class Trials:
     """Trials that methods are followed on.
 
     Parameters
     ----------
     title : str
         Which trials.
-    drawn : Drawn
+    drawn : DrawnCase
         The trials (n).
-    methods : tuple of Method
+    methods : tuple of StudyMethod
         Who is followed.
     least : array (n,)
         Least cost that is known of each trial.
@@ -90,8 +90,8 @@ class Question:
     """
 
     title: str
-    drawn: Drawn
-    methods: tuple[Method, ...]
+    drawn: DrawnCase
+    methods: tuple[StudyMethod, ...]
     least: Array
     remarks: tuple[str, ...] = ()
 
@@ -118,7 +118,7 @@ class Histories:
     remarks: tuple[str, ...]
 
 
-def histories(asked: Question) -> Histories:
+def histories(asked: Trials) -> Histories:
     """Return the histories of methods on trials.
 
     Raises
@@ -152,7 +152,7 @@ def histories(asked: Question) -> Histories:
     return Histories(asked.title, pd.concat(parts, ignore_index=True), tuple(ways), tuple(remarks))
 
 
-def _rows(method: str, trial: int, way: Way, least: float) -> pd.DataFrame:
+def _rows(method: str, trial: int, way: ConvergenceTrace, least: float) -> pd.DataFrame:
     import pandas as pd
 
     best = np.minimum.accumulate(way.cost)
@@ -233,7 +233,7 @@ def reach(found: Histories, tau: float) -> list[Reach]:
 # One method on some trials.
 
 
-def way_of(method: Method, drawn: Drawn) -> tuple[list[Way], str]:
+def way_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTrace], str]:
     """Return the way of a method on each trial, empty where it tells none, and what it does not tell in words."""
     if method.baseline is None:
         assert method.method is not None
@@ -245,13 +245,13 @@ def way_of(method: Method, drawn: Drawn) -> tuple[list[Way], str]:
     return _by_stopping(Pipeline.parse(baseline.method), drawn.problem, start, _choice(method))
 
 
-def _choice(method: Method) -> Choice:
+def _choice(method: StudyMethod) -> Choice:
     """Return the nonlinear solver of a method; IPOPT is what stages take by themselves."""
     named = method.solver if method.solver and "max_iter" in SETTINGS.get(method.solver, {}) else "ipopt"
     return Choice("nonlinear", named, method.settings if named == method.solver else {})
 
 
-def _by_listening(baseline: Baseline, drawn: Drawn, start: Array) -> tuple[list[Way], str]:
+def _by_listening(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[list[ConvergenceTrace], str]:
     ways, failed = [], ""
     for i in range(len(start)):
         kept: list[float] = []
@@ -262,7 +262,7 @@ def _by_listening(baseline: Baseline, drawn: Drawn, start: Array) -> tuple[list[
                 failed = f"{type(error).__name__}: {error}".splitlines()[0]
         # What is no number is above everything.
         cost = np.nan_to_num(np.array(kept), nan=np.inf)
-        ways.append(Way(cost, np.arange(1.0, len(cost) + 1.0), np.full(len(cost), np.nan)))
+        ways.append(ConvergenceTrace(cost, np.arange(1.0, len(cost) + 1.0), np.full(len(cost), np.nan)))
     if not any(len(way.cost) for way in ways):
         return ways, "it asks for no cost on its way" + (f" ({failed})" if failed else "")
     return ways, f"it ended with an error in some trial ({failed})" if failed else ""
@@ -277,7 +277,9 @@ class _Steps(NamedTuple):
     counted: bool
 
 
-def _by_stopping(method: Pipeline, problem: Problem, start: Array | None, choice: Choice) -> tuple[list[Way], str]:
+def _by_stopping(
+    method: Pipeline, problem: Problem, start: Array | None, choice: Choice
+) -> tuple[list[ConvergenceTrace], str]:
     words, n = list(method.words), problem.batch_shape[0]
     pool = None if start is None else begin(problem, start)
     known = {word for formulation in FORMULATIONS.values() for word in formulation.starts}
@@ -286,7 +288,7 @@ def _by_stopping(method: Pipeline, problem: Problem, start: Array | None, choice
         words = words[1:]
     if pool is None:
         return [_nowhere()] * n, f"{words[0]} has no cost on its way"
-    parts: list[list[Way]] = []
+    parts: list[list[ConvergenceTrace]] = []
     while words and words[0] in _FOLLOWED and (steps := _FOLLOWED[words[0]](problem, pool, choice)) is not None:
         parts.append(_ways(n, pool, steps))
         pool = SOLVERS[words.pop(0)].run(problem, pool)
@@ -302,11 +304,11 @@ def _by_stopping(method: Pipeline, problem: Problem, start: Array | None, choice
     return ways, "shown stage by stage; machine code that does both at once has no cost on its way" * shortcut(method)
 
 
-def _nowhere() -> Way:
-    return Way(*(np.zeros(0) for _ in Way._fields))
+def _nowhere() -> ConvergenceTrace:
+    return ConvergenceTrace(*(np.zeros(0) for _ in ConvergenceTrace._fields))
 
 
-def _ways(n: int, pool: Pool, steps: _Steps) -> list[Way]:
+def _ways(n: int, pool: Pool, steps: _Steps) -> list[ConvergenceTrace]:
     """Return the way of each trial: of its candidates, which go side by side, the best one at each count."""
     item, _ = pool.occupied
     out = []
@@ -320,17 +322,19 @@ def _ways(n: int, pool: Pool, steps: _Steps) -> list[Way]:
         at, cost = np.minimum(steps.at[:last], most), np.nan_to_num(steps.cost[:last, own], nan=np.inf)
         # Each step tried is one evaluation, and so is the start of each candidate.
         made = 1.0 + np.minimum(at[:, None], steps.took[own])
-        out.append(Way(cost.min(1), made.sum(1) if steps.counted else np.full(last, np.nan), at.astype(float)))
+        out.append(
+            ConvergenceTrace(cost.min(1), made.sum(1) if steps.counted else np.full(last, np.nan), at.astype(float))
+        )
     return out
 
 
-def _joined(parts: Sequence[Way]) -> Way:
+def _joined(parts: Sequence[ConvergenceTrace]) -> ConvergenceTrace:
     """Return ways one behind the other as one."""
     out = parts[0]
     for more in parts[1:]:
         before = [values[-1] if len(values) else 0.0 for values in out[1:]]
         shifted = [values + last for values, last in zip(more[1:], before, strict=True)]
-        out = Way(*(np.concatenate(pair) for pair in zip(out, (more.cost, *shifted), strict=True)))
+        out = ConvergenceTrace(*(np.concatenate(pair) for pair in zip(out, (more.cost, *shifted), strict=True)))
     return out
 
 
@@ -401,7 +405,7 @@ _FOLLOWED: dict[str, _Follow] = {
 
 def question(
     place: Path, names: Sequence[str], count: int, case: str | None = None, noise: str | None = None
-) -> Question:
+) -> Trials:
     """Return what is asked of a study's folder, or of the epochs of a problem file.
 
     Parameters
@@ -423,7 +427,7 @@ def question(
     return _of_study(place, names, count, case, noise) if place.is_dir() else _of_file(place, names, count)
 
 
-def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Question:
+def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Trials:
     manifest = read_manifest(folder)
     design = design_of_manifest(manifest)
     if design is None:
@@ -446,7 +450,7 @@ def _of_study(folder: Path, names: Sequence[str], count: int, case: str | None, 
         for name in dict.fromkeys(manifest.methods.values())
         if name not in known
     )
-    return Question(f"{title}, {level}", drawn, tuple(methods.values()), least, missing)
+    return Trials(f"{title}, {level}", drawn, tuple(methods.values()), least, missing)
 
 
 def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
@@ -458,7 +462,7 @@ def _chosen(word: str | None, known: Mapping[str, object], what: str) -> str:
     return word
 
 
-def _known(folder: Path, case: Case, count: int) -> tuple[Drawn, Array]:
+def _known(folder: Path, case: Case, count: int) -> tuple[DrawnCase, Array]:
     """Return the first trials of a case, and the least cost that the study knows of each."""
     rows = read_frame(folder, "scenario sweep noise_label trial data cost cost_truth".split())
     rows = rows[
@@ -477,7 +481,7 @@ def _known(folder: Path, case: Case, count: int) -> tuple[Drawn, Array]:
     return drawn, by_trial["least"].to_numpy(dtype=float)
 
 
-def _of_file(file: Path, names: Sequence[str], count: int) -> Question:
+def _of_file(file: Path, names: Sequence[str], count: int) -> Trials:
     loaded = read(file)
     problem = by_epoch(loaded.problem).flat() if separable(loaded.problem) else loaded.problem.flat()
     kept = np.arange(min(count, problem.batch_shape[0]))
@@ -489,6 +493,6 @@ def _of_file(file: Path, names: Sequence[str], count: int) -> Question:
     # A place beside the stations' centre, always the same, where methods begin that need a start.
     wild = np.random.default_rng(0).uniform(-0.5, 0.5, (n, problem.dimension))
     nothing = np.full((n, problem.layout.size), np.nan)
-    drawn = Drawn(problem, nothing, wild, ("",) * n, ("",) * n, np.zeros(n, dtype=int), places[0])
+    drawn = DrawnCase(problem, nothing, wild, ("",) * n, ("",) * n, np.zeros(n, dtype=int), places[0])
     least = solve(problem).cost
-    return Question(loaded.title or file.name, drawn, tuple(added(names or _USUAL)), np.asarray(least))
+    return Trials(loaded.title or file.name, drawn, tuple(added(names or _USUAL)), np.asarray(least))

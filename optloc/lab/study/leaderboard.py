@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.lab.study.design import StudyDesign
-from optloc.lab.study.folder import Manifest, read_frame, read_manifest
+from optloc.lab.study.folder import StudyManifest, read_frame, read_manifest
 from optloc.lab.study.paired import paired
 from optloc.lab.study.summary import COLUMNS, judged, methods, wilson
 
@@ -39,7 +39,7 @@ def page(folder: Path, design: StudyDesign) -> str:
     return "\n".join(lines)
 
 
-def _about(manifest: Manifest, design: StudyDesign) -> str:
+def _about(manifest: StudyManifest, design: StudyDesign) -> str:
     return (
         f"optloc {manifest.version}, {manifest.created[:10]}, test set {design.data[:16]}, seed {manifest.seed}, "
         f"{design.cells[0].case.trials} trials a scene; {manifest.machine}."

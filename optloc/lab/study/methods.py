@@ -17,19 +17,19 @@ import numpy as np
 from optloc.files import Units, join
 from optloc.lab.study.baselines import BASELINES, heard, only_networks, start_of
 from optloc.lab.study.document import MethodTable
-from optloc.lab.study.draws import Drawn
+from optloc.lab.study.draws import DrawnCase
 from optloc.lab.study.minimizers import baseline_of, code_of, load_minimizer
-from optloc.lab.study.networks import CALIBRATE, Found, Networks, calibrated
+from optloc.lab.study.networks import CALIBRATE, NetworkResult, Networks, calibrated
 from optloc.problem import ANSWERED, Array, Certificate, Fix, InvalidProblem, Status, nearest
 from optloc.solvers import backend_kind, backends, kind_of, version_of
 
 # Back ends stand in a module of their own; studies know them from here.
 __all__ = [
     "SETTINGS",
-    "Method",
+    "MethodRun",
     "Nonsense",
-    "Run",
     "Setting",
+    "StudyMethod",
     "added",
     "backend_kind",
     "backends",
@@ -42,7 +42,7 @@ __all__ = [
 
 
 @dataclass(frozen=True, slots=True)
-class Method:
+class StudyMethod:
     """One way to solve.
 
     Parameters
@@ -91,7 +91,7 @@ class Method:
             return baseline_of(self.baseline).slow
         if self.method == CALIBRATE:
             return True
-        from optloc.solvers import Method as Pipeline
+        from optloc.solvers import StudyMethod as Pipeline
 
         assert self.method is not None
         return not all(entry.batched for entry in Pipeline.parse(self.method).entries)
@@ -119,7 +119,7 @@ class Method:
         return known.reference or (known.guess and self.start == "truth")
 
 
-def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
+def methods_of(table: MethodTable, number: int) -> Iterator[StudyMethod]:
     """Yield the methods of a table: one for each combination of its lists.
 
     Parameters
@@ -144,7 +144,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
         raise InvalidProblem("its list of methods is empty", where, "name one, or leave the table out")
     for name, solver in product(names, solvers):
         if table.method is not None:
-            from optloc.solvers import Method as Pipeline
+            from optloc.solvers import StudyMethod as Pipeline
 
             try:
                 _ = name == CALIBRATE or Pipeline.parse(name)
@@ -157,7 +157,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
             check_settings(solver, table.settings, join(where, "settings"))
         elif table.settings:
             raise InvalidProblem("settings belong to a solver", join(where, "settings"), "name it in 'solver'")
-        yield Method(
+        yield StudyMethod(
             _name(table, name, solver, len(names) * len(solvers)),
             None if table.method is None else name,
             None if table.baseline is None else name,
@@ -171,7 +171,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
         )
 
 
-def added(names: Sequence[str]) -> list[Method]:
+def added(names: Sequence[str]) -> list[StudyMethod]:
     """Return methods that the user names beside those of a file.
 
     Parameters
@@ -188,7 +188,7 @@ def added(names: Sequence[str]) -> list[Method]:
     for name in names:
         if ":" in name:
             load_minimizer(name)
-            found.append(Method(name.rpartition(":")[2], None, name, code=code_of(name)))
+            found.append(StudyMethod(name.rpartition(":")[2], None, name, code=code_of(name)))
         else:
             table = {"baseline": name} if name in BASELINES else {"method": name}
             found += methods_of(MethodTable.model_validate(table), len(found) + 1)
@@ -210,12 +210,12 @@ def _name(table: MethodTable, name: str, solver: str | None, count: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class MethodRun:
     """What a call gave.
 
     Parameters
     ----------
-    fix : Fix or tuple of Found
+    fix : Fix or tuple of NetworkResult
         Fixes (n,), or networks.
     seconds : float
         Time of the call.
@@ -229,7 +229,7 @@ class Run:
         Whether the back end that was asked for has solved anything; True where none was asked for.
     """
 
-    fix: Fix | tuple[Found, ...]
+    fix: Fix | tuple[NetworkResult, ...]
     seconds: float
     processor: float
     evaluations: Array
@@ -241,7 +241,7 @@ class Nonsense(Exception):  # noqa: N818  (a word for what it is, as all of them
     """What a method returned is no answer to its trials."""
 
 
-def run(method: Method, drawn: Drawn | Networks) -> Run:
+def run(method: StudyMethod, drawn: DrawnCase | Networks) -> MethodRun:
     """Return the fixes of trials by a method, with the back end and the settings that it asks for.
 
     Raises
@@ -264,14 +264,14 @@ def run(method: Method, drawn: Drawn | Networks) -> Run:
         _check(fix, drawn)
     used = choice is None or choice.name in {name for name, _ in tally}
     iterations = float(sum(n for _, n in tally)) if tally else np.nan
-    return Run(fix, seconds, busy, np.where(asked > 0.0, asked, np.nan), iterations, used)
+    return MethodRun(fix, seconds, busy, np.where(asked > 0.0, asked, np.nan), iterations, used)
 
 
 def _add(counts: Array, trial: int) -> None:
     counts[trial] += 1.0
 
 
-def require_program(method: Method, found: Run) -> None:
+def require_program(method: StudyMethod, found: MethodRun) -> None:
     """Raise InvalidProblem where the back end that was asked for has solved nothing."""
     # A method that never asks the back end would be measured under its name.
     if not found.used:
@@ -279,7 +279,7 @@ def require_program(method: Method, found: Run) -> None:
         raise InvalidProblem(what, f"method {method.name!r}", "leave the solver out, or use a stage such as sdp or nlp")
 
 
-def _solved(method: Method, drawn: Drawn | Networks) -> Any:
+def _solved(method: StudyMethod, drawn: DrawnCase | Networks) -> Any:
     if isinstance(drawn, Networks):
         finds = calibrated if method.baseline is None else baseline_of(method.baseline).networks
         assert finds is not None  # `design_of_text` refuses other methods
@@ -299,7 +299,7 @@ def _solved(method: Method, drawn: Drawn | Networks) -> Any:
 _ROUNDING = 1e-8
 
 
-def _check(fix: Any, drawn: Drawn) -> None:
+def _check(fix: Any, drawn: DrawnCase) -> None:
     """Raise Nonsense where something is no fix of trials: its type, its shapes and kinds of numbers, its answers."""
     if not isinstance(fix, Fix):
         raise Nonsense(f"it returned {type(fix).__name__} in the place of a fix")

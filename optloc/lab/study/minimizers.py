@@ -16,7 +16,7 @@ import numpy as np
 
 from optloc.engine import FEW, Normal, equations_at, pack, usable, walks
 from optloc.lab.study.baselines import BASELINES, Baseline, claim, teller, weighed_at, weighings
-from optloc.lab.study.draws import Drawn
+from optloc.lab.study.draws import DrawnCase
 from optloc.problem import Array, Fix, InvalidProblem, Problem, load_plugin, nearest, plugin_module, whiten
 
 Cost = Callable[[Array], tuple[float, Array]]
@@ -35,7 +35,7 @@ class Minimizer:
 
     function: Callable[[Cost, Array], Array]
 
-    def __call__(self, drawn: Drawn, start: Array) -> Fix:
+    def __call__(self, drawn: DrawnCase, start: Array) -> Fix:
         """Return the fixes; they claim to be answers wherever they are finite, and the study judges them."""
         x = np.array(start, dtype=float)
         for _ in range(weighings(drawn.problem)):

@@ -18,7 +18,7 @@ from optloc.lab.study.document import Amount, NetworkTable
 from optloc.problem import ANSWERED, Array, InvalidProblem, Status
 from optloc.sites.calibration.calibrated import Calibration, calibrate
 from optloc.sites.calibration.gauge import determined
-from optloc.sites.calibration.likelihood import Estimate, likelihood, together
+from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood, together
 from optloc.sites.calibration.network import Network, network_of
 
 CALIBRATE = "calibrate"
@@ -99,7 +99,7 @@ class Networks:
     ----------
     networks : tuple of n Network
         As methods get them.
-    truth : Estimate
+    truth : NetworkEstimate
         The n true ones.
     seed, digest : tuple of n str
         Names of the trials' seeds, and what was drawn.
@@ -108,7 +108,7 @@ class Networks:
     """
 
     networks: tuple[Network, ...]
-    truth: Estimate
+    truth: NetworkEstimate
     seed: tuple[str, ...]
     digest: tuple[str, ...]
     bad: Array
@@ -157,7 +157,7 @@ def _size(table: NetworkTable, where: str) -> float:
     return Units("length").plain(size, "m", place)
 
 
-def _trial(case: NetworkCase, number: int) -> tuple[Network, Estimate, int]:
+def _trial(case: NetworkCase, number: int) -> tuple[Network, NetworkEstimate, int]:
     """Return one network, its true values and how many of its arrivals have a gross error."""
     # A seed sequence mixes words of 32 bits; what is placed, measured and left out do not shift one another.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
@@ -180,7 +180,7 @@ def _trial(case: NetworkCase, number: int) -> tuple[Network, Estimate, int]:
     least = min(m, d + 1 + _SPARE)
     kept = (chance >= table.missing) | (np.argsort(np.argsort(-chance, axis=1), axis=1) < least)
     made = network_of(np.where(kept, z, np.nan), case.level, dimension=d, synchronised=table.synchronised)
-    truth = Estimate(stations[None], clocks[None], pulses[None], sent[None])
+    truth = NetworkEstimate(stations[None], clocks[None], pulses[None], sent[None])
     return made, truth, int((bad & kept).sum())
 
 
@@ -195,7 +195,7 @@ def _digest(case: NetworkCase, network: Network) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class NetworkResult:
     """What a method made of one network.
 
     Parameters
@@ -229,47 +229,49 @@ class Found:
     others: tuple[Array, ...] = ()
 
 
-def calibrated(networks: Networks) -> tuple[Found, ...]:
+def calibrated(networks: Networks) -> tuple[NetworkResult, ...]:
     """Return what `optloc.calibrate` finds of each network."""
     return tuple(_of_calibration(calibrate(network)) for network in networks.networks)
 
 
-def _of_calibration(found: Calibration) -> Found:
+def _of_calibration(found: Calibration) -> NetworkResult:
     reason = found.findings[0] if found.findings else ""
     others = tuple(one.stations for one in found.alternatives)
     values = (found.stations, found.clocks, found.covariance, found.cost, found.dof)
-    return Found(found.status, reason, *values, found.proof, others)
+    return NetworkResult(found.status, reason, *values, found.proof, others)
 
 
-def refined(network: Network, starts: Estimate) -> Found:
+def refined(network: Network, starts: NetworkEstimate) -> NetworkResult:
     """Return the cheapest minimum that estimates lead to, claimed whatever it is.
 
     Parameters
     ----------
     network : Network
         What was measured.
-    starts : Estimate
+    starts : NetworkEstimate
         S estimates; with none there is no network.
     """
     m, d = network.stations, network.dimension
     p = m * d + (0 if network.synchronised else m)
     nothing = np.full((m, d), np.nan), np.full(m, np.nan), np.full((p, p), np.nan)
     if not starts.count:
-        return Found(Status.NUMERICAL, "There is no start.", *nothing, np.nan, 0)
+        return NetworkResult(Status.NUMERICAL, "There is no start.", *nothing, np.nan, 0)
     lik = likelihood(network)
     ends, cost = lik.refine(starts)
     if not np.isfinite(cost).any():
-        return Found(Status.NUMERICAL, "No start led to a network.", *nothing, np.nan, 0)
+        return NetworkResult(Status.NUMERICAL, "No start led to a network.", *nothing, np.nan, 0)
     at = ends.take(np.array([int(np.nanargmin(cost))]))
     covariance, free = _covariance(network, at)
     dof = network.rows - network.unknowns + free
     if not np.isfinite(covariance).all():
         words = "More than the frame is open."
-        return Found(Status.SINGULAR_GEOMETRY, words, at.stations[0], at.clocks[0], covariance, np.nanmin(cost), dof)
-    return Found(Status.OK, "", at.stations[0], at.clocks[0], covariance, float(np.nanmin(cost)), dof)
+        return NetworkResult(
+            Status.SINGULAR_GEOMETRY, words, at.stations[0], at.clocks[0], covariance, np.nanmin(cost), dof
+        )
+    return NetworkResult(Status.OK, "", at.stations[0], at.clocks[0], covariance, float(np.nanmin(cost)), dof)
 
 
-def _covariance(network: Network, at: Estimate) -> tuple[Array, int]:
+def _covariance(network: Network, at: NetworkEstimate) -> tuple[Array, int]:
     """Return the covariance of an estimate in the frame of all stations, NaN where there is none, and what is free."""
     told = determined(likelihood(network), at)
     p, free = told.jacobian.shape[1], told.free.shape[1]
@@ -281,17 +283,17 @@ def _covariance(network: Network, at: Estimate) -> tuple[Array, int]:
     return np.full((p, p), np.nan), free
 
 
-def each(refine: Callable[[Network, int], Found]) -> Callable[[Networks], tuple[Found, ...]]:
+def each(refine: Callable[[Network, int], NetworkResult]) -> Callable[[Networks], tuple[NetworkResult, ...]]:
     """Return what finds the networks of trials one by one, by a function of one and a seed of its own."""
 
-    def run(networks: Networks) -> tuple[Found, ...]:
+    def run(networks: Networks) -> tuple[NetworkResult, ...]:
         seeds = [int(digest, 16) for digest in networks.digest]
         return tuple(refine(one, seed) for one, seed in zip(networks.networks, seeds, strict=True))
 
     return run
 
 
-def from_truth(networks: Networks) -> tuple[Found, ...]:
+def from_truth(networks: Networks) -> tuple[NetworkResult, ...]:
     """Return where the likelihood leads from the truth: the judge of the others."""
     return tuple(refined(one, networks.truth.take(slice(i, i + 1))) for i, one in enumerate(networks.networks))
 
@@ -346,7 +348,7 @@ def _spread(covariance: Array, network: Network) -> tuple[float, float]:
     return float(np.sqrt(variance[: m * d].sum() / m)), clocks
 
 
-def found_columns(known: KnownNetworks, found: tuple[Found, ...]) -> dict[str, Any]:
+def found_columns(known: KnownNetworks, found: tuple[NetworkResult, ...]) -> dict[str, Any]:
     """Return the columns of what a method found of n networks."""
     truth = [known.drawn.truth.take(slice(i, i + 1)) for i in range(len(found))]
     rows = [_row(*one) for one in zip(found, known.drawn.networks, truth, known.bound, strict=True)]
@@ -356,7 +358,7 @@ def found_columns(known: KnownNetworks, found: tuple[Found, ...]) -> dict[str, A
     return values | nothing | {"rejected": 0, "certificate": ""}
 
 
-def _row(one: Found, network: Network, truth: Estimate, bound: Array) -> dict[str, Any]:
+def _row(one: NetworkResult, network: Network, truth: NetworkEstimate, bound: Array) -> dict[str, Any]:
     error = apart(one.stations, truth.stations[0])
     size, located = error.size, bool(np.isfinite(one.stations).all())
     # in the frame of what was found, as its covariance is

@@ -86,7 +86,7 @@ class Profiles:
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class SolvedShare:
     """What a method solves.
 
     Parameters
@@ -179,11 +179,11 @@ def data_profile(spent: Array, solved: Array, budgets: Array) -> Array:
     return np.stack([np.searchsorted(row, budgets, side="right") / len(row) for row in needed])
 
 
-def shares(found: Profiles) -> list[Share]:
+def shares(found: Profiles) -> list[SolvedShare]:
     """Return what each method solves within multiples of the least work of any method."""
     within = found.performance(np.array(RATIOS))
     return [
-        Share(
+        SolvedShare(
             name,
             found.spent.shape[1],
             int(found.solved[i].sum()),

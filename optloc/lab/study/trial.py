@@ -18,12 +18,12 @@ import numpy as np
 from optloc.bounds import crlb
 from optloc.engine import TOLERANCE, covariance, eliminated, equations_at, exact, linalg, violation
 from optloc.lab.study.design import Cell, Chunk
-from optloc.lab.study.draws import Case, Drawn
+from optloc.lab.study.draws import Case, DrawnCase
 from optloc.lab.study.methods import Nonsense, require_program, run, version_of
 from optloc.lab.study.networks import (
-    Found,
     KnownNetworks,
     NetworkCase,
+    NetworkResult,
     Networks,
     found_columns,
     known_networks,
@@ -203,7 +203,7 @@ def arrow_schema() -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class TrialPart:
     """What a chunk gave.
 
     Parameters
@@ -250,7 +250,7 @@ _WORDS = 200
 _warm: set[tuple[str, str]] = set()
 
 
-def compute(chunk: Chunk) -> Part:
+def compute(chunk: Chunk) -> TrialPart:
     """Return the rows of a chunk.
 
     Numerical libraries work on one thread inside, so that the last digit does not depend on where it runs.
@@ -281,7 +281,7 @@ def compute(chunk: Chunk) -> Part:
     return _part(chunk, known, found, build)
 
 
-def _warm_up(cell: Cell, drawn: Drawn | Networks) -> float:
+def _warm_up(cell: Cell, drawn: DrawnCase | Networks) -> float:
     """Solve one trial where that was not done in this process, and return how long it took."""
     key = (cell.case.key, cell.method.identity)
     if key in _warm:
@@ -297,7 +297,9 @@ def _warm_up(cell: Cell, drawn: Drawn | Networks) -> float:
     return perf_counter() - began
 
 
-def _solve_in_halves(cell: Cell, known: Known | KnownNetworks, first: int, count: int) -> list[tuple[int, Values]]:
+def _solve_in_halves(
+    cell: Cell, known: KnownTrials | KnownNetworks, first: int, count: int
+) -> list[tuple[int, Values]]:
     """Return the values of some trials; where the call fails, halves are tried until the one trial is found."""
     try:
         return [(count, _solve(cell, known.part(first, count)))]
@@ -314,7 +316,7 @@ def _solve_in_halves(cell: Cell, known: Known | KnownNetworks, first: int, count
     return [*_solve_in_halves(cell, known, first, half), *_solve_in_halves(cell, known, first + half, count - half)]
 
 
-def _solve(cell: Cell, known: Known | KnownNetworks) -> Values:
+def _solve(cell: Cell, known: KnownTrials | KnownNetworks) -> Values:
     count = len(known.drawn.seed)
     found = run(cell.method, known.drawn)
     values = fix_values(cell.case, known, found.fix)
@@ -330,13 +332,13 @@ def _failure(status: str, reason: str) -> Values:
     return values | {"proof": "unknown", "certificate": "", "batch": 1}
 
 
-def part_of_lost(chunk: Chunk, lost: Lost) -> Part:
+def part_of_lost(chunk: Chunk, lost: Lost) -> TrialPart:
     """Return the part of a chunk whose trials all have the status of what came of it."""
     found = {name: _spread(value, chunk.count) for name, value in _failure(lost.status, lost.reason).items()}
     return _part(chunk, known_of(chunk.cell.case.draw(chunk.first, chunk.count)), found, 0.0)
 
 
-def join_parts(chunk: Chunk, parts: list[Part]) -> Part:
+def join_parts(chunk: Chunk, parts: list[TrialPart]) -> TrialPart:
     """Return the parts of a chunk's pieces as one."""
     import pyarrow as pa
 
@@ -347,7 +349,7 @@ def join_parts(chunk: Chunk, parts: list[Part]) -> Part:
     for part in parts:
         for status, count in part.counts.items():
             counts[status] = counts.get(status, 0) + count
-    return Part(chunk.key, table.set_column(name, table.schema.field(name), key), counts)
+    return TrialPart(chunk.key, table.set_column(name, table.schema.field(name), key), counts)
 
 
 def _spread(value: Any, count: int) -> Any:
@@ -360,7 +362,7 @@ def _spread(value: Any, count: int) -> Any:
     return out
 
 
-def _part(chunk: Chunk, known: Known | KnownNetworks, found: Values, build: float) -> Part:
+def _part(chunk: Chunk, known: KnownTrials | KnownNetworks, found: Values, build: float) -> TrialPart:
     """Return the Arrow table of a chunk, whose fixes have the values found."""
     import pyarrow as pa
 
@@ -388,7 +390,7 @@ def _part(chunk: Chunk, known: Known | KnownNetworks, found: Values, build: floa
     arrays = [_arrow(column, values[column.name], n) for column in COLUMNS]
     status, times = np.unique(np.asarray(_spread(values["status"], n), dtype=str), return_counts=True)
     counts = dict(zip(status.tolist(), times.tolist(), strict=True))
-    return Part(chunk.key, pa.Table.from_arrays(arrays, schema=arrow_schema()), counts)
+    return TrialPart(chunk.key, pa.Table.from_arrays(arrays, schema=arrow_schema()), counts)
 
 
 _NUMBERS = {"int": np.int64, "float": np.float64, "bool": np.bool_}
@@ -412,12 +414,12 @@ _REJECTED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownTrials:
     """What holds for trials whatever the method.
 
     Parameters
     ----------
-    drawn : Drawn
+    drawn : DrawnCase
         The trials.
     bound : array (n, p, p)
         Cramer-Rao bound of the shared unknowns at the truth; NaN where the geometry is singular.
@@ -425,19 +427,19 @@ class Known:
         Cost at the truth.
     """
 
-    drawn: Drawn
+    drawn: DrawnCase
     bound: Array
     cost: Array
 
-    def part(self, first: int, count: int) -> Known:
+    def part(self, first: int, count: int) -> KnownTrials:
         """Return what holds for some of the trials; of all of them it is the same object, nothing is copied."""
         if (first, count) == (0, len(self.drawn.truth)):
             return self
         kept = slice(first, first + count)
-        return Known(self.drawn.part(first, count), self.bound[kept], self.cost[kept])
+        return KnownTrials(self.drawn.part(first, count), self.bound[kept], self.cost[kept])
 
 
-def known_of(drawn: Drawn | Networks) -> Known | KnownNetworks:
+def known_of(drawn: DrawnCase | Networks) -> KnownTrials | KnownNetworks:
     """Return bound and cost at the truth of trials."""
     if isinstance(drawn, Networks):
         return known_networks(drawn)
@@ -446,10 +448,10 @@ def known_of(drawn: Drawn | Networks) -> Known | KnownNetworks:
         equations = equations_at(problem, drawn.truth)
         bound = crlb(problem, drawn.truth) if exact(problem) else covariance(equations)[0]
         cost = _admitted(problem, drawn.truth, np.broadcast_to(eliminated(equations).cost, (size,)))
-    return Known(drawn, np.broadcast_to(bound, (size, *bound.shape[-2:])), cost)
+    return KnownTrials(drawn, np.broadcast_to(bound, (size, *bound.shape[-2:])), cost)
 
 
-def truth_values(case: Case | NetworkCase, known: Known | KnownNetworks) -> Values:
+def truth_values(case: Case | NetworkCase, known: KnownTrials | KnownNetworks) -> Values:
     """Return the columns that do not depend on the method."""
     if isinstance(case, NetworkCase) or isinstance(known, KnownNetworks):
         assert isinstance(known, KnownNetworks)
@@ -468,7 +470,9 @@ def truth_values(case: Case | NetworkCase, known: Known | KnownNetworks) -> Valu
     return values
 
 
-def fix_values(case: Case | NetworkCase, known: Known | KnownNetworks, fix: Fix | tuple[Found, ...]) -> Values:
+def fix_values(
+    case: Case | NetworkCase, known: KnownTrials | KnownNetworks, fix: Fix | tuple[NetworkResult, ...]
+) -> Values:
     """Return the columns of fixes (n,) of trials, or of networks found."""
     if isinstance(known, KnownNetworks):
         assert isinstance(fix, tuple)

@@ -43,7 +43,7 @@ LONG = 100.0
 
 
 @dataclass(slots=True)
-class Work:
+class ChainWork:
     """What is left of the work that one call may do, in about a millisecond each."""
 
     left: float
@@ -57,7 +57,7 @@ class Work:
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class ChainTerms:
     """What is assumed of all targets.
 
     Parameters
@@ -76,7 +76,7 @@ class Terms:
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class DetectionChain:
     """Detections that may be of one target, in their order of time.
 
     Parameters
@@ -113,7 +113,7 @@ def is_flat(cov: Array, position: Array, detection: Any) -> bool:
     return bool(np.isfinite(cov).all() and np.sqrt(np.linalg.eigvalsh(cov)[-1]) < _FLAT * nearest)
 
 
-def posed(runs: Sequence[Sequence[Any]], terms: Terms) -> tuple[Problem, Array]:
+def posed(runs: Sequence[Sequence[Any]], terms: ChainTerms) -> tuple[Problem, Array]:
     """Return the problem of runs of detections (B), without their values, and the values (B, m) of its rows.
 
     The runs have the same rows in each scan, and the same times before the last; the state is that at the last.
@@ -160,12 +160,12 @@ def _grouped(keys: Sequence[Any]) -> list[list[int]]:
     return list(found.values())
 
 
-def alone(scan: Sequence[Any], terms: Terms) -> list[Chain]:
+def alone(scan: Sequence[Any], terms: ChainTerms) -> list[DetectionChain]:
     """Return a chain of each detection of a scan: where its own rows place it."""
     out: list[Any] = [None] * len(scan)
     for members in _grouped([_key([detection]) for detection in scan]):
         moving = scan[members[0]].measurement_model.rates is not None
-        own = Terms(terms.order if moving else 0, terms.speed, terms.least_p)
+        own = ChainTerms(terms.order if moving else 0, terms.speed, terms.least_p)
         problem, z = posed([[scan[i]] for i in members], own)
         fixes = prepare(problem, _QUICK)(z).flat()
         for place, i in enumerate(members):
@@ -173,12 +173,12 @@ def alone(scan: Sequence[Any], terms: Terms) -> list[Chain]:
     return out
 
 
-def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: Terms) -> Chain:
+def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: ChainTerms) -> DetectionChain:
     """Return a chain with the states of its single fix: where rows do not show the velocity, its prior does."""
     p = float(fix.p_value)
     p = 1.0 if np.isnan(p) else p
     if not bool(fix.answered) or bool(fix.has(Status.UNBOUNDED)):
-        return Chain(detections, np.zeros((0, len(fix.x))), None, p)
+        return DetectionChain(detections, np.zeros((0, len(fix.x))), None, p)
     rivals = fix.alternatives.x[fix.alternatives.gap < GAP]
     x, cov = np.concatenate([fix.x[None], rivals])[:_KEPT], np.array(fix.cov)
     d = fix.position.shape[-1]
@@ -186,10 +186,10 @@ def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: Terms) -> Chain:
         x, cov = np.hstack([x, np.zeros_like(x)]), np.kron(np.diag([0.0, terms.speed**2]), np.eye(d))
         cov[:d, :d] = fix.cov
     good = len(x) == 1 and is_flat(cov[:d, :d], x[0, :d], detections[-1])
-    return Chain(detections, x, cov if good else None, p)
+    return DetectionChain(detections, x, cov if good else None, p)
 
 
-def near(chains: Sequence[Chain], single: Chain, terms: Terms) -> list[tuple[float, int]]:
+def near(chains: Sequence[DetectionChain], single: DetectionChain, terms: ChainTerms) -> list[tuple[float, int]]:
     """Return how far a detection is from each chain that it may continue, and the chain's place.
 
     The squared distance in the covariance of the innovation, in shares of the gate: 1 at its edge; 1 as well for
@@ -234,7 +234,7 @@ def _alike(one: Any, two: Any) -> bool:
     return a.stations.shape == b.stations.shape and list(a.mapping) == list(b.mapping)
 
 
-def _ahead(x: Array, chain: Chain, detection: Any, d: int) -> Array:
+def _ahead(x: Array, chain: DetectionChain, detection: Any, d: int) -> Array:
     """Return states (q, n) of a chain at the time of a detection, in uniform motion."""
     if x.shape[1] == d:
         return x
@@ -242,7 +242,7 @@ def _ahead(x: Array, chain: Chain, detection: Any, d: int) -> Array:
     return np.hstack([x[:, :d] + step * x[:, d:], x[:, d:]])
 
 
-def _starts(chain: Chain, single: Chain, terms: Terms) -> Array:
+def _starts(chain: DetectionChain, single: DetectionChain, terms: ChainTerms) -> Array:
     """Return the states (q, n) from which a chain with one more detection is fitted."""
     detection = single.detections[-1]
     d = len(detection.measurement_model.mapping)
@@ -258,12 +258,14 @@ def _starts(chain: Chain, single: Chain, terms: Terms) -> Array:
     return np.concatenate(ahead)
 
 
-def grown(pairs: Sequence[tuple[Chain, Chain]], terms: Terms, work: Work) -> list[tuple[Chain, Chain, Chain]]:
+def grown(
+    pairs: Sequence[tuple[DetectionChain, DetectionChain]], terms: ChainTerms, work: ChainWork
+) -> list[tuple[DetectionChain, DetectionChain, DetectionChain]]:
     """Return (longer chain, chain, chain of the detection) of the pairs that fit, the first within the work left.
 
     Pairs of the same rows and times are fitted together, from all their starts at once.
     """
-    chosen: dict[Any, list[tuple[Chain, Chain, Array]]] = {}
+    chosen: dict[Any, list[tuple[DetectionChain, DetectionChain, Array]]] = {}
     for chain, single in pairs:
         key, starts = _key((*chain.detections, *single.detections)), _starts(chain, single, terms)
         if not work.take((0.0 if key in chosen else _BATCH) + _DESCENT * len(starts)):
@@ -278,12 +280,14 @@ def grown(pairs: Sequence[tuple[Chain, Chain]], terms: Terms, work: Work) -> lis
     return out
 
 
-def _fitted(runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: Terms, work: Work) -> list[Chain | None]:
+def _fitted(
+    runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: ChainTerms, work: ChainWork
+) -> list[DetectionChain | None]:
     """Return the chains of runs of the same rows and times; None where it takes a search and no work is left."""
     problem, z = posed(runs, terms)
     problem = problem.with_rows(z=z)
     dof = degrees_of_freedom(problem)
-    out: list[Chain | None] = [None] * len(runs)
+    out: list[DetectionChain | None] = [None] * len(runs)
     begun = [i for i, start in enumerate(starts) if len(start)]
     if begun:
         item = np.repeat(begun, [len(starts[i]) for i in begun])
@@ -296,14 +300,14 @@ def _fitted(runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: Ter
         if len(starts[i]):
             continue
         if dof[i] < 0:  # too few rows for any state: more scans may do
-            out[i] = Chain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
+            out[i] = DetectionChain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
         elif work.take(LONG):
             fix = solve(problem.take(np.array([i])), "roots+lsr").flat()[0]
             out[i] = _of_fix(runs[i], fix, terms)
     return out
 
 
-def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array) -> Chain:
+def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array) -> DetectionChain:
     """Return the chain of a run by the descents that are its own: their distinct ends, the best first."""
     own = own[np.argsort(np.where(np.isfinite(done.cost[own]), done.cost[own], np.inf), kind="stable")]
     first, d = own[0], len(run[-1].measurement_model.mapping)
@@ -316,4 +320,4 @@ def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array)
             kept.append(i)
     value = 1.0 if np.isnan(p[first]) and np.isfinite(done.cost[first]) else float(np.nan_to_num(p[first]))
     good = len(kept) == 1 and is_flat(cov[first, :d, :d], done.x[first, :d], run[-1])
-    return Chain(run, done.x[np.array(kept, dtype=int)], cov[first] if good else None, value)
+    return DetectionChain(run, done.x[np.array(kept, dtype=int)], cov[first] if good else None, value)

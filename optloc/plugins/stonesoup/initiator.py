@@ -18,7 +18,18 @@ from stonesoup.types.state import GaussianState, WeightedGaussianState
 from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
-from optloc.plugins.stonesoup.chains import GAP, LONG, Chain, Terms, Work, alone, grown, is_flat, near, posed
+from optloc.plugins.stonesoup.chains import (
+    GAP,
+    LONG,
+    ChainTerms,
+    ChainWork,
+    DetectionChain,
+    alone,
+    grown,
+    is_flat,
+    near,
+    posed,
+)
 from optloc.plugins.stonesoup.models import StationMeasurement, values_of
 from optloc.problem import Fix, InvalidProblem, Problem
 from optloc.solvers import solve
@@ -37,7 +48,7 @@ def mixture_state(
     Parameters
     ----------
     problem, fix : Problem, Fix
-        One static position and its single fix, as `optloc.mixture` takes them.
+        One static position and its single fix, as `optloc.uncertainty.mixture` takes them.
     mapping : sequence of int
         Places of the position in the state.
     prior_state : GaussianState
@@ -98,7 +109,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         super().__init__(*args, **kwargs)
         if self.order not in (0, 1):
             raise InvalidProblem(f"a motion of order {self.order}", "order", "use 0 or 1")
-        self._chains: list[Chain] = []
+        self._chains: list[DetectionChain] = []
 
     def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:
         """Return the tracks that begin with some of the detections that belong to no track yet.
@@ -112,7 +123,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
             if not isinstance(detection.measurement_model, StationMeasurement):
                 what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
                 raise InvalidProblem(what, "initiator", "use a model of this plug-in, such as TDOA")
-        work, tracks = Work(float(self.work)), set()
+        work, tracks = ChainWork(float(self.work)), set()
         # In an order of their own, so that a set that is iterated in another one begins the same tracks.
         ordered = sorted(detections, key=lambda d: (d.timestamp, tuple(values_of(d))))
         for _, scan in groupby(ordered, key=lambda d: d.timestamp):
@@ -126,9 +137,9 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
             self._chains = [*self._chains, *waiting][-_REMEMBERED:]
         return tracks
 
-    def _continued(self, scan: list[Any], work: Work) -> list[Chain]:
+    def _continued(self, scan: list[Any], work: ChainWork) -> list[DetectionChain]:
         """Return the chains that the detections of a scan continue, which are taken, and those that they begin."""
-        terms = Terms(self.order, self.speed, self.least_p)
+        terms = ChainTerms(self.order, self.speed, self.least_p)
         # Where the rows of a detection do not fit together no chain with it would fit.
         singles = [single for single in alone(scan, terms) if single.p >= self.least_p]
         pairs = [
@@ -147,13 +158,13 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         self._chains = [chain for chain in self._chains if id(chain) not in taken]
         return [*out, *(single for single in singles if id(single) not in taken)]
 
-    def _proven(self, chain: Chain, work: Work) -> Fix | None:
+    def _proven(self, chain: DetectionChain, work: ChainWork) -> Fix | None:
         """Return the fix of a chain that is long enough where it is the only one, and nearly Gaussian; else None."""
         size = len(chain.detections[-1].measurement_model.mapping) * (self.order + 1)
         # Another place is looked for where all else speaks for a track: that takes as long as hundreds of descents.
         if len(chain) < self.confirm or chain.cov is None or len(chain.cov) != size or not work.take(LONG):
             return None
-        problem, z = posed([chain.detections], Terms(self.order, self.speed, self.least_p))
+        problem, z = posed([chain.detections], ChainTerms(self.order, self.speed, self.least_p))
         fix = solve(problem.with_rows(z=z[0]))
         known = is_one_gaussian(fix) and not (fix.alternatives.gap < GAP).any()
         # Without redundancy nothing speaks against the chain.
@@ -161,7 +172,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
             return None
         return fix if is_flat(fix.covariance(), fix.position, chain.detections[-1]) else None
 
-    def _track(self, chain: Chain, fix: Fix) -> Track:
+    def _track(self, chain: DetectionChain, fix: Fix) -> Track:
         detection = chain.detections[-1]
         model = detection.measurement_model
         place = [*model.mapping, *self._rates(model)]

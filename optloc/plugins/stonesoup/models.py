@@ -322,7 +322,7 @@ class AnyRows(RateMeasurement):
     """Any mixture of kinds in one measurement, with one inverse of all of them together.
 
     Stone Soup's combined model of several sums their inverses, which is a state of none: name the rows here instead.
-    Elements follow `optloc.MODELS`: metres, radians, ratios, metres per second.
+    Elements follow `optloc.models.MODELS`: metres, radians, ratios, metres per second.
     """
 
     table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 where a kind takes none.")

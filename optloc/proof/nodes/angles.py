@@ -15,7 +15,7 @@ from optloc.proof.nodes.node import (
     AZIMUTH,
     SCALED,
     Node,
-    Row,
+    NodeRow,
     Triple,
     blend,
     excess,
@@ -189,7 +189,7 @@ def _ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) 
     return sin(swing[j]), hypot(flat, r)
 
 
-def _numbers(row: Row) -> Array:
+def _numbers(row: NodeRow) -> Array:
     return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a), MEASURED: row.measured[:, None]})
 
 
@@ -385,7 +385,7 @@ def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
     return least
 
 
-def _upright_numbers(row: Row) -> Array:
+def _upright_numbers(row: NodeRow) -> Array:
     return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a)})
 
 

@@ -18,7 +18,7 @@ from optloc.proof.nodes.node import (
     CONVEX,
     FLAT,
     Node,
-    Row,
+    NodeRow,
     Triple,
     across,
     blend,
@@ -61,7 +61,7 @@ def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
     return lay_out(parts if origin is None else parts | {ORIGIN: origin})
 
 
-def _of_row(row: Row) -> Array:
+def _of_row(row: NodeRow) -> Array:
     """Return the numbers of a row: none is linear in the position; priors make these nodes themselves."""
     raise NotImplementedError("a row of measurements does not say which linear form it is of")
 
@@ -195,7 +195,7 @@ def height_numbers(problem: Problem) -> Array:
     return lay_out({ECEF: frame.origin_ecef()[None], ROTATION: frame.rotation_to_ecef().reshape(1, 9)})
 
 
-def _numbers(row: Row) -> Array:
+def _numbers(row: NodeRow) -> Array:
     return height_numbers(row.problem)
 
 

@@ -12,7 +12,7 @@ from optloc.kernels.jit import compiled
 from optloc.proof.nodes.node import (
     BALANCED,
     Node,
-    Row,
+    NodeRow,
     Symmetric,
     blend,
     length,
@@ -86,7 +86,7 @@ def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvatu
     return change
 
 
-def _numbers(row: Row) -> Array:
+def _numbers(row: NodeRow) -> Array:
     return row.place(row.a)
 
 

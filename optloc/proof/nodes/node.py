@@ -62,7 +62,7 @@ H00, H01, H02, H11, H12, H22, TURN0, TURN1, TURN2, CHI, FORCE, PULL0, PULL1, PUL
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class NodeRow:
     """The row of a flat batch of N problems that a node is made for.
 
     Parameters
@@ -162,7 +162,7 @@ class Node:
     name: str
     width: int
     points: int
-    numbers: Callable[[Row], Array]
+    numbers: Callable[[NodeRow], Array]
     bound: Kernel | None = None
     curve: Kernel | None = None
     shape: int = MIXED

@@ -9,7 +9,7 @@ from math import inf, sqrt
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined
-from optloc.proof.atlas import Frame, scaled_station, set_line
+from optloc.proof.atlas import AtlasFrame, scaled_station, set_line
 from optloc.proof.nodes.node import (
     CHI,
     CONVEX,
@@ -32,8 +32,8 @@ from optloc.proof.nodes.node import (
     TURN1,
     TURN2,
     Node,
+    NodeRow,
     RangeForm,
-    Row,
     Symmetric,
     Triple,
     add,
@@ -152,7 +152,7 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
 
 @inlined
 def bound_difference(
-    frame: Frame, data: Array, centre: RangeForm, h: Triple, away: Array, sense: Array
+    frame: AtlasFrame, data: Array, centre: RangeForm, h: Triple, away: Array, sense: Array
 ) -> tuple[float, float, float, Triple, RangeForm]:
     """Return a range less the distance to the centre over a box, metres: value, ends of the remainder, slope, its form.
 
@@ -160,7 +160,7 @@ def bound_difference(
 
     Parameters
     ----------
-    frame : Frame
+    frame : AtlasFrame
         Where the box lies.
     data : array (width,)
         The node.
@@ -198,7 +198,14 @@ def curve_centre(slant: Array, centre: RangeForm, h: Triple) -> RangeBend:
 
 @inlined
 def curve_difference(
-    frame: Frame, data: Array, node: Array, centre: RangeForm, bent: RangeBend, h: Triple, away: Array, sense: Array
+    frame: AtlasFrame,
+    data: Array,
+    node: Array,
+    centre: RangeForm,
+    bent: RangeBend,
+    h: Triple,
+    away: Array,
+    sense: Array,
 ) -> tuple[Symmetric, Triple, float]:
     """Return how a range less the distance to the centre curves over a box: Hessian, and bounds of what changes.
 
@@ -241,7 +248,7 @@ def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, 
     return data[0], data[1], data[2], most
 
 
-def _numbers(row: Row) -> Array:
+def _numbers(row: NodeRow) -> Array:
     return row.place(row.a)
 
 

@@ -13,7 +13,7 @@ from optloc.kernels.jit import compiled
 from optloc.proof.nodes.node import (
     SCALED,
     Node,
-    Row,
+    NodeRow,
     across,
     blend,
     inner,
@@ -95,7 +95,7 @@ def _size(data: Array, reach: float) -> float:
     return float(abs(data[VELOCITY]) + abs(data[VELOCITY + 1]) + abs(data[VELOCITY + 2]))
 
 
-def _numbers(row: Row) -> Array:
+def _numbers(row: NodeRow) -> Array:
     # The target stays: what it would add is the station's velocity reversed.
     return lay_out({STATION: row.place(row.a), VELOCITY: -row.velocity(row.a)})
 

@@ -9,7 +9,7 @@ from optloc.kernels.jit import compiled, inlined
 from optloc.proof.nodes.node import (
     SCALED,
     Node,
-    Row,
+    NodeRow,
     Symmetric,
     Triple,
     add,
@@ -247,7 +247,7 @@ def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, 
     return c0, c1, c2, q * sqrt(p0 * p0 + p1 * p1 + p2 * p2) * scale
 
 
-def _numbers(row: Row) -> Array:
+def _numbers(row: NodeRow) -> Array:
     return lay_out({STATION: row.place(row.a), STATION_B: row.place(row.b)})
 
 

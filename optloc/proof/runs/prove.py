@@ -11,7 +11,7 @@ from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, enabled, inlined, put, usable, zero
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, home_of, set_centre, with_minima
-from optloc.proof.batch import Answered, Asked, plainly, without_rivals
+from optloc.proof.batch import ProofRequest, ProofResult, plainly, without_rivals
 from optloc.proof.box import (
     DEPTH,
     bound_nodes,
@@ -35,7 +35,7 @@ from optloc.proof.near import (
     STATIONARY,
     UNIQUE,
     VALUE,
-    Aim,
+    Goal,
     region_of,
 )
 from optloc.proof.nodes.dispatch import infinity_of
@@ -49,10 +49,10 @@ from optloc.proof.runs.rows import (
     is_convex_by,
     residual_at,
 )
-from optloc.proof.runs.run_costs import Courses, Run, Runs
+from optloc.proof.runs.run_costs import CourseCosts, RunCost, Runs
 from optloc.proof.runs.search import (
     CAPACITY,
-    Tables,
+    RunTables,
     blur_beside,
     cost_at_coordinates,
     search_run,
@@ -61,13 +61,13 @@ from optloc.proof.runs.search import (
 )
 from optloc.proof.runs.state_bounds import axes_of, hessian_of_state
 from optloc.proof.runs.state_search import prove_course
-from optloc.proof.runs.states import STATE, Course, cost_of_state
+from optloc.proof.runs.states import STATE, ConstantVelocityCost, cost_of_state
 from optloc.proof.search_space import (
     COARSEST,
     HIDDEN_REACH,
     LINES,
-    Chart,
-    Known,
+    KnownMinima,
+    LocalAxes,
     accuracy_floor,
     chart_on,
     equal_within,
@@ -89,7 +89,7 @@ _WIDER, _WIDE = 3.0, 40.0
 
 @compiled
 def _convex_sides(
-    run: Run, space: Space, tables: Tables, at: Array, piece: int, hull: Array, margin: float, sides: Array
+    run: RunCost, space: Space, tables: RunTables, at: Array, piece: int, hull: Array, margin: float, sides: Array
 ) -> bool:
     """Write half-widths (3,), none beyond the hull, of a box around a place on which the cost is convex."""
     box, share, floor = tables.box, _WIDEST, floor_of(space, run.cost)
@@ -107,7 +107,7 @@ def _convex_sides(
 
 
 @inlined
-def _margin(tables: Tables, noise: float, eps: float) -> float:
+def _margin(tables: RunTables, noise: float, eps: float) -> float:
     """Return how convex a box must be for its cost to fall by no more than eps below that of its centre."""
     total = 0.0
     for k in range(3):
@@ -117,7 +117,9 @@ def _margin(tables: Tables, noise: float, eps: float) -> float:
 
 
 @compiled
-def _set_far(run: Run, space: Space, tables: Tables, i: int, x: Array, value: float, eps: float, limit: float) -> bool:
+def _set_far(
+    run: RunCost, space: Space, tables: RunTables, i: int, x: Array, value: float, eps: float, limit: float
+) -> bool:
     """Write a minimum and its surroundings into an atlas; see `optloc.proof.everywhere.set_minimum`."""
     atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
     minima, piece = atlas.minima, 2 * d + 1 + i
@@ -146,7 +148,15 @@ def _set_far(run: Run, space: Space, tables: Tables, i: int, x: Array, value: fl
 
 @compiled
 def _set_near(
-    run: Run, space: Space, tables: Tables, i: int, x: Array, corners: Array, value: float, eps: float, hidden: bool
+    run: RunCost,
+    space: Space,
+    tables: RunTables,
+    i: int,
+    x: Array,
+    corners: Array,
+    value: float,
+    eps: float,
+    hidden: bool,
 ) -> bool:
     """Write a minimum in search coordinates, and the sides of a convex box around it."""
     chart, box, hull, shift, at = space.chart, tables.box, np.zeros(3), np.zeros(3), space.minima[i]
@@ -177,7 +187,7 @@ def _set_near(
 
 
 @compiled
-def _reaches_infinity(run: Run) -> bool:
+def _reaches_infinity(run: RunCost) -> bool:
     """Return whether the cost stays finite at infinity, so that the atlas holds; see `reaches_infinity`."""
     kinds, rows = run.cost.kinds, run.rows
     ones, out = np.zeros(kinds.shape[0]), np.zeros(rows.w.shape[0])
@@ -189,7 +199,7 @@ def _reaches_infinity(run: Run) -> bool:
 
 
 @compiled
-def cost_of_place(run: Run, x: Array, tables: Tables) -> float:
+def cost_of_place(run: RunCost, x: Array, tables: RunTables) -> float:
     """Return the cost at a position x (D,)."""
     cost, box, axes = run.cost, tables.box, np.zeros((3, 3))
     box.half[:], box.centre[:] = 0.0, 0.0
@@ -199,16 +209,16 @@ def cost_of_place(run: Run, x: Array, tables: Tables) -> float:
     return residual_at(run.rows, box.nodes, tables.sheet)
 
 
-class Task(NamedTuple):
+class ProofTask(NamedTuple):
     """What is to be proven of one fix.
 
     Parameters
     ----------
     x : array (D,)
         The fix.
-    beside : Known
+    beside : KnownMinima
         What else is known.
-    aim : Aim
+    aim : Goal
         What is to be shown of every box.
     eps : float
         How far below the cost of the fix still counts as equal.
@@ -219,8 +229,8 @@ class Task(NamedTuple):
     """
 
     x: Array
-    beside: Known
-    aim: Aim
+    beside: KnownMinima
+    aim: Goal
     eps: float
     budget: int
     found: Array
@@ -228,7 +238,15 @@ class Task(NamedTuple):
 
 @compiled
 def prove_run(
-    run: Run, x: Array, beside: Known, kappa: float, eps: float, budget: int, lower: Array, upper: Array, found: Array
+    run: RunCost,
+    x: Array,
+    beside: KnownMinima,
+    kappa: float,
+    eps: float,
+    budget: int,
+    lower: Array,
+    upper: Array,
+    found: Array,
 ) -> tuple[int, int, float]:
     """Prove of a run what `optloc.proof.near.prove` proves of a cost; arguments and result as there.
 
@@ -246,8 +264,8 @@ def prove_run(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
-    aim = Aim(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
-    task = Task(x, beside, aim, eps, budget, found)
+    aim = Goal(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0, 0)
+    task = ProofTask(x, beside, aim, eps, budget, found)
     if far:
         return _prove_far(run, task, atlas_of(middle, radius, D, 1 + beside.points.shape[0]), chart, tables)
     if not good:
@@ -256,7 +274,7 @@ def prove_run(
 
 
 @compiled
-def _blur(run: Run, chart: Chart, x: Array, far: bool, tables: Tables) -> float:
+def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables) -> float:
     """Return a bound of the rounding errors of a residual (its length) at a fix, and in the atlas of all positions."""
     middle, radius = cube(run.cost.kinds, run.cost.data, x)
     atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
@@ -267,7 +285,9 @@ def _blur(run: Run, chart: Chart, x: Array, far: bool, tables: Tables) -> float:
 
 
 @compiled
-def _prove_far(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables) -> tuple[int, int, float]:
+def _prove_far(
+    run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables
+) -> tuple[int, int, float]:
     """Prove over all space."""
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
     space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
@@ -288,7 +308,7 @@ def _prove_far(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables)
 
 
 @compiled
-def _verdict(outcome: int, aim: Aim) -> int:
+def _verdict(outcome: int, aim: Goal) -> int:
     """Return the verdict of a proof by the outcome of its search."""
     if outcome == CLEAR:
         return UNIQUE if aim.level > aim.value else VALUE
@@ -301,7 +321,7 @@ def _verdict(outcome: int, aim: Aim) -> int:
 
 @compiled
 def _prove_near(
-    run: Run, task: Task, atlas: Atlas, around: Chart, tables: Tables, lower: Array, upper: Array
+    run: RunCost, task: ProofTask, atlas: Atlas, around: LocalAxes, tables: RunTables, lower: Array, upper: Array
 ) -> tuple[int, int, float]:
     """Prove in search coordinates around a fix: a region, what few rows enclose, or all pieces of a surface."""
     corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
@@ -332,7 +352,9 @@ def _prove_near(
 
 
 @compiled
-def _beside(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables, corners: Array, own: bool) -> Space:
+def _beside(
+    run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables, corners: Array, own: bool
+) -> Space:
     """Return search coordinates with their known minima, that of the fix (`own`) first; none where it is none."""
     others, known, place = task.beside.points, zero(), np.empty(task.x.shape[0])
     room = np.zeros((2, 1 + others.shape[0], 3))
@@ -350,18 +372,18 @@ def _beside(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables, co
     return Space(False, atlas, chart, room[0, :known], room[1, :known])
 
 
-def prove_runs(costs: Runs, asked: Asked) -> Answered:
+def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
     """Return the outcome of the proofs of n fixes of n long problems, see `optloc.proof.batch.prove_all`.
 
     Plain Python would take a second for ten boxes: without machine code none is looked at.
     """
     n, d = asked.x.shape
     verdict, boxes, bound, whole = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.bool_)
-    found, asked = np.full((n, d), np.nan), Asked(*(plainly(array) for array in asked))
+    found, asked = np.full((n, d), np.nan), ProofRequest(*(plainly(array) for array in asked))
 
     def prove(i: int) -> None:
         others = asked.others[i, : asked.known[i]]
-        beside = Known(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
+        beside = KnownMinima(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
         for corners in (asked.region[i], asked.fallback[i]):
             verdict[i], boxes[i], bound[i] = prove_run(
                 costs.runs[i],
@@ -385,7 +407,7 @@ def prove_runs(costs: Runs, asked: Asked) -> Answered:
     return without_rivals(verdict, boxes, bound, whole, asked, found)
 
 
-def runs_lack_code(costs: Runs | Courses, count: int) -> bool:
+def runs_lack_code(costs: Runs | CourseCosts, count: int) -> bool:
     """Return whether proofs of so many long problems were left because there is no machine code of them yet."""
     return enabled() and not usable(prove_run if isinstance(costs, Runs) else prove_course, count)
 
@@ -405,7 +427,7 @@ def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
 # Targets that move.
 
 
-def prove_courses(costs: Courses, asked: Asked) -> Answered:
+def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
     """Return the outcome of the proofs of n fixes of n problems of a moving target; x holds velocities as well.
 
     Without machine code none is looked at, as of `prove_runs`.
@@ -434,7 +456,9 @@ def prove_courses(costs: Courses, asked: Asked) -> Answered:
     return without_rivals(verdict, boxes, bound, np.zeros(n, np.bool_), asked, found)
 
 
-def _on_surface(courses: tuple[Course, Course], state: Array) -> tuple[tuple[Course, Course], Ground]:
+def _on_surface(
+    courses: tuple[ConstantVelocityCost, ConstantVelocityCost], state: Array
+) -> tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], Ground]:
     """Return courses with the axes along which states are counted around one, and what they are carried over."""
     if not over_ground(courses[0].ground):
         return courses, courses[0].ground
@@ -443,7 +467,7 @@ def _on_surface(courses: tuple[Course, Course], state: Array) -> tuple[tuple[Cou
     return (whole, few), whole.ground
 
 
-def costs_of_courses(costs: Courses, states: Array) -> tuple[Array, Array]:
+def costs_of_courses(costs: CourseCosts, states: Array) -> tuple[Array, Array]:
     """Return costs (n, P) of states (n, P, 2 d) and the rounding of their residuals, see `costs_at`."""
     out = np.zeros((2, *states.shape[:2]))
     for i, (whole, _) in enumerate(costs.courses):

@@ -52,7 +52,7 @@ _ULP = 2.0**-52
 _WITHIN = 32
 
 
-class Rows(NamedTuple):
+class RunRows(NamedTuple):
     """Whitened rows ``e = S phi - w`` and what other unknowns reach.
 
     Parameters
@@ -77,7 +77,7 @@ class Rows(NamedTuple):
     weight: Array
 
 
-class Sheet(NamedTuple):
+class RunWorkspace(NamedTuple):
     """Working memory for rows over one box.
 
     Parameters
@@ -101,14 +101,14 @@ class Sheet(NamedTuple):
 
 
 @compiled
-def sheet_of(rows: Rows) -> Sheet:
+def sheet_of(rows: RunRows) -> RunWorkspace:
     """Return working memory for rows."""
     q, J = rows.w.shape[0], rows.weight.shape[0]
-    return Sheet(np.empty(q), np.empty(J), np.empty((3, q)), np.empty((3, J)), np.empty(J), np.empty(q))
+    return RunWorkspace(np.empty(q), np.empty(J), np.empty((3, q)), np.empty((3, J)), np.empty(J), np.empty(q))
 
 
 @compiled
-def multiply(rows: Rows, values: Array, out: Array) -> None:
+def multiply(rows: RunRows, values: Array, out: Array) -> None:
     """Write ``S values``."""
     for i in range(out.shape[0]):
         total = 0.0
@@ -118,7 +118,7 @@ def multiply(rows: Rows, values: Array, out: Array) -> None:
 
 
 @compiled
-def pull_back(rows: Rows, values: Array, out: Array) -> None:
+def pull_back(rows: RunRows, values: Array, out: Array) -> None:
     """Write ``S'values``."""
     out[:] = 0.0
     for i in range(values.shape[0]):
@@ -128,7 +128,7 @@ def pull_back(rows: Rows, values: Array, out: Array) -> None:
 
 
 @compiled
-def project(rows: Rows, values: Array) -> None:
+def project(rows: RunRows, values: Array) -> None:
     """Take off values (q,) what other unknowns can change."""
     for _ in range(2):  # twice is exact (Parlett)
         for k in range(rows.basis.shape[0]):
@@ -140,7 +140,7 @@ def project(rows: Rows, values: Array) -> None:
 
 
 @compiled
-def greatest_length(rows: Rows, values: Array, out: Array) -> float:
+def greatest_length(rows: RunRows, values: Array, out: Array) -> float:
     """Return the greatest length of ``S y`` over all y with ``|y_j| <= values_j``."""
     total = 0.0
     for i in range(out.shape[0]):
@@ -152,12 +152,12 @@ def greatest_length(rows: Rows, values: Array, out: Array) -> float:
 
 
 @compiled
-def blur_of(rows: Rows, floor: float, nodes: Array) -> float:
+def blur_of(rows: RunRows, floor: float, nodes: Array) -> float:
     """Return a bound of the rounding errors of a residual (its length).
 
     Parameters
     ----------
-    rows : Rows
+    rows : RunRows
         The rows.
     floor : float
         What limits the accuracy beside the nodes: lengths of w and of coordinates times their weights.
@@ -171,19 +171,19 @@ def blur_of(rows: Rows, floor: float, nodes: Array) -> float:
 
 
 @compiled
-def digits_of(rows: Rows) -> float:
+def digits_of(rows: RunRows) -> float:
     """Return the relative rounding error of sums over nodes and rows: one a term, and 32 within a node."""
     return float((_WITHIN + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
 
 
 @compiled
-def share_within(rows: Rows) -> float:
+def share_within(rows: RunRows) -> float:
     """Return the share of these digits that what is rounded within a node alone has, as coordinates are."""
     return float(_WITHIN / (_WITHIN + rows.w.shape[0] + rows.weight.shape[0]))
 
 
 @compiled
-def residual_at(rows: Rows, nodes: Array, sheet: Sheet) -> float:
+def residual_at(rows: RunRows, nodes: Array, sheet: RunWorkspace) -> float:
     """Write the residual at the centre of a box whose nodes are bounded, and its forces; return the cost there."""
     e, total = sheet.residual, 0.0
     for i in range(e.shape[0]):
@@ -203,7 +203,7 @@ _BALANCED = 1e-11
 
 
 @compiled
-def is_balanced(rows: Rows, ones: Array, out: Array) -> bool:
+def is_balanced(rows: RunRows, ones: Array, out: Array) -> bool:
     """Return whether equal changes of some nodes (J,) change no row but by what the other unknowns explain."""
     size = greatest_length(rows, ones, out)
     multiply(rows, ones, out)
@@ -216,7 +216,7 @@ def is_balanced(rows: Rows, ones: Array, out: Array) -> bool:
 
 @compiled
 def least_length(
-    half: Array, nodes: Array, curves: Array, lean: Array, slip: float, sheet: Sheet, cost: float, curved: bool
+    half: Array, nodes: Array, curves: Array, lean: Array, slip: float, sheet: RunWorkspace, cost: float, curved: bool
 ) -> float:
     """Return a lower bound of ``|P e|`` over a box, rounding apart; negative where it says nothing.
 
@@ -228,7 +228,7 @@ def least_length(
         Tables of the box.
     lean, slip : array (J,), float
         Slopes of nodes across a surface, and how far off it the centre may be; 0 elsewhere.
-    sheet : Sheet
+    sheet : RunWorkspace
         As `residual_at` has left it.
     cost : float
         What that returned.
@@ -272,7 +272,9 @@ def least_length(
 
 
 @compiled
-def sum_up_rows(rows: Rows, half: Array, nodes: Array, curves: Array, noise: float, sheet: Sheet, sums: Array) -> float:
+def sum_up_rows(
+    rows: RunRows, half: Array, nodes: Array, curves: Array, noise: float, sheet: RunWorkspace, sums: Array
+) -> float:
     """Fill sums (SUMS,) of a box and bounds of the Hessian's change in sums[C00:]; return one of the rest's norm.
 
     Along s the Jacobian changes by ``P S (N s + r)``, ``|r| <= chi |s| / 2``, and forces by ``S'P S (Phi s + q)`` with
@@ -280,13 +282,13 @@ def sum_up_rows(rows: Rows, half: Array, nodes: Array, curves: Array, noise: flo
 
     Parameters
     ----------
-    rows : Rows
+    rows : RunRows
         The rows.
     half, nodes, curves : arrays
         The box and its tables.
     noise : float
         The rounding of a residual.
-    sheet : Sheet
+    sheet : RunWorkspace
         As `residual_at` has left it; filled.
     sums : array (SUMS,)
         Written.
@@ -342,7 +344,9 @@ def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None
 
 
 @compiled
-def _rest(rows: Rows, half: Array, nodes: Array, curves: Array, blur: float, sheet: Sheet, sums: Array) -> float:
+def _rest(
+    rows: RunRows, half: Array, nodes: Array, curves: Array, blur: float, sheet: RunWorkspace, sums: Array
+) -> float:
     """Return a bound of the norm of what else changes in the Hessian; arguments as of `sum_up_rows`."""
     h0, h1, h2, reach = half[0], half[1], half[2], sheet.reach
     size = sqrt(h0 * h0 + h1 * h1 + h2 * h2)

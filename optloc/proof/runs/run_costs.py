@@ -18,8 +18,8 @@ from optloc.proof.batch import plainly
 from optloc.proof.groups import empty_groups
 from optloc.proof.nodes.level import height_numbers
 from optloc.proof.position_costs import (
-    Columns,
-    Others,
+    CostColumns,
+    OtherRows,
     PositionCosts,
     add_linear,
     columns_of,
@@ -30,8 +30,8 @@ from optloc.proof.position_costs import (
     turned_level,
 )
 from optloc.proof.runs.ground import STRAIGHT, Ground
-from optloc.proof.runs.rows import Rows
-from optloc.proof.runs.states import Course
+from optloc.proof.runs.rows import RunRows
+from optloc.proof.runs.states import ConstantVelocityCost
 from optloc.proof.scope import held_height
 from optloc.proof.search_space import (
     Cost,
@@ -49,21 +49,21 @@ _LOOK = 60
 _DENSE, _LONG = 12, 500
 
 
-class Run(NamedTuple):
+class RunCost(NamedTuple):
     """A cost of many rows.
 
     Parameters
     ----------
     cost : Cost
         Its nodes, weights and measurements; the rows are left out.
-    rows : Rows
+    rows : RunRows
         All rows.
     look : Cost
         The cost of few of them, which is nowhere larger.
     """
 
     cost: Cost
-    rows: Rows
+    rows: RunRows
     look: Cost
 
 
@@ -73,13 +73,13 @@ class Runs:
 
     Parameters
     ----------
-    runs : tuple of Run
+    runs : tuple of RunCost
         One for each problem.
     level : array (N,)
         Cost from which on angles may be off by a turn that the rows do not see.
     """
 
-    runs: tuple[Run, ...]
+    runs: tuple[RunCost, ...]
     level: Array
 
     @property
@@ -117,9 +117,9 @@ def few_costs(problem: Problem) -> PositionCosts:
     return PositionCosts(look.kinds, look.data[None], look.K[None], look.w[None], np.array([level]))
 
 
-def _read(problem: Problem) -> tuple[Others, Array, Array, Columns]:
+def _read(problem: Problem) -> tuple[OtherRows, Array, Array, CostColumns]:
     """Return the other unknowns, measurements without what is known to be added, which are there, and the nodes."""
-    others = Others.of(problem)
+    others = OtherRows.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
@@ -127,7 +127,7 @@ def _read(problem: Problem) -> tuple[Others, Array, Array, Columns]:
     return others.with_stations(problem, made), known, usable, made
 
 
-def _run_cost(problem: Problem) -> tuple[Run, float]:
+def _run_cost(problem: Problem) -> tuple[RunCost, float]:
     """Return one problem of a batch of one as a run, and its level of turns."""
     others, known, usable, made = _read(problem)
     priors = position_prior(problem, made)
@@ -144,25 +144,25 @@ def _run_cost(problem: Problem) -> tuple[Run, float]:
     rows = whole.rows()
     none = np.empty((0, len(kinds)))
     cost = Cost(kinds, plainly(data), none, rows.w, np.empty((0, 0)), rows.weight, empty_groups(0))
-    return Run(cost, rows, look), float(turned_level(problem, others, known)[0])
+    return RunCost(cost, rows, look), float(turned_level(problem, others, known)[0])
 
 
 # From a problem whose target moves: its nodes are of the places at their epochs.
 
 
 @dataclass(frozen=True, slots=True)
-class Courses:
+class CourseCosts:
     """The costs of a flat batch of problems of a moving target, as `Runs` holds those of one that stays.
 
     Parameters
     ----------
-    courses : tuple of (Course, Course)
+    courses : tuple of (ConstantVelocityCost, ConstantVelocityCost)
         All rows of each problem, and those of few epochs, which cost nowhere more.
     level : array (N,)
         As of `Runs`.
     """
 
-    courses: tuple[tuple[Course, Course], ...]
+    courses: tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], ...]
     level: Array
 
     @property
@@ -170,20 +170,20 @@ class Courses:
         """Return with how many nodes of dense rows a box would be as dear, as far as it takes boxes from a budget."""
         return float(_DENSE)
 
-    def take(self, items: Array | slice) -> Courses:
+    def take(self, items: Array | slice) -> CourseCosts:
         """Return the costs of some of the problems."""
         numbers = np.arange(len(self.courses))[items]
-        return Courses(tuple(self.courses[i] for i in numbers), self.level[items])
+        return CourseCosts(tuple(self.courses[i] for i in numbers), self.level[items])
 
 
-def course_costs(problem: Problem) -> Courses:
+def course_costs(problem: Problem) -> CourseCosts:
     """Return the costs of a flat batch of N problems over position and velocity, all else at its best values."""
     problem = weighed(problem)
     costs = [_course_cost(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
-    return Courses(tuple(courses for courses, _ in costs), np.array([level for _, level in costs]))
+    return CourseCosts(tuple(courses for courses, _ in costs), np.array([level for _, level in costs]))
 
 
-def _course_cost(problem: Problem) -> tuple[tuple[Course, Course], float]:
+def _course_cost(problem: Problem) -> tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], float]:
     """Return one problem of a batch of one as courses of all rows and of few, and its level of turns."""
     others, known, usable, made = _read(problem)
     since = problem.times - problem.origin
@@ -207,7 +207,7 @@ def _rise(problem: Problem) -> Array:
     return np.zeros(problem.epochs) if rise is None else np.reshape(rise[..., 0], (-1, problem.epochs))[0]
 
 
-def _state_prior(problem: Problem, made: Columns, span: float) -> tuple[Any, list[float]]:
+def _state_prior(problem: Problem, made: CostColumns, span: float) -> tuple[Any, list[float]]:
     """Add the nodes of priors on position and velocity; return their rows over all nodes, and when nodes are, seconds.
 
     A velocity is the difference of two places, a span of time apart, over that.
@@ -233,7 +233,7 @@ def _state_prior(problem: Problem, made: Columns, span: float) -> tuple[Any, lis
     return sparse.csr_array(entries, shape=(count, len(made.kinds))), times
 
 
-def _course(problem: Problem, system: _System, made: Columns, when: Array) -> Course:
+def _course(problem: Problem, system: _System, made: CostColumns, when: Array) -> ConstantVelocityCost:
     """Return whitened rows as a course over the nodes that they touch, by time and height (J, 2) of these."""
     used = np.flatnonzero(np.bincount(system.nodes.indices, minlength=len(when)))
     order = used[np.lexsort((when[used, 1], when[used, 0]))]
@@ -243,7 +243,7 @@ def _course(problem: Problem, system: _System, made: Columns, when: Array) -> Co
     data = own.marked(kinds, made.numbers[:1, order])
     since, rise = (plainly(column) for column in epochs.T)
     ground = _ground(problem, since, rise)
-    return Course(kinds, data, np.append(first, len(order)), since, own.rows(), ground)
+    return ConstantVelocityCost(kinds, data, np.append(first, len(order)), since, own.rows(), ground)
 
 
 def _ground(problem: Problem, since: Array, rise: Array) -> Ground:
@@ -272,7 +272,9 @@ class _System:
     measured: Array
 
     @classmethod
-    def of(cls, problem: Problem, present: Array, made: Columns, others: Others, value: Array, prior: Any) -> _System:
+    def of(
+        cls, problem: Problem, present: Array, made: CostColumns, others: OtherRows, value: Array, prior: Any
+    ) -> _System:
         from scipy import sparse  # with the first long run: problems of one epoch need none
 
         size, white = len(made.kinds), _whitening(problem, present)
@@ -296,14 +298,14 @@ class _System:
         alone = np.asarray(touched.T @ shared.astype(float)) == 0.0
         return plainly(mark_nodes(kinds, data, alone[None], size[None], force[None], self.measured[None])[0])
 
-    def rows(self) -> Rows:
+    def rows(self) -> RunRows:
         """Return them for machine code."""
         basis = span_of(self.unknowns) if self.unknowns.shape[1] else self.unknowns
         kept = basis.any(0)
         start, column = (np.asarray(index, dtype=np.int64) for index in (self.nodes.indptr, self.nodes.indices))
         weight = np.sqrt(np.asarray(self.nodes.multiply(self.nodes).sum(0)))
         arrays = (self.nodes.data, self.measured, basis[:, kept].T, weight)
-        return Rows(start, column, *map(plainly, arrays))
+        return RunRows(start, column, *map(plainly, arrays))
 
 
 def _rows_at(nodes: list[int], size: int) -> Any:

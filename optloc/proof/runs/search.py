@@ -30,12 +30,12 @@ from optloc.proof.box import (
 from optloc.proof.convex_boxes import is_known
 from optloc.proof.curvature import has_no_infimum
 from optloc.proof.descents import damped_step
-from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, Aim
+from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, Goal
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
 from optloc.proof.pieces import is_listed
 from optloc.proof.runs.rows import (
-    Sheet,
+    RunWorkspace,
     blur_of,
     least_length,
     multiply,
@@ -44,7 +44,7 @@ from optloc.proof.runs.rows import (
     sheet_of,
     sum_up_rows,
 )
-from optloc.proof.runs.run_costs import Run
+from optloc.proof.runs.run_costs import RunCost
 from optloc.proof.search_space import (
     Box,
     empty_box,
@@ -53,24 +53,24 @@ from optloc.proof.space import Space, bound_or_halve, floor_of, place_of, set_cu
 from optloc.proof.surface import SLIP
 
 
-class Tables(NamedTuple):
+class RunTables(NamedTuple):
     """Working memory: a box for few nodes and one for all, and a sheet for all rows."""
 
     small: Box
     box: Box
-    sheet: Sheet
+    sheet: RunWorkspace
 
 
 @compiled
-def tables_of(run: Run) -> Tables:
+def tables_of(run: RunCost) -> RunTables:
     """Return tables for a run."""
     box = empty_box(0, run.cost.kinds.shape[0])
     box.lean[:], box.graph[:] = 0.0, 0.0  # which only a surface writes
-    return Tables(empty_box(run.look.K.shape[0], run.look.K.shape[1]), box, sheet_of(run.rows))
+    return RunTables(empty_box(run.look.K.shape[0], run.look.K.shape[1]), box, sheet_of(run.rows))
 
 
 @compiled
-def sum_at(run: Run, space: Space, tables: Tables, floor: float) -> tuple[float, float]:
+def sum_at(run: RunCost, space: Space, tables: RunTables, floor: float) -> tuple[float, float]:
     """Return the cost at the centre of a box that is set, and the norm of the rest of its Hessian's change.
 
     The sums of the box are filled. Both are infinite where nothing is bounded.
@@ -100,21 +100,28 @@ _LOOKS = 10
 
 @compiled
 def search_run(
-    run: Run, space: Space, tables: Tables, stack: Array, size: int, aim: Aim, budget: int, found: Array
+    run: RunCost,
+    space: Space,
+    tables: RunTables,
+    stack: Array,
+    size: int,
+    aim: Goal,
+    budget: int,
+    found: Array,
 ) -> tuple[int, int, float]:
     """Search boxes for minima of a run that cost less than a level.
 
     Parameters
     ----------
-    run : Run
+    run : RunCost
         The cost.
     space : Space
         Where the boxes are.
-    tables : Tables
+    tables : RunTables
         Working memory.
     stack, size : array (capacity, DEPTH), int
         The boxes.
-    aim : Aim
+    aim : Goal
         What is to be shown of each.
     budget : int
         How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
@@ -170,7 +177,14 @@ def search_run(
 
 @compiled
 def _is_done(
-    run: Run, space: Space, tables: Tables, aim: Aim, here: float, low: float, touching: bool, floor: float
+    run: RunCost,
+    space: Space,
+    tables: RunTables,
+    aim: Goal,
+    here: float,
+    low: float,
+    touching: bool,
+    floor: float,
 ) -> bool:
     """Return whether a box that has a cost at its centre and a bound need not be split."""
     if reaches(low, aim.level):
@@ -184,7 +198,7 @@ def _is_done(
 
 
 @compiled
-def _is_flat_out(run: Run, space: Space, tables: Tables, level: float) -> bool:
+def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) -> bool:
     """Return whether a small box at infinity costs less than a level there."""
     half, box = tables.small.half, tables.box
     if not max(half[0], half[1], half[2]) < _TINY:
@@ -195,7 +209,7 @@ def _is_flat_out(run: Run, space: Space, tables: Tables, level: float) -> bool:
 
 
 @compiled
-def _bound(run: Run, space: Space, tables: Tables, floor: float, level: float) -> tuple[float, float]:
+def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: float) -> tuple[float, float]:
     """Return the cost at the centre of a box and a lower bound of the residual over it, negative where none is."""
     box, sheet, rows = tables.box, tables.sheet, run.rows
     if not set_nodes(space, run.cost, box):
@@ -220,7 +234,7 @@ _ASIDE = 1.5
 
 
 @compiled
-def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array) -> bool:
+def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found: Array) -> bool:
     """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
     box, d, home = tables.box, found.shape[0], 0
     u, before, face = box.at.copy(), np.zeros(3), False
@@ -256,7 +270,7 @@ def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array
 
 
 @compiled
-def cost_at_coordinates(run: Run, space: Space, tables: Tables, home: int, u: Array) -> float:
+def cost_at_coordinates(run: RunCost, space: Space, tables: RunTables, home: int, u: Array) -> float:
     """Return the cost at coordinates of a piece, with its derivatives in the sums of the box."""
     tables.box.half[:] = 0.0
     put(u, tables.box.at)
@@ -266,7 +280,7 @@ def cost_at_coordinates(run: Run, space: Space, tables: Tables, home: int, u: Ar
 
 
 @compiled
-def blur_beside(run: Run, space: Space, tables: Tables, floor: float) -> float:
+def blur_beside(run: RunCost, space: Space, tables: RunTables, floor: float) -> float:
     """Return a bound of the rounding errors of a residual (its length) at a place whose nodes are bounded.
 
     On a surface that of the height as well, see `optloc.proof.search_space.blur_at`.

@@ -20,13 +20,13 @@ from optloc.proof.runs.rows import (
     pull_back,
     residual_at,
 )
-from optloc.proof.runs.states import STATE, Axes, Course, Table, set_bends, set_box, table_of
+from optloc.proof.runs.states import STATE, ConstantVelocityCost, StateAxes, StateTable, set_bends, set_box, table_of
 
 # Rows over a box.
 
 
 @compiled
-def set_lines(course: Course, table: Table) -> None:
+def set_lines(course: ConstantVelocityCost, table: StateTable) -> None:
     """Write the Jacobian of the rows at the centre of a box whose nodes are bounded."""
     values, d = table.sheet.reach, table.lever.shape[1]
     for m in range(table.at.shape[0]):
@@ -46,7 +46,7 @@ _SWEEPS = 3
 
 
 @compiled
-def _reach(course: Course, table: Table, direction: Array, curved: bool) -> float:
+def _reach(course: ConstantVelocityCost, table: StateTable, direction: Array, curved: bool) -> float:
     """Return a lower bound of ``|P e|`` over a box from one direction (q,), rounding apart; see `least_length`."""
     n, d, force = table.at.shape[0], table.lever.shape[1], table.sheet.force
     length, total, rest = 0.0, 0.0, 0.0
@@ -84,7 +84,7 @@ def _reach(course: Course, table: Table, direction: Array, curved: bool) -> floa
 
 
 @compiled
-def least_length(course: Course, table: Table, cost: float, curved: bool) -> float:
+def least_length(course: ConstantVelocityCost, table: StateTable, cost: float, curved: bool) -> float:
     """Return a lower bound of ``|P e|`` over a box, rounding apart; negative where it says nothing.
 
     The residual at the centre and the Jacobian are set. Of the directions that are tried the last is the residual
@@ -117,7 +117,7 @@ def least_length(course: Course, table: Table, cost: float, curved: bool) -> flo
 
 
 @compiled
-def sum_up(course: Course, table: Table, noise: float) -> tuple[float, float]:
+def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tuple[float, float]:
     """Fill gradient, Hessian and its change of first order; return bounds of the rest's norm and the gradient's blur.
 
     As `optloc.proof.runs.rows.sum_up_rows`, in units of the half-widths of the box; nodes, Hessians of nodes, residual
@@ -153,7 +153,7 @@ def sum_up(course: Course, table: Table, noise: float) -> tuple[float, float]:
 
 
 @compiled
-def _blur_of_lines(course: Course, table: Table) -> float:
+def _blur_of_lines(course: ConstantVelocityCost, table: StateTable) -> float:
     """Return a bound of the rounding of each column of the Jacobian."""
     most, missed = 0.0, _missed(course, table)
     for m in range(table.at.shape[0]):
@@ -167,7 +167,7 @@ def _blur_of_lines(course: Course, table: Table) -> float:
 
 
 @compiled
-def _missed(course: Course, table: Table) -> float:
+def _missed(course: ConstantVelocityCost, table: StateTable) -> float:
     """Return a bound of what differences leave out of each column of the Jacobian."""
     total = 0.0
     if table.lever.shape[1] == 3:
@@ -182,7 +182,7 @@ def _missed(course: Course, table: Table) -> float:
 
 
 @compiled
-def _turn(course: Course, table: Table) -> None:
+def _turn(course: ConstantVelocityCost, table: StateTable) -> None:
     """Add the nodes' part of the Hessian, and write what is linear in s of its change."""
     n = table.at.shape[0]
     third = np.zeros((n, n, n))
@@ -203,7 +203,7 @@ def _turn(course: Course, table: Table) -> None:
 
 
 @compiled
-def _rest(course: Course, table: Table, blur: float) -> float:
+def _rest(course: ConstantVelocityCost, table: StateTable, blur: float) -> float:
     """Return a bound of the norm of what else changes in the Hessian; see `optloc.proof.runs.rows`."""
     rows, sheet, reach, n = course.rows, table.sheet, table.sheet.reach, table.at.shape[0]
     own = cross = ball = 0.0
@@ -229,7 +229,7 @@ def _rest(course: Course, table: Table, blur: float) -> float:
 
 
 @compiled
-def is_convex(table: Table, ball: float, margin: float) -> bool:
+def is_convex(table: StateTable, ball: float, margin: float) -> bool:
     """Return whether the Hessian of f/2, in lengths of 1, exceeds `margin` all over a box whose sums are filled."""
     if not ball < inf:
         return False
@@ -244,7 +244,7 @@ def is_convex(table: Table, ball: float, margin: float) -> bool:
 
 
 @compiled
-def has_no_minimum(table: Table, ball: float, noise: float) -> bool:
+def has_no_minimum(table: StateTable, ball: float, noise: float) -> bool:
     """Return whether no minimum of the cost can lie in a box whose sums are filled.
 
     The gradient does not vanish, or the cost bends downwards along a coordinate.
@@ -284,11 +284,11 @@ def has_no_minimum(table: Table, ball: float, noise: float) -> bool:
 
 
 @compiled
-def hessian_of_state(course: Course, state: Array) -> Array:
+def hessian_of_state(course: ConstantVelocityCost, state: Array) -> Array:
     """Return the Hessian (4, 4) of f/2 at a state (4,)."""
     table = table_of(course)
     table.unit[:] = 1.0
-    axes = Axes(state, np.eye(STATE), np.eye(STATE), np.zeros((2, STATE)))
+    axes = StateAxes(state, np.eye(STATE), np.eye(STATE), np.zeros((2, STATE)))
     set_box(course, axes, table)
     residual_at(course.rows, table.nodes, table.sheet)
     set_lines(course, table)
@@ -297,7 +297,7 @@ def hessian_of_state(course: Course, state: Array) -> Array:
     return table.hessian
 
 
-def axes_of(hessian: Array, state: Array, corners: Array) -> Axes | None:
+def axes_of(hessian: Array, state: Array, corners: Array) -> StateAxes | None:
     """Return the principal axes of the cost at a state (n,), in standard deviations; None where it is no minimum."""
     size = np.sqrt(np.maximum(np.diag(hessian), 0.0))
     if not (np.isfinite(hessian).all() and size.all()):
@@ -306,4 +306,4 @@ def axes_of(hessian: Array, state: Array, corners: Array) -> Axes | None:
     if not values[0] > 0.0:
         return None
     turn = vectors / size[:, None] / np.sqrt(values)
-    return Axes(state, plainly(turn), plainly(np.linalg.inv(turn)), corners)
+    return StateAxes(state, plainly(turn), plainly(np.linalg.inv(turn)), corners)

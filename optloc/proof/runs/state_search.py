@@ -23,16 +23,16 @@ from optloc.proof.near import (
     STATIONARY,
     UNIQUE,
     VALUE,
-    Aim,
+    Goal,
 )
 from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.runs.state_bounds import has_no_minimum, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import (
     SHIFT,
     WIDER,
-    Axes,
-    Course,
-    Table,
+    ConstantVelocityCost,
+    StateAxes,
+    StateTable,
     floor_of,
     put,
     set_bends,
@@ -55,11 +55,11 @@ class Search(NamedTuple):
 
     Parameters
     ----------
-    whole, few : Course
+    whole, few : ConstantVelocityCost
         All rows, and those of few epochs, which cost nowhere more.
-    axes : Axes
+    axes : StateAxes
         The coordinates.
-    table, small : Table
+    table, small : StateTable
         Working memory for all rows, and for few.
     floors : tuple of 2 float
         Sizes of what residuals of all and of few rows are differences of, beside the nodes.
@@ -67,18 +67,18 @@ class Search(NamedTuple):
         Known minima, and half-widths of boxes around them on which the cost is convex.
     """
 
-    whole: Course
-    few: Course
-    axes: Axes
-    table: Table
-    small: Table
+    whole: ConstantVelocityCost
+    few: ConstantVelocityCost
+    axes: StateAxes
+    table: StateTable
+    small: StateTable
     floors: tuple[float, float]
     minima: Array
     sides: Array
 
 
 @compiled
-def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: int, found: Array) -> tuple[int, int]:
+def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: int, found: Array) -> tuple[int, int]:
     """Search boxes for minima that cost less than a level; return the outcome and how many boxes were looked at.
 
     Parameters
@@ -87,7 +87,7 @@ def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: in
         Where.
     stack, size : array (capacity, 2 n), int
         The boxes: centres, half-widths.
-    aim : Aim
+    aim : Goal
         What is to be shown of each.
     budget : int
         How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
@@ -136,7 +136,9 @@ def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: in
 
 
 @compiled
-def _look(course: Course, axes: Axes, table: Table, floor: float, level: float) -> tuple[float, float]:
+def _look(
+    course: ConstantVelocityCost, axes: StateAxes, table: StateTable, floor: float, level: float
+) -> tuple[float, float]:
     """Return the cost at the centre of a box that is set and a lower bound of the residual over it."""
     set_box(course, axes, table)
     here = residual_at(course.rows, table.nodes, table.sheet)
@@ -152,7 +154,7 @@ def _look(course: Course, axes: Axes, table: Table, floor: float, level: float) 
 
 
 @compiled
-def _curve(search: Search, table: Table) -> tuple[float, float]:
+def _curve(search: Search, table: StateTable) -> tuple[float, float]:
     """Fill the sums of a box that was looked at with all rows, see `sum_up`."""
     noise = blur_of(search.whole.rows, search.floors[0], table.nodes)
     set_bends(search.whole, search.axes, table)
@@ -160,7 +162,7 @@ def _curve(search: Search, table: Table) -> tuple[float, float]:
 
 
 @compiled
-def _where(axes: Axes, at: Array, half: Array) -> int:
+def _where(axes: StateAxes, at: Array, half: Array) -> int:
     """Return -1 where no state of a box is in the region, 1 where all are in its inside, else 0."""
     inside = 1
     for i in range(at.shape[0]):
@@ -176,7 +178,7 @@ def _where(axes: Axes, at: Array, half: Array) -> int:
 
 
 @compiled
-def _is_inside(axes: Axes, at: Array, state: Array) -> bool:
+def _is_inside(axes: StateAxes, at: Array, state: Array) -> bool:
     """Write the state of search coordinates; return whether it is in the region."""
     inside = True
     for i in range(at.shape[0]):
@@ -200,7 +202,7 @@ def _is_known(search: Search, at: Array, half: Array) -> bool:
 
 
 @compiled
-def _steepest(table: Table) -> int:
+def _steepest(table: StateTable) -> int:
     """Return the side of a box that was looked at along which the residual changes most."""
     best, steepest, side, n = -1.0, 0.0, 0, table.at.shape[0]
     for m in range(n):
@@ -217,7 +219,7 @@ def _steepest(table: Table) -> int:
 
 
 @compiled
-def _push_halves(stack: Array, size: int, table: Table, side: int) -> int:
+def _push_halves(stack: Array, size: int, table: StateTable, side: int) -> int:
     """Push the halves of a box; return the size of the stack."""
     n = table.at.shape[0]
     for sign in (-0.5, 0.5):
@@ -268,7 +270,7 @@ def _descends(search: Search, level: float, found: Array) -> bool:
 
 
 @compiled
-def _linearise(search: Search, table: Table) -> float:
+def _linearise(search: Search, table: StateTable) -> float:
     """Return the cost at coordinates that are set, with residual, Jacobian and slope in lengths of 1."""
     for m in range(table.at.shape[0]):
         table.half[m], table.unit[m] = 0.0, 1.0
@@ -279,7 +281,7 @@ def _linearise(search: Search, table: Table) -> float:
 
 
 @compiled
-def _step(table: Table, damping: float) -> float:
+def _step(table: StateTable, damping: float) -> float:
     """Write a damped Gauss-Newton step; return its squared length in units of what is left, NaN where there is none."""
     n, matrix, lines = table.at.shape[0], table.solve, table.lines
     for m in range(n):
@@ -351,15 +353,22 @@ def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) 
 
 @compiled
 def prove_course(
-    whole: Course, few: Course, axes: Axes, others: Array, kappa: float, eps: float, budget: int, found: Array
+    whole: ConstantVelocityCost,
+    few: ConstantVelocityCost,
+    axes: StateAxes,
+    others: Array,
+    kappa: float,
+    eps: float,
+    budget: int,
+    found: Array,
 ) -> tuple[int, int, float]:
     """Prove of a course what `optloc.proof.near.prove` proves of a cost, within a region.
 
     Parameters
     ----------
-    whole, few : Course
+    whole, few : ConstantVelocityCost
         All rows, and those of few epochs.
-    axes : Axes
+    axes : StateAxes
         Of the fix, with the region.
     others : array (P, n)
         Other known minima.
@@ -384,7 +393,7 @@ def prove_course(
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
-    aim = Aim(level, least - eps, least - 0.5 * eps, False, 0, 0)
+    aim = Goal(level, least - eps, least - 0.5 * eps, False, 0, 0)
     known, place = zero(), x.copy()
     for p in range(1 + (others.shape[0] if kappa > 0.0 else 0)):
         for m in range(n if p > 0 else 0):
@@ -404,7 +413,7 @@ def prove_course(
 
 
 @compiled
-def _set_first(axes: Axes, at: Array, half: Array) -> None:
+def _set_first(axes: StateAxes, at: Array, half: Array) -> None:
     """Write the box that holds a region."""
     for m in range(at.shape[0]):
         for i in range(at.shape[0]):

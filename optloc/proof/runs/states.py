@@ -33,8 +33,8 @@ from optloc.proof.runs.ground import (
     slope_of,
 )
 from optloc.proof.runs.rows import (
-    Rows,
-    Sheet,
+    RunRows,
+    RunWorkspace,
     blur_of,
     norm_of,
     residual_at,
@@ -46,7 +46,7 @@ from optloc.proof.search_space import accuracy_floor
 # What is searched.
 
 
-class Course(NamedTuple):
+class ConstantVelocityCost(NamedTuple):
     """The cost of a run over the state of a target in uniform motion.
 
     Parameters
@@ -57,7 +57,7 @@ class Course(NamedTuple):
         Where the nodes of each epoch begin, and the end.
     since : array (K,)
         Seconds of each epoch from the time at which the state holds.
-    rows : Rows
+    rows : RunRows
         All rows.
     ground : Ground
         What the target is carried over; `optloc.proof.runs.ground.STRAIGHT` in the plane.
@@ -67,11 +67,11 @@ class Course(NamedTuple):
     data: Array
     first: Array
     since: Array
-    rows: Rows
+    rows: RunRows
     ground: Ground
 
 
-class Axes(NamedTuple):
+class StateAxes(NamedTuple):
     """Search coordinates s of states: ``(p, v) = origin + turn s``.
 
     Parameters
@@ -90,7 +90,7 @@ class Axes(NamedTuple):
     corners: Array
 
 
-class Table(NamedTuple):
+class StateTable(NamedTuple):
     """Working memory for one box of a course.
 
     Parameters
@@ -117,7 +117,7 @@ class Table(NamedTuple):
     rests : array (J, 3)
         Bounds of what a node is off by its second-order form, of the norm of its Hessian's change over the box, and
         of the Hessian's norm.
-    sheet : Sheet
+    sheet : RunWorkspace
         Of the rows.
     lines, pulls : array (n, q), (n, J)
         Columns of the Jacobian, and what they pull at the nodes.
@@ -145,7 +145,7 @@ class Table(NamedTuple):
     curves: Array
     bends: Array
     rests: Array
-    sheet: Sheet
+    sheet: RunWorkspace
     lines: Array
     pulls: Array
     slope: Array
@@ -163,12 +163,12 @@ WIDER, SHIFT = 1e-12, 1e-15
 
 
 @compiled
-def table_of(course: Course) -> Table:
+def table_of(course: ConstantVelocityCost) -> StateTable:
     """Return working memory for boxes."""
     J, K, q, n = course.kinds.shape[0], course.since.shape[0], course.rows.w.shape[0], STATE
     over = over_ground(course.ground)
     vectors, matrices = np.zeros((6, n)), np.zeros((3, n, n))
-    return Table(
+    return StateTable(
         vectors[0],
         vectors[1],
         vectors[2],
@@ -196,14 +196,14 @@ def table_of(course: Course) -> Table:
 
 
 @compiled
-def put(table: Table, at: Array, half: Array) -> None:
+def put(table: StateTable, at: Array, half: Array) -> None:
     """Set a box, whose derivatives are taken in its half-widths."""
     for m in range(at.shape[0]):
         table.at[m], table.half[m], table.unit[m] = at[m], half[m], half[m]
 
 
 @compiled
-def set_box(course: Course, axes: Axes, table: Table) -> None:
+def set_box(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
     """Bound all nodes over a box that is set, and write the levers of its unit."""
     if over_ground(course.ground):
         _carry(course, axes, table)
@@ -215,7 +215,7 @@ def set_box(course: Course, axes: Axes, table: Table) -> None:
 
 
 @compiled
-def _bound(course: Course, table: Table) -> None:
+def _bound(course: ConstantVelocityCost, table: StateTable) -> None:
     """Bound all nodes over the places of their epochs."""
     plan, line = np.zeros((3, 3)), np.zeros(6)
     for i in range(table.lever.shape[1]):
@@ -226,7 +226,7 @@ def _bound(course: Course, table: Table) -> None:
 
 
 @compiled
-def _shift(course: Course, axes: Axes, table: Table) -> None:
+def _shift(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
     """Write places and levers of a course in the plane."""
     at, half = table.at, table.half
     for k in range(course.since.shape[0]):
@@ -248,7 +248,7 @@ def _shift(course: Course, axes: Axes, table: Table) -> None:
 
 
 @compiled
-def _carry(course: Course, axes: Axes, table: Table) -> None:
+def _carry(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
     """Write places and levers of a course over ground, and bounds of the derivatives of its places."""
     ground, state, half = course.ground, np.zeros(STATE), np.zeros(STATE)
     for i in range(STATE):
@@ -286,7 +286,7 @@ def _carry(course: Course, axes: Axes, table: Table) -> None:
 
 
 @compiled
-def _rest_of_places(table: Table, k: int, blur: float) -> float:
+def _rest_of_places(table: StateTable, k: int, blur: float) -> float:
     """Return how far places over ground are from their linear form, metres."""
     return float(0.5 * table.limits[1] * table.sizes[k, 0] + blur * sqrt(table.sizes[k, 0]))
 
@@ -296,7 +296,7 @@ _ANY = 1e300
 
 
 @compiled
-def _fold(course: Course, table: Table) -> None:
+def _fold(course: ConstantVelocityCost, table: StateTable) -> None:
     """Add to the bounds of nodes what places over ground are off their linear form."""
     blur, _ = errors_of(table.limits[2])
     for k in range(course.since.shape[0]):
@@ -311,7 +311,7 @@ def _fold(course: Course, table: Table) -> None:
 
 
 @compiled
-def set_bends(course: Course, axes: Axes, table: Table) -> None:
+def set_bends(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
     """Bound second derivatives of all nodes over a box whose nodes are bounded."""
     plan, line, second, d = np.zeros((3, 3)), np.zeros(6), np.zeros((3, 3)), table.lever.shape[1]
     for i in range(d):
@@ -348,7 +348,7 @@ def _pull_back(curve: Array, lever: Array, out: Array) -> None:
 
 
 @compiled
-def _carry_beside(course: Course, axes: Axes, table: Table) -> None:
+def _carry_beside(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
     """Write where the states lead that second derivatives of places over ground are taken from."""
     state = np.zeros(STATE)
     for i in range(STATE):
@@ -362,7 +362,7 @@ def _carry_beside(course: Course, axes: Axes, table: Table) -> None:
 
 
 @compiled
-def _bends_over(table: Table, k: int, j: int, chi: float, size: float) -> tuple[float, float, float]:
+def _bends_over(table: StateTable, k: int, j: int, chi: float, size: float) -> tuple[float, float, float]:
     """Return bounds of change and norm of the Hessian of a node over ground, states in metres, and what slopes miss.
 
     With g slope and N Hessian of the node by the place, and F the place: ``F''(g) + F'(N, F')``. What does not shrink
@@ -382,7 +382,7 @@ def _bends_over(table: Table, k: int, j: int, chi: float, size: float) -> tuple[
 
 
 @compiled
-def _bend_over(course: Course, axes: Axes, table: Table, k: int) -> None:
+def _bend_over(course: ConstantVelocityCost, axes: StateAxes, table: StateTable, k: int) -> None:
     """Add what the second derivatives of a place over ground are to the Hessians of its nodes."""
     time, n = course.since[k], STATE
     scaled, own = np.zeros((n, n)), np.zeros((n, n))
@@ -412,7 +412,7 @@ def _bend_over(course: Course, axes: Axes, table: Table, k: int) -> None:
 
 
 @compiled
-def cost_of_state(course: Course, state: Array) -> tuple[float, float]:
+def cost_of_state(course: ConstantVelocityCost, state: Array) -> tuple[float, float]:
     """Return the cost of any position and velocity (2 d,), at its height or not, and the rounding of its residual."""
     table, d = table_of(course), state.shape[0] // 2
     for k in range(course.since.shape[0]):
@@ -428,7 +428,7 @@ def cost_of_state(course: Course, state: Array) -> tuple[float, float]:
 
 
 @compiled
-def floor_of(course: Course, state: Array) -> float:
+def floor_of(course: ConstantVelocityCost, state: Array) -> float:
     """Return the sizes of what residuals are differences of, beside the nodes, over all places of a state."""
     d, last, most = state.shape[0] // 2, 0.0, np.zeros(3)
     for time in course.since:

@@ -15,7 +15,7 @@ from optloc.proof.groups import NONE, empty_groups
 from optloc.proof.near import region_of
 from optloc.proof.nodes.node import LOG_RANGE, RANGE
 from optloc.proof.scaled.reduction import Scaled
-from optloc.proof.search_space import Chart, Cost, chart_at, cost_of, empty_box
+from optloc.proof.search_space import Cost, LocalAxes, chart_at, cost_of, empty_box
 
 
 @compiled
@@ -51,7 +51,9 @@ _LEAST_GAP = 0.03
 
 
 @compiled
-def first_enclosed(scaled: Scaled, chart: Chart, x: Array, levels: Array, least: float, low: Array, high: Array) -> int:
+def first_enclosed(
+    scaled: Scaled, chart: LocalAxes, x: Array, levels: Array, least: float, low: Array, high: Array
+) -> int:
     """Return the first level whose positions are enclosed, or the number of levels; write the corners of their box."""
     for k in range(levels.shape[0]):
         level = max(levels[k], least)
@@ -106,7 +108,7 @@ def _without_factors(scaled: Scaled) -> Cost:
 
 
 @compiled
-def _enclose(cost: Cost, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
+def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box that holds all positions where a cost is below a level; return False for no box."""
     q, J = cost.K.shape
     if q == 0 or J == 0:
@@ -159,7 +161,7 @@ def _fitted(scaled: Scaled, R: Array, j: int) -> float:
 
 
 @compiled
-def _meet_balls(scaled: Scaled, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
+def _meet_balls(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box that holds the balls of all ranges; return False without balls.
 
     A range times the factor is within ``rho sqrt(R_jj)`` of its least-squares value, with R the inverse of K'K.
@@ -180,7 +182,7 @@ def _meet_balls(scaled: Scaled, chart: Chart, x: Array, level: float, low: Array
 
 
 @compiled
-def _meet_differences(scaled: Scaled, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
+def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box around stations with two waves of one emission time; return False without any.
 
     The difference of both arrivals is the range times the difference of the factors. K'K has the vector of ones as its
@@ -213,7 +215,7 @@ def _meet_differences(scaled: Scaled, chart: Chart, x: Array, level: float, low:
 
 
 @compiled
-def _meet_field(scaled: Scaled, chart: Chart, x: Array, level: float, low: Array, high: Array) -> bool:
+def _meet_field(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box around a ball outside which levels with a free exponent cost too much; or False.
 
     Let places s_j be at most D/2 from the middle. Then ``log r_j`` is ``log D - u.s_j / D`` within ``(s_j / D)^2``.

@@ -17,7 +17,7 @@ from optloc.kernels.systems import positive_along
 from optloc.proof.box import digits, is_empty, uncut
 from optloc.proof.curvature import C00, G0, LENGTH0, NOISE0, bends_down, clip_newton, entry
 from optloc.proof.nodes.node import CHI, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, SLOPE0, TURN0
-from optloc.proof.scaled.reduction import Scaled, Sheet, blur_of, is_positive
+from optloc.proof.scaled.reduction import Scaled, ScaledWorkspace, blur_of, is_positive
 from optloc.proof.search_space import Box
 
 # Share of the information that its rounding is below: sums over some tens of rows and nodes.
@@ -27,7 +27,7 @@ _ROUNDS = 2
 
 
 @compiled
-def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> float:
+def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) -> float:
     """Fill Hessian, gradient and bounds of their change over a box; return the bound of the norm of the rest.
 
     Parameters
@@ -38,7 +38,7 @@ def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> float:
         Whether the positive part of the change of ``E'E`` counts.
     box : Box
         Its nodes and their curves are filled; the sums are written.
-    sheet : Sheet
+    sheet : ScaledWorkspace
         Reduced rows with the ranges of the factors; derivatives and changes are written.
     """
     if not is_positive(sheet):
@@ -60,19 +60,19 @@ def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> float:
 
 
 @inlined
-def factor_of(scaled: Scaled, sheet: Sheet, j: int) -> float:
+def factor_of(scaled: Scaled, sheet: ScaledWorkspace, j: int) -> float:
     """Return the factor of a node at the centre of a box."""
     return float(sheet.best[scaled.group[j]]) if scaled.group[j] >= 0 else 1.0
 
 
 @inlined
-def _range_of(sheet: Sheet, g: int) -> float:
+def _range_of(sheet: ScaledWorkspace, g: int) -> float:
     """Return the largest distance of a factor from its value at the centre; zero for no factor."""
     return float(max(sheet.most[g] - sheet.best[g], sheet.best[g] - sheet.least[g])) if g >= 0 else 0.0
 
 
 @inlined
-def _greatest(sheet: Sheet, g: int) -> float:
+def _greatest(sheet: ScaledWorkspace, g: int) -> float:
     """Return the greatest value of a factor; 1 for no factor."""
     return float(max(sheet.most[g], sheet.best[g])) if g >= 0 else 1.0
 
@@ -87,7 +87,7 @@ def _change_of(box: Box, j: int) -> float:
 
 
 @inlined
-def _derive(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
+def _derive(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Write derivatives of residual and factors, pulls, changes of derivatives, and reaches of the coordinates."""
     nodes, E, lean, back, third = box.nodes, sheet.E, sheet.lean, sheet.back, sheet.third
     (q, J), G = scaled.cost.K.shape, back.shape[0]
@@ -126,7 +126,7 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: Sheet) -> float:
+def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: ScaledWorkspace) -> float:
     """Return the largest coordinate of a factor, at points whose factors are best."""
     nodes, half, G, reach = box.nodes, box.half, sheet.back.shape[0], sheet.spin[g] + noise
     for m in range(3):
@@ -146,7 +146,7 @@ def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: Sheet) -> f
 
 
 @inlined
-def _set_turn(scaled: Scaled, j: int, box: Box, sheet: Sheet) -> None:
+def _set_turn(scaled: Scaled, j: int, box: Box, sheet: ScaledWorkspace) -> None:
     """Write the pulls on a node, and how its multiples in the derivatives of the residual change over a box."""
     nodes, g, G = box.nodes, scaled.group[j], sheet.back.shape[0]
     change = _change_of(box, j)
@@ -163,7 +163,7 @@ def _set_turn(scaled: Scaled, j: int, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _add_information(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> None:
+def _add_information(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Add ``E'E`` and the gradient to the sums, and their rounding to the bounds of change."""
     sums, E, weight, share, longest = box.sums, sheet.E, scaled.cost.weight, digits(scaled.cost.K), 0.0
     for i in range(E.shape[0]):
@@ -188,7 +188,7 @@ def _add_information(scaled: Scaled, noise: float, box: Box, sheet: Sheet) -> No
 
 
 @inlined
-def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: Sheet) -> float:
+def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: ScaledWorkspace) -> float:
     """Return the second derivative along two offsets of a node times its factor."""
     own, g = factor_of(scaled, sheet, j) * box.curves[j, entry(k, m)], scaled.group[j]
     if g < 0:
@@ -198,7 +198,7 @@ def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: Sheet) -> f
 
 
 @inlined
-def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> float:
+def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorkspace) -> float:
     """Return the change of the force of a node over a box without its linear part."""
     A, nodes, G = scaled.cost.A, box.nodes, sheet.back.shape[0]
     rest = scaled.cost.weight[j] * noise
@@ -218,7 +218,7 @@ def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> fl
 
 
 @inlined
-def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> float:
+def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorkspace) -> float:
     """Add the second derivatives of a node times its force to the sums; return what the change of them adds."""
     curves, sums, third, g, G = box.curves, box.sums, sheet.third, scaled.group[j], sheet.back.shape[0]
     force, rest, linear = sheet.force[j], _rest_of(scaled, noise, j, box, sheet), 0.0
@@ -245,7 +245,7 @@ def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: Sheet) -> f
 
 
 @inlined
-def _add_third(box: Box, sheet: Sheet) -> None:
+def _add_third(box: Box, sheet: ScaledWorkspace) -> None:
     """Add what forces change in a straight line to the bounds of the Hessian's change; they change together."""
     G = sheet.back.shape[0]
     for at in range(6):
@@ -256,7 +256,7 @@ def _add_third(box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _add_mixed(scaled: Scaled, box: Box, sheet: Sheet) -> None:
+def _add_mixed(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
     """Add the same to the bounds of the change between offsets and factors."""
     G = sheet.back.shape[0]
     for h in range(G):
@@ -271,7 +271,7 @@ def _add_mixed(scaled: Scaled, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> None:
+def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) -> None:
     """Add the change of ``E'E`` to the bounds of the Hessian's change; `squares`: the positive part of it as well."""
     A, sums, turn, tie, G = scaled.cost.A, box.sums, sheet.turn, sheet.tie, sheet.back.shape[0]
     for j in range(A.shape[0]):
@@ -290,7 +290,7 @@ def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: Sheet) -> None:
 
 
 @compiled
-def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: Sheet) -> bool:
+def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: ScaledWorkspace) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` all over a box, at all factors of interest.
 
     Then the box has one stationary point at most, of those whose residual is as short as the ranges of factors say.
@@ -315,7 +315,7 @@ def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: Sheet) -> b
 
 
 @compiled
-def clip_stationary(scaled: Scaled, box: Box, sheet: Sheet) -> bool:
+def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
     """Clip a box to where a minimum with a short residual may be; or return False for no such place.
 
     Interval Newton in the offsets, as `optloc.proof.curvature.clip_to_minima`. The coordinates of the factors of a

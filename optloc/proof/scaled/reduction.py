@@ -54,7 +54,7 @@ class Scaled(NamedTuple):
     group: Array
 
 
-class Sheet(NamedTuple):
+class ScaledWorkspace(NamedTuple):
     """Working memory for one box.
 
     Parameters
@@ -121,12 +121,12 @@ class Sheet(NamedTuple):
 
 
 @compiled
-def sheet_of(scaled: Scaled) -> Sheet:
+def sheet_of(scaled: Scaled) -> ScaledWorkspace:
     """Return working memory for boxes of a cost."""
     q, J = scaled.cost.K.shape
     G = scaled.lift.shape[1]
     wide = J + 3 * G
-    return Sheet(
+    return ScaledWorkspace(
         np.zeros((q, wide)),
         np.zeros(q),
         np.zeros(wide),
@@ -158,7 +158,7 @@ def sheet_of(scaled: Scaled) -> Sheet:
 
 
 @compiled
-def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: Sheet) -> None:
+def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Project the factors out of the rows at the centre of a box whose nodes are bounded.
 
     Parameters
@@ -169,7 +169,7 @@ def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: Sheet) -> None:
         The sizes that limit the accuracy of residuals, apart from the nodes.
     box : Box
         Its nodes are filled.
-    sheet : Sheet
+    sheet : ScaledWorkspace
         Written, except the ranges of the factors. Without independent columns `best` is NaN.
 
     Notes
@@ -205,7 +205,7 @@ def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _orthogonalise(sheet: Sheet) -> None:
+def _orthogonalise(sheet: ScaledWorkspace) -> None:
     """Replace the columns of the factors by orthonormal ones, each projected twice, and write the inverse of R."""
     unit, back, good = sheet.unit, sheet.back, True
     q, G = unit.shape
@@ -237,7 +237,7 @@ def _orthogonalise(sheet: Sheet) -> None:
 
 
 @inlined
-def _project(scaled: Scaled, sheet: Sheet) -> None:
+def _project(scaled: Scaled, sheet: ScaledWorkspace) -> None:
     """Write the projected rows and measurements, the factors at the centre, and the cost there."""
     K, unit, back, w, here = scaled.cost.K, sheet.unit, sheet.back, sheet.w, 0.0
     (q, J), G = K.shape, unit.shape[1]
@@ -272,7 +272,7 @@ def _project(scaled: Scaled, sheet: Sheet) -> None:
 
 
 @inlined
-def _forwards(sheet: Sheet) -> float:
+def _forwards(sheet: ScaledWorkspace) -> float:
     """Return the cost of factors that are not negative: a negative best factor becomes zero, of several all do."""
     G, cost = sheet.best.shape[0], 0.0
     low = 0
@@ -291,7 +291,7 @@ def _forwards(sheet: Sheet) -> float:
 
 
 @compiled
-def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> bool:
+def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> bool:
     """Write the ranges of factors at which points of a box have residuals shorter than rho; False for no factors.
 
     The rows are reduced. ``k = best + R^-1 U'(residual) - R^-1 U'(change of the rows)``, and the change grows with k.
@@ -324,7 +324,7 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> bool:
 
 
 @inlined
-def _bound_by_priors(scaled: Scaled, rho: float, sheet: Sheet) -> None:
+def _bound_by_priors(scaled: Scaled, rho: float, sheet: ScaledWorkspace) -> None:
     """Narrow the ranges of the factors to what the rows of priors allow: the last rows, one for each factor."""
     lift, w = scaled.lift, scaled.cost.w
     q, G = lift.shape
@@ -337,7 +337,7 @@ def _bound_by_priors(scaled: Scaled, rho: float, sheet: Sheet) -> None:
 
 
 @inlined
-def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
+def _swing(scaled: Scaled, blur: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Write how much the change of each column of the rows over a box, and its rounding, may change the factors."""
     nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third  # memory that is free
     G, J = V.shape
@@ -361,7 +361,7 @@ def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _reach_of(sheet: Sheet, g: int, blur: float) -> float:
+def _reach_of(sheet: ScaledWorkspace, g: int, blur: float) -> float:
     """Return the largest change of a factor by residuals."""
     total = 0.0
     for h in range(g, sheet.best.shape[0]):
@@ -370,7 +370,7 @@ def _reach_of(sheet: Sheet, g: int, blur: float) -> float:
 
 
 @inlined
-def _narrow(sheet: Sheet, blur: float) -> bool:
+def _narrow(sheet: ScaledWorkspace, blur: float) -> bool:
     """Narrow the ranges of the factors, which are bounded; return False where one is empty."""
     G, least, most, fall, rise = sheet.best.shape[0], sheet.least, sheet.most, sheet.fall, sheet.rise
     for g in range(G):
@@ -390,7 +390,7 @@ def _narrow(sheet: Sheet, blur: float) -> bool:
 
 
 @inlined
-def _solve_swing(sheet: Sheet, blur: float) -> bool:
+def _solve_swing(sheet: ScaledWorkspace, blur: float) -> bool:
     """Bound the greatest factors by ``(1 - N) k <= best + reach``; return False where that has no solution k >= 0.
 
     With positive pivots the inverse of 1 - N has no negative entry (an M-matrix). Elimination without pivoting.
@@ -421,7 +421,7 @@ def _solve_swing(sheet: Sheet, blur: float) -> bool:
 
 
 @inlined
-def _set_slopes(scaled: Scaled, box: Box, sheet: Sheet) -> None:
+def _set_slopes(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
     """Write the derivatives of the columns of the factors along each coordinate, before their projection."""
     K, nodes, J = scaled.cost.K, box.nodes, box.nodes.shape[0]
     sheet.K[:, J:] = 0.0
@@ -434,7 +434,7 @@ def _set_slopes(scaled: Scaled, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def _turn(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
+def _turn(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Write how long a residual along U may be whose factors are the best at their position."""
     nodes, half, back = box.nodes, box.half, sheet.back
     J, G = nodes.shape[0], back.shape[0]
@@ -456,7 +456,7 @@ def _turn(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
 
 
 @compiled
-def bound_rows(scaled: Scaled, box: Box, sheet: Sheet) -> float:
+def bound_rows(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> float:
     """Return a lower bound of the residual over a box whose factors are bounded, negative where it says nothing."""
     nodes, out, G = box.nodes, sheet.nodes, sheet.best.shape[0]
     if not is_bounded(sheet):
@@ -479,7 +479,7 @@ def bound_rows(scaled: Scaled, box: Box, sheet: Sheet) -> float:
 
 
 @inlined
-def _length_of(sheet: Sheet, j: int) -> float:
+def _length_of(sheet: ScaledWorkspace, j: int) -> float:
     """Return the length of a projected column."""
     square = 0.0
     for i in range(sheet.K.shape[0]):
@@ -488,7 +488,7 @@ def _length_of(sheet: Sheet, j: int) -> float:
 
 
 @inlined
-def _has_signs(scaled: Scaled, sheet: Sheet) -> bool:
+def _has_signs(scaled: Scaled, sheet: ScaledWorkspace) -> bool:
     """Return whether nodes without a lower end add to the residual along the direction of its bound, rounding apart."""
     good = True
     for j in range(scaled.cost.K.shape[1]):
@@ -502,7 +502,7 @@ def _has_signs(scaled: Scaled, sheet: Sheet) -> bool:
 
 
 @inlined
-def _add_range(g: int, box: Box, sheet: Sheet) -> None:
+def _add_range(g: int, box: Box, sheet: ScaledWorkspace) -> None:
     """Project the columns of the range of a factor; write by how much it may differ from the middle times the box."""
     K, out, J, unit = sheet.K, sheet.nodes, box.nodes.shape[0], sheet.unit
     wide = 0.5 * (sheet.most[g] - sheet.least[g])
@@ -522,7 +522,7 @@ def _add_range(g: int, box: Box, sheet: Sheet) -> None:
 
 
 @inlined
-def is_bounded(sheet: Sheet) -> bool:
+def is_bounded(sheet: ScaledWorkspace) -> bool:
     """Return whether all factors are bounded, and independent at the centre of the box."""
     good = True
     for g in range(sheet.best.shape[0]):
@@ -531,7 +531,7 @@ def is_bounded(sheet: Sheet) -> bool:
 
 
 @inlined
-def is_positive(sheet: Sheet) -> bool:
+def is_positive(sheet: ScaledWorkspace) -> bool:
     """Return whether all factors are bounded and greater than zero."""
     good = is_bounded(sheet)
     for g in range(sheet.best.shape[0]):
@@ -540,7 +540,7 @@ def is_positive(sheet: Sheet) -> bool:
 
 
 @inlined
-def size_of(sheet: Sheet) -> float:
+def size_of(sheet: ScaledWorkspace) -> float:
     """Return the sizes that limit the accuracy of residuals at any factors of a box."""
     most = 1.0
     for g in range(sheet.best.shape[0]):
@@ -549,13 +549,13 @@ def size_of(sheet: Sheet) -> float:
 
 
 @inlined
-def blur_of(scaled: Scaled, sheet: Sheet) -> float:
+def blur_of(scaled: Scaled, sheet: ScaledWorkspace) -> float:
     """Return a bound of the rounding errors of a residual (its length) in a box."""
     return float(digits(scaled.cost.K) * size_of(sheet))
 
 
 @compiled
-def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
+def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Write the ends of what is left of a box where residuals may be shorter than rho; its rows are bounded."""
     uncut(box.half, box.cut)
     if not is_bounded(sheet):
@@ -565,7 +565,7 @@ def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
 
 
 @compiled
-def look_at(scaled: Scaled, sheet: Sheet, box: Box, look: Cost) -> None:
+def look_at(scaled: Scaled, sheet: ScaledWorkspace, box: Box, look: Cost) -> None:
     """Write rows that are the cost, its slope and information at a point whose rows are reduced, without factors."""
     J = box.nodes.shape[0]
     for i in range(sheet.K.shape[0]):

@@ -14,7 +14,7 @@ from optloc.linear.normal import prior_parts
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, with_minima
-from optloc.proof.batch import FIRST_BOXES, Answered, Asked, empty_answer, plainly
+from optloc.proof.batch import FIRST_BOXES, ProofRequest, ProofResult, empty_answer, plainly
 from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around
 from optloc.proof.convex_boxes import accuracy_floor_far, widen_core
 from optloc.proof.everywhere import verdict_of
@@ -24,8 +24,8 @@ from optloc.proof.position_costs import costs_of_groups, factors_of_rows
 from optloc.proof.scaled.enclosures import first_enclosed, stays_finite
 from optloc.proof.scaled.reduction import HERE, Scaled, blur_of, look_at, reduce_rows
 from optloc.proof.scaled.scaled_search import (
-    Tables,
-    Work,
+    ScaledSearchWorkspace,
+    ScaledTables,
     cost_near,
     search_scaled,
     set_near_minimum,
@@ -35,7 +35,7 @@ from optloc.proof.scaled.scaled_search import (
 from optloc.proof.search_space import (
     COARSEST,
     LINES,
-    Chart,
+    LocalAxes,
     accuracy_floor,
     chart_at,
     cost_of,
@@ -158,7 +158,7 @@ def prove_scaled(
         space, size = _in_box(scaled, tables, atlas, chart, x, others, levels, least, eps, low, high, stack)
     if size == 0:
         return STATIONARY, 0, -inf, gaps[0], 0
-    work = Work(scaled, tables, floor_of(space, cost), tables.box, tables.near)
+    work = ScaledSearchWorkspace(scaled, tables, floor_of(space, cost), tables.box, tables.near)
     outcome, boxes, bound, shown, met = search_scaled(
         work, space, stack, size, levels, eps, True, budget, rivals, found
     )
@@ -168,9 +168,9 @@ def prove_scaled(
 @compiled
 def _with_minima(
     scaled: Scaled,
-    tables: Tables,
+    tables: ScaledTables,
     atlas: Atlas,
-    chart: Chart,
+    chart: LocalAxes,
     x: Array,
     others: Array,
     levels: Array,
@@ -194,9 +194,9 @@ def _with_minima(
 @compiled
 def _in_box(
     scaled: Scaled,
-    tables: Tables,
+    tables: ScaledTables,
     atlas: Atlas,
-    chart: Chart,
+    chart: LocalAxes,
     x: Array,
     others: Array,
     levels: Array,
@@ -224,14 +224,14 @@ def _in_box(
     return space, push_around(stack, 0, low, high, room[1, 0], 0)
 
 
-def prove_all_scaled(costs: ScaledCosts, asked: Asked) -> Answered:
+def prove_all_scaled(costs: ScaledCosts, asked: ProofRequest) -> ProofResult:
     """Return the outcome of the proofs of n fixes of n problems, see `optloc.proof.batch.prove_all`.
 
     Claims are about all positions, whatever region is asked for. Few proofs begin in plain Python, because most of
     them end before machine code is loaded.
     """
     n, d = asked.x.shape
-    out, asked = empty_answer(n, d), Asked(*map(plainly, asked))
+    out, asked = empty_answer(n, d), ProofRequest(*map(plainly, asked))
     out.everywhere[:] = True
 
     def prove(i: int, most: int) -> None:

@@ -35,7 +35,7 @@ from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scale
 from optloc.proof.scaled.reduction import (
     HERE,
     Scaled,
-    Sheet,
+    ScaledWorkspace,
     bound_factors,
     bound_rows,
     clip_rows,
@@ -44,33 +44,33 @@ from optloc.proof.scaled.reduction import (
     reduce_rows,
     sheet_of,
 )
-from optloc.proof.search_space import Box, Chart, Cost, curve_at, empty_box, place, widen
+from optloc.proof.search_space import Box, Cost, LocalAxes, curve_at, empty_box, place, widen
 from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, set_nodes, set_place
 
 
-class Tables(NamedTuple):
+class ScaledTables(NamedTuple):
     """Working memory: a box of the atlas with its sheet, one around a position, and rows without factors."""
 
     box: Box
-    sheet: Sheet
+    sheet: ScaledWorkspace
     near: Box
     look: Cost
 
 
 @compiled
-def tables_of(scaled: Scaled) -> Tables:
+def tables_of(scaled: Scaled) -> ScaledTables:
     """Return tables for a cost."""
     cost = scaled.cost
     q, J = cost.K.shape
     look = Cost(cost.kinds, cost.data, np.zeros((q, J)), np.zeros(q), cost.A, cost.weight, cost.groups)
-    return Tables(empty_box(q, J), sheet_of(scaled), empty_box(q, J), look)
+    return ScaledTables(empty_box(q, J), sheet_of(scaled), empty_box(q, J), look)
 
 
 # The cost at a position, and descents.
 
 
 @compiled
-def cost_near(scaled: Scaled, chart: Chart, tables: Tables) -> float:
+def cost_near(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
     """Return the least cost over the factors at the centre of the box around a position; its sums are filled."""
     near, cost = tables.near, scaled.cost
     near.half[:] = 0.0
@@ -89,7 +89,7 @@ _SAME_COST = 1e-13
 
 
 @compiled
-def descend_scaled(scaled: Scaled, chart: Chart, tables: Tables) -> float:
+def descend_scaled(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
     """Move the box around a position to a minimum; return its cost, or infinity where none is reached."""
     near = tables.near
     now, damping, start = cost_near(scaled, chart, tables), _DAMPING, near.at.copy()
@@ -124,7 +124,7 @@ _SMALLEST = 1e-6  # standard deviations: a smaller box holds only rounding
 
 @compiled
 def _convex(
-    scaled: Scaled, tables: Tables, space: Space, piece: int, at: Array, half: Array, rho: float, margin: float
+    scaled: Scaled, tables: ScaledTables, space: Space, piece: int, at: Array, half: Array, rho: float, margin: float
 ) -> bool:
     """Return whether the cost has one minimum on a box around a minimum."""
     box = tables.box
@@ -138,7 +138,7 @@ def _convex(
 
 
 @inlined
-def _fill(scaled: Scaled, tables: Tables, space: Space, piece: int, floor: float) -> None:
+def _fill(scaled: Scaled, tables: ScaledTables, space: Space, piece: int, floor: float) -> None:
     """Set the centre of a box, bound its nodes and reduce its rows."""
     set_place(space, tables.box, piece)
     set_nodes(space, scaled.cost, tables.box)
@@ -147,15 +147,23 @@ def _fill(scaled: Scaled, tables: Tables, space: Space, piece: int, floor: float
 
 @compiled
 def set_scaled_minimum(
-    scaled: Scaled, tables: Tables, atlas: Atlas, chart: Chart, i: int, x: Array, value: float, eps: float, rho: float
+    scaled: Scaled,
+    tables: ScaledTables,
+    atlas: Atlas,
+    chart: LocalAxes,
+    i: int,
+    x: Array,
+    value: float,
+    eps: float,
+    rho: float,
 ) -> bool:
     """Write a minimum and its surroundings into an atlas; return False if it is no minimum or costs too little.
 
     Parameters
     ----------
-    scaled, tables : Scaled, Tables
+    scaled, tables : Scaled, ScaledTables
         The cost, and working memory.
-    chart : Chart
+    chart : LocalAxes
         Search coordinates around the fix.
     atlas, i, x, value, eps
         As of `optloc.proof.convex_boxes.set_minimum`.
@@ -188,13 +196,13 @@ def set_scaled_minimum(
 
 @compiled
 def set_near_minimum(
-    scaled: Scaled, tables: Tables, space: Space, i: int, hull: Array, value: float, eps: float, rho: float
+    scaled: Scaled, tables: ScaledTables, space: Space, i: int, hull: Array, value: float, eps: float, rho: float
 ) -> bool:
     """Write the half-widths of a box around minimum i of search coordinates; return False if it is no minimum.
 
     Parameters
     ----------
-    scaled, tables, space : Scaled, Tables, Space
+    scaled, tables, space : Scaled, ScaledTables, Space
         The cost, working memory, and search coordinates, in which the minimum is written.
     i, hull : int, array (3,)
         Which minimum, and half-widths beyond which nothing is searched.
@@ -216,7 +224,7 @@ def set_near_minimum(
 @compiled
 def _grow(
     scaled: Scaled,
-    tables: Tables,
+    tables: ScaledTables,
     space: Space,
     piece: int,
     at: Array,
@@ -247,18 +255,18 @@ def _grow(
 # The search.
 
 
-class Work(NamedTuple):
+class ScaledSearchWorkspace(NamedTuple):
     """A cost and working memory for its search; the tables hold `box` and `near` as well."""
 
     scaled: Scaled
-    tables: Tables
+    tables: ScaledTables
     floor: float
     box: Box
     near: Box
 
 
 @compiled
-def _bound_row(work: Work, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
     end_at_infinity(box, space.atlas.dimension - 1, infinity(space.atlas, piece) if space.far else -inf)
@@ -274,7 +282,7 @@ def _bound_row(work: Work, space: Space, stack: Array, row: int, level: float) -
 
 
 @compiled
-def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: bool) -> int:
+def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
     scaled, box, sheet, d = work.scaled, work.box, work.tables.sheet, space.atlas.dimension
     if not is_bounded(sheet):
         uncut(box.half, box.cut)
@@ -299,17 +307,26 @@ def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: b
 
 
 @compiled
-def _descend_near(work: Work, chart: Chart) -> float:
+def _descend_near(work: ScaledSearchWorkspace, chart: LocalAxes) -> float:
     return descend_scaled(work.scaled, chart, work.tables)
 
 
 @compiled
-def _set_rival(work: Work, atlas: Atlas, chart: Chart, i: int, x: Array, value: float, eps: float, rho: float) -> bool:
+def _set_rival(
+    work: ScaledSearchWorkspace,
+    atlas: Atlas,
+    chart: LocalAxes,
+    i: int,
+    x: Array,
+    value: float,
+    eps: float,
+    rho: float,
+) -> bool:
     return set_scaled_minimum(work.scaled, work.tables, atlas, chart, i, x, value, eps, rho)
 
 
 @compiled
-def _cost_set(work: Work, atlas: Atlas) -> float:
+def _cost_set(work: ScaledSearchWorkspace, atlas: Atlas) -> float:
     bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
     reduce_rows(work.scaled, work.floor, work.box, work.tables.sheet)
     return float(work.tables.sheet.span[HERE])

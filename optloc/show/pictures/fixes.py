@@ -31,7 +31,7 @@ from optloc.show.pictures.style import (
     PURPLE,
     SKY,
     YELLOW,
-    Scene,
+    PictureScene,
     View,
     apart,
     figure_class,
@@ -122,7 +122,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     return figure
 
 
-def _overview(panel: Axes, scene: Scene, view: View) -> float:
+def _overview(panel: Axes, scene: PictureScene, view: View) -> float:
     """Draw everything, and return the size of the unit."""
     lines = (*scene.tracks, *scene.paths, *scene.other_paths, *scene.known)
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives, *lines])
@@ -138,7 +138,7 @@ def _overview(panel: Axes, scene: Scene, view: View) -> float:
     return size
 
 
-def _edges(panel: Axes, scene: Scene, size: float) -> None:
+def _edges(panel: Axes, scene: PictureScene, size: float) -> None:
     """Draw the outlines of the regions that must hold the target."""
     label: str | None = "region"
     for corners in scene.regions:
@@ -147,7 +147,7 @@ def _edges(panel: Axes, scene: Scene, size: float) -> None:
         label = None
 
 
-def _lines(panel: Axes, scene: Scene, view: View, size: float) -> None:
+def _lines(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
     """Draw what moves as lines, and known targets."""
     spots: dict[str, Any] = {"marker": "s", "markersize": 4, "markevery": [0]}
     styles: tuple[tuple[tuple[Array, ...], dict[str, Any]], ...] = (
@@ -190,7 +190,7 @@ def _plan(problem: Problem, line: Array) -> Array:
     return np.asarray((line if local is None else local.from_ecef(line))[:, :2])
 
 
-def _nearby(scene: Scene) -> bool:
+def _nearby(scene: PictureScene) -> bool:
     """Return whether the fixes are so close together that they deserve a panel of their own."""
     known = np.asarray(np.isfinite(scene.fixes).all(-1))
     if not known.any():
@@ -200,7 +200,7 @@ def _nearby(scene: Scene) -> bool:
     return reach < _CLOSE * float(np.ptp(np.concatenate([scene.stations, *scene.tracks])[:, :2]))
 
 
-def _close(panel: Axes, scene: Scene) -> float:
+def _close(panel: Axes, scene: PictureScene) -> float:
     """Draw the surroundings of the fixes, their ellipses or their own spread, and return the size of the unit."""
     known: Array = np.asarray(np.isfinite(scene.fixes).all(-1))
     view = PLAN
@@ -226,13 +226,13 @@ def _close(panel: Axes, scene: Scene) -> float:
     return size
 
 
-def _shift(scene: Scene, centre: Array) -> Scene:
+def _shift(scene: PictureScene, centre: Array) -> PictureScene:
     shift = np.zeros(scene.stations.shape[-1])
     shift[:2] = centre
     return replace(scene.moved(lambda place: place - shift), regions=tuple(ring - centre for ring in scene.regions))
 
 
-def _reach(scene: Scene, known: Array, centre: Array) -> float:
+def _reach(scene: PictureScene, known: Array, centre: Array) -> float:
     outlined = np.array([bool(regions) for regions in scene.outlines] or [False] * len(known))
     semi_axes, _ = error_ellipse(scene.covariances[known & ~outlined][:, :2, :2])
     largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)

@@ -19,7 +19,7 @@ from optloc.show.pictures.style import (
     ORANGE,
     PLAN,
     YELLOW,
-    Scene,
+    PictureScene,
     apart,
     figure_class,
     finish,
@@ -105,7 +105,7 @@ def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
     return flat, answer
 
 
-def limits(scene: Scene, widen: float = 0.25) -> Array:
+def limits(scene: PictureScene, widen: float = 0.25) -> Array:
     """Return the square [[x0, y0], [x1, y1]] that holds stations, fix and alternatives with a rim, metres."""
     points = np.concatenate([scene.stations, scene.fixes, scene.alternatives])[:, :2]
     low, high = points.min(0), points.max(0)
@@ -141,7 +141,7 @@ def _excess(problem: Problem, fix: Fix, points: Array, held: int) -> Array:
     return np.asarray(np.sqrt(np.maximum(cost - fix.cost[0], 0.0)))
 
 
-def _whole(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
+def _whole(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     from matplotlib.colors import LogNorm
 
     corners = limits(scene)
@@ -161,7 +161,7 @@ def _whole(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
     bar.ax.minorticks_off()
 
 
-def _near(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
+def _near(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene) -> None:
     centre, spread = scene.fixes[0], np.sqrt(np.diagonal(scene.covariances[0])[:2])
     if not np.isfinite(spread).all():
         panel.set_axis_off()
@@ -186,7 +186,7 @@ def _near(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
     panel.set_title(f"around {scene.axes[0]} {centre[0]:.1f} m, {scene.axes[1]} {centre[1]:.1f} m")
 
 
-def _square(panel: Axes, scene: Scene, corners: Array, unit: str) -> None:
+def _square(panel: Axes, scene: PictureScene, corners: Array, unit: str) -> None:
     style.name_axes(panel, scene, PLAN, unit)
     panel.grid(visible=False)
     panel.set_aspect("equal", adjustable="box")
@@ -256,7 +256,7 @@ def plot_convergence(
     return figure
 
 
-def _inset(panel: Axes, scene: Scene) -> None:
+def _inset(panel: Axes, scene: PictureScene) -> None:
     """Draw the surroundings of the fix in a corner: in the plan of all starts its ellipse is a dot."""
     centre, covariance = scene.fixes[0], scene.covariances[0]
     half = _AROUND * float(np.sqrt(np.diagonal(covariance)[:2].max()))
@@ -294,7 +294,7 @@ def _ends(panel: Axes, found: Basins, x: Array, y: Array) -> None:
     panel.pcolormesh(x, y, found.ends, cmap=colours, vmin=-0.5, vmax=2.5, rasterized=True, shading="nearest")
 
 
-def _marks(panel: Axes, scene: Scene, size: float, corners: Array, unit: str, *, last: bool) -> None:
+def _marks(panel: Axes, scene: PictureScene, size: float, corners: Array, unit: str, *, last: bool) -> None:
     style.stations(panel, scene, PLAN, size, named=False, s=36, edgecolors="white", linewidths=0.8)
     if last:
         style.ellipses(panel, scene, PLAN, size)

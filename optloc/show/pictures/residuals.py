@@ -44,13 +44,13 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
     Residuals of compass bearings are clockwise.
 
     A bar reaches over twice the standard deviation of a row, the other way of its zero too. Of many residuals the box
-    holds the middle half. A fix follows its measurements, so that residuals are smaller than errors: `optloc.health`
-    compares each station with what the others say.
+    holds the middle half. A fix follows its measurements, so that residuals are smaller than errors:
+    `optloc.station_health.health` compares each station with what the others say.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of problems; one whose epochs are fixed by themselves is to be given as `optloc.by_epoch` makes it.
+        Batch (...) of problems; give epochs that are fixed by themselves as `optloc.problem.by_epoch` makes them.
     fix : Fix
         Their fixes, with the same batch axes.
     title : str
@@ -70,7 +70,7 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
     good = np.flatnonzero(np.isfinite(answers.x).all(-1))
     if len(answers) != flat.batch_shape[0]:
         what = f"{len(answers)} fixes do not belong to {flat.batch_shape[0]} problems"
-        raise InvalidProblem(what, "plot", "give the problem that was fixed; see `optloc.by_epoch`")
+        raise InvalidProblem(what, "plot", "give the problem that was fixed; see `optloc.problem.by_epoch`")
     if not len(good):
         raise InvalidProblem("nothing was fixed, so there are no residuals", "plot", "see `optloc fix` for the reasons")
     part, vectors = flat.take(good), answers.x[good]
@@ -168,7 +168,7 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
     Parameters
     ----------
     health : Health
-        Of `optloc.health`.
+        Of `optloc.station_health.health`.
     title : str
         Title of the picture.
 

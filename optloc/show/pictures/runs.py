@@ -26,7 +26,7 @@ from optloc.show.pictures.style import (
     literal,
     panels_for,
 )
-from optloc.solvers.running import Growing
+from optloc.solvers.running import GrowingRun
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -164,13 +164,13 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
 
 
 def plot_biases(
-    found: Growing, title: str = "", *, names: Sequence[str] | None = None, truth: Mapping[str, Array] | None = None
+    found: GrowingRun, title: str = "", *, names: Sequence[str] | None = None, truth: Mapping[str, Array] | None = None
 ) -> Figure:
     """Return a picture of estimates against the length of a run, with 95 % intervals, one panel for each family.
 
     Parameters
     ----------
-    found : Growing
+    found : GrowingRun
         Estimates after the first epochs, of `optloc.solvers.running.growing`.
     title : str
         Title of the picture.
@@ -199,7 +199,7 @@ def plot_biases(
     return finish(figure, title)
 
 
-def _bias_panel(panel: Axes, found: Growing, slot: Slot, truth: Array | None) -> None:
+def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None) -> None:
     values, sigma = found.take(slot.name)
     for i, entry in enumerate(slot.entries[:_MOST]):
         colour, band = _BIAS_COLOURS[i % len(_BIAS_COLOURS)], _95 * sigma[:, i]

@@ -232,7 +232,7 @@ def _put(note: Annotation, place: tuple[int, int]) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class PictureScene:
     """What is drawn, metres along the picture's axes (east, north, up on Earth).
 
     Parameters
@@ -285,7 +285,7 @@ class Scene:
     outlines: tuple[dict[View, Outline], ...] = ()
     local: Array | None = None
 
-    def moved(self, change: Callable[[Array], Array]) -> Scene:
+    def moved(self, change: Callable[[Array], Array]) -> PictureScene:
         """Return the scene with all positions changed; regions, outlines about the fixes and covariances stay."""
         return replace(
             self,
@@ -299,7 +299,7 @@ class Scene:
         )
 
 
-def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) -> Scene:
+def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) -> PictureScene:
     """Return what is to be drawn of a problem and its fixes, and outlines of what no ellipse covers if asked for."""
     # Of moving stations the first epoch, of a batch the first problem: tracks are drawn as lines.
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
@@ -316,7 +316,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
     paths, other = _paths(problem, fixes)
     known = tuple(m.known.reshape(-1, *m.known.shape[-2:])[:, 0] for m in problem.motions if m.known is not None)
     outlines = _outlines(problem, fixes, len(position)) if outlined else ()
-    scene = Scene(
+    scene = PictureScene(
         *(stations, problem.stations.names, position, covariance, clean, others, gaps, axes[:d], regions),
         tracks=_tracks(problem),
         paths=paths,
@@ -388,7 +388,7 @@ def placed_points(problem: Problem, points: Array) -> tuple[Array, Array]:
     return local.to_ecef(points), local.rotation_to_ecef().T
 
 
-def _local(problem: Problem, scene: Scene) -> Scene:
+def _local(problem: Problem, scene: PictureScene) -> PictureScene:
     """Return a scene in ECEF along east, north and up at the stations' centre."""
     local = local_frame(problem)
     assert local is not None
@@ -493,7 +493,7 @@ def xy(points: Array, view: View, size: float) -> tuple[Array, Array]:
     return points[:, view[0]] / size, points[:, view[1]] / size
 
 
-def stations(panel: Axes, scene: Scene, view: View, size: float, *, named: bool = True, **style: Any) -> None:
+def stations(panel: Axes, scene: PictureScene, view: View, size: float, *, named: bool = True, **style: Any) -> None:
     """Draw the stations, with their names where there are not too many."""
     label = "station, first epoch" if scene.tracks else "station"
     look: dict[str, Any] = {"marker": "^", "s": 60, "color": BLACK, "label": label, "zorder": 3} | style
@@ -513,7 +513,7 @@ def note(panel: Axes, text: str, x: float, y: float, colour: str = BLACK) -> Non
     made.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
 
 
-def points(panel: Axes, scene: Scene, view: View, size: float) -> None:
+def points(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
     """Draw fixes, and alternatives with their cost gaps."""
     many = len(scene.fixes) > _FEW_FIXES
     for clean, colour, mark, label in ((True, BLUE, "o", "fix"), (False, ORANGE, "X", "fix, status not ok")):
@@ -528,7 +528,7 @@ def points(panel: Axes, scene: Scene, view: View, size: float) -> None:
         note(panel, f"+{gap:.3g}" if gap >= _NO_GAP else "+0", x, y, ORANGE)
 
 
-def ellipses(panel: Axes, scene: Scene, view: View, size: float, **style: Any) -> None:
+def ellipses(panel: Axes, scene: PictureScene, view: View, size: float, **style: Any) -> None:
     """Draw the 95 % ellipses of the fixes, and the outlines of the regions where ellipses do not cover."""
     if len(scene.fixes) > _ELLIPSES:
         return
@@ -556,7 +556,7 @@ def ring(covariance: Array) -> Array:
     return np.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=-1) * semi_axes @ directions.T)
 
 
-def name_axes(panel: Axes, scene: Scene, view: View, unit: str) -> None:
+def name_axes(panel: Axes, scene: PictureScene, view: View, unit: str) -> None:
     """Give both axes of a plan one scale, names and units."""
     panel.margins(0.12)
     # One scale on both axes, or an ellipse would have another shape.

@@ -44,7 +44,7 @@ _95 = 1.96
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class PlottedTrack:
     """One target's track.
 
     Parameters
@@ -77,12 +77,12 @@ class _Line:
     bad: Array
 
 
-def plot_tracks(drawn: Sequence[Drawn], title: str = "") -> Figure:
+def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
     """Return a picture of tracks: plan, in three dimensions the height, sigma of the position, and NIS against time.
 
     Parameters
     ----------
-    drawn : sequence of Drawn
+    drawn : sequence of PlottedTrack
         At least one target; ECEF is drawn along east, north and up at the stations' centre, or at the first position
         where the stations are further than that from the ground.
     title : str
@@ -108,7 +108,7 @@ def plot_tracks(drawn: Sequence[Drawn], title: str = "") -> Figure:
     return finish(figure, title, [panels["plan"]], 6)
 
 
-def _along(drawn: Sequence[Drawn]) -> tuple[list[_Line], Array, tuple[str, ...]]:
+def _along(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str, ...]]:
     """Return tracks and stations (s, d) of the first scan along the picture's axes, and the axes' names."""
     first = drawn[0].problem
     d = first.dimension
@@ -126,7 +126,7 @@ def _along(drawn: Sequence[Drawn]) -> tuple[list[_Line], Array, tuple[str, ...]]
     return moved, local.from_ecef(stations), axes
 
 
-def _line(drawn: Drawn, d: int) -> _Line:
+def _line(drawn: PlottedTrack, d: int) -> _Line:
     entries = drawn.entries
     cov = np.stack([e.updated.cov[:d, :d] for e in entries])
     return _Line(

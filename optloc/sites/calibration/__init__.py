@@ -1,6 +1,6 @@
 """Self-calibration: stations, clocks and emitters unknown together."""
 
 from optloc.sites.calibration.calibrated import Alternative, Calibration, calibrate
-from optloc.sites.calibration.network import Network, Slot, network_of
+from optloc.sites.calibration.network import Network, NetworkSlot, network_of
 
-__all__ = ["Alternative", "Calibration", "Network", "Slot", "calibrate", "network_of"]
+__all__ = ["Alternative", "Calibration", "Network", "NetworkSlot", "calibrate", "network_of"]

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from optloc.problem import tail_probability
-from optloc.sites.calibration.blocks import MOVED, Block, blocks, elsewhere, moved
-from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.blocks import MOVED, StationBlock, blocks, elsewhere, moved
+from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.motions import bent
 from optloc.sites.calibration.network import CLOCKED, Network
-from optloc.sites.calibration.rounds import Ends, joined, rounds, starts_of
+from optloc.sites.calibration.rounds import RoundEnds, joined, rounds, starts_of
 from optloc.solvers import REFUTED, equal_cost
 
 AGREEING = 3
@@ -31,14 +31,14 @@ _SAME = 0.01
 
 
 @dataclass(slots=True)
-class Found:
+class NetworkSearchResult:
     """What a search has arrived at so far.
 
     `ends` are the minima of starts; `onward` tells where moves of blocks lead from the cost of one.
     """
 
-    ends: Ends
-    best: Estimate
+    ends: RoundEnds
+    best: NetworkEstimate
     cost: float
     made: int
     onward: dict[float, float] = field(default_factory=dict)
@@ -54,7 +54,9 @@ def _key(cost: float) -> float:
     return round(float(cost), 4)
 
 
-def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], None] | None) -> Found | None:
+def search(
+    net: Network, seed: int, limit: int | None, tell: Callable[[str], None] | None
+) -> NetworkSearchResult | None:
     """Return the cheapest network that a search finds, None where no start leads to one.
 
     Parameters
@@ -70,7 +72,7 @@ def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], Non
     """
     limit = limit or _STARTS
     lik = likelihood(net)
-    found: Found | None = None
+    found: NetworkSearchResult | None = None
     for made, one in rounds(starts_of(lik, seed)):
         good = np.isfinite(one.cost)
         if good.any():
@@ -86,19 +88,19 @@ def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], Non
     return found
 
 
-def _added(found: Found | None, ends: Ends, made: int) -> Found:
+def _added(found: NetworkSearchResult | None, ends: RoundEnds, made: int) -> NetworkSearchResult:
     if found is not None:
         ends = joined([found.ends, ends])
     i = int(ends.cost.argmin())
     if found is None:
-        return Found(ends, ends.at.take(np.array([i])), float(ends.cost[i]), made)
+        return NetworkSearchResult(ends, ends.at.take(np.array([i])), float(ends.cost[i]), made)
     found.ends, found.made = ends, made
     if ends.cost[i] < found.cost - _SAME:
         found.best, found.cost = ends.at.take(np.array([i])), float(ends.cost[i])
     return found
 
 
-def _move_on(lik: Likelihood, found: Found) -> None:
+def _move_on(lik: Likelihood, found: NetworkSearchResult) -> None:
     """Move single blocks of the cheapest networks to their other places, as long as that lowers the cost."""
     ends = found.ends
     tried = 0
@@ -114,7 +116,7 @@ def _move_on(lik: Likelihood, found: Found) -> None:
             found.best, found.cost = at, cost
 
 
-def _swept(lik: Likelihood, at: Estimate, cost: float) -> tuple[Estimate, float]:
+def _swept(lik: Likelihood, at: NetworkEstimate, cost: float) -> tuple[NetworkEstimate, float]:
     """Return where moves of blocks lead from a minimum."""
     for _ in range(_SWEEPS):
         found = sorted(elsewhere(lik, at), key=lambda block: block.gaps[0])[:_MOVES]
@@ -128,26 +130,28 @@ def _swept(lik: Likelihood, at: Estimate, cost: float) -> tuple[Estimate, float]
     return at, cost
 
 
-def proven(lik: Likelihood, at: Estimate) -> tuple[Estimate, tuple[Block, ...], list[tuple[str, Estimate]]]:
+def proven(
+    lik: Likelihood, at: NetworkEstimate
+) -> tuple[NetworkEstimate, tuple[StationBlock, ...], list[tuple[str, NetworkEstimate]]]:
     """Move blocks to all places that a proof leaves, until none lowers the cost.
 
     Parameters
     ----------
     lik : Likelihood
         The network.
-    at : Estimate
+    at : NetworkEstimate
         A minimum, S = 1.
 
     Returns
     -------
-    at : Estimate
+    at : NetworkEstimate
         The cheapest network.
-    blocks : tuple of Block
+    blocks : tuple of StationBlock
         What is proven of it.
-    others : list of (str, Estimate)
+    others : list of (str, NetworkEstimate)
         Networks with one block elsewhere, refined.
     """
-    cost, others = float(lik.cost(at)[0]), list[tuple[str, Estimate]]()
+    cost, others = float(lik.cost(at)[0]), list[tuple[str, NetworkEstimate]]()
     for _ in range(_SWEEPS):
         at, cost, beside = _straightened(lik, at, cost)
         found = blocks(lik, at)
@@ -168,7 +172,9 @@ def proven(lik: Likelihood, at: Estimate) -> tuple[Estimate, tuple[Block, ...], 
     return at, found, others + beside
 
 
-def _straightened(lik: Likelihood, at: Estimate, cost: float) -> tuple[Estimate, float, list[tuple[str, Estimate]]]:
+def _straightened(
+    lik: Likelihood, at: NetworkEstimate, cost: float
+) -> tuple[NetworkEstimate, float, list[tuple[str, NetworkEstimate]]]:
     """Return the cheapest network that joint moves lead to, its cost, and the other ends of these moves."""
     for _ in range(_SWEEPS):
         made = bent(lik, at)

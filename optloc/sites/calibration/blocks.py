@@ -9,7 +9,7 @@ import numpy as np
 from optloc.engine import refine, vectors
 from optloc.models import MODELS
 from optloc.problem import GLOBAL, Array, Fix, Measured, Prior, Problem, assemble, measured
-from optloc.sites.calibration.likelihood import Estimate, Likelihood, clock_signs, together
+from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, clock_signs, together
 from optloc.sites.calibration.network import Network
 from optloc.solvers import AMBIGUOUS_GAP, equal_cost, solve
 
@@ -33,7 +33,7 @@ _EXACT = 1e-7
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class StationBlock:
     """What became of one station or pulse with the others held.
 
     Parameters
@@ -66,24 +66,24 @@ class Block:
     places: Array
 
 
-def blocks(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
+def blocks(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """Return what is proven of each station that is not known exactly, and of each pulse, with all others held.
 
     Parameters
     ----------
     lik : Likelihood
         The network.
-    at : Estimate
+    at : NetworkEstimate
         One estimate, S = 1.
 
     Returns
     -------
-    tuple of Block
+    tuple of StationBlock
         Stations first. The proof is that of a fix from known stations; it does not exclude that several blocks move
         together.
     """
     net = lik.network
-    d, cost, found = net.dimension, float(lik.cost(at)[0]), list[Block]()
+    d, cost, found = net.dimension, float(lik.cost(at)[0]), list[StationBlock]()
     fixes = _stations(net, at, _sought(net))
     if fixes:
         costs = lik.cost(together(*(_moved_station(lik, at, i, fix.position[:d]) for i, fix in fixes)))
@@ -125,19 +125,19 @@ def minima(problem: Problem, places: Array) -> tuple[Array, Array]:
     return done.x.reshape(count, each, -1), done.cost.reshape(count, each)
 
 
-def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
+def elsewhere(lik: Likelihood, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """Return the likeliest other places of each station and pulse, the others held: nothing is proven.
 
     Parameters
     ----------
     lik : Likelihood
         The network.
-    at : Estimate
+    at : NetworkEstimate
         One minimum, S = 1.
 
     Returns
     -------
-    tuple of Block
+    tuple of StationBlock
         Those that have other places, found from mirror images in the principal planes of their partners.
     """
     net = lik.network
@@ -157,11 +157,11 @@ def elsewhere(lik: Likelihood, at: Estimate) -> tuple[Block, ...]:
                     places.append(x[n, k])
                     name = f"station {net.names[which[n]]}" if station else f"pulse {net.labels[which[n]]}"
                     lower, gaps = bool(gap[n, k] < 0.0), (float(gap[n, k]),)
-                    found.append(Block(name, station, int(which[n]), False, False, lower, gaps, x[n, k][None]))
+                    found.append(StationBlock(name, station, int(which[n]), False, False, lower, gaps, x[n, k][None]))
     return tuple(found)
 
 
-def pulses_alone(net: Network, at: Estimate, which: Array | None = None) -> Problem:
+def pulses_alone(net: Network, at: NetworkEstimate, which: Array | None = None) -> Problem:
     """Return n pulses (all) of S estimates as a batch of S n fixes from stations that are held."""
     which = np.arange(net.pulses) if which is None else which
     first, second, sign = clock_signs(net)
@@ -183,7 +183,7 @@ def _given(kind: str, z: Array, sigma: Array, given: Array, **ends: Array) -> Me
     return measured(kind, np.where(given, z, 0.0), sigma=deviation, weight=weight, **ends)
 
 
-def settled(net: Network, at: Estimate) -> Estimate:
+def settled(net: Network, at: NetworkEstimate) -> NetworkEstimate:
     """Return estimates with their pulses where they fit best, the stations held."""
     problem = pulses_alone(net, at)
     done = minima(problem, at.pulses.reshape(-1, 1, net.dimension))[0].reshape(at.count, net.pulses, -1)
@@ -191,7 +191,7 @@ def settled(net: Network, at: Estimate) -> Estimate:
     return replace(at, pulses=done[..., :d], emission=done[..., d] if done.shape[-1] > d else at.emission)
 
 
-def stations_alone(net: Network, at: Estimate, which: Array) -> Problem:
+def stations_alone(net: Network, at: NetworkEstimate, which: Array) -> Problem:
     """Return some stations as a batch of fixes from pulses and the other stations, which are held."""
     places, kinds = _station_rows(net, at)
     rows = []
@@ -207,7 +207,7 @@ def stations_alone(net: Network, at: Estimate, which: Array) -> Problem:
     return assemble(places, *rows, priors=(prior,) if soft.any() else ()).flat()
 
 
-def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> Block:
+def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> StationBlock:
     """Return a block from the fix that has its place: `above` is what the present place costs beyond the best."""
     claims, d = fix.claims, len(here)
     x = np.concatenate([fix.position[None, :d], fix.alternatives.x.reshape(-1, fix.x.shape[-1])[:, :d]])
@@ -221,17 +221,17 @@ def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: f
     refuted = above > _ALIKE + equal_cost(float(fix.cost))
     cheapest = claims.proof.item() == GLOBAL and not refuted
     proven = cheapest and claims.margin.item() >= AMBIGUOUS_GAP
-    return Block(name, station, index, proven, cheapest, refuted, tuple(gaps[others] - above), x[others])
+    return StationBlock(name, station, index, proven, cheapest, refuted, tuple(gaps[others] - above), x[others])
 
 
-def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto") -> Fix:
+def place_pulses(net: Network, at: NetworkEstimate, which: Array, method: str = "auto") -> Fix:
     """Return fixes of some pulses from stations that are held.
 
     Parameters
     ----------
     net : Network
         What was measured.
-    at : Estimate
+    at : NetworkEstimate
         One estimate, S = 1; that of the pulses is not used.
     which : int array (n,)
         The pulses.
@@ -251,7 +251,7 @@ def _shared(values: Array) -> Array:
     return np.asarray(values[0]) if (values == values[0]).all() else values
 
 
-def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
+def _station_rows(net: Network, at: NetworkEstimate) -> tuple[Array, list[tuple[str, Array, Array, Array]]]:
     """Return places of all, and rows of stations: kind, which place, deviations and values (M, q)."""
     timed, ranged = _ranges(net, at)
     near = np.full((net.stations, net.stations), np.inf), np.zeros((net.stations, net.stations))
@@ -265,7 +265,7 @@ def _station_rows(net: Network, at: Estimate) -> tuple[Array, list[tuple[str, Ar
     return np.concatenate([at.pulses[0], at.stations[0]]), kinds
 
 
-def _stations(net: Network, at: Estimate, which: list[int]) -> list[tuple[int, Fix]]:
+def _stations(net: Network, at: NetworkEstimate, which: list[int]) -> list[tuple[int, Fix]]:
     """Return fixes of some stations from pulses and stations that are held."""
     soft = np.isfinite(net.place_sigma[which]).any(axis=1) if which else np.zeros(0, dtype=bool)
     plain = np.array(which, dtype=int)[~soft]
@@ -284,7 +284,7 @@ def _fixes(problem: Problem, here: Array) -> Fix:
     return solve(problem, "lsr+certify", start=start)
 
 
-def _ranges(net: Network, at: Estimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def _ranges(net: Network, at: NetworkEstimate) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return deviations and values (M, N) of what each station's rows say of its ranges: with and without its clock.
 
     Several rows of one pulse are one range: their mean by inverse variance.
@@ -309,14 +309,14 @@ def _ranges(net: Network, at: Estimate) -> tuple[tuple[Array, Array], tuple[Arra
     return (sigma[0], values[0]), (sigma[1], values[1])
 
 
-def moved(lik: Likelihood, at: Estimate, block: Block, place: Array) -> Estimate:
+def moved(lik: Likelihood, at: NetworkEstimate, block: StationBlock, place: Array) -> NetworkEstimate:
     """Return an estimate with one block at another place, and its clock or emission as that place wants it."""
     if block.station:
         return _moved_station(lik, at, block.index, place)
     return moved_pulses(lik, at, np.array([block.index]), place[None])
 
 
-def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array) -> Estimate:
+def moved_pulses(lik: Likelihood, at: NetworkEstimate, which: Array, places: Array) -> NetworkEstimate:
     """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it."""
     net, pulses, emission = lik.network, at.pulses.copy(), at.emission.copy()
     pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
@@ -326,7 +326,7 @@ def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array) -> 
     return replace(there, emission=np.where(net.emission, emission, at.emission))
 
 
-def _moved_station(lik: Likelihood, at: Estimate, i: int, place: Array) -> Estimate:
+def _moved_station(lik: Likelihood, at: NetworkEstimate, i: int, place: Array) -> NetworkEstimate:
     stations, clocks, net = at.stations.copy(), at.clocks.copy(), lik.network
     stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])
     there = replace(at, stations=stations)

@@ -9,10 +9,10 @@ import numpy as np
 
 from optloc.engine import STRAIGHT
 from optloc.problem import PRECEDENCE, Array, InvalidProblem, NoSolution, Status, nearest, tail_probability
-from optloc.sites.calibration.agreement import AGREEING, Found, frame_size, proven, search
-from optloc.sites.calibration.blocks import Block, blocks, moved_pulses, place_pulses
+from optloc.sites.calibration.agreement import AGREEING, NetworkSearchResult, frame_size, proven, search
+from optloc.sites.calibration.blocks import StationBlock, blocks, moved_pulses, place_pulses
 from optloc.sites.calibration.gauge import (
-    Determined,
+    GaugeRank,
     departure,
     determined,
     fixed_by,
@@ -21,7 +21,7 @@ from optloc.sites.calibration.gauge import (
     over,
     with_mean_clock,
 )
-from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.outliers import PRICE, outliers
 from optloc.sites.calibration.rounds import laid
@@ -269,26 +269,26 @@ def _without_gross(
 
 def _all_residuals(network: Network, found: Calibration) -> Array:
     """Return whitened residuals (N, R) of all rows; zeros of pulses without a place."""
-    at = Estimate(found.stations[None], found.clocks[None], found.pulses[None], found.emission[None])
+    at = NetworkEstimate(found.stations[None], found.clocks[None], found.pulses[None], found.emission[None])
     return np.asarray(np.nan_to_num(likelihood(network).residual(at)[0]))
 
 
-def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Estimate:
+def _with_rest(network: Network, at: NetworkEstimate, core: Array, rest: Array) -> NetworkEstimate:
     """Return an estimate of all pulses that can be placed: the core's, and fixes of the others."""
     n, d = network.pulses, network.dimension
     pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
     pulses[0, rest] = at.stations[0].mean(axis=0)
-    there = Estimate(at.stations, at.clocks, pulses, emission)
+    there = NetworkEstimate(at.stations, at.clocks, pulses, emission)
     whole = moved_pulses(likelihood(network), there, rest, place_pulses(network, at, rest, _QUICK).position)
     every = np.sort(np.concatenate([core, rest]))
-    return Estimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
+    return NetworkEstimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
 
 
 # The verdict.
 
 
-def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...]) -> Calibration:
+def _judged(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, named: tuple[int, ...]) -> Calibration:
     net = lik.network
     soft = bool(np.isfinite(net.place_sigma).any())
     at, checked, others = proven(lik, at)
@@ -333,7 +333,7 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...])
     )
 
 
-def _open_words(net: Network, told: Determined) -> str:
+def _open_words(net: Network, told: GaugeRank) -> str:
     m, d = net.stations, net.dimension
     share = np.sqrt((told.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
     if not net.synchronised:
@@ -357,7 +357,7 @@ class _Facts:
 
     Parameters
     ----------
-    net, found, motions : Network, Found, Determined
+    net, found, motions : Network, NetworkSearchResult, GaugeRank
         The network, its starts, and the motions that the data determine.
     p : float
         Probability of residuals as large.
@@ -365,7 +365,7 @@ class _Facts:
         Sentences on stations, or pulses, in one plane.
     departure : float
         See `optloc.sites.calibration.gauge.departure`; NaN where a motion is open.
-    blocks : tuple of Block
+    blocks : tuple of StationBlock
         Stations and pulses with their proofs.
     elsewhere : tuple of Alternative
         Networks with other stations that fit about as well.
@@ -374,12 +374,12 @@ class _Facts:
     """
 
     net: Network
-    found: Found
-    motions: Determined
+    found: NetworkSearchResult
+    motions: GaugeRank
     p: float
     sides: tuple[str, ...]
     departure: float
-    blocks: tuple[Block, ...]
+    blocks: tuple[StationBlock, ...]
     elsewhere: tuple[Alternative, ...]
     twofold: Array
 
@@ -438,26 +438,30 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def refuted_blocks(network: Network, at: Estimate) -> tuple[Block, ...]:
+def refuted_blocks(network: Network, at: NetworkEstimate) -> tuple[StationBlock, ...]:
     """Return the stations and pulses that cost less elsewhere with the others held, proven.
 
     Parameters
     ----------
     network : Network
         What was measured.
-    at : Estimate
+    at : NetworkEstimate
         One network, S = 1, for instance one with a station on the wrong side.
 
     Returns
     -------
-    tuple of Block
+    tuple of StationBlock
         Empty where none is.
     """
     return tuple(block for block in blocks(likelihood(network), at) if block.refuted)
 
 
 def _alternatives(
-    lik: Likelihood, at: Estimate, cost: float, found: Found, others: list[tuple[str, Estimate]]
+    lik: Likelihood,
+    at: NetworkEstimate,
+    cost: float,
+    found: NetworkSearchResult,
+    others: list[tuple[str, NetworkEstimate]],
 ) -> tuple[Alternative, ...]:
     """Return other minima within `LISTED_GAP`: blocks elsewhere, ends of other starts, and the mirror image."""
     net = lik.network
@@ -489,7 +493,7 @@ def _alternatives(
     return tuple(out)
 
 
-def _same_stations(at: Estimate, other: Alternative, covariance: Array) -> bool:
+def _same_stations(at: NetworkEstimate, other: Alternative, covariance: Array) -> bool:
     """Return whether another network has the stations where this one has them, as far as its covariance tells.
 
     They are within its 95 % ellipsoid, and what the other's share of the likelihood adds to squared errors is covered.
@@ -507,13 +511,13 @@ def _same_stations(at: Estimate, other: Alternative, covariance: Array) -> bool:
     return within and share * shift <= _COVERS * dof
 
 
-def _moved_pulses(at: Estimate, other: Alternative) -> Array:
+def _moved_pulses(at: NetworkEstimate, other: Alternative) -> Array:
     """Return which pulses another network has elsewhere (N,): the rest gives way a little."""
     apart = np.linalg.norm(other.pulses - at.pulses[0], axis=1)
     return np.asarray(apart > _GIVES_WAY * apart.max())
 
 
-def _shape(at: Estimate, soft: bool) -> Array:
+def _shape(at: NetworkEstimate, soft: bool) -> Array:
     """Return distances between stations and to the pulses, which no frame changes; places too where these are known."""
     points = np.concatenate([at.stations[0], at.pulses[0]])
     apart = np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel()

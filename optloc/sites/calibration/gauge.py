@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from optloc.problem import Array, quantile
 from optloc.sites.calibration.blocks import settled
-from optloc.sites.calibration.likelihood import Estimate, Likelihood, together
+from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, together
 from optloc.sites.calibration.network import Network
 from optloc.solvers import AMBIGUOUS_GAP
 
@@ -23,7 +23,7 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Determined:
+class GaugeRank:
     """What rows determine of stations and clocks at an estimate, pulses eliminated.
 
     Parameters
@@ -53,7 +53,7 @@ class Determined:
         return np.asarray(half @ half.T)
 
 
-def determined(lik: Likelihood, at: Estimate) -> Determined:
+def determined(lik: Likelihood, at: NetworkEstimate) -> GaugeRank:
     """Return what the rows determine at an estimate (S = 1)."""
     p, jacobian = lik.free.size, without_pulses(lik, at)
     motions = frame_moves(lik.network, at)
@@ -64,10 +64,10 @@ def determined(lik: Likelihood, at: Estimate) -> Determined:
     rest = rest[:, np.abs(rest[lik.free]).max(axis=0) > _ZERO]
     held = np.flatnonzero(~lik.free)
     rest = _span(rest - np.isin(np.arange(p), held)[:, None] * rest)
-    return Determined(jacobian, free, _unseen(jacobian, rest, size))
+    return GaugeRank(jacobian, free, _unseen(jacobian, rest, size))
 
 
-def without_pulses(lik: Likelihood, at: Estimate) -> Array:
+def without_pulses(lik: Likelihood, at: NetworkEstimate) -> Array:
     """Return a triangle (q, P) with the derivatives of an estimate (S = 1), what pulses explain taken away."""
     by_station, by_pulse, known = lik.jacobian(at)
     n, r, p = by_station.shape
@@ -86,7 +86,7 @@ _FAR = 3.0
 _NONE = 1e-9
 
 
-def departure(lik: Likelihood, at: Estimate, told: Determined) -> float:
+def departure(lik: Likelihood, at: NetworkEstimate, told: GaugeRank) -> float:
     """Return how far the cost departs from that of a Gaussian with the covariance found.
 
     Three deviations to either side along each principal axis of stations and clocks, the pulses wherever they then fit
@@ -96,9 +96,9 @@ def departure(lik: Likelihood, at: Estimate, told: Determined) -> float:
     ----------
     lik : Likelihood
         The network.
-    at : Estimate
+    at : NetworkEstimate
         The one found, S = 1.
-    told : Determined
+    told : GaugeRank
         What is determined there, nothing left open.
     """
     width, axes = np.linalg.eigh(told.covariance(told.free.T))
@@ -108,7 +108,7 @@ def departure(lik: Likelihood, at: Estimate, told: Determined) -> float:
     return float(np.abs(np.log(np.maximum(rise, _NONE))).max())
 
 
-def shifted(at: Estimate, moves: Array) -> Estimate:
+def shifted(at: NetworkEstimate, moves: Array) -> NetworkEstimate:
     """Return an estimate (S = 1) with its stations, and clocks where these are sought, moved in several ways (n, P)."""
     there, size = at.take(np.zeros(len(moves), dtype=int)), at.stations[0].size
     stations = there.stations + moves[:, :size].reshape(there.stations.shape)
@@ -116,7 +116,7 @@ def shifted(at: Estimate, moves: Array) -> Estimate:
     return replace(there, stations=stations, clocks=clocks)
 
 
-def over(one: Estimate, at: Estimate) -> Estimate:
+def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
     """Return a network turned, and mirrored if need be, onto another's stations (Procrustes)."""
     a, b = one.stations[0], at.stations[0]
     u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
@@ -143,7 +143,7 @@ def _unseen(jacobian: Array, basis: Array, size: float) -> Array:
     return np.asarray(basis @ turn[small].T)
 
 
-def frame_moves(net: Network, at: Estimate) -> Array:
+def frame_moves(net: Network, at: NetworkEstimate) -> Array:
     """Return columns (P, g): translations, rotations and, with clocks, the common offset of all."""
     m, d = net.stations, net.dimension
     p = m * d + (0 if net.synchronised else m)
@@ -162,14 +162,14 @@ def frame_moves(net: Network, at: Estimate) -> Array:
     return np.array([c / max(float(np.linalg.norm(c)), 1e-300) for c in columns]).T
 
 
-def in_frame(net: Network, at: Estimate, named: tuple[int, ...]) -> Estimate:
+def in_frame(net: Network, at: NetworkEstimate, named: tuple[int, ...]) -> NetworkEstimate:
     """Return a free network in the frame of some stations, or of all.
 
     Parameters
     ----------
     net : Network
         What was measured.
-    at : Estimate
+    at : NetworkEstimate
         S = 1.
     named : tuple of int
         The first is the origin, the second lies on the first axis, the third in the plane of the first two (in space).
@@ -177,7 +177,7 @@ def in_frame(net: Network, at: Estimate, named: tuple[int, ...]) -> Estimate:
 
     Returns
     -------
-    Estimate
+    NetworkEstimate
         Of the two mirror images in space the one in which the station farthest from the plane of the first two axes is
         above it; in the plane likewise.
     """
@@ -200,14 +200,14 @@ def in_frame(net: Network, at: Estimate, named: tuple[int, ...]) -> Estimate:
     return with_mean_clock(net, moved, named[:1])
 
 
-def with_mean_clock(net: Network, at: Estimate, named: tuple[int, ...] = ()) -> Estimate:
+def with_mean_clock(net: Network, at: NetworkEstimate, named: tuple[int, ...] = ()) -> NetworkEstimate:
     """Return a network whose clocks are told against that of a named station, or against their mean.
 
     Parameters
     ----------
     net : Network
         What was measured.
-    at : Estimate
+    at : NetworkEstimate
         S = 1.
     named : tuple of int
         The station, or empty.
@@ -228,14 +228,14 @@ def fixed_by(net: Network, named: tuple[int, ...]) -> Array:
     return np.eye(p)[held]
 
 
-def flat(lik: Likelihood, at: Estimate, covariance: Array) -> list[str]:
+def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
     """Return what follows from stations, or pulses, in one plane, in sentences.
 
     Parameters
     ----------
     lik : Likelihood
         The network.
-    at : Estimate
+    at : NetworkEstimate
         Its minimum, S = 1.
     covariance : array (P, P)
         Of station coordinates and clocks, in any frame.
@@ -275,7 +275,7 @@ def _in_one_plane(points: Array, covariance: Callable[[Array], Array]) -> bool:
     return bool(height @ np.linalg.pinv(spread, hermitian=True) @ height < quantile(_LEVEL, len(left)))
 
 
-def _of_pulses(lik: Likelihood, at: Estimate, covariance: Array, which: Array, normal: Array) -> Array:
+def _of_pulses(lik: Likelihood, at: NetworkEstimate, covariance: Array, which: Array, normal: Array) -> Array:
     """Return the covariance (n, n) of the heights of some pulses: from their own rows, and from the stations."""
     by_station, by_pulse = (one[which] for one in lik.jacobian(at)[:2])
     own = np.einsum("c,jcr->jr", normal, np.linalg.pinv(by_pulse)[:, : len(normal)])

@@ -21,7 +21,7 @@ _EXACT = 1e-7
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class NetworkEstimate:
     """Values of all unknowns, of S estimates at once.
 
     Parameters
@@ -46,14 +46,14 @@ class Estimate:
         """Return how many estimates there are."""
         return int(self.stations.shape[0])
 
-    def take(self, which: Array | slice) -> Estimate:
+    def take(self, which: Array | slice) -> NetworkEstimate:
         """Return some of the estimates (mask, indices or slice)."""
-        return Estimate(self.stations[which], self.clocks[which], self.pulses[which], self.emission[which])
+        return NetworkEstimate(self.stations[which], self.clocks[which], self.pulses[which], self.emission[which])
 
-    def where(self, mask: Array, other: Estimate) -> Estimate:
+    def where(self, mask: Array, other: NetworkEstimate) -> NetworkEstimate:
         """Return the other's values where the mask (S,) is false."""
         two, three = mask[:, None], mask[:, None, None]
-        return Estimate(
+        return NetworkEstimate(
             np.where(three, self.stations, other.stations),
             np.where(two, self.clocks, other.clocks),
             np.where(three, self.pulses, other.pulses),
@@ -61,10 +61,10 @@ class Estimate:
         )
 
 
-def together(*estimates: Estimate) -> Estimate:
+def together(*estimates: NetworkEstimate) -> NetworkEstimate:
     """Return all estimates of several."""
-    names = Estimate.__dataclass_fields__
-    return Estimate(*(np.concatenate([getattr(one, name) for one in estimates]) for name in names))
+    names = NetworkEstimate.__dataclass_fields__
+    return NetworkEstimate(*(np.concatenate([getattr(one, name) for one in estimates]) for name in names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class Likelihood:
         clocks = np.ones(0 if self.network.synchronised else self.network.stations, dtype=bool)
         return np.concatenate([(self.network.place_sigma > 0.0).ravel(), clocks])
 
-    def posed(self, at: Estimate) -> tuple[Problem, Array]:
+    def posed(self, at: NetworkEstimate) -> tuple[Problem, Array]:
         """Return estimates as S problems, each about its own stations and clocks, and as vectors (S, size)."""
         net, problem, (j, r) = self.network, self.problem, rows_of(self.network)
         known = np.isfinite(net.place_sigma)
@@ -123,15 +123,15 @@ class Likelihood:
         x[:, layout.n_shared :] = local.reshape(at.count, -1)
         return made, x
 
-    def _estimate(self, problem: Problem, x: Array, at: Estimate) -> Estimate:
+    def _estimate(self, problem: Problem, x: Array, at: NetworkEstimate) -> NetworkEstimate:
         net, local = self.network, problem.layout.split(x)[1]
         moved = problem.stations.position[:, 0] + x[:, _columns(problem, "stations")].reshape(at.stations.shape)
         stations = np.where(net.place_sigma > 0.0, moved, net.place)
         clocks = at.clocks if net.synchronised else at.clocks + x[:, _columns(problem, "clock")]
         d = net.dimension
-        return Estimate(stations, clocks, local[..., :d], local[..., d] if local.shape[-1] > d else at.emission)
+        return NetworkEstimate(stations, clocks, local[..., :d], local[..., d] if local.shape[-1] > d else at.emission)
 
-    def refine(self, at: Estimate, steps: int = _STEPS) -> tuple[Estimate, Array]:
+    def refine(self, at: NetworkEstimate, steps: int = _STEPS) -> tuple[NetworkEstimate, Array]:
         """Return the minima that estimates lead to, and their costs (S,)."""
         if not at.count:
             return at, np.zeros(0)
@@ -139,30 +139,30 @@ class Likelihood:
         done = refine(problem, x, tolerance=_LAST, limit=steps)
         return self._estimate(problem, done.x, at), done.cost
 
-    def _whitened(self, at: Estimate) -> Array:
+    def _whitened(self, at: NetworkEstimate) -> Array:
         """Return whitened residuals (S, m) of all rows, without weights."""
         problem, x = self.posed(at)
         return np.asarray((problem.observed - predict(problem, x)) / np.sqrt(variances(problem.noise, problem.count)))
 
-    def cost(self, at: Estimate) -> Array:
+    def cost(self, at: NetworkEstimate) -> Array:
         """Return the weighted sum of squared residuals, (S,); weights of rows do not enter it."""
         place = np.where(self.network.place_sigma > 0.0, self.network.place_sigma, np.inf)
         known = (at.stations - self.network.place) / place
         return np.asarray((self._whitened(at) ** 2).sum(axis=1) + (known**2).sum(axis=(1, 2)))
 
-    def residual(self, at: Estimate) -> Array:
+    def residual(self, at: NetworkEstimate) -> Array:
         """Return whitened residuals (S, N, R) of the measurements of pulses, without weights; zero where absent."""
         j, r = rows_of(self.network)
         out = np.zeros((at.count, *self.network.z.shape))
         out[:, j, r] = self._whitened(at)[:, : len(j)]
         return out
 
-    def jacobian(self, at: Estimate) -> tuple[Array, Array, Array]:
+    def jacobian(self, at: NetworkEstimate) -> tuple[Array, Array, Array]:
         """Return whitened derivatives of the rows of one estimate.
 
         Parameters
         ----------
-        at : Estimate
+        at : NetworkEstimate
             S = 1.
 
         Returns

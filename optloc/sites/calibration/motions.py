@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.problem import Array
 from optloc.sites.calibration.gauge import determined, shifted
-from optloc.sites.calibration.likelihood import Estimate, Likelihood
+from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate
 
 # Directions of largest variance, and standard deviations to either side: other minima were 5 to 20 deviations away, in
 # a valley that is curved.
@@ -22,7 +22,7 @@ _SETTLING = 30
 _EXACT = 1e-9
 
 
-def bent(lik: Likelihood, at: Estimate) -> tuple[Estimate, Array] | None:
+def bent(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array] | None:
     """Return the minima that bent networks lead to, and their costs.
 
     Each network is moved along one direction and refined while its stations are tethered there, so that the directions
@@ -32,7 +32,7 @@ def bent(lik: Likelihood, at: Estimate) -> tuple[Estimate, Array] | None:
     ----------
     lik : Likelihood
         The network.
-    at : Estimate
+    at : NetworkEstimate
         A minimum, S = 1.
 
     Returns

@@ -20,7 +20,7 @@ KINDS = (*CLOCKED, "range")
 
 
 @dataclass(frozen=True, slots=True)
-class Slot:
+class NetworkSlot:
     """Which stations measure what: one column of the table of measurements.
 
     Parameters
@@ -44,7 +44,7 @@ class Network:
     ----------
     names : tuple of M str
         Stations.
-    slots : tuple of R Slot
+    slots : tuple of R NetworkSlot
         Columns of `z`.
     z : array (N, R)
         Measured values of N pulses, metres (times multiplied by the speed of propagation).
@@ -65,7 +65,7 @@ class Network:
     """
 
     names: tuple[str, ...]
-    slots: tuple[Slot, ...]
+    slots: tuple[NetworkSlot, ...]
     z: Array
     sigma: Array
     place: Array
@@ -195,9 +195,9 @@ def network_of(
     count = values.shape[1] if pairs is None else 1 + max(max(pair) for pair in pairs)
     names = tuple(names) if names is not None else tuple(f"A{i + 1}" for i in range(count))
     if pairs is None:
-        slots = tuple(Slot(kind, i) for i in range(values.shape[1]))
+        slots = tuple(NetworkSlot(kind, i) for i in range(values.shape[1]))
     else:
-        slots = tuple(Slot(kind, int(a), int(b)) for a, b in pairs)
+        slots = tuple(NetworkSlot(kind, int(a), int(b)) for a, b in pairs)
     deviations = np.where(np.isnan(z), np.inf, np.broadcast_to(np.asarray(sigma, dtype=float), values.shape))
     free = np.full((len(names), dimension), np.nan)
     known = free if place is None else np.asarray(place, dtype=float)

@@ -29,7 +29,7 @@ from optloc.files import (
 from optloc.models import MODELS, kind_named
 from optloc.problem import SPEED_OF_LIGHT, Array, InvalidProblem, nearest
 from optloc.sites.calibration.calibrated import Calibration
-from optloc.sites.calibration.network import KINDS, Network, Slot, checked
+from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked
 
 # Deviation that stations of the frame get in a file, metres: as good as exact.
 _EXACT = 1e-6
@@ -38,7 +38,7 @@ BETWEEN = "station_range"
 """Kind of rows that are distances between two stations."""
 
 
-class _Table(BaseModel):
+class _NetworkTable(BaseModel):
     """A table of the file; keys that it does not know are refused."""
 
     model_config = ConfigDict(
@@ -70,7 +70,7 @@ class NetworkRows(DataTable):
     """Standard deviation of each row, where there is no column sigma."""
 
 
-class NetworkFile(_Table):
+class NetworkFile(_NetworkTable):
     """A network whose stations are to be found."""
 
     format: Literal[1, 2]
@@ -198,7 +198,7 @@ def _stations(table: Table, key: str, names: tuple[str, ...]) -> Array:
 
 def _by_pulse(
     rows: list[tuple[str, Array, Array, Array, Array, Array]],
-) -> tuple[tuple[str, ...], tuple[Slot, ...], Array, Array]:
+) -> tuple[tuple[str, ...], tuple[NetworkSlot, ...], Array, Array]:
     """Return labels of pulses, slots, and tables (N, R) of values and deviations.
 
     What the same stations measure of one pulse more than once has a slot for each time.
@@ -220,7 +220,7 @@ def _by_pulse(
     deviations = np.full(table.shape, np.inf)
     for j, slot, value, deviation in cells:
         table[j, slot], deviations[j, slot] = value, deviation
-    return tuple(labels), tuple(Slot(kind, a, b) for kind, a, b, _ in slots), table, deviations
+    return tuple(labels), tuple(NetworkSlot(kind, a, b) for kind, a, b, _ in slots), table, deviations
 
 
 def check_name(out: Path) -> None:

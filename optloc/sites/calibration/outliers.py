@@ -16,7 +16,7 @@ import numpy as np
 from optloc.engine import predict, vectors
 from optloc.problem import Array, Problem, variances
 from optloc.sites.calibration.blocks import minima, pulses_alone, stations_alone
-from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.rounds import Starts, starts_of
 
@@ -68,7 +68,7 @@ def weights(residual: Array, given: Array) -> Array:
     return np.asarray((1.0 + (residual / width) ** 2) ** -2.0)
 
 
-def reweighted(lik: Likelihood, at: Estimate, rounds: int) -> Estimate:
+def reweighted(lik: Likelihood, at: NetworkEstimate, rounds: int) -> NetworkEstimate:
     """Refine networks (S) in rounds of weights: steps without them would lead away from what most rows agree with."""
     for _ in range(rounds):
         own = weights(lik.residual(at), lik.network.given)
@@ -76,7 +76,7 @@ def reweighted(lik: Likelihood, at: Estimate, rounds: int) -> Estimate:
     return at
 
 
-def truncated(lik: Likelihood, at: Estimate) -> tuple[Estimate, Array]:
+def truncated(lik: Likelihood, at: NetworkEstimate) -> tuple[NetworkEstimate, Array]:
     """Refine networks (S) without what is beyond four sigma; return them and their truncated costs (S,)."""
     for _ in range(_SETTLING):
         at, _ = replace(lik, weight=1.0 * (lik.residual(at) ** 2 < PRICE)).refine(at, 2 * _STEPS)
@@ -84,7 +84,7 @@ def truncated(lik: Likelihood, at: Estimate) -> tuple[Estimate, Array]:
     return at, np.asarray(lik.cost(at) - np.maximum(square - PRICE, 0.0).sum(axis=(1, 2)))
 
 
-def placed_anew(lik: Likelihood, starts: Starts, at: Estimate) -> Estimate:
+def placed_anew(lik: Likelihood, starts: Starts, at: NetworkEstimate) -> NetworkEstimate:
     """Return a network (S = 1) with pulses, and then stations, at the places that most of their rows agree with."""
     net, d = lik.network, lik.network.dimension
     x = _agreed(pulses_alone(net, at), at.pulses[0], starts)

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from formulations.low_rank_network import fit_low_rank, random_stations
 from formulations.metric_upgrade import unknowns, upgrade
 from optloc.problem import Array
-from optloc.sites.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.network import Network
 
 # Starts at a time: a batch of eight costs little more than one.
@@ -31,12 +31,12 @@ _LOOSE = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Ends:
+class RoundEnds:
     """Minima that starts arrived at.
 
     Parameters
     ----------
-    at : Estimate
+    at : NetworkEstimate
         S minima.
     cost : array (S,)
         Their costs.
@@ -45,23 +45,23 @@ class Ends:
         where that leads, right or wrong.
     """
 
-    at: Estimate
+    at: NetworkEstimate
     cost: Array
     start: Array
 
-    def take(self, which: Array) -> Ends:
+    def take(self, which: Array) -> RoundEnds:
         """Return some of the ends."""
-        return Ends(self.at.take(which), self.cost[which], self.start[which])
+        return RoundEnds(self.at.take(which), self.cost[which], self.start[which])
 
     def counted(self, which: Array) -> int:
         """Return how many starts some of the ends (mask) come from."""
         return len(np.unique(self.start[which]))
 
 
-def joined(some: list[Ends]) -> Ends:
+def joined(some: list[RoundEnds]) -> RoundEnds:
     """Return all ends of several rounds."""
     arrays = (np.concatenate([getattr(one, name) for one in some]) for name in ("cost", "start"))
-    return Ends(together(*(one.at for one in some)), *arrays)
+    return RoundEnds(together(*(one.at for one in some)), *arrays)
 
 
 def arrivals(network: Network) -> tuple[Array, Array, Array]:
@@ -136,7 +136,7 @@ class Starts:
         """Return 2 or 3."""
         return self.lik.network.dimension
 
-    def low_rank(self, count: int) -> tuple[Estimate, Array]:
+    def low_rank(self, count: int) -> tuple[NetworkEstimate, Array]:
         """Return networks from the fits of low rank that `count` starts find, and the number of each fit."""
         net, d = self.lik.network, self.dimension
         full = (self.weight > 0.0).sum(axis=1) >= d + 3
@@ -158,11 +158,11 @@ class Starts:
         offsets = np.zeros((len(which), net.pulses))
         offsets[:, full] = fit.pulses.o[order[new]][which] * self.spread
         offsets = np.where(self.emission, offsets + self.shift, 0.0)
-        made = Estimate(stations * self.spread, b, places, offsets * net.emission)
+        made = NetworkEstimate(stations * self.spread, b, places, offsets * net.emission)
         self._settle(made, ~full)
         return made, which
 
-    def _settle(self, made: Estimate, few: Array) -> None:
+    def _settle(self, made: NetworkEstimate, few: Array) -> None:
         """Give pulses that took no part in a fit the emission that their places at the centre call for."""
         if few.any():
             apart = np.linalg.norm(made.stations[:, None] - made.pulses[:, few, None], axis=-1)
@@ -170,7 +170,7 @@ class Starts:
             offset = ((self.z[few] - apart) * weight).sum(axis=-1)
             made.emission[:, few] = offset * self.lik.network.emission[few]
 
-    def random(self, count: int) -> Estimate:
+    def random(self, count: int) -> NetworkEstimate:
         """Return networks with all places drawn, in the spread that the arrivals tell."""
         net, d = self.lik.network, self.dimension
         size = np.full(d, self.spread)
@@ -181,9 +181,9 @@ class Starts:
         apart = np.linalg.norm(stations[:, None] - pulses[:, :, None], axis=-1)
         weight = self.weight / np.maximum(self.weight.sum(axis=1, keepdims=True), 1e-300)
         offset = ((self.z - apart) * weight).sum(axis=-1)
-        return Estimate(stations, np.zeros((count, net.stations)), pulses, offset * net.emission)
+        return NetworkEstimate(stations, np.zeros((count, net.stations)), pulses, offset * net.emission)
 
-    def ends(self, at: Estimate, start: Array) -> Ends:
+    def ends(self, at: NetworkEstimate, start: Array) -> RoundEnds:
         """Refine networks, laid over what is known of the stations in both ways."""
         net = self.lik.network
         if np.isfinite(net.place_sigma).any():
@@ -191,12 +191,12 @@ class Starts:
             rough, _ = likelihood(free).refine(at, _ROUGH)
             at, start = laid(rough, net, self.rng), np.tile(start, 2)
         found, cost = self.lik.refine(at)
-        return Ends(found, cost, start)
+        return RoundEnds(found, cost, start)
 
 
-def _nothing(net: Network) -> Estimate:
+def _nothing(net: Network) -> NetworkEstimate:
     m, n, d = net.stations, net.pulses, net.dimension
-    return Estimate(np.zeros((0, m, d)), np.zeros((0, m)), np.zeros((0, n, d)), np.zeros((0, n)))
+    return NetworkEstimate(np.zeros((0, m, d)), np.zeros((0, m)), np.zeros((0, n, d)), np.zeros((0, n)))
 
 
 def starts_of(lik: Likelihood, seed: int) -> Starts:
@@ -210,7 +210,7 @@ def starts_of(lik: Likelihood, seed: int) -> Starts:
     return Starts(lik, z, weight, emission, shift, spread, np.random.default_rng(seed))
 
 
-def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
+def rounds(starts: Starts) -> Iterator[tuple[int, RoundEnds]]:
     """Yield how many starts were made, and the ends of each round: low rank where it applies, and random places."""
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
@@ -228,12 +228,12 @@ def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
         yield begun, starts.ends(at, start)
 
 
-def laid(at: Estimate, net: Network, rng: np.random.Generator) -> Estimate:
+def laid(at: NetworkEstimate, net: Network, rng: np.random.Generator) -> NetworkEstimate:
     """Return networks moved and turned onto what is known of the stations: S as they are, then S mirrored.
 
     Parameters
     ----------
-    at : Estimate
+    at : NetworkEstimate
         S networks.
     net : Network
         With places that are known, each coordinate by itself.
@@ -242,7 +242,7 @@ def laid(at: Estimate, net: Network, rng: np.random.Generator) -> Estimate:
 
     Returns
     -------
-    Estimate
+    NetworkEstimate
         2 S networks; exact coordinates are as they are known.
     """
     d = net.dimension

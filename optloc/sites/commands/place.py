@@ -28,7 +28,7 @@ _LINES = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class PlaceOptions:
     """What the command line says in the place of the file, None where it says nothing.
 
     Parameters
@@ -56,7 +56,7 @@ class Wanted:
 
 
 def run_place(
-    file: Path, wanted: Wanted, *, plot: Path | None, out: Path | None, as_json: bool = False, quiet: bool = False
+    file: Path, wanted: PlaceOptions, *, plot: Path | None, out: Path | None, as_json: bool = False, quiet: bool = False
 ) -> int:
     """Choose sites, print and write what was chosen, and return the exit code: 1 where the gap did not close."""
     claim_outputs(out, picture=plot, inputs=[file])
@@ -87,7 +87,7 @@ def run_place(
     return 0 if found.closed and (found.draws is None or found.draws.clean) else 1
 
 
-def _of_problem(file: Path, wanted: Wanted) -> LoadedSelection:
+def _of_problem(file: Path, wanted: PlaceOptions) -> LoadedSelection:
     """Return the selection of stations of an ordinary problem file, for a target at a place or the fix."""
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
@@ -106,7 +106,7 @@ def _of_problem(file: Path, wanted: Wanted) -> LoadedSelection:
     return LoadedSelection(SiteSelection(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
 
 
-def _with(selection: SiteSelection, wanted: Wanted) -> SiteSelection:
+def _with(selection: SiteSelection, wanted: PlaceOptions) -> SiteSelection:
     """Return a selection with the options of the command line."""
     given: dict[str, Any] = {
         key: value

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formulations.placement import Ground, Region
+from formulations.placement import PlacementGround, PlacementRegion
 from optloc.files import DataTable, json_of, read_text, table_of
 from optloc.problem import Array, Frame, InvalidProblem
 
@@ -57,7 +57,7 @@ def inside(points: Array, ring: Array) -> Array:
     return np.asarray((span & (x < cross)).sum(-1) % 2 == 1)
 
 
-def visible(ground: Ground, places: Array, stations: Array) -> Array:
+def visible(ground: PlacementGround, places: Array, stations: Array) -> Array:
     """Return 1 for pairs (P, s) of a place and a station whose line stays above the ground, else 0."""
     share = np.linspace(0.0, 1.0, _SAMPLES + 2)[1:-1, None]
     out = np.ones((len(places), len(stations)))
@@ -68,7 +68,7 @@ def visible(ground: Ground, places: Array, stations: Array) -> Array:
     return out
 
 
-def ground_of(path: Path, where: str) -> Ground:
+def ground_of(path: Path, where: str) -> PlacementGround:
     """Return the ground of a CSV file with x, y, z on a full grid."""
     table = table_of(DataTable(file=path.name), path.parent, where)
     x, y, z = (table.numbers(key) for key in "xyz")
@@ -80,14 +80,14 @@ def ground_of(path: Path, where: str) -> Ground:
     height[np.searchsorted(xs, x), np.searchsorted(ys, y)] = z
     if np.isnan(height).any():
         raise InvalidProblem("a point of the grid occurs twice", table.source, "give z once at every pair")
-    return Ground(xs, ys, height)
+    return PlacementGround(xs, ys, height)
 
 
-def region_of(ring: Array, low: float, high: float) -> Region:
+def region_of(ring: Array, low: float, high: float) -> PlacementRegion:
     """Return a convex ring (v, 2), counted counter-clockwise, as half-planes."""
     along = np.roll(ring, -1, axis=0) - ring
     normal = np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
-    return Region(normal, (normal * ring).sum(1), low, high)
+    return PlacementRegion(normal, (normal * ring).sum(1), low, high)
 
 
 def convex_parts(ring: Array) -> list[Array]:

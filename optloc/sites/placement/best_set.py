@@ -20,7 +20,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from formulations.placement import Criterion, Design
 from optloc.problem import Array
 from optloc.sites.placement.branching import FREE, IN, OUT, expand, propagate, score, settle
-from optloc.sites.placement.completions import Asked, exhaust
+from optloc.sites.placement.completions import CompletionRequest, exhaust
 
 # Random sets that are exchanged beside the rounded relaxation, and steps of a relaxation: at the root, and of a node.
 _STARTS, _ROOT_STEPS, _STEPS = 15, 60, 40
@@ -42,7 +42,7 @@ _KINDS: dict[Criterion, int] = {"A": 0, "D": 1, "E": 2}
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class SearchTask:
     """What is searched.
 
     Parameters
@@ -88,13 +88,15 @@ class Task:
             )
         )
 
-    def asked(self) -> Asked:
+    def asked(self) -> CompletionRequest:
         """Return what sets are judged by, for machine code."""
         design = self.design
         sites = np.ascontiguousarray(np.moveaxis(design.rows, -1, 1))
         whole = np.trace(design.prior, axis1=1, axis2=2) + (sites**2).sum(axis=(1, 2, 3))
         kinds = self.kind, int(self.worst), int(self.fail)
-        return Asked(sites, design.prior, whole, design.weight, design.dimension, *kinds, self.rules, self.limits)
+        return CompletionRequest(
+            sites, design.prior, whole, design.weight, design.dimension, *kinds, self.rules, self.limits
+        )
 
     def fits(self, sets: Array) -> Array:
         """Return whether sets (B, n) meet the rules."""
@@ -113,7 +115,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Searched:
+class BestSetResult:
     """What a search found.
 
     Parameters
@@ -144,8 +146,8 @@ class Searched:
 class _Open:
     """The state of a search: sets that were seen, open nodes, how far it is."""
 
-    task: Task
-    asked: Asked
+    task: SearchTask
+    asked: CompletionRequest
     gap: float
     keep: int
     seen: dict[bytes, tuple[float, Array]]
@@ -177,19 +179,19 @@ class _Open:
 
 
 def search(
-    task: Task,
+    task: SearchTask,
     *,
     gap: float = 0.01,
     seconds: float = 60.0,
     keep: int = 5,
     seed: int = 0,
     tell: Callable[[float, float, int], None] = lambda bound, value, nodes: None,
-) -> Searched:
+) -> BestSetResult:
     """Return the best set that was found and the bound of all.
 
     Parameters
     ----------
-    task : Task
+    task : SearchTask
         What is searched.
     gap : float
         Share of the value at which it stops.
@@ -208,7 +210,7 @@ def search(
     task = replace(task, design=replace(task.design, rows=rows))
     made, state = _Open(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
-        return Searched((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
+        return BestSetResult((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
     root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
     if (state == FREE).any():
         w[state == FREE] = 0.5
@@ -217,7 +219,7 @@ def search(
     for value, chosen in _starts(task, state, w, seed):
         made.add(value, chosen)
     if not made.seen:
-        return Searched((), np.inf, True, np.inf, made.nodes, np.zeros((0, 3)))
+        return BestSetResult((), np.inf, True, np.inf, made.nodes, np.zeros((0, 3)))
     course = [(monotonic() - begun, made.bound, made.value)]
     while made.heap and made.heap[0][0] < made.enough and monotonic() - begun < seconds:
         _branch(made, *made.heap[0][:1], *heappop(made.heap)[2:])
@@ -232,13 +234,13 @@ def search(
         if chosen.any():
             made.add(value, chosen)
     best = sorted(made.seen.values(), key=itemgetter(0))[: made.keep]
-    return Searched(tuple(best), made.bound, closed, root, made.nodes, np.array(course))
+    return BestSetResult(tuple(best), made.bound, closed, root, made.nodes, np.array(course))
 
 
 def _load() -> None:
     """Have machine code at hand before the time counts: where it is made first, that takes a minute."""
     prior, none = np.ones((1, 1, 1)), np.zeros(0)
-    one = Task(
+    one = SearchTask(
         Design(np.ones((1, 1, 1, 2)), prior, np.ones(1), 1), "A", False, False, np.ones((1, 2)), np.ones(1), none
     )
     state = np.full(2, FREE, dtype=np.int64)
@@ -309,14 +311,16 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
                 return
 
 
-def _exhausted(asked: Asked, state: Array, w: Array, enough: float, most: int = sys.maxsize) -> tuple[float, Array]:
+def _exhausted(
+    asked: CompletionRequest, state: Array, w: Array, enough: float, most: int = sys.maxsize
+) -> tuple[float, Array]:
     """Return the best set (n,) of a node and its value, below `enough`; of zeros where there is none."""
     best, free = np.zeros(len(state), dtype=np.int64), np.flatnonzero(state == FREE)
     order = free[np.argsort(w[free], kind="stable")]
     return float(exhaust(asked, state, order, most, enough, best)), best
 
 
-def _is_small(task: Task, state: Array) -> bool:
+def _is_small(task: SearchTask, state: Array) -> bool:
     """Return whether a node has so few sets that it is cheaper to look at each."""
     free = task.rules[0][state == FREE]
     left = task.limits[0] - task.rules[0][state == IN].sum()
@@ -328,7 +332,7 @@ def _is_small(task: Task, state: Array) -> bool:
     return number <= (_FEW_FAIL if task.fail else _FEW) * (1.0 if at_once else _SLOW)
 
 
-def _starts(task: Task, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
+def _starts(task: SearchTask, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
     """Yield sets that no exchange of two sites improves, from the rounded relaxation and random ones, with values."""
     rng = np.random.default_rng(seed)
     for priority in (w, *rng.random((_STARTS, len(w)))):
@@ -338,7 +342,7 @@ def _starts(task: Task, state: Array, w: Array, seed: int) -> Iterator[tuple[flo
         yield exchanged(task, chosen)
 
 
-def _rounded(task: Task, state: Array, priority: Array) -> Array | None:
+def _rounded(task: SearchTask, state: Array, priority: Array) -> Array | None:
     """Return a set (n,) of sites of large priority that meets the rules and has no room for another; None for none."""
     chosen = (state == IN).astype(np.int64)
     for j in np.argsort(-priority, kind="stable"):
@@ -359,7 +363,7 @@ def _rounded(task: Task, state: Array, priority: Array) -> Array | None:
     return None if found.x is None else np.asarray(np.round(found.x).astype(np.int64))
 
 
-def random_sets(task: Task, count: int, seed: int) -> Iterator[Array]:
+def random_sets(task: SearchTask, count: int, seed: int) -> Iterator[Array]:
     """Yield random sets (n,) that meet the rules and leave no room for another site."""
     rng = np.random.default_rng(seed)
     for priority in rng.random((count, len(task.state))):
@@ -368,7 +372,7 @@ def random_sets(task: Task, count: int, seed: int) -> Iterator[Array]:
             yield chosen
 
 
-def exchanged(task: Task, chosen: Array) -> tuple[float, Array]:
+def exchanged(task: SearchTask, chosen: Array) -> tuple[float, Array]:
     """Return value and set (n,) after the best exchanges of two sites, or additions, until none improves it."""
     asked, value = task.asked(), float(task.score(chosen[None])[0])
     while True:
@@ -382,7 +386,9 @@ def exchanged(task: Task, chosen: Array) -> tuple[float, Array]:
         value, chosen = float(task.score(other[None])[0]), other
 
 
-def _exchange(task: Task, asked: Asked, chosen: Array, gone: int | None, enough: float) -> tuple[float, Array]:
+def _exchange(
+    task: SearchTask, asked: CompletionRequest, chosen: Array, gone: int | None, enough: float
+) -> tuple[float, Array]:
     """Return the best set (n,) with another site in the place of one, or beside all, and its value, as `_exhausted`."""
     state = np.where(chosen == 1, IN, np.where(task.state == FREE, FREE, OUT))
     if gone is not None:

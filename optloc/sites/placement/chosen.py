@@ -12,7 +12,7 @@ from formulations.placement import covariances
 from optloc.bounds import bound_map, crlb, extent, map_coordinates
 from optloc.engine import degrees_of_freedom, simulate
 from optloc.problem import Array, InvalidProblem, Status
-from optloc.sites.placement.best_set import Searched, Task, random_sets, search
+from optloc.sites.placement.best_set import BestSetResult, SearchTask, random_sets, search
 from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 
 if TYPE_CHECKING:
@@ -221,10 +221,10 @@ def place(
         banned.append(chosen)
 
 
-def task_of(candidates: Candidates) -> Task:
+def task_of(candidates: Candidates) -> SearchTask:
     """Return the search for the best set of some candidates."""
     selection = candidates.selection
-    return Task(
+    return SearchTask(
         candidates.design,
         LETTER[selection.criterion],
         selection.worst,
@@ -235,7 +235,7 @@ def task_of(candidates: Candidates) -> Task:
     )
 
 
-def _without(task: Task, banned: Sequence[Array]) -> Task:
+def _without(task: SearchTask, banned: Sequence[Array]) -> SearchTask:
     """Return a task that does not allow some sets."""
     rules = np.array([chosen / chosen.sum() for chosen in banned]).reshape(len(banned), len(task.state))
     limits = np.array([1.0 - 1.0 / chosen.sum() for chosen in banned])
@@ -243,7 +243,7 @@ def _without(task: Task, banned: Sequence[Array]) -> Task:
 
 
 def _answer(
-    candidates: Candidates, task: Task, found: Searched, checked: Draws | None, banned: Sequence[Array]
+    candidates: Candidates, task: SearchTask, found: BestSetResult, checked: Draws | None, banned: Sequence[Array]
 ) -> Placement:
     selection, names = candidates.selection, candidates.names
     value, chosen = found.best[0]
@@ -283,7 +283,7 @@ def _answer(
     )
 
 
-def _course(task: Task, course: Array) -> Array:
+def _course(task: SearchTask, course: Array) -> Array:
     out = course.copy()
     out[:, 1:] = [[task.scale(v) for v in row] for row in course[:, 1:]]
     return out
@@ -314,7 +314,7 @@ def _failed(candidates: Candidates, chosen: Array) -> Array:
     return np.asarray(np.sqrt(variance.max(0)))
 
 
-def _before(candidates: Candidates, task: Task) -> tuple[Array, tuple[str, ...]]:
+def _before(candidates: Candidates, task: SearchTask) -> tuple[Array, tuple[str, ...]]:
     kept = (candidates.state == 1).astype(np.int64)
     if kept.any():
         per_place, share = _per_place(candidates, kept)
@@ -331,7 +331,7 @@ def _redundancy(candidates: Candidates, chosen: Array) -> Array:
     return np.asarray(degrees_of_freedom(problem))
 
 
-def _swaps(task: Task, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
+def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
     found = []
     for i in np.flatnonzero(chosen).tolist():
         without = chosen.copy()
@@ -349,7 +349,7 @@ def _swaps(task: Task, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
     yield from sorted(found, key=lambda swap: -swap.value)
 
 
-def _following(task: Task, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
+def _following(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
     others = np.flatnonzero((chosen == 0) & (task.state != 0)).tolist()
     if not others:
         return

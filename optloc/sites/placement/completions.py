@@ -25,7 +25,7 @@ _WRONG = 1e-6
 _COMPARE, _AGAIN = 1e9, 1e8
 
 
-class Asked(NamedTuple):
+class CompletionRequest(NamedTuple):
     """What sets are judged by.
 
     Parameters
@@ -56,7 +56,7 @@ class Asked(NamedTuple):
     limits: Array
 
 
-class Others(NamedTuple):
+class OtherSites(NamedTuple):
     """Sites that may be added, in their order.
 
     Parameters
@@ -74,7 +74,7 @@ class Others(NamedTuple):
     products: Array
 
 
-class Scratch(NamedTuple):
+class CompletionWorkspace(NamedTuple):
     """Arrays that are overwritten: (m, m) twice, (d, d) three times, (d,), and the loss that was the worst, (1,)."""
 
     matrix: Array
@@ -96,7 +96,9 @@ def trace_of(matrix: Array, d: int) -> float:
 
 
 @compiled
-def inverse_of(asked: Asked, p: int, members: Array, size: int, lost: int, matrix: Array, out: Array) -> bool:
+def inverse_of(
+    asked: CompletionRequest, p: int, members: Array, size: int, lost: int, matrix: Array, out: Array
+) -> bool:
     """Write the inverse (m, m) of the information of members but entry `lost` (or -1); return whether there is one.
 
     Of `members` the first `size` entries are taken; `matrix` (m, m) is overwritten.
@@ -134,7 +136,15 @@ def update(inverse: Array, row: Array, s: Array) -> None:
 
 
 @compiled
-def grow(asked: Asked, members: Array, size: int, last: Array, condition: float, out: Array, work: Scratch) -> float:
+def grow(
+    asked: CompletionRequest,
+    members: Array,
+    size: int,
+    last: Array,
+    condition: float,
+    out: Array,
+    work: CompletionWorkspace,
+) -> float:
     """Write the inverses (P, m, m) of members from those `last` of all but the latest; return their condition at most.
 
     Where rounding would show they are computed from sums.
@@ -157,7 +167,9 @@ def grow(asked: Asked, members: Array, size: int, last: Array, condition: float,
 
 
 @compiled
-def worth(asked: Asked, members: Array, size: int, lost: int, enough: float, work: Scratch) -> float:
+def worth(
+    asked: CompletionRequest, members: Array, size: int, lost: int, enough: float, work: CompletionWorkspace
+) -> float:
     """Return the criterion of members but one, or, where it is not below `enough`, a number that is not either."""
     d, worst = asked.d, asked.worst
     total = -np.inf if worst else 0.0
@@ -176,7 +188,7 @@ def worth(asked: Asked, members: Array, size: int, lost: int, enough: float, wor
 
 
 @compiled
-def with_loss(asked: Asked, members: Array, size: int, enough: float, work: Scratch) -> float:
+def with_loss(asked: CompletionRequest, members: Array, size: int, enough: float, work: CompletionWorkspace) -> float:
     """Return the criterion of a set, with its worst loss where one may fail; as `worth` does.
 
     The loss that was too bad in the set before is looked at first.
@@ -220,7 +232,9 @@ def trace_with(products: Array, inverse: Array, d: int, begin: int, along: Array
 
 
 @compiled
-def one_more(asked: Asked, others: Others, inverses: Array, begin: int, values: Array, work: Scratch) -> None:
+def one_more(
+    asked: CompletionRequest, others: OtherSites, inverses: Array, begin: int, values: Array, work: CompletionWorkspace
+) -> None:
     """Write the criterion (q,) of a set with each other site from `begin` on, by updates of its inverses (P, m, m)."""
     d, n = asked.d, len(others.site)
     single, brought = np.empty(n), np.empty(n)
@@ -240,7 +254,7 @@ def one_more(asked: Asked, others: Others, inverses: Array, begin: int, values: 
 
 
 @compiled
-def comparable(asked: Asked, inverses: Array, condition: float, enough: float) -> bool:
+def comparable(asked: CompletionRequest, inverses: Array, condition: float, enough: float) -> bool:
     """Return whether updates of inverses (P, m, m) tell criteria near `enough` to the share that they may be wrong."""
     if asked.kind == VOLUME:
         return condition * condition < _COMPARE
@@ -252,7 +266,7 @@ def comparable(asked: Asked, inverses: Array, condition: float, enough: float) -
 
 
 @compiled
-def allowed(asked: Asked, members: Array, size: int, partly: bool) -> bool:
+def allowed(asked: CompletionRequest, members: Array, size: int, partly: bool) -> bool:
     """Return whether members meet the rules; if they are a part of a set, those without a negative entry."""
     for i in range(asked.rules.shape[0]):
         used, low = 0.0, 0.0
@@ -268,10 +282,10 @@ def allowed(asked: Asked, members: Array, size: int, partly: bool) -> bool:
 
 @compiled
 def finish(
-    asked: Asked,
+    asked: CompletionRequest,
     members: Array,
     size: int,
-    others: Others,
+    others: OtherSites,
     begin: int,
     one: bool,
     two: bool,
@@ -279,7 +293,7 @@ def finish(
     condition: float,
     enough: float,
     best: Array,
-    work: Scratch,
+    work: CompletionWorkspace,
 ) -> float:
     """Return the least criterion below `enough` of members with `one` site more, or `two`; `best` (n,) gets the set.
 
@@ -307,7 +321,7 @@ def finish(
 
 
 @compiled
-def picked(asked: Asked, order: Array) -> Others:
+def picked(asked: CompletionRequest, order: Array) -> OtherSites:
     """Return sites in an order (q,), with what is compared of them."""
     places, _, r, m = asked.sites.shape
     count = len(order)
@@ -321,18 +335,20 @@ def picked(asked: Asked, order: Array) -> Others:
                 for b in range(a + 1):
                     products[p, i, j] = asked.sites[p, order[j], 0, a] * asked.sites[p, order[j], 0, b]
                     i += 1
-    return Others(order, rows, products)
+    return OtherSites(order, rows, products)
 
 
 @compiled
-def scratch(m: int, d: int) -> Scratch:
+def scratch(m: int, d: int) -> CompletionWorkspace:
     """Return arrays for `m` unknowns, of which `d` are the position."""
     square, small = np.empty((2, m, m)), np.empty((3, d, d))
-    return Scratch(square[0], square[1], small[0], small[1], small[2], np.empty(d), np.zeros(1, dtype=np.int64))
+    return CompletionWorkspace(
+        square[0], square[1], small[0], small[1], small[2], np.empty(d), np.zeros(1, dtype=np.int64)
+    )
 
 
 @compiled
-def is_counted(asked: Asked, order: Array) -> bool:
+def is_counted(asked: CompletionRequest, order: Array) -> bool:
     """Return whether all that rules say is how many of these sites are taken: then no set is a part of another."""
     for j in order:
         if asked.rules[0, j] != asked.rules[0, order[0]]:
@@ -341,12 +357,12 @@ def is_counted(asked: Asked, order: Array) -> bool:
 
 
 @compiled
-def exhaust(asked: Asked, state: Array, order: Array, most: int, enough: float, best: Array) -> float:
+def exhaust(asked: CompletionRequest, state: Array, order: Array, most: int, enough: float, best: Array) -> float:
     """Return the least criterion below `enough` of all sets of a node, or `enough`; `best` (n,) gets the set.
 
     Parameters
     ----------
-    asked : Asked
+    asked : CompletionRequest
         What sets are judged by.
     state : int array (n,)
         FREE, OUT or IN.

@@ -15,7 +15,7 @@ _NAMED, _GROUPS = 8, 3
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class CountGroup:
     """A rule about some of the sites.
 
     Parameters
@@ -32,13 +32,13 @@ class Group:
 
 
 def check_groups(
-    groups: Sequence[Group], members: Array, names: Sequence[str], state: Array, choose: int | None
+    groups: Sequence[CountGroup], members: Array, names: Sequence[str], state: Array, choose: int | None
 ) -> None:
     """Refuse groups that no set of sites meets, and a number of sites that is too large or too small for them.
 
     Parameters
     ----------
-    groups : sequence of Group
+    groups : sequence of CountGroup
         The rules.
     members : bool array (G, n)
         Which sites belong to each.
@@ -73,7 +73,7 @@ def check_groups(
         raise InvalidProblem(what, "choose", f"ask for {least} or more, or ask for fewer sites of a group")
 
 
-def _check_one(where: str, group: Group, own: Array, names: Sequence[str], state: Array) -> None:
+def _check_one(where: str, group: CountGroup, own: Array, names: Sequence[str], state: Array) -> None:
     """Refuse a group that cannot be met whatever the others say."""
     kept, able, who = int((own & (state == 1)).sum()), int((own & (state != 0)).sum()), _listed(own, names)
     if group.most is not None and kept > group.most:
@@ -87,7 +87,7 @@ def _check_one(where: str, group: Group, own: Array, names: Sequence[str], state
         raise InvalidProblem(what, where, "correct one of the two")
 
 
-def _count(groups: Sequence[Group], members: Array, state: Array, sign: float) -> int | None:
+def _count(groups: Sequence[CountGroup], members: Array, state: Array, sign: float) -> int | None:
     """Return the greatest (-1) or least (1) number of free sites that meets the groups; None where no set does."""
     low = np.array([-np.inf if g.least is None else g.least for g in groups], dtype=float)
     high = np.array([np.inf if g.most is None else g.most for g in groups], dtype=float)
@@ -98,7 +98,7 @@ def _count(groups: Sequence[Group], members: Array, state: Array, sign: float) -
     return None if solved.x is None else round(float(free @ solved.x))
 
 
-def _binding(groups: Sequence[Group], members: Array, state: Array, most: int) -> list[int]:
+def _binding(groups: Sequence[CountGroup], members: Array, state: Array, most: int) -> list[int]:
     """Return the groups without which more sites were possible: a single one if that is enough, else all that limit."""
     limiting = [i for i, group in enumerate(groups) if group.most is not None and group.most < members[i].sum()]
     for i in limiting:
@@ -113,5 +113,5 @@ def _listed(own: Array, names: Sequence[str]) -> str:
     return ", ".join(told[:_NAMED]) + (f" and {len(told) - _NAMED} more" if len(told) > _NAMED else "")
 
 
-def _told(groups: Sequence[Group]) -> str:
+def _told(groups: Sequence[CountGroup]) -> str:
     return ", ".join(str(i + 1) for i in range(len(groups)))

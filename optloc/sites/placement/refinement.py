@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from formulations.backend import SolverError
-from formulations.placement import Ground, Region, refine, value
+from formulations.placement import PlacementGround, PlacementRegion, refine, value
 from optloc.models import MODELS, Point
 from optloc.problem import Array, InvalidProblem
 from optloc.sites.placement.best_set import exchanged, random_sets
@@ -25,8 +25,8 @@ _EDGE = 1e-6
 def refined(
     selection: SiteSelection,
     found: Placement,
-    regions: Sequence[Region],
-    ground: Ground | None = None,
+    regions: Sequence[PlacementRegion],
+    ground: PlacementGround | None = None,
     *,
     starts: int = _STARTS,
 ) -> Placement:
@@ -42,9 +42,9 @@ def refined(
         As it was given to `place`.
     found : Placement
         Its answer.
-    regions : sequence of Region
+    regions : sequence of PlacementRegion
         Convex parts of where stations may stand.
-    ground : Ground, optional
+    ground : PlacementGround, optional
         Height of the ground, which the heights of the regions are then above.
     starts : int
         Random sets that are refined, too.
@@ -79,7 +79,7 @@ def refined(
 
 
 def _optima(
-    candidates: Candidates, sites: Array, begin: Array, parts: Sequence[Region], ground: Ground | None
+    candidates: Candidates, sites: Array, begin: Array, parts: Sequence[PlacementRegion], ground: PlacementGround | None
 ) -> list[Array]:
     """Return the start and, where it has one inside the regions, the local optimum from it."""
     selection, out = candidates.selection, [begin]
@@ -117,13 +117,15 @@ def _stations(candidates: Candidates) -> Array:
     return np.unique(np.concatenate([rows.a for rows in candidates.problem.rows]))
 
 
-def _home(place: Array, regions: Sequence[Region], ground: Ground | None) -> tuple[Region, Array]:
+def _home(
+    place: Array, regions: Sequence[PlacementRegion], ground: PlacementGround | None
+) -> tuple[PlacementRegion, Array]:
     """Return the region that a place is in, or moves least to reach, and where it is then."""
     moved = [(region, region.nearest(place, ground)) for region in regions]
     return min(moved, key=lambda pair: float(np.linalg.norm(pair[1] - place)))
 
 
-def _inside(place: Array, region: Region, ground: Ground | None) -> bool:
+def _inside(place: Array, region: PlacementRegion, ground: PlacementGround | None) -> bool:
     return bool((region.excess(place, ground) <= _EDGE).all())
 
 

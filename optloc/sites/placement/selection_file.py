@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from formulations.placement import Ground, Region
+from formulations.placement import PlacementGround, PlacementRegion
 from optloc.files import (
     Amount,
     DataTable,
@@ -50,7 +50,7 @@ from optloc.sites.placement.areas import (
     region_of,
     visible,
 )
-from optloc.sites.placement.sites import Group, Name, SiteSelection
+from optloc.sites.placement.sites import CountGroup, Name, SiteSelection
 
 # Columns of stations and candidates that a problem file knows.
 _PLACE = (
@@ -77,7 +77,7 @@ _ROWS = {"file", "rows", "columns", "separator"}
 _MANY = 10_000
 
 
-class _Table(BaseModel):
+class _SelectionTable(BaseModel):
     """A table of the file; keys that it does not know are refused."""
 
     model_config = ConfigDict(
@@ -85,7 +85,7 @@ class _Table(BaseModel):
     )
 
 
-class ChoiceTable(_Table):
+class ChoiceTable(_SelectionTable):
     """What to choose, by what, and when to stop."""
 
     choose: int | None = Field(default=None, ge=1)
@@ -139,7 +139,7 @@ class SightTable(DataTable):
     """CSV file with columns x, y, z on a grid, metres of the frame: what is behind the ground is out of sight."""
 
 
-class GroupTable(_Table):
+class GroupTable(_SelectionTable):
     """How many of some candidates: those of a mast, of a region, of an owner."""
 
     group: str | None = None
@@ -152,7 +152,7 @@ class GroupTable(_Table):
     """At least so many."""
 
 
-class RefineTable(_Table):
+class RefineTable(_SelectionTable):
     """Where stations may move for the refinement."""
 
     polygon: str
@@ -163,7 +163,7 @@ class RefineTable(_Table):
     """CSV file with columns x, y, z on a grid."""
 
 
-class SelectionFile(_Table):
+class SelectionFile(_SelectionTable):
     """A site selection: which of these candidates to take."""
 
     format: Literal[1]
@@ -199,9 +199,9 @@ class LoadedSelection:
         Name of the file, and what it says it is.
     settings : dict
         Tables of the problem file of all sites.
-    regions : tuple of Region
+    regions : tuple of PlacementRegion
         Where stations may move; none without a refinement.
-    ground : Ground, optional
+    ground : PlacementGround, optional
         What their heights are above.
     """
 
@@ -209,8 +209,8 @@ class LoadedSelection:
     source: str
     title: str
     settings: dict[str, Any]
-    regions: tuple[Region, ...] = ()
-    ground: Ground | None = None
+    regions: tuple[PlacementRegion, ...] = ()
+    ground: PlacementGround | None = None
 
 
 def is_selection(path: Path) -> bool:
@@ -355,20 +355,20 @@ def _column(candidates: Table, key: str, problem: Problem) -> Array:
     return np.array([given.get(name, 0.0) for name in problem.stations.names])
 
 
-def _group(table: GroupTable, candidates: Table, where: str) -> Group:
+def _group(table: GroupTable, candidates: Table, where: str) -> CountGroup:
     if (table.group is None) == (table.members is None):
         raise InvalidProblem("a group is given once", where, "give group, a word of the column, or members")
     if table.most is None and table.least is None:
         raise InvalidProblem("the group has no rule", where, "give most or least")
     if table.members is not None:
-        return Group(tuple(table.members), table.most, table.least)
+        return CountGroup(tuple(table.members), table.most, table.least)
     words = [str(word) for word in candidates.raw("group")]
     if table.group not in words:
         what = f"no candidate is in group {table.group!r}"
         raise InvalidProblem(what, where, nearest(str(table.group), sorted({*words})))
     labels = candidates.labels("name")
     members = tuple(str(name) for name, word in zip(labels, words, strict=True) if word == table.group)
-    return Group(members, table.most, table.least)
+    return CountGroup(members, table.most, table.least)
 
 
 def _places(
@@ -467,7 +467,7 @@ def _sight(
 
 def _regions(
     section: RefineTable | None, frame: Frame, dimension: int, folder: Path, source: str
-) -> tuple[tuple[Region, ...], Ground | None]:
+) -> tuple[tuple[PlacementRegion, ...], PlacementGround | None]:
     if section is None:
         return (), None
     where = join(source, "[refine]")

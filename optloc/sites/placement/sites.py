@@ -12,12 +12,12 @@ from formulations.placement import Criterion, Design
 from optloc.engine import Normal, linearise, with_priors
 from optloc.models import MODELS
 from optloc.problem import Array, InvalidProblem, Prior, Problem, as_arrivals, emission_name, nearest, variances
-from optloc.sites.placement.counts import Group, check_groups
+from optloc.sites.placement.counts import CountGroup, check_groups
 
 Name = Literal["rms", "volume", "axis"]
 """Criteria: mean-square error, volume and longest axis of the error ellipsoid."""
 
-__all__ = ["LETTER", "Candidates", "Group", "Name", "SiteSelection", "candidates_of"]
+__all__ = ["LETTER", "Candidates", "CountGroup", "Name", "SiteSelection", "candidates_of"]
 
 LETTER: dict[str, Criterion] = {"rms": "A", "volume": "D", "axis": "E"}
 """The criteria's names in the literature."""
@@ -54,7 +54,7 @@ class SiteSelection:
         Of each station, not negative.
     kept, forbidden : tuple of str
         Sites that are taken, and that are not, in any case.
-    groups : tuple of Group
+    groups : tuple of CountGroup
         Further rules.
     criterion : "rms", "volume" or "axis"
         Mean-square error (A), determinant (D) or largest eigenvalue (E) of the covariance of the position.
@@ -89,7 +89,7 @@ class SiteSelection:
     cost: Array | None = None
     kept: tuple[str, ...] = ()
     forbidden: tuple[str, ...] = ()
-    groups: tuple[Group, ...] = ()
+    groups: tuple[CountGroup, ...] = ()
     criterion: Name = "rms"
     worst: bool = False
     fail_one: bool = False

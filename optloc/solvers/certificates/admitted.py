@@ -34,7 +34,7 @@ from optloc.problem.claims import GLOBAL, REGION, Claims, untried
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.batch import Asked
+from optloc.proof.batch import ProofRequest
 from optloc.proof.near import BETTER, STATIONARY, VALUE
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.scope import is_run, unsupported
@@ -313,13 +313,13 @@ def _costs(problem: Problem, costs: Costs, x: Array) -> Array:
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> Asked:
+def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, effort: float) -> ProofRequest:
     """Return the question whether nothing along a face costs less than vectors x (n, size) by more than `less` (n,)."""
     place = x[:, state_columns(on)]
     (n, d), value = place.shape, np.zeros(len(x))
     planes, surface = surfaces_of(on, place)
     region = limits if np.isfinite(limits).all() else np.full_like(limits, np.nan)
-    return Asked(
+    return ProofRequest(
         x=place,
         others=np.zeros((n, 0, d)),
         known=np.zeros(n, dtype=np.int64),

@@ -19,7 +19,7 @@ from optloc.problem.chart import quantile
 from optloc.problem.claims import GLOBAL, PROOFS, REGION, UNKNOWN, Claims, claim, untried
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.batch import Answered, Asked
+from optloc.proof.batch import ProofRequest, ProofResult
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, UNIQUE, VALUE
 from optloc.proof.scaled.scaled_proof import ScaledCosts
@@ -146,7 +146,7 @@ HIDDEN = 4
 
 
 @dataclass(slots=True)
-class Work:
+class BoundWorkspace:
     """A flat batch of N pools while they are proven; entries are replaced as better candidates are found.
 
     Parameters
@@ -205,7 +205,7 @@ class Work:
     @classmethod
     def begin(
         cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: float
-    ) -> Work:
+    ) -> BoundWorkspace:
         """Return the work before the first round."""
         size, state = len(fix.x), fix.x[:, state_columns(problem)]
         d = state.shape[-1]
@@ -246,7 +246,7 @@ def gaps_below(margin: float, dimension: int) -> list[float]:
     return [margin, *below[:-1], near, 0.0] if margin > 0.0 else [0.0]
 
 
-def settle(work: Work) -> Work:
+def settle(work: BoundWorkspace) -> BoundWorkspace:
     """Return the work with a certificate for every fix that was to be proven."""
     asked = np.flatnonzero(work.pending)
     for _ in range(int(_ROUNDS * max(work.effort, 1))):
@@ -259,7 +259,7 @@ def settle(work: Work) -> Work:
     return work
 
 
-def _compare(work: Work, items: Array) -> None:
+def _compare(work: BoundWorkspace, items: Array) -> None:
     """Take back what was proven of another cost than that of a fix."""
     proven = items[np.isin(work.proven.proof[items], (GLOBAL, REGION))]
     if not len(proven):
@@ -269,7 +269,7 @@ def _compare(work: Work, items: Array) -> None:
     work.mismatched += len(off)
 
 
-def _round(work: Work, items: Array) -> None:
+def _round(work: BoundWorkspace, items: Array) -> None:
     """Try to prove some fixes once, and settle or change what can be."""
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
@@ -308,7 +308,7 @@ def _round(work: Work, items: Array) -> None:
     _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
 
-def _asked(work: Work, items: Array) -> Asked:
+def _asked(work: BoundWorkspace, items: Array) -> ProofRequest:
     fix, ignored, last = work.fix, work.ignored[items], len(work.margins) - 1
     gaps = work.margins[np.minimum(work.level[items, None] + np.arange(last + 1), last)]
     kappa = gaps[:, 0]
@@ -320,7 +320,7 @@ def _asked(work: Work, items: Array) -> Asked:
     place = fix.alternatives.x[items][..., own]
     others = pack(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
     seen = np.isfinite(ignored).all(-1).sum(1)
-    return Asked(
+    return ProofRequest(
         x=fix.x[items, own],
         others=np.where(np.isfinite(others), others, 0.0),
         known=np.isfinite(others).all(-1).sum(1),
@@ -348,7 +348,7 @@ def _unfinished(costs: Costs, count: int) -> str:
     return UNFINISHED + (LACKS_CODE if lacks(costs, count) else "")
 
 
-def _lower(work: Work, items: Array, why: str, *, remote: bool = False) -> None:
+def _lower(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False) -> None:
     """Let proofs that failed try for a smaller margin, then for a region; give up where that was all."""
     last = len(work.margins) - 1
     work.level[items] += 1
@@ -362,13 +362,13 @@ def _lower(work: Work, items: Array, why: str, *, remote: bool = False) -> None:
     _give_up(work, spent[~everywhere], why)
 
 
-def _give_up(work: Work, items: Array, why: str) -> None:
+def _give_up(work: BoundWorkspace, items: Array, why: str) -> None:
     work.proven.write(items, unknown(why))
     work.proven.boxes[items] = work.spent[items]
     work.pending[items] = False
 
 
-def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array) -> None:
+def _claim(work: BoundWorkspace, items: Array, asked: ProofRequest, answer: ProofResult, done: Array) -> None:
     """Write the certificates of those of some fixes that are proven."""
     proven, kappa = items[done], answer.gap[done]
     listed = (work.fix.alternatives.gap[proven] < kappa[:, None]).sum(1)
@@ -386,13 +386,13 @@ def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array
     work.pending[proven] = False
 
 
-def _add(work: Work, items: Array, points: Array, better: Array) -> None:
+def _add(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
     """Refine points (n, d) that were found beside some fixes, and let them compete."""
     _, changed = _compete(work, items, points[:, None])
     _stick(work, items[~changed], points[~changed], better[~changed])
 
 
-def _list(work: Work, items: Array, answer: Answered) -> Array:
+def _list(work: BoundWorkspace, items: Array, answer: ProofResult) -> Array:
     """Refine minima that proofs of some fixes went on beside, let them compete; return which claims hold (n,)."""
     rivals = answer.rivals[:, : answer.met.max()]
     rivals = np.where((np.arange(rivals.shape[1]) < answer.met[:, None])[..., None], rivals, np.nan)
@@ -408,7 +408,7 @@ def _list(work: Work, items: Array, answer: Answered) -> Array:
     return np.asarray(holds)
 
 
-def _compete(work: Work, items: Array, points: Array) -> tuple[Array, Array]:
+def _compete(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, Array]:
     """Refine points (n, P, d) beside some fixes; return which fixes they replaced, and of which they say more, (n,)."""
     began = perf_counter()
     part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
@@ -429,14 +429,14 @@ def _compete(work: Work, items: Array, points: Array) -> tuple[Array, Array]:
     return lower, changed
 
 
-def _stick(work: Work, items: Array, points: Array, better: Array) -> None:
+def _stick(work: BoundWorkspace, items: Array, points: Array, better: Array) -> None:
     """Say what becomes of fixes beside which points (n, d) were found that are no candidates."""
     stuck = np.flatnonzero(~_ignore(work, items, points))
     _bar(work, items, points, stuck[better[stuck]])
     _lower(work, items[stuck[~better[stuck]]], _unfinished(work.costs, len(items)))
 
 
-def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
+def _bar(work: BoundWorkspace, items: Array, points: Array, barred: Array) -> None:
     """Give up fixes beside which a point costs less that did not replace them, and say what forbids it."""
     if not len(barred):
         return
@@ -449,7 +449,7 @@ def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
         _give_up(work, np.array([item]), BARRED.format(why) if breaks or behind else LOST)
 
 
-def _ignore(work: Work, items: Array, points: Array) -> Array:
+def _ignore(work: BoundWorkspace, items: Array, points: Array) -> Array:
     """Note the minima next to points (n, d) that the Earth hides, and return which are new (n,)."""
     problem = work.problem
     if not problem.frame.geodetic or problem.motions[0].order or not len(items) or work.ignored.shape[1] >= HIDDEN:
@@ -505,7 +505,7 @@ def certified_freely(
         proven.write(answered, unknown(why))
         return replace(pool, proven=proven, stages=(*pool.stages, certify_stage(why or "nothing to prove", began)))
 
-    work = Work.begin(problem, pool, fix, answered & ~proven_before, region, margin, effort)
+    work = BoundWorkspace.begin(problem, pool, fix, answered & ~proven_before, region, margin, effort)
     if pool.tried_before is not None:
         work.proven.write(proven_before, take(pool.tried_before.proven, proven_before))
     work = settle(work)

@@ -17,7 +17,7 @@ from optloc.base.types import Array, Band
 from optloc.linear.constraints import Level, exact, levels
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.proof.batch import Answered, Asked, cost_here, costs_at, empty_answer, prove_all, prove_here
+from optloc.proof.batch import ProofRequest, ProofResult, cost_here, costs_at, empty_answer, prove_all, prove_here
 from optloc.proof.near import VALUE
 from optloc.proof.position_costs import Affine, PositionCosts
 from optloc.solvers.certificates.branch_and_bound import budgets
@@ -69,11 +69,11 @@ def edges_of(problem: Problem) -> Edges | None:
     return Edges(tuple(level for level, _ in found), np.array([value for _, value in found]), region)
 
 
-def question(edges: Edges, count: int, d: int, nodes: float) -> Asked:
+def question(edges: Edges, count: int, d: int, nodes: float) -> ProofRequest:
     """Return arrays for the questions about the edges of a number of fixes, in d coordinates."""
     n = count * len(edges.levels)
     none = np.zeros(n, dtype=np.int64)
-    return Asked(
+    return ProofRequest(
         x=np.empty((n, d)),
         others=np.zeros((n, 0, d)),
         known=none,
@@ -88,7 +88,7 @@ def question(edges: Edges, count: int, d: int, nodes: float) -> Asked:
     )
 
 
-def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array, asked: Asked) -> None:
+def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array, asked: ProofRequest) -> None:
     """Write planes to questions, and the places on them where the quadratic model of the cost is least.
 
     Parameters
@@ -99,7 +99,7 @@ def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array,
         Fixes and covariances.
     missing, slope : array (n, e), (n, e, d)
         Bounds less the bounded quantities at the fixes, and gradients.
-    asked : Asked
+    asked : ProofRequest
         Written.
     """
     d = x.shape[1]
@@ -118,30 +118,37 @@ def lay_planes(edges: Edges, x: Array, cov: Array, missing: Array, slope: Array,
 # Few fixes by machine code, on arrays that are kept.
 
 
-class Scratch(NamedTuple):
+class ReachWorkspace(NamedTuple):
     """Arrays of a thread, for n fixes and e edges: costs, questions, answers, costs at places."""
 
     costs: PositionCosts
-    asked: Asked
-    answered: Answered
+    asked: ProofRequest
+    answered: ProofResult
     found: Array
 
 
-def scratch(affine: Affine, edges: Edges, count: int, d: int) -> Scratch:
+def scratch(affine: Affine, edges: Edges, count: int, d: int) -> ReachWorkspace:
     """Return arrays for a number of fixes."""
     n = count * len(edges.levels)
     costs = affine.room(n)
-    return Scratch(costs, question(edges, count, d, len(costs.kinds)), empty_answer(n, d), np.zeros((2, n, 1)))
+    return ReachWorkspace(costs, question(edges, count, d, len(costs.kinds)), empty_answer(n, d), np.zeros((2, n, 1)))
 
 
 def are_out_of_reach(
-    edges: Edges, room: Scratch, costs: PositionCosts, x: Array, cov: Array, cost: Array, value: Array, normal: Array
+    edges: Edges,
+    room: ReachWorkspace,
+    costs: PositionCosts,
+    x: Array,
+    cov: Array,
+    cost: Array,
+    value: Array,
+    normal: Array,
 ) -> bool:
     """Return True if every position on the edges of n fixes costs at least `LISTED_GAP` more than the fixes.
 
     Parameters
     ----------
-    edges, room : Edges, Scratch
+    edges, room : Edges, ReachWorkspace
         Of the problem.
     costs : PositionCosts
         Of the fixes, written.
@@ -164,7 +171,7 @@ def are_out_of_reach(
     return bool(_are_shown(room.answered, level).all())
 
 
-def _are_shown(answered: Answered, level: Array) -> Array:
+def _are_shown(answered: ProofResult, level: Array) -> Array:
     """Return flags (n,): a plane is proven to cost at least a level everywhere."""
     # where rounding is coarse a bound may be lower than the level
     return np.asarray((answered.verdict == VALUE) & (answered.bound > level - equal_cost(level)))

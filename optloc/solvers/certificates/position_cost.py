@@ -12,11 +12,11 @@ from optloc.linear.normal import eliminated, step
 from optloc.models.primitives import geodetic_normal
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.proof.batch import Answered, Asked, costs_at, lacks_code, prove_all
+from optloc.proof.batch import ProofRequest, ProofResult, costs_at, lacks_code, prove_all
 from optloc.proof.nodes.level import height_numbers
 from optloc.proof.position_costs import PositionCosts, position_costs
 from optloc.proof.runs.prove import costs_of_courses, costs_of_runs, prove_courses, prove_runs, runs_lack_code
-from optloc.proof.runs.run_costs import Courses, Runs, course_costs, run_costs
+from optloc.proof.runs.run_costs import CourseCosts, Runs, course_costs, run_costs
 from optloc.proof.scaled.scaled_proof import (
     ScaledCosts,
     costs_at_scaled,
@@ -31,7 +31,7 @@ from optloc.solvers.starts.position import spread_of
 # Costs over the target's state: its position, with dense rows or sparse ones where there are many, or where it moves
 # its position and velocity.
 
-Costs = PositionCosts | ScaledCosts | Runs | Courses
+Costs = PositionCosts | ScaledCosts | Runs | CourseCosts
 
 
 def eliminate_nuisance(problem: Problem) -> Costs:
@@ -43,9 +43,9 @@ def eliminate_nuisance(problem: Problem) -> Costs:
     return run_costs(problem) if is_run(problem) else position_costs(problem)
 
 
-def prove(costs: Costs, asked: Asked) -> Answered:
+def prove(costs: Costs, asked: ProofRequest) -> ProofResult:
     """Return the outcome of the proofs of n fixes of n problems by their costs."""
-    if isinstance(costs, Courses):
+    if isinstance(costs, CourseCosts):
         return prove_courses(costs, asked)
     if isinstance(costs, ScaledCosts):
         return prove_all_scaled(costs, asked)
@@ -61,7 +61,7 @@ def lacks(costs: Costs, count: int) -> bool:
 
 def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
     """Return position costs (N, P) of states (N, P, n) and the rounding of their residuals."""
-    if isinstance(costs, Courses):
+    if isinstance(costs, CourseCosts):
         return costs_of_courses(costs, states)
     if isinstance(costs, ScaledCosts):
         return costs_at_scaled(costs, states)
@@ -240,7 +240,7 @@ def agrees(problem: Problem, fix: Fix, costs: Costs) -> Array:
         N problems within the scope of the proof.
     fix : Fix
         Their fixes.
-    costs : PositionCosts, Runs or Courses
+    costs : PositionCosts, Runs or CourseCosts
         Their costs over the position, equalities apart.
     """
     places = _places(problem, fix)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from formulations.range_enclosure import Box, Ranged, ball, enclosure
+from formulations.range_enclosure import EnclosingBox, Ranged, ball, enclosure
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
@@ -223,5 +223,5 @@ def _scaled(found: Ranges, i: int, nodes: Array, station: Array, size: float) ->
     return Ranged(station, sign, offset, covariance / size**2, bool(found.sign[i].any()))
 
 
-def _region(own: Ranged, region: float | None, size: float) -> Box | None:
+def _region(own: Ranged, region: float | None, size: float) -> EnclosingBox | None:
     return None if region is None else ball(own, np.zeros(own.station.shape[1]), region / size)

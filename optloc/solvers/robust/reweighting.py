@@ -150,7 +150,7 @@ def fold_signs(loss: Loss, u: Array, sided: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Minima:
+class LossMinima:
     """Where reweighting ended, for M starts.
 
     Parameters
@@ -180,7 +180,7 @@ def reweight(
     limit: int = 50,
     tolerance: float = _TOLERANCE,
     face: Face = (),
-) -> Minima:
+) -> LossMinima:
     """Return the minima of a robust cost next to starts.
 
     Least squares with the weights that the loss gives at the point before: for independent rows its cost touches the
@@ -237,7 +237,7 @@ def reweight(
         weight = weigh_by(loss, problem, doubt, x, weight)
         cost = robust_cost(loss, problem, doubt, x, weight)
     status[~np.isfinite(cost)] = Status.NUMERICAL
-    return Minima(x, np.where(np.isfinite(cost), cost, np.inf), status, weight)
+    return LossMinima(x, np.where(np.isfinite(cost), cost, np.inf), status, weight)
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,7 +190,7 @@ def rejected(problem: Problem, fix: Fix) -> Array:
     Parameters
     ----------
     problem : Problem
-        As it was solved; epochs that share nothing as a batch, see `optloc.by_epoch`.
+        As it was solved; epochs that share nothing as a batch, see `optloc.problem.by_epoch`.
     fix : Fix
         Of a robust method.
     """

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from formulations.bearing_course import Courses, sight_courses
+from formulations.bearing_course import BearingCourses, sight_courses
 from formulations.bearing_ls import rays, sight
 from formulations.bistatic import course, triad
 from optloc.base.linalg import centre_and_spread
@@ -102,7 +102,7 @@ def instrumental(seen: Bearings) -> Array:
     return seen.metres(np.where(found.ok[:, None], found.instrumental, np.nan))[:, None]
 
 
-def courses(problem: Problem) -> Courses | None:
+def courses(problem: Problem) -> BearingCourses | None:
     """Return the pseudo-linear courses of a flat batch of runs, or None where its rows are not all angles.
 
     Parameters
@@ -112,7 +112,7 @@ def courses(problem: Problem) -> Courses | None:
 
     Returns
     -------
-    Courses
+    BearingCourses
         In metres and seconds since the time at which the target's state holds.
     """
     if any(rows.kind not in ("azimuth", "elevation") for rows in problem.rows):
@@ -139,7 +139,9 @@ def courses(problem: Problem) -> Courses | None:
         out[:, 0] += seen.centre
         return out
 
-    return Courses(metres(found.plain), metres(found.weighted), metres(found.instrumental), found.ok, found.ahead)
+    return BearingCourses(
+        metres(found.plain), metres(found.weighted), metres(found.instrumental), found.ok, found.ahead
+    )
 
 
 def course_states(problem: Problem) -> Array | None:

@@ -8,7 +8,7 @@ from optloc.base.types import Array, Band
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import is_exact
 from optloc.problem.problem import Problem
-from optloc.proof.best_first import Places, find_minima
+from optloc.proof.best_first import FoundPlaces, find_minima
 from optloc.proof.position_costs import position_costs
 from optloc.proof.runs.run_costs import few_costs
 from optloc.proof.scope import is_run
@@ -41,7 +41,7 @@ def best_first_starts(problem: Problem) -> Array:
     region = centre[:, None] + _SPREADS * spread[:, None, None] * np.array([[-1.0], [1.0]])
     x = _on_planes(problem, np.broadcast_to(centre, (size, d)))
     planes, surface = surfaces_of(problem, x)
-    places = Places(x, np.broadcast_to(region, (size, 2, d)), planes, surface)
+    places = FoundPlaces(x, np.broadcast_to(region, (size, 2, d)), planes, surface)
     budget = _BUDGET if enabled() else _SLOW_BUDGET
     if not is_run(problem):
         return find_minima(position_costs(problem), places, LISTED_GAP, budget, _MOST)[0]
@@ -51,9 +51,9 @@ def best_first_starts(problem: Problem) -> Array:
     return np.concatenate(each)
 
 
-def _place(places: Places, i: int) -> Places:
+def _place(places: FoundPlaces, i: int) -> FoundPlaces:
     """Return the places of one problem as a batch."""
-    return Places(*(array[i : i + 1] for array in places))
+    return FoundPlaces(*(array[i : i + 1] for array in places))
 
 
 def _on_planes(problem: Problem, x: Array) -> Array:

@@ -63,7 +63,7 @@ def doppler_starts(problem: Problem) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _DopplerNotes:
     """The rows that the relaxation takes, of all problems of a batch: numbers (m,) or (N, m) of each.
 
     Parameters
@@ -89,12 +89,12 @@ class _Told:
     ranges: Array
     design: Array
 
-    def take(self, index: Array) -> _Told:
+    def take(self, index: Array) -> _DopplerNotes:
         """Return some of the rows."""
-        return _Told(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return _DopplerNotes(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-def _gather(problem: Problem) -> _Told:
+def _gather(problem: Problem) -> _DopplerNotes:
     shared, parts = problem.layout.n_shared, list(_parts(problem))
     row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
     design = np.zeros((problem.count, shared))
@@ -102,7 +102,7 @@ def _gather(problem: Problem) -> _Told:
         mine = links.adds.column < shared
         np.add.at(design, (start + links.adds.row[mine], links.adds.column[mine]), links.adds.coefficient[mine])
     _, group = np.unique(np.stack([kind, a, b]), axis=1, return_inverse=True)
-    return _Told(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
+    return _DopplerNotes(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
 
 
 def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
@@ -129,7 +129,7 @@ def _ranges(rows: Rows) -> tuple[int, int]:
     return (0, 0) if model.ranges is None or model.emission else model.ranges
 
 
-def _start(problem: Problem, i: int, every: _Told, surface: Ellipsoid | None) -> Array:
+def _start(problem: Problem, i: int, every: _DopplerNotes, surface: Ellipsoid | None) -> Array:
     """Return the points (1 + 2 d, d) of one problem."""
     one = problem.take(np.array([i]))
     z, weight = one.observed[0, every.row], np.broadcast_to(one.weight, (1, one.count))[0, every.row]
@@ -154,7 +154,7 @@ def _start(problem: Problem, i: int, every: _Told, surface: Ellipsoid | None) ->
     return found if surface is None else problem.frame.from_ecef(found)
 
 
-def _few(problem: Problem, told: _Told, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
+def _few(problem: Problem, told: _DopplerNotes, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
     """Return the rows that are used, their values, and standard deviations where they stand for several."""
     if _size(problem, told) <= SIZE:
         return np.arange(len(z)), z, None
@@ -172,12 +172,12 @@ def _few(problem: Problem, told: _Told, z: Array, weight: Array) -> tuple[Array,
     return normal_points(time, z, sigma, cut[:: next(steps, len(cut))])
 
 
-def _size(problem: Problem, told: _Told) -> int:
+def _size(problem: Problem, told: _DopplerNotes) -> int:
     _, ranges, rates = _nodes(problem, told)
     return lifted_size(problem.dimension, ranges, rates, told.design[:, told.design.any(axis=0)])
 
 
-def _nodes(problem: Problem, told: _Told) -> tuple[Array, Array, Array]:
+def _nodes(problem: Problem, told: _DopplerNotes) -> tuple[Array, Array, Array]:
     """Return the nodes (M, 2) of rows, epoch and station each, and what rows add up of their ranges and rates."""
     stations = problem.stations
     assert stations.velocity is not None

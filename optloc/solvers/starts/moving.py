@@ -77,7 +77,7 @@ def _search(costs: PositionCosts, d: int) -> Array:
             return np.empty((0, d))
         middle, radius = cube(kinds, data, np.zeros(d))
         atlas = atlas_of(middle, radius, d, 0)
-        rows, nodes, centre = _Rows(K, w, data, kinds == RATE), np.zeros((len(kinds), NODE_WIDTH)), np.empty(d)
+        rows, nodes, centre = _MovingRows(K, w, data, kinds == RATE), np.zeros((len(kinds), NODE_WIDTH)), np.empty(d)
         queue = [(0.0, piece, *_whole(piece, d)) for piece in range(2 * d + 1)]
         heapify(queue)
         met: list[tuple[float, tuple[float, ...]]] = []
@@ -116,7 +116,7 @@ def _apart(met: list[tuple[float, tuple[float, ...]]], middle: Array) -> Array:
     return np.array(out).reshape(-1, len(middle))
 
 
-class _Rows:
+class _MovingRows:
     """Whitened rows, and what they say over a box of an atlas when the velocity is the best one for its centre."""
 
     def __init__(self, K: Array, w: Array, data: Array, rates: Array) -> None:

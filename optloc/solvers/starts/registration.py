@@ -8,7 +8,7 @@ from math import factorial
 
 import numpy as np
 
-from formulations.registration import Course, candidates
+from formulations.registration import RegistrationCourse, candidates
 from optloc.base import linalg
 from optloc.base.types import Array, Bias, Status
 from optloc.kernels.least_squares import refine
@@ -377,12 +377,12 @@ _LOOSE = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class RegistrationRun:
     """The range offsets of a run in units of its own size.
 
     Parameters
     ----------
-    course : Course
+    course : RegistrationCourse
         N problems.
     column : int array (q,)
         Shared unknown of each bias.
@@ -392,7 +392,7 @@ class Run:
         Units, metres and seconds.
     """
 
-    course: Course
+    course: RegistrationCourse
     column: Array
     origin: Array
     length: float
@@ -414,7 +414,7 @@ def closed_form(problem: Problem) -> Array | None:
     return place_states(problem, run, state, np.repeat(bias[:, None], state.shape[1], axis=1))
 
 
-def place_states(problem: Problem, run: Run, state: Array, bias: Array) -> Array:
+def place_states(problem: Problem, run: RegistrationRun, state: Array, bias: Array) -> Array:
     """Return vectors (N, C, size) of states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
     state = state * (run.length / run.duration ** np.arange(state.shape[2])[:, None])
     state[:, :, 0] += run.origin
@@ -426,7 +426,7 @@ def place_states(problem: Problem, run: Run, state: Array, bias: Array) -> Array
     return x
 
 
-def run_of(problem: Problem) -> Run | None:
+def run_of(problem: Problem) -> RegistrationRun | None:
     """Return the range offsets of a flat batch of runs; None where no epoch has any."""
     found = ranges(split_epochs(problem).flat())
     if found is None or not (found.free & (found.inside.sum(-1) > 1)).any():
@@ -443,7 +443,7 @@ def run_of(problem: Problem) -> Run | None:
     duration = float(np.abs(since).max()) or 1.0
     column, effect = _effects(problem, found)
     mean, sigma = _prior(problem, column)
-    course = Course(
+    course = RegistrationCourse(
         since / duration,
         (_places(problem, found.station[[reference, *others]]) - origin) / length,
         np.where(heard, found.offset[:, others], 0.0).reshape(size, epochs, -1) / length,
@@ -453,7 +453,7 @@ def run_of(problem: Problem) -> Run | None:
         mean / length,
         sigma / length,
     )
-    return Run(course, column, origin, length, duration)
+    return RegistrationRun(course, column, origin, length, duration)
 
 
 def split_epochs(problem: Problem) -> Problem:

@@ -13,7 +13,7 @@ from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
-from optloc.engine.lifts import Entry, Known, azimuths_beside, enter, pair_elevation
+from optloc.engine.lifts import KnownLift, LiftEntry, azimuths_beside, enter, pair_elevation
 from optloc.linear.least_squares_ranges import Ranges
 from optloc.models import MODELS, Point
 from optloc.problem.noise import variances
@@ -52,7 +52,7 @@ class Squared:
         Whitening matrix of the least-squares ranges, 1/metres.
     place : array (N, s, d)
         Scaled positions of the stations of `ranged`.
-    others : tuple of Lifted
+    others : tuple of LiftedRows
         Rows of other kinds.
     """
 
@@ -63,7 +63,7 @@ class Squared:
     ranged_right: Array
     whiten: Array
     place: Array
-    others: tuple[Lifted, ...]
+    others: tuple[LiftedRows, ...]
 
 
 def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
@@ -265,7 +265,7 @@ class Coordinates:
 
 
 @dataclass(frozen=True, slots=True)
-class Lifted:
+class LiftedRows:
     """Linear rows of one kind, ``row . y = right``.
 
     Parameters
@@ -286,7 +286,7 @@ class Lifted:
     factor: Factor
 
 
-def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to: Coordinates) -> Lifted | None:
+def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to: Coordinates) -> LiftedRows | None:
     """Return the linear rows of one kind, or None where it has none.
 
     Parameters
@@ -314,7 +314,7 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
         # without ranges the paired form is the only linear one; with some, only where every elevation has its azimuth
         paired = paired if found is None or bool(np.all(paired)) else None
     if paired is not None:
-        entry: Entry | None = pair_elevation(m, problem.observed[..., beside], a)
+        entry: LiftEntry | None = pair_elevation(m, problem.observed[..., beside], a)
     else:
         known = None if found is None else _known(found, rows, to)
         entry = enter(model, m, a, b, known)
@@ -335,7 +335,7 @@ def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to
             return np.ones(1)
         return np.asarray(entry.factor(Point(tuple(point[:, None, c] for c in range(point.shape[-1])))))
 
-    return Lifted(np.where(present[..., None], row, 0.0), np.where(present, right, 0.0), sigma, factor)
+    return LiftedRows(np.where(present[..., None], row, 0.0), np.where(present, right, 0.0), sigma, factor)
 
 
 def _wide(parts: list[Any], size: int, count: int) -> Array:
@@ -356,20 +356,20 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
     return Point(components, None, tuple(tuple(axes[..., i, c] for c in d) for i in d))
 
 
-def _stays_unknown(entry: Entry, known: tuple[Known, Known]) -> bool:
+def _stays_unknown(entry: LiftEntry, known: tuple[KnownLift, KnownLift]) -> bool:
     """Return whether a row has a range that is not known, nor up to the common unknown."""
     lost = np.isnan(known[0].sign) | np.isnan(known[1].sign)
     return bool((np.isnan(entry.last) & lost).any())
 
 
-def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[Known, Known]:
+def _known(found: Ranges, rows: Rows, to: Coordinates) -> tuple[KnownLift, KnownLift]:
     """Return the ranges of both ends of rows, scaled; NaN where one stays unknown."""
     both = []
     for index in (rows.a, rows.b):
         node = np.array([_node(found, int(s), int(e)) for s, e in zip(index, rows.epoch, strict=True)])
         offset = np.where(node >= 0, found.offset[:, node], np.nan) / to.scale[:, None]
         # on the paraboloid ranges are known (sign 0), and the last coordinate is no range
-        both.append(Known(offset, np.where(node >= 0, found.sign[:, node] * to.on_cone, np.nan)))
+        both.append(KnownLift(offset, np.where(node >= 0, found.sign[:, node] * to.on_cone, np.nan)))
     return both[0], both[1]
 
 

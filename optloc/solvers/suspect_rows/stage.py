@@ -318,12 +318,12 @@ def _with_grown(alike: Alike, doubted: _Doubted, outcomes: list[Outcome]) -> lis
 def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome]) -> Array:
     """Return what is concluded of problems (N,) in which the same rows are present, None where nothing is."""
     arrivals, out = as_arrivals(problem), fill(len(outcomes), None)
-    cases: list[Case] = []
+    cases: list[SuspectCase] = []
     chosen: dict[int, Rest] = {}
     for i, outcome in enumerate(outcomes):
         item = np.array([i])
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(item))
-        cases.append(Case(problem.take(item), one, groups, fix[i]))
+        cases.append(SuspectCase(problem.take(item), one, groups, fix[i]))
         if not outcome.rests:
             out[i] = _unexplained(cases[i], outcome)
         elif (best := _best_rest(cases[i], outcome)) is not None:
@@ -370,7 +370,7 @@ def _grow(alike: Alike, i: int, doubted: _Doubted, start: Rest | None) -> Outcom
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class SuspectCase:
     """A problem whose data contradict each other, and in which form it was looked at.
 
     Parameters
@@ -407,7 +407,7 @@ class Case:
         return tuple(sorted({int(i) for row in group.rows for i in self.arrivals.origin[row]}))
 
 
-def _unexplained(case: Case, outcome: Outcome) -> Conclusion | None:
+def _unexplained(case: SuspectCase, outcome: Outcome) -> Conclusion | None:
     """Return the conclusion of a problem that nothing explains; None where the fix of all data is kept."""
     # no set was tried and nothing stood out: a run whose noise is larger than stated keeps its fix
     if case.whole.answered and set(outcome.p_value) == {()} and not outcome.note:
@@ -415,7 +415,7 @@ def _unexplained(case: Case, outcome: Outcome) -> Conclusion | None:
     return Conclusion((), case.whole, case.whole.alternatives, tried=_name_closest(case, outcome))
 
 
-def _best_rest(case: Case, outcome: Outcome) -> Rest | None:
+def _best_rest(case: SuspectCase, outcome: Outcome) -> Rest | None:
     """Return the rest that explains a problem best, to be proven; None where the fix of all data is kept."""
     best, *others = outcome.rests
     if not best.left and all(_same_place(best.fix, rest.fix) for rest in others):
@@ -423,7 +423,7 @@ def _best_rest(case: Case, outcome: Outcome) -> Rest | None:
     return best
 
 
-def _explained(case: Case, outcome: Outcome, rests: Sequence[Rest], told: Sequence[_Told]) -> Conclusion:
+def _explained(case: SuspectCase, outcome: Outcome, rests: Sequence[Rest], told: Sequence[_Told]) -> Conclusion:
     """Return the conclusion of a problem of which the first rest is proven, with the errors of each rest."""
     (best, *_), (first, *others) = rests, outcome.rests
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
@@ -450,7 +450,7 @@ def _same_place(best: Fix, other: Fix) -> bool:
     return bool(regular) and float(step @ inverse @ step) <= quantile(COVERED, len(step))
 
 
-def _in_layout(case: Case, fix: Fix) -> Fix:
+def _in_layout(case: SuspectCase, fix: Fix) -> Fix:
     """Return a fix with the shared unknowns of the given problem alone."""
     layout = case.problem.layout
     if fix.layout == layout:
@@ -463,7 +463,7 @@ def _in_layout(case: Case, fix: Fix) -> Fix:
     )
 
 
-def _name_closest(case: Case, outcome: Outcome) -> str:
+def _name_closest(case: SuspectCase, outcome: Outcome) -> str:
     """Return what came closest to an explanation, in words."""
     tested = {left: p for left, p in outcome.p_value.items() if left and np.isfinite(p)}
     if not tested:
@@ -474,7 +474,7 @@ def _name_closest(case: Case, outcome: Outcome) -> str:
     return reason + (f"; {outcome.note}" if outcome.note else "")
 
 
-def _explanation(case: Case, rest: Rest, outcome: Outcome, told: _Told) -> Explanation:
+def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, told: _Told) -> Explanation:
     fix = rest.fix
     p_without = float(fix.p_value)
     # Errors of compass bearings are reported in the sense of the readings.
@@ -533,7 +533,7 @@ def _p_with(fix: Fix, error: Error | None) -> float:
     return float(gammaincc((int(fix.dof) + error.dof) / 2, (float(fix.cost) + error.statistic) / 2))
 
 
-def _alternatives(case: Case, best: Rest, elsewhere: Sequence[Rest]) -> Alternatives:
+def _alternatives(case: SuspectCase, best: Rest, elsewhere: Sequence[Rest]) -> Alternatives:
     """Return the other positions of the best explanation and those of the others, by score, cheapest first."""
     first = best.fix
     x = [case.vector(first, first.alternatives.x), *(case.vector(rest.fix)[None] for rest in elsewhere)]

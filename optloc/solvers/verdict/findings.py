@@ -41,7 +41,8 @@ BENT_SENTENCE = {
 }
 """Sentences on a fix that is `curved`, by the kind of its chart."""
 BOTH_SIDES = (
-    "the stations lie in a plane, and the target is on either side or in it: `optloc.distance_from_plane` says how far"
+    "the stations lie in a plane, and the target is on either side or in it: "
+    "`optloc.model_checks.distance_from_plane` says how far"
 )
 """Sentence on a fix whose two mirror images are one region."""
 _ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros

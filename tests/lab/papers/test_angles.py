@@ -144,7 +144,7 @@ def test_many_rays_need_instrumental_variables_and_few_do_not():
     assert best == pytest.approx(many.bound, rel=0.10)
 
 
-TINY = angles_tables.Sample(8, 12, 3, 1)
+TINY = angles_tables.AnglesSample(8, 12, 3, 1)
 
 
 @pytest.fixture(scope="module")

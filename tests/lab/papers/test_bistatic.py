@@ -92,7 +92,7 @@ def test_a_ground_repairs_the_height_only():
     assert found["known height"][1] < 1e-3
 
 
-TINY = bistatic.Sample(20, 4, 4, epochs=60)
+TINY = bistatic.BistaticSample(20, 4, 4, epochs=60)
 
 
 @pytest.fixture(scope="module")

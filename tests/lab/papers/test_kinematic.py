@@ -14,7 +14,7 @@ from optloc.lab.papers.kinematic import (
     FILTERS,
     ORDERS,
     PLAIN,
-    Scenario,
+    KinematicScenario,
     association,
     baseline,
     batch,
@@ -37,7 +37,7 @@ from optloc.problem.epochs import cut
 from optloc.show.sheet import ABSENT
 
 RUN = CliRunner()
-SCENE = Scenario()
+SCENE = KinematicScenario()
 KM = 1e-3
 
 
@@ -245,7 +245,7 @@ def test_the_course_of_a_target_that_begins_to_accelerate():
     assert end == pytest.approx([300e3, 400e3 + 45e3 - 0.5 * 100.0 * 22.5**2, 0.0, 1e3 - 2250.0, 0.0, -100.0])
 
 
-TINY = kinematic_tables.Sample(6, 3)
+TINY = kinematic_tables.KinematicSample(6, 3)
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from optloc import by_epoch, simulate, solve
+from optloc import simulate, solve
 from optloc.lab.papers import angles, bistatic, kinematic, registration, satellites
+from optloc.problem import by_epoch
 
 METHODS = ("sdp+lsr", "socp+lsr", "gtrs+nlp+lsr")
 TRIALS = {"registration": 1, "registration, prior": 1}
@@ -45,7 +46,7 @@ def test_every_way_ends_at_the_minimum_of_auto(name):
 
 def test_every_way_ends_at_the_minimum_of_auto_along_a_course():
     """The kinematic paper: a target that stands anew at each epoch."""
-    scene = kinematic.Scenario()
+    scene = kinematic.KinematicScenario()
     drawn = by_epoch(kinematic.draw(scene, scene.course(1), 1, (5,)).runs).flat().take(np.arange(0, 60, 15))
     best = solve(drawn, "auto")
     for method in METHODS:

@@ -9,8 +9,9 @@ from often import few
 from typer.testing import CliRunner
 from verdicts import alone
 
-from optloc import crlb, linearise, simulate, solve
+from optloc import crlb, simulate, solve
 from optloc.cli import app
+from optloc.engine import linearise
 from optloc.files import read
 from optloc.lab.papers import registration, registration_tables
 from optloc.lab.papers.registration import (
@@ -18,7 +19,7 @@ from optloc.lab.papers.registration import (
     NANOSECOND,
     PRINTED,
     SPATIAL,
-    Setting,
+    RegistrationSetting,
     branch,
     ghost,
     mirror,
@@ -137,20 +138,20 @@ def test_the_image_of_a_moving_target_explains_all_data_exactly():
 
 
 def test_both_places_of_a_moving_target_are_listed_and_a_spatial_array_has_one():
-    fix = solve(Setting(MOVING, 10, 1, 1).draw(600))
+    fix = solve(RegistrationSetting(MOVING, 10, 1, 1).draw(600))
     image = mirror(MOVING)[0]
     for place in (MOVING.target, image):
         apart = np.linalg.norm(np.concatenate([fix.x[:, None], fix.alternatives.x], 1)[..., :3] - place, axis=-1)
         assert (np.nanmin(apart, axis=1) < 3e3).all()
     flying = replace(SPATIAL, target=MOVING.target, course=MOVING.course)
-    single = solve(Setting(flying, 10, 1, 1).draw(600))
+    single = solve(RegistrationSetting(flying, 10, 1, 1).draw(600))
     assert alone(single).all()
     assert not score(single.x, truth(flying, problem(flying, 1)), bound(flying, 600)).lost.any()
 
 
 @pytest.mark.parametrize("scenario", [PRINTED, MOVING, SPATIAL])
 def test_a_step_of_the_recursion_solves_the_normal_equations(scenario):
-    setting, k = Setting(scenario, 4, 1, 1), 400
+    setting, k = RegistrationSetting(scenario, 4, 1, 1), 400
     drawn, start = setting.draw(k), setting.starts(1.0)
     arrivals = np.concatenate([np.zeros((4, k, 1)), drawn.z.reshape(4, k, 4)], axis=-1).swapaxes(1, 2)
     move, bias = step(start, arrivals, scenario.track(k).T, scenario.times(k))
@@ -165,7 +166,7 @@ def test_a_step_of_the_recursion_solves_the_normal_equations(scenario):
 def test_a_step_of_the_joint_recursion_solves_the_normal_equations(sizes):
     """With ratios a thousand times better than printed too, where station errors tie both kinds."""
     arrival, gain, size = sizes
-    setting, k = Setting(SPATIAL, 4, 1, 1, arrival, size, gain), 300
+    setting, k = RegistrationSetting(SPATIAL, 4, 1, 1, arrival, size, gain), 300
     drawn, start = setting.draw(k), setting.starts(1.0)
     measured = np.concatenate([rows.z.reshape(4, k, 4) for rows in drawn.rows], axis=-1)
     weight = joint_weights(start, SPATIAL.track(k), sizes)
@@ -180,7 +181,7 @@ def test_a_step_of_the_joint_recursion_solves_the_normal_equations(sizes):
 @pytest.mark.parametrize("gain", few([None, 0.03], 1))
 def test_the_recursion_meets_the_bound_from_a_good_start(gain):
     trials = 60 if gain is None else 20
-    setting = Setting(PRINTED, trials, 1, 1, gain_sigma=gain)
+    setting = RegistrationSetting(PRINTED, trials, 1, 1, gain_sigma=gain)
     drawn = setting.draw(300)
     bounds = [setting.bound(k) for k in (200, 300)]
     size = 7 if gain is None else 11
@@ -204,7 +205,7 @@ def test_what_runs_away_stays_lost():
 
 
 def divergence(count, seed):
-    setting = Setting(PRINTED, count, seed, 5)
+    setting = RegistrationSetting(PRINTED, count, seed, 5)
     drawn, limit = setting.draw(600), setting.bound(600)
     (plain,) = wander(setting, drawn, (600,), (limit,), width=20.0)
     # Without the proof, which takes seconds a run and has tests of its own.
@@ -233,7 +234,7 @@ def test_accuracies_and_cells():
 
 
 def test_the_nearest_branch_is_scored():
-    fix = solve(Setting(MOVING, 3, 2, 2).draw(500))
+    fix = solve(RegistrationSetting(MOVING, 3, 2, 2).draw(500))
     exact = truth(MOVING, problem(MOVING, 1))
     assert (np.linalg.norm(branch(fix, exact)[:, :3] - exact[:3], axis=1) < 10e3).all()
 
@@ -250,7 +251,7 @@ def test_the_shipped_problem_is_made_by_its_script_and_solved():
     assert 1e-3 < fix.p_value < 0.999
 
 
-TINY = registration_tables.Sample(4, 6, (150, 200, 300, 400), (300, 400, 550, 700), last=150)
+TINY = registration_tables.RegistrationSample(4, 6, (150, 200, 300, 400), (300, 400, 550, 700), last=150)
 
 
 @pytest.fixture(scope="module")
@@ -301,7 +302,7 @@ def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
 
 
 def test_draws_depend_on_seed_and_key_alone():
-    one, same, seed, key = (Setting(PRINTED, 2, *at).draw(50).z for at in ((1, 1), (1, 1), (2, 1), (1, 2)))
+    one, same, seed, key = (RegistrationSetting(PRINTED, 2, *at).draw(50).z for at in ((1, 1), (1, 1), (2, 1), (1, 2)))
     assert (one == same).all()
     assert abs(one - seed).max() > 1.0
     assert abs(one - key).max() > 1.0

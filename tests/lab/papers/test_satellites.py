@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import ECEF, crlb, predict
+from optloc import crlb
 from optloc.cli import app
+from optloc.engine import predict
 from optloc.lab.papers import satellites
 from optloc.lab.papers.report import Study
 from optloc.lab.papers.satellites import (
@@ -24,6 +25,7 @@ from optloc.lab.papers.satellites import (
     surface_course,
     truth,
 )
+from optloc.problem import ECEF
 
 RUN = CliRunner()
 
@@ -112,7 +114,7 @@ def test_orbits_keep_the_formation_and_its_height():
     assert np.arctan2(step @ east, step @ north) == pytest.approx(0.7, abs=1e-2)
 
 
-TINY = satellites.Sample(4, 4, (100e3,), steps=20, far=12)
+TINY = satellites.SatellitesSample(4, 4, (100e3,), steps=20, far=12)
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,9 @@ import pytest
 from lab.study.texts import design
 from scipy.spatial import Delaunay
 
-from optloc import MODELS, predict
+from optloc.engine import predict
 from optloc.lab.study.draws import block_size, draw
+from optloc.models import MODELS
 
 HEAD = 'format = 1\nname = "x"\nseed = 3\ntrials = 2000\n[[method]]\nmethod = "gtrs+lsr"\n[[scenario]]\nname = "s"\n'
 

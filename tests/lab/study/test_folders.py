@@ -28,7 +28,7 @@ from optloc.lab.study.folder import (
     swept,
 )
 from optloc.lab.study.summary import compared
-from optloc.lab.study.trial import Part, compute
+from optloc.lab.study.trial import TrialPart, compute
 
 HERE = executor("processes", 1)
 
@@ -74,7 +74,7 @@ def damage(path, how):
     elif how == "no name":
         path.with_name(f"{path.name.partition('.')[0]}.parquet").write_bytes(content)
     elif how == "few rows":
-        store(path.parent.parent, Part(path.name.partition(".")[0], table.slice(1), {}))
+        store(path.parent.parent, TrialPart(path.name.partition(".")[0], table.slice(1), {}))
 
 
 @pytest.mark.slow
@@ -228,7 +228,7 @@ def test_parts_that_contradict_each_other_are_refused(whole, tmp_path):
     other = pa.array(["0123456789abcdef"] * len(table)).dictionary_encode()
     part.unlink()
     key = part.name.partition(".")[0]
-    store(out, Part(key, table.set_column(column, table.schema.field(column), other), {}))
+    store(out, TrialPart(key, table.set_column(column, table.schema.field(column), other), {}))
     with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
         run_design(design(QUICK), out, HERE)
 

@@ -5,7 +5,7 @@ import pytest
 from lab.study.texts import QUICK, design
 
 from optloc.base.types import Status
-from optloc.lab.papers.registration import PRINTED, Setting
+from optloc.lab.papers.registration import PRINTED, RegistrationSetting
 from optloc.lab.papers.registration_recursion import recursion as printed
 from optloc.lab.study.baselines import BASELINES, recursion, single_step
 from optloc.lab.study.draws import draw
@@ -16,7 +16,7 @@ from optloc.solvers.verdict.judge import judge
 
 
 def test_the_recursion_is_that_of_the_paper():
-    setting = Setting(PRINTED, 3, 1, 1)
+    setting = RegistrationSetting(PRINTED, 3, 1, 1)
     run, start = setting.draw(120), setting.starts(1.0)
     wanted = printed(PRINTED.track(120), PRINTED.times(120), run.z.reshape(3, 120, 4), start)[:, -1]
     found = recursion(run, np.concatenate([start, np.zeros((3, 4))], axis=1))

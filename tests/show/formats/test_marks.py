@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from show.ranging import ENU, ranged
 
-from optloc import ECEF, InvalidProblem
+from optloc import InvalidProblem
 from optloc.base.frames import CARTESIAN
+from optloc.problem import ECEF
 from optloc.show.columns import fix_columns
 from optloc.show.formats.marks import Results, ellipse, geojson, mark_of, need_earth
 

@@ -72,7 +72,7 @@ def rates(position, velocity, truth, frame, sigma):
     count, d = len(position), len(truth)
     rows = optloc.measured("fdoa", a=np.zeros(count, int), b=np.ones(count, int), epoch=np.arange(count), sigma=0.1)
     stations = optloc.station_array(position, ("one", "two"), velocity=velocity)
-    near = (optloc.Prior("position", np.array(truth), sigma**2 * np.eye(d)),)
+    near = (optloc.problem.Prior("position", np.array(truth), sigma**2 * np.eye(d)),)
     options = {"times": np.arange(count), "motions": (optloc.Motion(),), "frame": frame, "priors": near}
     problem = optloc.simulate(optloc.assemble(stations, rows, **options), truth=truth, seed=1)
     return problem, solve(problem)
@@ -81,7 +81,7 @@ def rates(position, velocity, truth, frame, sigma):
 def pair():
     velocity = np.array([[100.0, 20.0], [90.0, -30.0]])
     position = np.array([[0.0, 0.0], [6e3, 1e3]]) + 2.0 * np.arange(40)[:, None, None] * velocity
-    return rates(position, np.broadcast_to(velocity, position.shape), [12e3, 15e3], optloc.CARTESIAN, 3e3)
+    return rates(position, np.broadcast_to(velocity, position.shape), [12e3, 15e3], optloc.problem.CARTESIAN, 3e3)
 
 
 def orbit():
@@ -133,11 +133,13 @@ def test_isodopplers_go_through_the_fix_with_its_rate(scene):
     assert {name for name, _ in lines} == {"fdoa one – two, as at the fix"}
     assert len(lines) >= 9
     picked = np.linspace(0, problem.count - 1, 9).astype(int)
-    level = optloc.predict(problem, fix.x)[picked]
+    level = optloc.engine.predict(problem, fix.x)[picked]
     for _, line in lines:
-        values = optloc.predict(problem, place(line))[:, picked]
+        values = optloc.engine.predict(problem, place(line))[:, picked]
         # one of the rows has the same rate all along
-        assert np.abs(values - level).max(axis=0).min() < 2e-3 * np.ptp(optloc.predict(problem, place(grid))[:, picked])
+        assert np.abs(values - level).max(axis=0).min() < 2e-3 * np.ptp(
+            optloc.engine.predict(problem, place(grid))[:, picked]
+        )
     assert sum(np.linalg.norm(line - at, axis=1).min() < close for _, line in lines) >= 9
 
 
@@ -151,12 +153,12 @@ def measured_in_the_plane(kind, absent=()):
     """Return a problem in the plane whose rows are off by some sigmas, and its fix."""
     stations = optloc.station_array(np.array([[0.0, 0.0], [900.0, 100.0], [700.0, 800.0], [-100.0, 600.0]]), "ABCD")
     a, b = np.arange(4), np.array([1, 2, 3, 0])
-    pair = {"b": b} if optloc.MODELS[kind].stations > 1 else {}
+    pair = {"b": b} if optloc.models.MODELS[kind].stations > 1 else {}
     weight = {"weight": np.where(np.isin(a, absent), 0.0, 1.0)}
     sigma = 0.01 if kind in {"azimuth", "groa"} else 10.0
     empty = optloc.assemble(stations, optloc.measured(kind, None, a=a, **pair, sigma=sigma, **weight))
     truth = np.append([300.0, 420.0], [50.0] * (empty.layout.size - 2))
-    z = optloc.predict(empty, truth) + sigma * np.array([1.0, -0.5, 0.3, 0.8])
+    z = optloc.engine.predict(empty, truth) + sigma * np.array([1.0, -0.5, 0.3, 0.8])
     problem = optloc.assemble(stations, optloc.measured(kind, z, a=a, **pair, sigma=sigma, **weight))
     return problem, solve(problem)
 
@@ -175,7 +177,7 @@ def test_lines_of_position_are_where_a_row_is_what_was_measured(kind):
     for one in lines:
         row = "ABC".index(one.name[0])
         vectors = np.concatenate([one.line, np.tile(np.asarray(fix.x)[2:], (len(one.line), 1))], axis=-1)
-        off = optloc.predict(problem, vectors) - problem.z
+        off = optloc.engine.predict(problem, vectors) - problem.z
         off = off[:, row] - (off[:, first] if kind == "toa" else 0.0)
         # bearings are steep beside their stations, where the grid is coarse for them
         far = np.linalg.norm(one.line - problem.stations.position[0, row], axis=-1) > 100.0

@@ -28,7 +28,7 @@ RUN = CliRunner()
 @cache
 def solved(name):
     problem = optloc.load(DEMOS / f"{name}.toml")
-    problem = optloc.by_epoch(problem) if name == "run" else problem
+    problem = optloc.problem.by_epoch(problem) if name == "run" else problem
     return problem, optloc.solve(problem)
 
 

@@ -7,8 +7,9 @@ import pytest
 from scipy.stats import chi2
 from show.ranging import ENU, PLACES
 
-from optloc import ECEF, Motion, assemble, measured
-from optloc.show.pictures.track import Drawn, _along, _near, plot_tracks
+from optloc import Motion, assemble, measured
+from optloc.problem import ECEF
+from optloc.show.pictures.track import PlottedTrack, _along, _near, plot_tracks
 
 
 def drawn(frame=ENU, places=PLACES, origin=None):
@@ -21,7 +22,7 @@ def drawn(frame=ENU, places=PLACES, origin=None):
         mean = np.concatenate([(np.zeros(d) if origin is None else origin) + 100.0 * k * np.eye(d)[0], np.zeros(d)])
         updated = SimpleNamespace(mean=mean, cov=np.diag(np.full(2 * d, 4.0)), nis=np.float64(3.0), count=4)
         entries.append(SimpleNamespace(time=float(k), updated=updated, event="started" if k == 0 else "", code=code))
-    return Drawn("target", problem, tuple(entries))
+    return PlottedTrack("target", problem, tuple(entries))
 
 
 def test_a_picture_has_the_path_its_doubts_and_the_limit_of_the_nis():

@@ -6,7 +6,7 @@ import numpy as np
 
 from formulations.placement import Design
 from optloc import assemble, measured
-from optloc.sites.placement.best_set import Task
+from optloc.sites.placement.best_set import SearchTask
 
 CRITERIA = ("A", "D", "E")
 CASES = [(criterion, worst, fail) for criterion in CRITERIA for worst in (False, True) for fail in (False, True)]
@@ -35,7 +35,7 @@ def task(seed, n, k, places, criterion="A", worst=False, fail=False, rules=None,
     """Return the choice of k of n sites, or by other rules."""
     rules = np.ones((1, n)) if rules is None else rules
     limits = np.array([float(k)]) if limits is None else limits
-    return Task(design(seed, n, places), criterion, worst, fail, rules, limits, np.full(n, -1))
+    return SearchTask(design(seed, n, places), criterion, worst, fail, rules, limits, np.full(n, -1))
 
 
 def every_set(n, k):

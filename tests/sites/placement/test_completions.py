@@ -7,7 +7,7 @@ import pytest
 from sites.placement.scenes import CASES, every_set, task
 
 from optloc.sites.placement.best_set import _exhausted, exchanged, random_sets
-from optloc.sites.placement.completions import Asked
+from optloc.sites.placement.completions import CompletionRequest
 
 ALL = np.array(np.meshgrid(*[[0, 1]] * 9)).reshape(9, -1).T
 
@@ -92,6 +92,6 @@ def test_no_exchange_improves_what_was_exchanged(seed):
 def test_a_last_site_that_is_not_lost_would_be_seen():
     """The pruning of pairs rests on the loss of the last: without losses, few of the sets that it drops are bad."""
     one = task(3, 10, 5, 3, fail=True)
-    spared = Asked(*one.asked()[:7], 0, *one.asked()[8:])
+    spared = CompletionRequest(*one.asked()[:7], 0, *one.asked()[8:])
     sets = every_set(10, 5)
     assert _exhausted(spared, np.full(10, -1), np.zeros(10), np.inf)[0] < 0.95 * one.score(sets).min()

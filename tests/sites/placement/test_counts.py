@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, assemble, measured, place
-from optloc.sites.placement.sites import Group, SiteSelection
+from optloc.sites.placement.sites import CountGroup, SiteSelection
 
 SITES = 8
 
@@ -18,11 +18,11 @@ def selection(seed=0, kind="range", names=None, **asked):
 
 
 def at_most(count, *numbers):
-    return Group(tuple(f"S{i}" for i in numbers), most=count)
+    return CountGroup(tuple(f"S{i}" for i in numbers), most=count)
 
 
 def at_least(count, *numbers):
-    return Group(tuple(f"S{i}" for i in numbers), least=count)
+    return CountGroup(tuple(f"S{i}" for i in numbers), least=count)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from often import few
 from sites.placement.scenes import drawn, hall
 
 import optloc
-from formulations.placement import Ground, Region
-from optloc import InvalidProblem, SiteSelection, assemble, crlb, measured, place
-from optloc.sites.placement import Draws, Group, chosen as chosen_module
+from formulations.placement import PlacementGround, PlacementRegion
+from optloc import InvalidProblem, assemble, crlb, measured, place
+from optloc.sites.placement import CountGroup, Draws, SiteSelection, chosen as chosen_module
 from optloc.sites.placement.chosen import drawn as simulated
 from optloc.sites.placement.refinement import refined
 from optloc.sites.placement.sites import candidates_of
@@ -70,7 +70,7 @@ def test_differences_with_full_covariance_are_arrivals_for_each_reference():
 
 
 def test_kept_forbidden_and_groups_are_met_and_the_gap_is_as_asked():
-    groups = (Group(("S0", "S1", "S2", "S3"), most=1), Group(("S8", "S9", "S10"), least=2))
+    groups = (CountGroup(("S0", "S1", "S2", "S3"), most=1), CountGroup(("S8", "S9", "S10"), least=2))
     found = place(selection(kept=("S4",), forbidden=("S5",), groups=groups))
     assert found.kept == ("S4",)
     assert len(found.chosen) == 5
@@ -195,9 +195,9 @@ def test_a_set_whose_fixes_are_ambiguous_is_given_up_for_the_next(monkeypatch):
 def test_refinement_never_worsens_and_stays_inside(more, ground):
     asked = selection(n=8, places=3, **more)
     found = place(asked)
-    region = Region(EDGES, np.full(4, 30.0), 0.0, 6.0)
+    region = PlacementRegion(EDGES, np.full(4, 30.0), 0.0, 6.0)
     x = np.linspace(-40.0, 40.0, 7)
-    surface = Ground(x, x, np.add.outer(np.sin(x / 20), np.cos(x / 20))) if ground else None
+    surface = PlacementGround(x, x, np.add.outer(np.sin(x / 20), np.cos(x / 20))) if ground else None
     moved = refined(asked, found, [region], surface, starts=0)
     assert moved.refined.shape == (5, 3)
     assert all((region.excess(one, surface) <= 1e-5).all() for one in moved.refined)
@@ -217,7 +217,7 @@ BAD = {
     "unknown site": ({"kept": ("S99",)}, "there is no site 'S99'"),
     "kept and forbidden": ({"kept": ("S1",), "forbidden": ("S1",)}, "kept and forbidden"),
     "groups that contradict k": (
-        {"groups": (Group(tuple(f"S{i}" for i in range(12)), least=6),)},
+        {"groups": (CountGroup(tuple(f"S{i}" for i in range(12)), least=6),)},
         "the groups need 6 at least",
     ),
     "criterion": ({"criterion": "trace"}, "there is no criterion 'trace'"),

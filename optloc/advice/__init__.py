@@ -1,0 +1,12 @@
+"""Explanations of a fix that cannot be used as it is."""
+
+from typing import TYPE_CHECKING
+
+from optloc.base.faces import exported
+
+if TYPE_CHECKING:
+    from optloc.advice.diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
+    from optloc.model_checks.advice import advise as advise, explained as explained
+    from optloc.model_checks.geometry import Advice as Advice
+
+__getattr__, __dir__, __all__ = exported(__name__, __file__)

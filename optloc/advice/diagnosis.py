@@ -1,0 +1,135 @@
+"""All checks of a fix at once: advice, observability, reliability, and the health of stations over many fixes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Status
+from optloc.bounds.rank import Observability, observability
+from optloc.model_checks.advice import advise
+from optloc.model_checks.evidence import Reliability, reliability
+from optloc.model_checks.geometry import Advice
+from optloc.problem.epochs import separable
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.station_health.stations import Health, health
+
+# Fixes below which statistics of stations say little: with ten the sigma of a noise level is a quarter of it.
+_FEW = 10
+# Fixes of a batch that are advised on one by one: each takes some ten milliseconds.
+_ADVISED = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What the checks of a fix found; ``print`` shows it as sentences.
+
+    Parameters
+    ----------
+    status : tuple of str
+        The label of each status that occurs, with its number of fixes where there are several.
+    advice : tuple of Advice
+        What may be wrong and what would help. Of a batch: for the first twenty fixes that are not ``ok``, each once.
+    observability : Observability, optional
+        What data and priors determine. None for a batch, and where there is no fix.
+    reliability : Reliability, optional
+        The error of each station that goes unnoticed, and what it does. None for a batch, and where there is no fix.
+    health : Health, optional
+        Statistics of stations over the fixes. None below ten fixes, and where they do not check each other.
+    """
+
+    status: tuple[str, ...]
+    advice: tuple[Advice, ...]
+    observability: Observability | None
+    reliability: Reliability | None
+    health: Health | None
+
+    def __str__(self) -> str:
+        """Return the findings, one sentence a line."""
+        return "\n".join(self.sentences)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Return the findings, one sentence each."""
+        return tuple(_sentences(self))
+
+
+def diagnose(problem: Problem, fix: Fix) -> Diagnosis:
+    """Return why a fix is not ``ok``, what its data determine, and which errors it would not notice.
+
+    Parameters
+    ----------
+    problem : Problem
+        One problem, a run, or a batch (...) of problems.
+    fix : Fix
+        Its fix, of the same batch.
+
+    Returns
+    -------
+    Diagnosis
+        Advice, observability, reliability and health of stations, as far as they apply.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the fix is not one of this problem.
+    """
+    label = [status.label for status in np.ravel(fix.statuses)]
+    counts = tuple(name if len(label) == 1 else f"{name}: {label.count(name)}" for name in dict.fromkeys(label))
+    single = not problem.batch_shape and not fix.shape
+    known = single and bool(np.isfinite(fix.x).all()) and fix.x.shape == (problem.layout.size,)
+    return Diagnosis(
+        counts,
+        tuple(_advice(problem, fix)),
+        observability(problem, fix.x) if known else None,
+        reliability(problem, fix.x, fix.suspects) if known else None,
+        _health(problem, fix),
+    )
+
+
+def _advice(problem: Problem, fix: Fix) -> Iterator[Advice]:
+    """Yield the advice on each fix that is not ok; equal advice once."""
+    if not problem.batch_shape:
+        yield from advise(problem, fix)
+        return
+    if fix.shape != problem.batch_shape:
+        raise InvalidProblem(
+            f"fixes of shape {fix.shape} for problems of shape {problem.batch_shape}", "fix", "give its own"
+        )
+    flat, fixes = problem.flat(), fix.flat()
+    doubtful = np.flatnonzero(~fixes.has(Status.OK))[:_ADVISED]
+    found = advise(flat.take(doubtful), fixes[doubtful]) if len(doubtful) else []
+    yield from dict.fromkeys(one for each in found for one in each)
+
+
+def _health(problem: Problem, fix: Fix) -> Health | None:
+    """Return the statistics of stations; None where the fixes are few or do not check each other."""
+    many = int(np.prod(problem.batch_shape)) if problem.batch_shape else problem.epochs
+    if many < _FEW or not (problem.batch_shape or separable(problem)):
+        return None
+    try:
+        return health(problem, fix=fix)
+    except InvalidProblem:
+        return None
+
+
+def _sentences(found: Diagnosis) -> Iterator[str]:
+    yield f"status {', '.join(found.status)}"
+    for one in found.advice:
+        yield f"{one.seen}: {one.advice}"
+    if found.observability is not None:
+        yield from found.observability.sentences
+    if found.reliability is not None:
+        weak = [
+            name
+            for name, least in zip(found.reliability.names, found.reliability.least, strict=True)
+            if np.isinf(least)
+        ]
+        if weak:
+            yield f"no other row checks {', '.join(weak)}"
+    if found.health is not None:
+        yield from found.health.sentences

@@ -1,0 +1,110 @@
+"""Names and packages of version 0.1 that have another place: they work with a warning for one version."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+# Names that were attributes of optloc, by the package that exports them now.
+_NAMES = {
+    "optloc.bounds": "Course Observability crlb_course observability",
+    "optloc.engine": "Linear Normal gauss_newton linearise normal predict reduce wander",
+    "optloc.files": "Budget satellites",
+    "optloc.model_checks": (
+        "Advice CommonLevel LateSignals Reliability advise determined distance_from_plane explained reliability"
+    ),
+    "optloc.models": "Atmosphere Layers MODELS Model",
+    "optloc.multi_target": "Emitters",
+    "optloc.problem": (
+        "Alternatives Bias CARTESIAN Certificate Chart Determined Direction ECEF Explanation LOSSES "
+        "Layout Loss Noise OptlocError Prior Quantity Rows Signal Stage Suspect by_epoch clock_densities "
+        "with_known_bias"
+    ),
+    "optloc.sites.calibration": "Calibration Network network_of",
+    "optloc.sites.placement": "Placement SiteSelection",
+    "optloc.solvers": (
+        "FORMULATIONS Formulation METHODS Prepared Running SOLVERS StatusShares rejected status_shares suspects"
+    ),
+    "optloc.station_health": (
+        "Health NoiseLevels NoiseStructure common_level health late_signals noise_levels noise_structure "
+        "with_estimated_noise with_noise_levels"
+    ),
+    "optloc.uncertainty": "Accuracy Arc Mixture Region Samples accuracy likelihood_region mixture samples trace_arc",
+}
+# Modules that were attributes of optloc.
+_MODULES = {"epochs": "optloc.problem.epochs", "frames": "optloc.base.frames", "noise": "optloc.problem.noise"}
+_PLACES = {name: f"{package}.{name}" for package, names in _NAMES.items() for name in names.split()} | _MODULES
+
+MOVED = frozenset(_PLACES)
+"""All names that have moved."""
+
+# Packages, and where they are inside optloc now.
+_PACKAGES = {
+    "adequacy": "model_checks",
+    "calibration": "sites.calibration",
+    "compute": "kernels",
+    "datasets": "lab.datasets",
+    "live": "service",
+    "papers": "lab.papers",
+    "placement": "sites.placement",
+    "plot": "show.pictures",
+    "quality": "station_health",
+    "report": "show",
+    "several": "multi_target",
+    "study": "lab.study",
+}
+
+
+def moved(name: str) -> Any:
+    """Return what an old name of optloc meant, with a warning."""
+    place = _PLACES[name]
+    _warn(f"optloc.{name}", place, 4)
+    package, _, inner = place.rpartition(".")
+    return import_module(place) if name in _MODULES else getattr(import_module(package), inner)
+
+
+def _warn(old: str, new: str, level: int) -> None:
+    warnings.warn(f"{old} is {new} now, and goes with version 0.2", DeprecationWarning, stacklevel=level)
+
+
+class _Alias(Loader):
+    """Loads a module by an old name: the module of the new name."""
+
+    def __init__(self, place: str) -> None:
+        self._place = place
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        """Return None: Python makes an empty module."""
+        return None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Put the module of today in the place of an empty one."""
+        sys.modules[module.__name__] = import_module(self._place)
+
+
+class _OldPackages(MetaPathFinder):
+    """Finds packages and their modules by old names."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return a spec that loads the module of today; None for all other names."""
+        root, _, rest = fullname.partition(".")
+        old, _, inner = rest.partition(".")
+        if root != "optloc" or old not in _PACKAGES:
+            return None
+        place = ".".join(filter(None, ("optloc", _PACKAGES[old], inner)))
+        _warn(fullname, place, 3)
+        return ModuleSpec(fullname, _Alias(place), is_package=True)
+
+
+def watch_old_packages() -> None:
+    """Let Python find packages by their old names."""
+    if not any(isinstance(finder, _OldPackages) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _OldPackages())  # before a module is found inside the package of today
