@@ -29,7 +29,7 @@ def test_an_entry_shows_its_fields_but_no_code():
     ]
 
 
-@pytest.mark.parametrize("name", ["kinds", "losses", "motions", "formats", "pictures", "demos", "starters"])
+@pytest.mark.parametrize("name", ["kinds", "methods", "losses", "motions", "formats", "pictures", "demos", "starters"])
 def test_every_name_is_listed_once_with_a_summary(name):
     rows = lists()[name]()
     names = [next(iter(row.values())) for row in rows]
@@ -45,6 +45,6 @@ def test_lists_are_printed_as_json_and_unknown_ones_are_refused(capsys):
 
 
 def test_a_table_is_imported_by_its_place():
-    assert [row["loss"] for row in registry("loss", "optloc:LOSSES")()]
+    assert [row["loss"] for row in registry("loss", "optloc.problem:LOSSES")()]
     with pytest.raises(ModuleNotFoundError):
         registry("loss", "optloc.nowhere:LOSSES")()
