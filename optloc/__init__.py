@@ -23,6 +23,21 @@ from optloc.problem.problem import Problem
 
 # Everything else loads when its name is first used: solvers, proofs and tables take half a second together.
 if TYPE_CHECKING:
+    import optloc.bounds
+    import optloc.engine
+    import optloc.files
+    import optloc.lab
+    import optloc.model_checks
+    import optloc.models
+    import optloc.multi_target
+    import optloc.problem
+    import optloc.service
+    import optloc.show
+    import optloc.sites
+    import optloc.solvers
+    import optloc.station_health
+    import optloc.tracking
+    import optloc.uncertainty
     from optloc.advice.diagnosis import diagnose as diagnose
     from optloc.base import units as units
     from optloc.base.errors import InvalidProblem as InvalidProblem, NoSolution as NoSolution
@@ -48,17 +63,17 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_find, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    _find, __dir__, __all__ = exported(__name__, __file__)
 
-
-def __getattr__(name: str) -> Any:
-    if name in __all__:
-        return _find(name)
-    if name in MOVED:
-        return moved(name)
-    if not name.startswith("_") and find_spec(f"optloc.{name}") is not None:
-        return import_module(f"optloc.{name}")  # a folder, such as `optloc.tracking`
-    raise AttributeError(f"module 'optloc' has no attribute {name!r}")
+    def __getattr__(name: str) -> Any:
+        if name in __all__:
+            return _find(name)
+        if name in MOVED:
+            return moved(name)
+        if not name.startswith("_") and find_spec(f"optloc.{name}") is not None:
+            return import_module(f"optloc.{name}")  # a folder, such as `optloc.tracking`
+        raise AttributeError(f"module 'optloc' has no attribute {name!r}")
 
 
 watch_old_packages()

@@ -9,4 +9,5 @@ if TYPE_CHECKING:
     from optloc.model_checks.advice import advise as advise, explained as explained
     from optloc.model_checks.geometry import Advice as Advice
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -39,7 +39,10 @@ _NAMES = {
 }
 # Modules that were attributes of optloc.
 _MODULES = {"epochs": "optloc.problem.epochs", "frames": "optloc.base.frames", "noise": "optloc.problem.noise"}
-_PLACES = {name: f"{package}.{name}" for package, names in _NAMES.items() for name in names.split()} | _MODULES
+_RENAMED = {"Plan": "optloc.sites.placement.SiteSelection"}
+_PLACES = (
+    {name: f"{package}.{name}" for package, names in _NAMES.items() for name in names.split()} | _MODULES | _RENAMED
+)
 
 MOVED = frozenset(_PLACES)
 """All names that have moved."""
@@ -49,7 +52,6 @@ _PACKAGES = {
     "adequacy": "model_checks",
     "calibration": "sites.calibration",
     "compute": "kernels",
-    "datasets": "lab.datasets",
     "live": "service",
     "papers": "lab.papers",
     "placement": "sites.placement",
@@ -59,6 +61,9 @@ _PACKAGES = {
     "several": "multi_target",
     "study": "lab.study",
 }
+
+# Modules that are public by a shorter path; they import by it without a warning.
+_SHORT = {"constraints": "linear.constraints", "datasets": "lab.datasets", "units": "base.units"}
 
 
 def moved(name: str) -> Any:
@@ -70,7 +75,7 @@ def moved(name: str) -> Any:
 
 
 def _warn(old: str, new: str, level: int) -> None:
-    warnings.warn(f"{old} is {new} now, and goes with version 0.2", DeprecationWarning, stacklevel=level)
+    warnings.warn(f"{old} is {new} now; version 0.2 removes the old name", DeprecationWarning, stacklevel=level)
 
 
 class _Alias(Loader):
@@ -97,10 +102,11 @@ class _OldPackages(MetaPathFinder):
         """Return a spec that loads the module of today; None for all other names."""
         root, _, rest = fullname.partition(".")
         old, _, inner = rest.partition(".")
-        if root != "optloc" or old not in _PACKAGES:
+        if root != "optloc" or old not in _PACKAGES | _SHORT:
             return None
-        place = ".".join(filter(None, ("optloc", _PACKAGES[old], inner)))
-        _warn(fullname, place, 3)
+        place = ".".join(filter(None, ("optloc", (_PACKAGES | _SHORT)[old], inner)))
+        if old in _PACKAGES:
+            _warn(fullname, place, 3)
         return ModuleSpec(fullname, _Alias(place), is_package=True)
 
 

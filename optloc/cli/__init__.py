@@ -54,4 +54,5 @@ if TYPE_CHECKING:
     )
     from optloc.cli.track import TrackOptions as TrackOptions, dynamics_of as dynamics_of, rules as rules
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -54,4 +54,5 @@ if TYPE_CHECKING:
     from optloc.linear.vectors import vectors as vectors
     from optloc.linear.walks import walks as walks, wander as wander
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

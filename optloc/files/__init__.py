@@ -62,4 +62,5 @@ if TYPE_CHECKING:
     from optloc.files.words import distinct as distinct
     from optloc.files.writer import harmless_column as harmless_column, toml_text as toml_text
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -12,4 +12,5 @@ if TYPE_CHECKING:
     from optloc.model_checks.geometry import Advice as Advice
     from optloc.model_checks.noise_level import CommonLevel as CommonLevel, LateSignals as LateSignals
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

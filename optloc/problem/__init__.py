@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         CARTESIAN as CARTESIAN,
         ECEF as ECEF,
         Frame as Frame,
+        check_geodetic as check_geodetic,
         ecef_to_geodetic as ecef_to_geodetic,
         geodetic_to_ecef as geodetic_to_ecef,
     )
@@ -57,11 +58,14 @@ if TYPE_CHECKING:
     from optloc.problem.epochs import (
         by_epoch as by_epoch,
         cut as cut,
+        joined as joined,
         separable as separable,
         tied as tied,
         window as window,
+        windows as windows,
     )
     from optloc.problem.fix import (
+        Active as Active,
         Alternatives as Alternatives,
         Explanation as Explanation,
         Fix as Fix,
@@ -84,4 +88,5 @@ if TYPE_CHECKING:
     from optloc.problem.problem import Problem as Problem
     from optloc.problem.signal import Signal as Signal
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

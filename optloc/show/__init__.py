@@ -62,4 +62,5 @@ if TYPE_CHECKING:
     from optloc.show.pictures.track import plot_tracks as plot_tracks
     from optloc.show.sheet import ABSENT as ABSENT, Sheet as Sheet, TextTable as TextTable
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         version_of as version_of,
     )
     from optloc.solvers.certificates.admitted import certify as certify
+    from optloc.solvers.certificates.relaxations import Reference as Reference, reference_bound as reference_bound
     from optloc.solvers.methods import (
         FORMULATIONS as FORMULATIONS,
         METHODS as METHODS,
@@ -40,9 +41,11 @@ if TYPE_CHECKING:
     from optloc.solvers.shares import StatusShares as StatusShares, status_shares as status_shares
     from optloc.solvers.solution import solve as solve
     from optloc.solvers.starts.angles import course_starts as course_starts, courses as courses
+    from optloc.solvers.starts.block_averages import average_blocks as average_blocks
     from optloc.solvers.starts.position import spread_of as spread_of
     from optloc.solvers.suspect_rows.stage import suspects as suspects
     from optloc.solvers.verdict.findings import Finding as Finding, objections as objections
     from optloc.solvers.verdict.judge import judge as judge
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -19,4 +19,5 @@ if TYPE_CHECKING:
         with_estimated_noise as with_estimated_noise,
     )
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

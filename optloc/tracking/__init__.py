@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         RowCandidates as RowCandidates,
         alone as alone,
         associated as associated,
+        candidates as candidates,
     )
     from optloc.tracking.start import (
         begun as begun,
@@ -46,7 +47,13 @@ if TYPE_CHECKING:
         two_point as two_point,
         with_height_rows as with_height_rows,
     )
-    from optloc.tracking.track import State as State, Track as Track, followed as followed, predicted as predicted
+    from optloc.tracking.track import (
+        State as State,
+        Track as Track,
+        followed as followed,
+        predicted as predicted,
+        scans as scans,
+    )
     from optloc.tracking.updates import (
         UPDATES as UPDATES,
         Filter as Filter,
@@ -55,10 +62,15 @@ if TYPE_CHECKING:
         ekf as ekf,
         filter_of as filter_of,
         gated as gated,
+        iekf as iekf,
+        innovation as innovation,
         joseph as joseph,
+        mgekf as mgekf,
+        mvekf as mvekf,
         reweighted as reweighted,
         whitened as whitened,
     )
     from optloc.tracking.whole_run import fitted as fitted, posterior_bound as posterior_bound, smoothed as smoothed
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
         mixture as mixture,
         samples as samples,
     )
-    from optloc.uncertainty.radii import Accuracy as Accuracy, accuracy as accuracy
-    from optloc.uncertainty.region import Region as Region, likelihood_region as likelihood_region
+    from optloc.uncertainty.radii import Accuracy as Accuracy, accuracy as accuracy, radius as radius
+    from optloc.uncertainty.region import Cells as Cells, Region as Region, likelihood_region as likelihood_region
 
-__getattr__, __dir__, __all__ = exported(__name__, __file__)
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

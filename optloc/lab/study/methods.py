@@ -91,7 +91,7 @@ class StudyMethod:
             return baseline_of(self.baseline).slow
         if self.method == CALIBRATE:
             return True
-        from optloc.solvers import StudyMethod as Pipeline
+        from optloc.solvers import Method as Pipeline
 
         assert self.method is not None
         return not all(entry.batched for entry in Pipeline.parse(self.method).entries)
@@ -144,7 +144,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[StudyMethod]:
         raise InvalidProblem("its list of methods is empty", where, "name one, or leave the table out")
     for name, solver in product(names, solvers):
         if table.method is not None:
-            from optloc.solvers import StudyMethod as Pipeline
+            from optloc.solvers import Method as Pipeline
 
             try:
                 _ = name == CALIBRATE or Pipeline.parse(name)
