@@ -4,9 +4,19 @@ from math import inf
 from pathlib import Path
 
 import pytest
+from typer.models import ArgumentInfo, OptionInfo
 
 from optloc import InvalidProblem, Status
-from optloc.cli.options import allowed, complete, constraints, coordinates, example, find_problem, shipped_problems
+from optloc.cli.options import (
+    allowed,
+    complete,
+    constraints,
+    coordinates,
+    example,
+    find_problem,
+    name_in,
+    shipped_problems,
+)
 
 
 def test_coordinates_are_finite_numbers_unless_they_are_bounds():
@@ -42,6 +52,11 @@ def test_a_bare_word_is_a_shipped_problem_and_a_path_never_is(tmp_path, monkeypa
     assert find_problem(Path("demo")) == Path("demo")
     with pytest.raises(InvalidProblem, match="did you mean 'ambiguous'"):
         find_problem(Path("ambigous"))
+
+
+def test_names_are_options_with_flags_and_arguments_without():
+    assert isinstance(name_in("motions", "Model", "--model"), OptionInfo)
+    assert isinstance(name_in("motions", "Model"), ArgumentInfo)
 
 
 def test_help_completes_names_and_shows_examples():

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from optloc import InvalidProblem
-from optloc.cli.output import Screen, claim_outputs, dumps, is_csv, meter, say_all, write_table
+from optloc.cli.output import Screen, claim_outputs, dumps, is_csv, meter, say_all, write_table, write_text
 
 
 def test_json_is_strict():
@@ -42,6 +42,12 @@ def test_outputs_of_unknown_type_are_refused(given, words, tmp_path):
     with pytest.raises(InvalidProblem, match=words):
         claim_outputs(**{key: tmp_path / name for key, name in given.items()})
     claim_outputs(table=tmp_path / "t.csv", picture=tmp_path / "p.svg")
+
+
+def test_a_minus_is_standard_output(tmp_path, capsys):
+    write_text(Path("-"), "a line")
+    write_text(tmp_path / "a.txt", "a line")
+    assert capsys.readouterr().out == (tmp_path / "a.txt").read_text() == "a line\n"
 
 
 def test_a_quiet_meter_prints_nothing(capsys):

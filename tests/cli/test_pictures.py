@@ -1,11 +1,13 @@
 """Pictures by name: each is drawn by a function with a summary, and wrong names and types are refused."""
 
+import numpy as np
 import pytest
 
 from optloc import InvalidProblem
 from optloc.cli.extensions import PictureRequest
 from optloc.cli.options import shipped_problems
 from optloc.cli.pictures import _PICTURES, _solve_one, pictures, run_plot
+from optloc.files import read
 
 
 def asked(tmp_path, name="p.svg", epoch=None):
@@ -35,7 +37,10 @@ def test_the_picture_asked_for_is_drawn_to_its_file(tmp_path, monkeypatch, capsy
 
 def test_an_epoch_is_chosen_by_its_label(tmp_path):
     _, fix, title = _solve_one(PictureRequest(shipped_problems()["run"], tmp_path / "p.svg", "auto", None))
-    assert len(fix) == 1
-    assert "epoch" in title
+    labels = read(shipped_problems()["run"]).epochs
+    assert title.endswith(f"epoch {labels[0]}")
+    _, last, _ = _solve_one(PictureRequest(shipped_problems()["run"], tmp_path / "p.svg", "auto", labels[-1]))
+    assert len(fix) == len(last) == 1
+    assert np.abs(fix.position - last.position).max() > 1.0
     with pytest.raises(InvalidProblem, match="no epoch 'never'"):
         _solve_one(PictureRequest(shipped_problems()["run"], tmp_path / "p.svg", "auto", "never"))

@@ -21,6 +21,19 @@ def test_exact_measurements_meet_the_truth_whatever_their_unit():
     assert feet.covariance() == pytest.approx(metres.covariance(), rel=1e-6)
 
 
+def test_bearings_are_those_of_a_compass_unless_the_axes_are_named():
+    away = {name: TRUTH - place for name, place in STATIONS.items() if name in "ABC"}
+    compass = {name: float(np.degrees(np.arctan2(x, y)) % 360.0) for name, (x, y) in away.items()}
+    axes = {name: float(np.degrees(np.arctan2(y, x))) for name, (x, y) in away.items()}
+    for bearings, options in (
+        (compass, {}),
+        ({name: b - 5.0 for name, b in compass.items()}, {"declination": "5 deg"}),
+        (axes, {"azimuth": "east-counterclockwise"}),
+    ):
+        fix = locate(STATIONS, bearings=bearings, sigma=0.5, unit="deg", **options)
+        assert fix.position == pytest.approx(TRUTH, abs=1e-4)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -10,6 +10,7 @@ CELLS = ["b", "a", "b", "c", "a", "b"]
 def test_words_are_the_column_that_they_were_made_of():
     words = words_of(objects(CELLS))
     assert words.tolist() == list(words) == np.asarray(words).tolist() == CELLS
+    assert isinstance(words[3], str)
     assert (words[3], words[1:3].tolist()) == ("c", ["a", "b"])
     assert (words == objects(CELLS)).all()
 

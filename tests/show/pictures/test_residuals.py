@@ -20,6 +20,14 @@ def test_points_are_the_residuals_of_each_station():
     assert panel.get_title() == "range"
 
 
+def test_a_residual_beyond_three_sigma_has_its_mark():
+    problem, fix = ranged()
+    wild = problem.with_rows(z=problem.z + np.array([0.0, 0.0, 20.0, 0.0]))
+    (panel,) = plot_residuals(wild, fix).axes
+    far = [one.get_offsets()[0].tolist() for one in panel.collections if one.get_label() == "residual beyond 3 sigma"]
+    assert [place for _, place in far] == [2]
+
+
 def test_fixes_of_other_problems_are_refused():
     problem, fix = ranged()
     with pytest.raises(InvalidProblem, match="2 fixes do not belong to 1 problems"):

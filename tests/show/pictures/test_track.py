@@ -30,6 +30,8 @@ def test_a_picture_has_the_path_its_doubts_and_the_limit_of_the_nis():
     plan, sigma, nis = figure.axes
     path = next(line for line in plan.lines if line.get_label() == "track")
     assert path.get_xydata().tolist() == [[0.0, 0.0], [100.0, 0.0], [200.0, 0.0]]
+    stations = next(one for one in plan.collections if one.get_label() == "station, first scan")
+    assert np.array_equal(stations.get_offsets(), PLACES)
     bad = next(one for one in plan.collections if one.get_label() == "status not ok")
     assert bad.get_offsets().tolist() == [[100.0, 0.0]]
     assert sigma.lines[0].get_ydata() == pytest.approx(np.full(3, np.sqrt(8.0)))
