@@ -54,7 +54,7 @@ def test_an_old_package_imports_and_warns(name):
 
 
 def test_a_module_of_an_old_package_is_the_module_of_today():
-    with pytest.warns(DeprecationWarning):
+    with pytest.warns(DeprecationWarning, match="optloc.multi_target"):
         old = importlib.import_module("optloc.several.sets")
     assert old is importlib.import_module("optloc.multi_target.sets")
 

@@ -89,7 +89,7 @@ def test_every_error_names_a_place_and_a_step():
             count += 1
             told = {word.arg: word.value for word in node.keywords}
             told |= dict(zip(("what", "where", "advice"), node.args, strict=False))
-            needed = ("advice",) if path.parent.name == "live" else ("where", "advice")
+            needed = ("advice",) if path.parent.name == "service" else ("where", "advice")
             parts = [told.get(part, ast.Constant(None)) for part in needed]
             if any(isinstance(part, ast.Constant) and not part.value for part in parts):
                 lacking.append(f"{path.relative_to(ROOT)}:{node.lineno}")

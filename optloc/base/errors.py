@@ -6,6 +6,7 @@ A well-posed call that finds no trustworthy answer returns a fix whose status sa
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from difflib import get_close_matches
 from itertools import islice
@@ -132,6 +133,20 @@ def nearest(word: str, known: Iterable[str]) -> str:
     more = f" and {len(names) - _FEW} more" if len(names) > 2 * _FEW else ""
     listed = "" if close and len(names) > _FEW else f"known are {', '.join(names[:_FEW] if more else names)}{more}"
     return " ".join(part for part in (hint, listed) if part)
+
+
+def check_once(names: Iterable[str], what: str, where: str) -> None:
+    """Refuse names of which one is there twice; `what` says so of "{!r}"."""
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise InvalidProblem(what.format(twice), where, "rename one of them")
+
+
+def no_station(
+    name: object, where: str | None, known: Iterable[str], error: type[InvalidProblem] = InvalidProblem
+) -> InvalidProblem:
+    """Return the error of a name that no station has, with the nearest that there are."""
+    return error(f"there is no station {name!r}", where, nearest(str(name), known))
 
 
 def _alike(word: str, known: Iterable[str]) -> list[str]:

@@ -21,6 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from optloc.base.arrays import Portable, atan2, cos, product, sin
 from optloc.base.errors import InvalidProblem
+from optloc.base.types import Amount
+from optloc.base.units import in_si
 
 __all__ = ["CARTESIAN", "ECEF", "Frame", "check_geodetic", "ecef_to_geodetic", "geodetic_to_ecef"]
 
@@ -58,9 +60,10 @@ class Frame:
             check_geodetic(*self.origin, where="origin of the ENU frame")
 
     @classmethod
-    def enu(cls, *, lat_deg: float, lon_deg: float, height: float = 0.0) -> Frame:
-        """Return the east-north-up frame at a geodetic point given in degrees and metres."""
-        return cls("enu", (math.radians(lat_deg), math.radians(lon_deg), float(height)))
+    def enu(cls, *, lat_deg: float, lon_deg: float, height: Amount = 0.0) -> Frame:
+        """Return the east-north-up frame at a geodetic point: degrees, and metres or text such as "1640 ft"."""
+        metres = float(in_si(height, "length", "height"))
+        return cls("enu", (math.radians(lat_deg), math.radians(lon_deg), metres))
 
     @property
     def geodetic(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from typing import Any, Literal
@@ -9,6 +10,15 @@ from typing import Any, Literal
 import numpy as np
 
 Array = np.ndarray[Any, np.dtype[Any]]
+
+Whole = int | Sequence[int] | Array
+"""Whole numbers, one or one for each row."""
+
+Amount = float | str
+"""A number in SI units, or text with a unit such as "20 ns"."""
+
+Amounts = Amount | Sequence[Amount] | Sequence[Sequence[float]] | Array
+"""Numbers in SI units, or texts with a unit, of any shape."""
 FormName = Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"]
 """Names of the forms of a `Bias`, for type checkers: the keys of `optloc.problem.forms.FORMS`."""
 

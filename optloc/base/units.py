@@ -22,7 +22,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -272,6 +272,66 @@ def sigma_to_si(
     return conversion(unit, quantity, propagation_speed=propagation_speed, carrier=carrier, where=where).sigma_to_si(
         sigma, values_si
     )
+
+
+def split_amount(value: float | str, quantity: Quantity, where: str) -> tuple[float, str]:
+    """Return the number and the unit of an amount such as ``"30 ns"``; the unit of a bare number is empty.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there is no number, or it is beyond `LARGEST`.
+    """
+    # A number that TOML read is spelled again: one way for both.
+    text, _, unit = str(value).strip().partition(" ")
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not abs(number) <= LARGEST:
+        what = f"{value!r} is beyond {LARGEST:g}" if math.isfinite(number) else f"{value!r} is no amount"
+        raise InvalidProblem(what, where, f"write a number and a unit, such as {example_of(number, text, quantity)}")
+    return number, unit.strip()
+
+
+def example_of(number: float, text: str, quantity: Quantity) -> str:
+    """Return an amount with its SI unit to be copied: the number that was written, if it is one."""
+    return f'"{text if abs(number) <= LARGEST else 1.5} {SI_UNIT[quantity]}"'
+
+
+def in_si(value: Any, quantity: Quantity, where: str) -> Any:
+    """Return numbers in SI units, where a number may be text with a unit.
+
+    Parameters
+    ----------
+    value : array_like, str, or sequence of str
+        Bare numbers are in SI units. ``"20 ns"`` of a length is multiplied by the speed of light.
+    quantity : Quantity
+        What the numbers measure.
+    where : str
+        Argument to name.
+
+    Returns
+    -------
+    float, array (...) or the value
+        The value itself where no part of it is text.
+
+    Raises
+    ------
+    InvalidProblem
+        For text that is not a number with a unit of the quantity.
+    """
+    if isinstance(value, str):
+        number, unit = split_amount(value, quantity, where)
+        if not unit:
+            example = example_of(number, value.strip(), quantity)
+            raise InvalidProblem(f"{value!r} has no unit", where, f"write it with its unit, such as {example}")
+        return float(conversion(unit, quantity, where=where).to_si(number))
+    if isinstance(value, list | tuple) and any(isinstance(each, str) for each in value):
+        return np.array([in_si(each, quantity, where) for each in value], dtype=float)
+    if isinstance(value, np.ndarray) and value.dtype.kind == "U":
+        return np.reshape([in_si(str(each), quantity, where) for each in value.flat], value.shape)
+    return value
 
 
 # Where sound is slow or quick: the temperatures, salinities and depths that the formulas were made for.

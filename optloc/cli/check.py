@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,11 @@ from rich.table import Table
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import together
 from optloc.base.types import Array, Bias, Stations
-from optloc.cli.file_fixes import CHUNK, table_json
+from optloc.cli.file_fixes import fix_epochs, table_json
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.from_table import read_problem
 from optloc.cli.output import (
     Screen,
-    bar,
     claim_outputs,
     dumps,
     say_all,
@@ -34,7 +33,9 @@ from optloc.model_checks.elements import By, batch_of
 from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.models import MODELS
+from optloc.problem.epoch_groups import explanations_by_epoch
 from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, records
 from optloc.show.fixes import with_sigma
@@ -114,7 +115,7 @@ def _health(loaded: Loaded, asked: CheckOptions, quiet: bool) -> Checked | None:
 def _advice(loaded: Loaded, checked: Checked | None) -> tuple[Advice, ...]:
     """Return what geometry, and where epochs are solved their values, suggest."""
     vectors = None if checked is None else checked.vectors
-    problem = loaded.problem
+    problem = loaded.problem if vectors is None else _with_noise(loaded.problem)
     if checked is None:
         # the file was only to be read: what it says of values is not looked at
         problem = problem.with_rows(z=np.full_like(problem.z, np.nan))
@@ -284,30 +285,38 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
 
 
 def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
-    from optloc.solvers.solution import solve
-
-    batch = batch_of(loaded.problem)
-    count = batch.batch_shape[0]
-    vectors, explained = np.full((count, batch.layout.size), np.nan), np.full(count, None, dtype=object)
+    batch, alone = batch_of(loaded.problem), separable(loaded.problem)
     if not batch.layout.size:
+        count = batch.batch_shape[0]
         return Checked(health_of(batch, (np.arange(count), np.zeros((count, 0))), by))
-    with bar(loaded.title, count, quiet) as advance:
-        for first in range(0, count, CHUNK):
-            items = np.arange(first, min(first + CHUNK, count))
-            fix = solve(batch.take(items), method)
-            # What has no answer is NaN, and left out below.
-            vectors[items] = np.where(fix.answered[:, None], fix.x, np.nan)
-            found = getattr(fix, "explanations", None)
-            explained[items] = None if found is None else found
-            advance(len(items))
+    fix = _fix(loaded, batch, method, quiet)
+    # What has no answer is NaN, and left out.
+    vectors = np.where(fix.answered[:, None], fix.x, np.nan)
     kept = np.flatnonzero(np.isfinite(vectors).all(-1))
     if not len(kept):
         raise InvalidProblem("no epoch has a fix", loaded.source, "see `optloc fix` for the reasons")
-    asked = any(each is not None for each in explained)
-    health = health_of(batch, (kept, vectors[kept]), by, explained if asked else None)
+    health = health_of(batch, (kept, vectors[kept]), by, fix.explanations)
     level = common_level_at(batch.take(kept), vectors[kept])
     late = late_signals_at(batch, kept, vectors[kept])
-    return Checked(health, vectors=vectors if separable(loaded.problem) else None, level=level, late=late)
+    return Checked(health, vectors=vectors if alone else None, level=level, late=late)
+
+
+def _fix(loaded: Loaded, batch: Problem, method: str, quiet: bool) -> Fix:
+    """Return the fixes of epochs by `optloc fix`, with errors of stations as noise and rows as of the batch."""
+    problem = _with_noise(loaded.problem)
+    if not separable(problem):
+        from optloc.solvers import solve
+
+        return solve(batch, method)
+    fix, _ = fix_epochs(replace(loaded, problem=problem), method, quiet)
+    if fix.explanations is None:
+        return fix
+    return replace(fix, explanations=explanations_by_epoch(problem, fix.explanations))
+
+
+def _with_noise(problem: Problem) -> Problem:
+    """Return a problem whose errors of stations in an epoch are noise: health is of fixes without them."""
+    return replace(problem, stations=problem.stations.with_noise())
 
 
 def _health_columns(health: Health) -> Columns:

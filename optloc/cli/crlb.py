@@ -23,7 +23,7 @@ from optloc.files.schema import Units
 from optloc.model_checks.evidence import Reliability, reliability
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable, tied
-from optloc.problem.fix import Suspect
+from optloc.problem.explanations import Suspect
 from optloc.problem.layout import Layout, Slot, state_names
 from optloc.problem.problem import Problem
 

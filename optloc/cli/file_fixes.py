@@ -27,8 +27,8 @@ from optloc.show.formats.marks import Results
 
 LOG = logging.getLogger("optloc.problem.fix")
 
-CHUNK = 1024
-"""Epochs that are solved at once: large enough for batched kernels, small enough for a bar that moves."""
+# Epochs that are solved at once: large enough for batched kernels, small enough for a bar that moves.
+_CHUNK = 1024
 # The same where a plan fixes them: a second of `auto`. Of `gtrs+lsr`, 1024 epochs at a time took 2.4 times as long.
 _QUICK_CHUNK = 8192
 
@@ -78,7 +78,7 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
     from optloc.solvers.solution import solve
 
     if separable(loaded.problem):
-        fix, reweighted = _fix_epochs(loaded, method, quiet)
+        fix, reweighted = fix_epochs(loaded, method, quiet)
         return FileFixes(loaded, fix, fix_columns(loaded, fix, 0), reweighted)
     fix = solve(loaded.problem, method=method)
     _log_stages(fix)
@@ -86,7 +86,7 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
     return FileFixes(loaded, fix, fix_columns(loaded, fix, None), reweighted, _observe(loaded.problem, fix))
 
 
-def _fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
+def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
     """Return the fixes of epochs that share nothing, in their order, and whether weights of rows are not as stated."""
     from optloc.solvers.methods import is_quick
     from optloc.solvers.solution import solve
@@ -97,7 +97,7 @@ def _fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
         nonlocal reweighted
         groups = epoch_groups(loaded.problem)
         _release_memory()
-        sizes = [_QUICK_CHUNK if is_quick(group.take(slice(CHUNK)).problem, method) else CHUNK for group in groups]
+        sizes = [_QUICK_CHUNK if is_quick(group.take(slice(_CHUNK)).problem, method) else _CHUNK for group in groups]
         for part in (part for group, size in zip(groups, sizes, strict=True) for part in group.parts(size)):
             problem = part.problem
             fix = solve(problem, method=method)

@@ -24,9 +24,15 @@ if TYPE_CHECKING:
         write_text as write_text,
         written as written,
     )
+    from optloc.files.measurements import (
+        Context as Context,
+        ends_of as ends_of,
+        sigma_of as sigma_of,
+        values_of as values_of,
+    )
     from optloc.files.one_call import locate as locate
     from optloc.files.orbits import satellites as satellites
-    from optloc.files.propagation import speed_of as speed_of
+    from optloc.files.propagation import positive_speed as positive_speed, speed_of as speed_of
     from optloc.files.reader import (
         Draft as Draft,
         Loaded as Loaded,
@@ -38,7 +44,6 @@ if TYPE_CHECKING:
     )
     from optloc.files.roles import worded as worded
     from optloc.files.schema import (
-        Amount as Amount,
         DataTable as DataTable,
         FrameTable as FrameTable,
         MeasurementsTable as MeasurementsTable,

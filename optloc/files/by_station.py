@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optloc.base.cache import Cache
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, no_station
 from optloc.base.types import Array
 from optloc.files.columns import stem, unit_of
 from optloc.files.roles import WORDS
@@ -39,17 +39,18 @@ _ENDS = Cache[list[tuple[int, int]]](256)
 
 
 class StationValues(NamedTuple):
-    """Values (..., m) as they are given, what each belongs to, and the unit that their column names."""
+    """Values (..., m) as they are given, what each belongs to, the unit that their column names, and row labels."""
 
     values: Array
     keys: list[Any]
     unit: str | None = None
+    labels: list[Any] | None = None
 
 
 def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
     """Return values by what they belong to: a station, or of time differences a pair of them."""
     if reference is not None and reference not in names:
-        raise InvalidProblem(f"there is no station {reference!r}", "reference", nearest(str(reference), names))
+        raise no_station(reference, "reference", names)
     first = names[0] if reference is None else reference
     given = _with_names(given)
     if hasattr(given, "columns") and hasattr(given, "index"):
@@ -79,7 +80,7 @@ def station_values(word: str, given: Any, names: Sequence[str], reference: str |
     kept = [i for i, (a, b) in enumerate(ends) if a != b]  # the reference against itself says nothing
     if not kept:
         raise InvalidProblem("there is nothing but the reference", word, "give the other stations")
-    return StationValues(found.values[..., kept], [ends[i] for i in kept], found.unit)
+    return found._replace(values=found.values[..., kept], keys=[ends[i] for i in kept])
 
 
 def _with_names(given: Any) -> Any:
@@ -109,7 +110,7 @@ def _ends(word: str, key: Any, names: Sequence[str], reference: str) -> tuple[in
         raise InvalidProblem(f"{key!r} does not name what was measured", word, "use the name of a station")
     unknown = [str(name) for name in pair if str(name) not in names]
     if unknown:
-        raise InvalidProblem(f"there is no station {unknown[0]!r}", word, nearest(unknown[0], names))
+        raise no_station(unknown[0], word, names)
     one, *other = (names.index(str(name)) for name in pair)
     return one, other[0] if other else -1
 
@@ -137,7 +138,7 @@ def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> Statio
             raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
     # By number: two columns may have one name.
     values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
-    return StationValues(np.stack(values, axis=-1), columns)
+    return StationValues(np.stack(values, axis=-1), columns, labels=list(frame.index))
 
 
 def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
@@ -187,7 +188,9 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
         seen.add(place)
         grid[place] = value
     named = unit_of(str(chosen["z"]), ("s", "ms", "us", "ns", "ps", "m", "km", "cm", "mm", "ft", "deg", "rad"))
-    return StationValues(grid if epochs is not None else grid[0], list(keys), named)
+    return StationValues(
+        grid if epochs is not None else grid[0], list(keys), named, None if epochs is None else list(rows)
+    )
 
 
 def _no_dates(word: str, values: Array) -> Array:

@@ -18,14 +18,13 @@ from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.cells import Decimals
 from optloc.files.columns import PLACE, role_named, role_of
-from optloc.files.declination import angle_of, date_of
+from optloc.files.declination import declination_of
 from optloc.files.foreign import read_table
 from optloc.files.headings import stations_turned
 from optloc.files.measurements import ESTIMATE
 from optloc.files.pseudoranges import is_gnss
 from optloc.files.reading_report import about, check_receivers, left_over, uses_of
 from optloc.files.readings import (
-    CARTESIAN,
     CONVENTIONS,
     ColumnHints,
     Named,
@@ -335,10 +334,7 @@ def _with_declination(section: Section, found: Readings, told: ColumnHints) -> S
     """Return a section of bearings with the declination that is told."""
     if told.declination is None or found.form.kind != "azimuth":
         return section
-    if found.azimuth == CARTESIAN:
-        raise InvalidProblem("angles from the x axis have no declination", "--declination", "leave it out")
-    if date_of(told.declination, "--declination") is None:
-        angle_of(told.declination, None, "--declination")
+    declination_of(told.declination, found.azimuth, None, "--declination")
     return replace(section, lines=(*section.lines, f"declination = {json.dumps(told.declination.strip())}"))
 
 

@@ -50,6 +50,30 @@ def date_of(given: Any, where: str) -> date | None:
         raise InvalidProblem(f"{text!r} is no date", where, 'write it as in "2026-06-01"') from None
 
 
+def declination_of(
+    given: Any, convention: str | None, unit: str | None, where: str, advice: str = "leave it out"
+) -> tuple[float, date | None]:
+    """Return the declination of bearings in radians, or zero and the day whose declination it is.
+
+    Parameters
+    ----------
+    given : float, str, date or DeclinationTable
+        As of `date_of`.
+    convention : str, optional
+        Of the bearings; angles from the x axis are refused.
+    unit : str, optional
+        Of a bare number.
+    where : str
+        Place to name.
+    advice : str
+        What to do with a declination of angles from the x axis.
+    """
+    if convention == "east-counterclockwise":
+        raise InvalidProblem("angles from the x axis have no declination", where, advice)
+    day = date_of(given, where)
+    return (0.0, day) if day is not None else (angle_of(given, unit, where), None)
+
+
 def angle_of(given: float | str, unit: str | None, where: str) -> float:
     """Return a declination in radians; `unit` is that of a bare number, None refuses it."""
     angle = Units("angle").plain(given, unit, where)

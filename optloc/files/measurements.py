@@ -13,8 +13,9 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Stations
 from optloc.base.units import LARGEST, Conversion
-from optloc.files.declination import angle_of, date_of, declinations
-from optloc.files.schema import DeclinationTable, MeasurementsTable, Units, join, kind_model
+from optloc.files.declination import declination_of, declinations
+from optloc.files.schema import MeasurementsTable, Units, join, kind_model
+from optloc.files.stations import numbers_of
 from optloc.files.table import Epochs, Table
 from optloc.files.words import distinct, numbered
 from optloc.models import Model
@@ -161,10 +162,8 @@ def _chunk(c: Context, kind: str) -> RowChunk:
     unit = units.conversion(name, join(c.where, "key 'unit'"))
     weight = _numbers(c, "weight", 1.0 if section.weight is None else section.weight)
     _check_weight(c, weight)
-    z = _values(c, unit, weight)
-    a, b = (_stations(c, key, needed) for key, needed in (("a", model.stations > 0), ("b", model.stations > 1)))
-    if model.stations > 1:
-        _check_pairs(c, kind, a, b)
+    z = values_of(c, unit, weight)
+    a, b = ends_of(c, kind, model.stations)
     # The sign of a difference is turned by its stations, not its value: noise and biases then need no second thought.
     if section.positive == "b-farther" and _compares(model):
         a, b = b, a
@@ -185,10 +184,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
 
 
 def _check_options(c: Context, kind: str, model: Model) -> None:
-    section, declined = c.section, c.section.declination is not None
-    if declined and kind == "azimuth" and section.azimuth == "east-counterclockwise":
-        advice = 'write azimuth = "north-clockwise" or "north-counterclockwise", or leave the declination out'
-        raise InvalidProblem("angles from the x axis have no declination", join(c.where, "key 'declination'"), advice)
+    section = c.section
     if section.kind is None:
         return  # settings of a mixed table apply to the kinds that know them
     if section.excess and not _adds_up(model):
@@ -199,7 +195,7 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
         raise InvalidProblem(f"{kind} has no sign to turn", join(c.where, "key 'positive'"), "leave it out")
     if kind != "azimuth":
         north = section.azimuth not in {None, "east-counterclockwise"}
-        key = "azimuth" if north else "declination" if declined else None
+        key = "azimuth" if north else "declination" if section.declination is not None else None
         if key is not None:
             raise InvalidProblem(f"{kind} is no azimuth", join(c.where, f"key {key!r}"), "leave it out")
 
@@ -237,7 +233,7 @@ def _check_weight(c: Context, weight: Array) -> None:
         )
 
 
-def _values(c: Context, unit: Conversion, weight: Array) -> Array:
+def values_of(c: Context, unit: Conversion, weight: Array) -> Array:
     """Return z in SI: zero where a row is absent, NaN where values are not needed and not there."""
     if not (c.values or c.table.has("z") or "z" in c.table.names):
         return np.full(c.table.count, np.nan)
@@ -261,20 +257,22 @@ def _stations(c: Context, key: str, needed: bool) -> Array:
     single = getattr(c.section, key)
     column = c.table.has(key) or single is None
     names, index = numbered(c.table.labels(key)) if column else ([single], np.zeros(c.table.count, dtype=np.int64))
-    number = {name: i for i, name in enumerate(c.stations)}
-    unknown = next((name for name in names if name not in number), None)
-    if unknown is not None:
-        row = int(np.flatnonzero(index == names.index(unknown))[0])
-        place = c.table.where(key, row) if c.table.has(key) else join(c.where, f"key {key!r}")
-        raise InvalidProblem(f"there is no station {unknown!r}", place, nearest(unknown, list(c.stations)))
-    return np.array([number[name] for name in names], dtype=np.int64)[index]
+
+    def where(name: int) -> str:
+        row = int(np.flatnonzero(index == name)[0])
+        return c.table.where(key, row) if c.table.has(key) else join(c.where, f"key {key!r}")
+
+    return numbers_of(names, c.stations, where)[index]
 
 
-def _check_pairs(c: Context, kind: str, a: Array, b: Array) -> None:
+def ends_of(c: Context, kind: str, count: int) -> tuple[Array, Array]:
+    """Return the stations (m,) at both ends of rows that name `count` of them, -1 for none."""
+    a, b = (_stations(c, key, count > i) for i, key in enumerate("ab"))
     same = np.flatnonzero(a == b)
-    if len(same):
+    if count > 1 and len(same):
         what = f"{kind} names station {c.stations[a[same[0]]]!r} twice"
         raise InvalidProblem(what, c.table.at(int(same[0])), "name two stations")
+    return a, b
 
 
 def _correction(c: Context, units: Units, unit: Conversion) -> Array:
@@ -296,14 +294,12 @@ def _size(unit: Conversion, units: Units, c: Context) -> float:
 
 def _declination(c: Context, unit: str) -> tuple[float, date | None]:
     """Return the declination of a section in radians, or zero and the day that it is the one of."""
-    given, place = c.section.declination, join(c.where, "key 'declination'")
-    if given is None:
+    if c.section.declination is None:
         return 0.0, None
-    day = date_of(given, place)
-    if day is not None or isinstance(given, DeclinationTable):
-        return 0.0, day
+    place = join(c.where, "key 'declination'")
+    advice = 'write azimuth = "north-clockwise" or "north-counterclockwise", or leave the declination out'
     # Bearings from magnetic north are anticlockwise of true ones by what magnetic north is east of north.
-    return angle_of(given, unit, place), None
+    return declination_of(c.section.declination, c.section.azimuth, unit, place, advice)
 
 
 def with_declination(chunk: RowChunk, epoch: Array, stations: Stations, frame: Frame) -> RowChunk:
@@ -371,18 +367,25 @@ def spread_of(
     if sum((column or section.sigma is not None, *(form is not None for form in forms))) > 1:
         advice = "give sigma, arrival_sigma, covariance or snr"
         raise InvalidProblem("the noise is given more than once", c.where, advice)
-    if column:
-        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True), None, None
-    if section.sigma == ESTIMATE:
+    if section.sigma == ESTIMATE and not column:
         return np.full(z.shape, _BEGIN.get(model.quantity, 1.0)), None, None
-    if section.sigma is not None:
-        number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
-        return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False), None, None
+    if (sigma := sigma_of(c, units, unit, z)) is not None:
+        return sigma, None, None
     if section.arrival_sigma is not None:
         return None, _arrival(c, model, units, unit, section.arrival_sigma), None
     # A matrix stays in the file's unit until the slope of each row is known.
     covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
     return None, None, covariance
+
+
+def sigma_of(c: Context, units: Units, unit: Conversion, z: Array) -> Array | None:
+    """Return the standard deviations (m,) of values z (m,) by the column or the key sigma, None without either."""
+    if c.table.has("sigma"):
+        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True)
+    if c.section.sigma is None:
+        return None
+    number, own = units.amount(c.section.sigma, unit, join(c.where, "key 'sigma'"))
+    return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False)
 
 
 def signal_of(c: Context) -> Signal | None:
@@ -395,10 +398,8 @@ def signal_of(c: Context) -> Signal | None:
         return None
     given = section.snr if isinstance(section.snr, Mapping) else dict.fromkeys(c.stations, section.snr)
     place, snr = join(c.where, "key 'snr'"), np.full(len(c.stations), np.nan)
-    for name, value in given.items():
-        if name not in c.stations:
-            raise InvalidProblem(f"there is no station {name!r}", place, nearest(name, list(c.stations)))
-        snr[c.stations.index(name)] = Units("power").plain(value, "1", place)
+    for i, value in zip(numbers_of([*given], c.stations, place), given.values(), strict=True):
+        snr[i] = Units("power").plain(value, "1", place)
     bandwidth = Units("frequency").plain(section.bandwidth, "Hz", join(c.where, "key 'bandwidth'"))
     duration = Units("time").plain(section.duration, "s", join(c.where, "key 'duration'"))
     try:
@@ -424,15 +425,11 @@ def _arrival(
         raise InvalidProblem("these rows do not add up what single stations measure", place, "give sigma or covariance")
     if not isinstance(given, Mapping):
         given = dict.fromkeys(c.stations, given)
-    numbers = {name: i for i, name in enumerate(c.stations)}
-    unknown = [name for name in given if name not in numbers]
-    if unknown:
-        raise InvalidProblem(f"there is no station {unknown[0]!r}", place, nearest(unknown[0], list(c.stations)))
     # A station that is not named measures exactly; rows without any noise are refused later.
     sigma = np.zeros(len(c.stations))
-    for name, value in given.items():
+    for i, value in zip(numbers_of([*given], c.stations, place), given.values(), strict=True):
         number, own = units.amount(value, unit, place)
-        sigma[numbers[name]] = own.sigma_to_si(number)
+        sigma[i] = own.sigma_to_si(number)
         if number <= 0.0:
             raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
     return sigma

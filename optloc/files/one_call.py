@@ -8,24 +8,23 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import Any, NamedTuple, cast, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast, get_args, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Array, Band, Stations
-from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
+from optloc.base.types import Amount, Array, Band, Stations
+from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
-from optloc.files.columns import stem
-from optloc.files.declination import angle_of, date_of, declinations
+from optloc.files.declination import declination_of, declinations
 from optloc.files.propagation import is_time
 from optloc.files.readings import CARTESIAN, COMPASS
-from optloc.files.roles import WORDS, worded
+from optloc.files.roles import worded
 from optloc.files.schema import FrameTable, StationsTable, Units
-from optloc.files.stations import survey
-from optloc.files.table import Table, of_frame
+from optloc.files.stations import station_table, survey
 from optloc.linear import constraints
 from optloc.models import MODELS
 from optloc.models.medium import Medium
@@ -34,6 +33,16 @@ from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.solution import solve
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Places: TypeAlias = "Mapping[str, Sequence[float]] | ArrayLike | pd.DataFrame"
+"""Coordinates by name, as an array (s, 2 or 3), or as a table."""
+Values: TypeAlias = (
+    "Mapping[str, ArrayLike] | Mapping[tuple[str, str], ArrayLike] | ArrayLike | pd.Series | pd.DataFrame"
+)
+"""Measurements by station or by pair of stations, in the order of the stations, or as a table."""
 
 # Nothing is nearer to the centre of the Earth than its poles, metres.
 _SURFACE = 6.3e6
@@ -66,24 +75,66 @@ class _North(NamedTuple):
     declination: Any
 
 
+@overload
 def locate(
-    stations: Any = None,
+    stations: Places,
     *,
-    latlon: Any = None,
-    toa: Any = None,
-    tdoa: Any = None,
-    ranges: Any = None,
-    pseudoranges: Any = None,
-    bearings: Any = None,
-    elevations: Any = None,
-    sigma: Any = None,
-    unit: Any = None,
+    latlon: None = None,
+    toa: Values | None = None,
+    tdoa: Values | None = None,
+    ranges: Values | None = None,
+    pseudoranges: Values | None = None,
+    bearings: Values | None = None,
+    elevations: Values | None = None,
+    sigma: Amount | Mapping[str, Amount] | None = None,
+    unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Any = None,
+    height: Amount | Sequence[Amount] | None = None,
     azimuth: str = COMPASS,
-    declination: Any = None,
+    declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: float | tuple[float, float] | Medium = SPEED_OF_LIGHT,
+    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    method: str = "auto",
+) -> Fix: ...
+@overload
+def locate(
+    stations: None = None,
+    *,
+    latlon: Places,
+    toa: Values | None = None,
+    tdoa: Values | None = None,
+    ranges: Values | None = None,
+    pseudoranges: Values | None = None,
+    bearings: Values | None = None,
+    elevations: Values | None = None,
+    sigma: Amount | Mapping[str, Amount] | None = None,
+    unit: str | Mapping[str, str] | None = None,
+    reference: str | None = None,
+    height: Amount | Sequence[Amount] | None = None,
+    azimuth: str = COMPASS,
+    declination: Amount | date | None = None,
+    frame: str = "cartesian",
+    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    method: str = "auto",
+) -> Fix: ...
+def locate(
+    stations: Places | None = None,
+    *,
+    latlon: Places | None = None,
+    toa: Values | None = None,
+    tdoa: Values | None = None,
+    ranges: Values | None = None,
+    pseudoranges: Values | None = None,
+    bearings: Values | None = None,
+    elevations: Values | None = None,
+    sigma: Amount | Mapping[str, Amount] | None = None,
+    unit: str | Mapping[str, str] | None = None,
+    reference: str | None = None,
+    height: Amount | Sequence[Amount] | None = None,
+    azimuth: str = COMPASS,
+    declination: Amount | date | None = None,
+    frame: str = "cartesian",
+    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
     method: str = "auto",
 ) -> Fix:
     """Return where something is from what receivers measured of it, in one call.
@@ -122,8 +173,9 @@ def locate(
         Unit of the values: "ns", "km", "rad" and so on.
     reference : str, optional
         Station that time differences are taken to; the first by default.
-    height : float, or (least, greatest), optional
-        Known height of the target: metres above the WGS 84 ellipsoid, or along z where there is no Earth.
+    height : float, str, or (least, greatest), optional
+        Known height of the target, metres or text such as "1640 ft": above the WGS 84 ellipsoid, or along z where
+        there is no Earth.
     azimuth : "north-clockwise", "north-counterclockwise" or "east-counterclockwise"
         Where bearings are counted from, and which way.
     declination : float, str or date, optional
@@ -132,10 +184,10 @@ def locate(
         compass bearings.
     frame : "cartesian" or "ecef"
         What x, y, z of stations mean.
-    speed : float, (float, float), Layers or Atmosphere
-        Propagation speed, m/s: light, or `optloc.units.sound_in_air` and `sound_in_water`; or `optloc.models.Layers`
-        and `optloc.models.Atmosphere`, through which rays bend. A pair is a speed and its standard deviation: the speed
-        is then estimated with the position, from all measurements that are times.
+    speed : float, str, (float, float), Layers or Atmosphere
+        Propagation speed, m/s or text such as "1480 m/s": light, `optloc.units.sound_in_air` or `sound_in_water`. Rays
+        bend through `optloc.models.Layers` and `optloc.models.Atmosphere`. A pair is a speed and its standard
+        deviation: the speed is then estimated with the position, from all measurements that are times.
     method : str
         As of `optloc.solve`.
 
@@ -169,8 +221,17 @@ def locate(
     north = _North(azimuth, declination)
     _check_north(north, given)
     own, spread = _speed(speed), _speed_sigma(speed)
-    problem = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, own, spread, north)
-    return solve(problem, method=method)
+    problem, labels = _problem_of(stations, latlon, given, sigma, unit, reference, height, frame, own, spread, north)
+    return _labelled(solve(problem, method=method), labels)
+
+
+def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
+    """Return fixes with the index of the data frame that their values come from."""
+    if labels is None or fix.shape != (len(labels),):
+        return fix
+    own = np.empty(len(labels), dtype=object)
+    own[:] = labels
+    return replace(fix, labels=own)
 
 
 def _check_north(north: _North, given: Mapping[str, Any]) -> None:
@@ -178,17 +239,13 @@ def _check_north(north: _North, given: Mapping[str, Any]) -> None:
     known = get_args(AzimuthConvention)
     if north.azimuth not in known:
         raise InvalidProblem(f"there is no convention {north.azimuth!r}", "azimuth", nearest(north.azimuth, known))
-    if north.declination is None:
-        return
-    if "bearings" not in given:
+    if north.declination is not None and "bearings" not in given:
         raise InvalidProblem("there are no bearings", "declination", "leave it out")
-    if north.azimuth == CARTESIAN:
-        raise InvalidProblem("angles from the x axis have no declination", "declination", "leave it out")
 
 
 def _speed_sigma(given: Any) -> float | None:
     """Return the standard deviation of a speed that is a pair."""
-    return float(given[1]) if isinstance(given, tuple | list) else None
+    return float(in_si(given[1], "speed", "speed")) if isinstance(given, tuple | list) else None
 
 
 def _speed(given: Any) -> float | Medium:
@@ -201,6 +258,7 @@ def _speed(given: Any) -> float | Medium:
             )
         _speed(given[1])  # as positive as the speed
         return _speed(given[0])
+    given = in_si(given, "speed", "speed")
     if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
         advice = "give metres per second, optloc.models.Layers or optloc.models.Atmosphere"
         raise InvalidProblem("the speed is no positive number", "speed", advice)
@@ -224,13 +282,14 @@ def _problem_of(
     through: float | Medium,
     spread: float | None,
     north: _North,
-) -> Problem:
-    """Return the problem of the arguments of `locate`."""
+) -> tuple[Problem, list[Any] | None]:
+    """Return the problem of the arguments of `locate`, and the labels of its rows."""
     medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
     places = _PLACES.call(_receivers, stations, latlon, frame)
-    rows, timed = [], []
+    rows, timed, labels = [], [], None
     for word, values in given.items():
         found = station_values(word, values, places.names, reference)
+        labels = found.labels if labels is None else labels
         own = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
         step, own_sigma = _SCALES.call(_scale, word, own, sigma, list(given), speed, convention)
@@ -239,7 +298,7 @@ def _problem_of(
         rows.append(_from_north(made, north, own, places) if word == "bearings" else made)
     at = _heights(height, places, given)
     problem = assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
-    return problem if spread is None else _with_speed(problem, speed, spread, timed)
+    return (problem if spread is None else _with_speed(problem, speed, spread, timed)), labels
 
 
 def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bool]) -> Problem:
@@ -270,10 +329,8 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
         raise InvalidProblem(what, "stations", "give stations= in metres, or latlon= in degrees")
     if frame not in ("cartesian", "ecef"):
         raise InvalidProblem(f"there is no frame {frame!r}", "frame", 'use "cartesian" or "ecef", or latlon=')
-    if isinstance(stations, Stations):
-        stations = dict(zip(stations.names, stations.position[..., 0, :, :], strict=True))
     where, axes = ("stations", "xyz") if latlon is None else ("latlon", ("lat_deg", "lon_deg", "height"))
-    table = worded(_station_table(stations if latlon is None else latlon, where, axes), "m")
+    table = worded(station_table(stations if latlon is None else latlon, where, axes), "m")
     globe = table.has("lat_deg") or table.has("lon_deg")
     if latlon is not None and not globe:
         raise InvalidProblem("there are no latitudes", "latlon", "call the columns lat and lon, or use stations=")
@@ -288,36 +345,6 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     return _Receivers(made, own, globe and not table.has("height"), extent)
 
 
-def _station_table(given: Any, where: str, axes: Sequence[str]) -> Table:
-    """Return stations as a table, whatever they are given as."""
-    if hasattr(given, "columns") and hasattr(given, "index"):
-        table = of_frame(given, where, {})
-        stems = {stem(name) for name in table.columns}
-        if stems & set(WORDS["name"].split()):
-            return table
-        return of_frame({"name": np.array([str(label) for label in given.index], dtype=object)} | {
-            name: table.columns[name] for name in table.columns
-        }, where, {})  # fmt: skip
-    if isinstance(given, Mapping) and {stem(str(key)) for key in given} & {"x", *WORDS["lat_deg"].split(), "latdeg"}:
-        return of_frame(given, where, {})
-    names = [str(name) for name in given] if isinstance(given, Mapping) else None
-    rows = list(given.values()) if isinstance(given, Mapping) else given
-    if isinstance(given, Mapping) and rows and all(isinstance(row, Mapping) for row in rows):
-        keys = dict.fromkeys(key for row in rows for key in row)
-        columns = {key: np.array([row.get(key) for row in rows], dtype=object) for key in keys}
-        return of_frame({"name": np.array(names, dtype=object)} | columns, where, {})
-    try:
-        place = np.array([np.asarray(row, dtype=float) for row in rows])
-    except (TypeError, ValueError):
-        place = np.zeros(0)
-    if place.ndim != 2 or place.shape[1] not in (2, 3):
-        what = "these are no positions of 2 or 3 coordinates each"
-        raise InvalidProblem(what, where, "give name: (x, y, z), or an array with a row for each station")
-    labels = names or [f"S{i}" for i in range(len(place))]
-    named = {"name": np.array(labels, dtype=object)}
-    return of_frame(named | dict(zip(axes, place.T, strict=False)), where, {})
-
-
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
     """Return what is known of the target's height."""
     d = places.stations.position.shape[-1]
@@ -329,12 +356,14 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
             raise InvalidProblem("bearings alone do not tell how high the target is", "bearings", advice)
         return ()
     try:
-        low, high = (float(end) for end in (height if np.ndim(height) else (height, height)))
+        ends = (height, height) if isinstance(height, str) or not np.ndim(height) else height
+        low, high = (float(in_si(end, "length", "height")) for end in ends)
+    except InvalidProblem:
+        raise
     except (TypeError, ValueError):
         low = high = np.nan
     if not low <= high:
-        what = f"{height!r} is no height" if isinstance(height, str) else "this is no height"
-        raise InvalidProblem(what, "height", "give metres, or the least and the greatest")
+        raise InvalidProblem("this is no height", "height", "give metres, or the least and the greatest")
     if places.frame.geodetic:
         return constraints.height(low, high)
     if d == 2:
@@ -413,12 +442,10 @@ def _from_north(made: Measured, north: _North, unit: str, places: _Receivers) ->
     if isinstance(east, bool) or not isinstance(east, str | date | float | int | np.number):
         what = f"{type(east).__name__} is no declination"
         raise InvalidProblem(what, "declination", 'give a number, "4 deg", or a date such as "2026-06-01"')
-    day = date_of(east, "declination")
-    if day is None:
-        amount = angle_of(str(east), unit, "declination")
-        return replace(made, rows=replace(rows, correction=rows.correction + amount))
-    each = declinations(places.stations.position[0], places.frame, day, "declination")
-    return replace(made, rows=replace(rows, correction=rows.correction + each[rows.a]))
+    angle, day = declination_of(east, north.azimuth, unit, "declination")
+    at = places.stations.position[0]
+    more = angle if day is None else declinations(at, places.frame, day, "declination")[rows.a]
+    return replace(made, rows=replace(rows, correction=rows.correction + more))
 
 
 def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:

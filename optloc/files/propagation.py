@@ -74,11 +74,11 @@ def _stated_speed(file: ProblemFile, source: str) -> float | None:
     if given is None:
         return None
     if isinstance(given, SpeedTable):
-        return _positive(given.value, "speed", place)
-    return _positive(given, "speed", place)
+        return positive_speed(given.value, "speed", place)
+    return positive_speed(given, "speed", place)
 
 
-def _positive(given: float | str, what: str, place: str) -> float:
+def positive_speed(given: float | str, what: str, place: str) -> float:
     """Return a speed or its sigma, metres per second; refuse zero and less."""
     speed = Units("speed").plain(given, "m/s", place)
     if not speed > 0.0:
@@ -120,6 +120,6 @@ def speed_bias(
         raise InvalidProblem("the medium states the speed", place, "leave the sigma out")
     if any(bias.name == SPEED for bias in biases):
         raise InvalidProblem("the bias 'speed' is there twice", place, "leave [[biases]] 'speed' or the sigma out")
-    speed, sigma = _positive(given.value, "speed", place), _positive(given.sigma, "sigma", place)
+    speed, sigma = positive_speed(given.value, "speed", place), positive_speed(given.sigma, "sigma", place)
     rows = [numbers for numbers, units, unit in written if is_time(units, unit, place)]
     return (scale_of(speed, sigma, rows, place),)

@@ -35,7 +35,7 @@ from optloc.files.schema import (
     read_document,
     validate,
 )
-from optloc.files.stations import over_epochs, survey
+from optloc.files.stations import over_epochs, station_table, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, of_frame, table_of
 from optloc.files.unknowns import (
     FREE,
@@ -556,7 +556,7 @@ def from_table(
     """
     names = dict(columns or {})
     place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
-    station_table = _station_table(stations, (station_options or {}).get("columns", {}))
+    places = station_table(stations, "stations", names=(station_options or {}).get("columns"))
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
     # The arguments as a problem file: one reader serves both, and complaints name "arguments".
     settings = {
@@ -570,23 +570,4 @@ def from_table(
         "constraints": [dict(constraint) for constraint in constraints],
     }
     file = validate(settings, "arguments")
-    return assemble(file, station_table, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem
-
-
-def _station_table(stations: Any, names: Mapping[str, str]) -> Table:
-    if isinstance(stations, Stations):
-        if stations.position.shape[:-2] != (1,):
-            raise InvalidProblem("these stations move or are a batch", "stations", "give a table with a column 'time'")
-        stations = dict(zip(stations.names, stations.position[0], strict=True))
-    # A mapping of names to coordinates, unless it has a column of names.
-    if isinstance(stations, Mapping) and "name" not in stations and names.get("name") not in stations:
-        try:
-            position = np.array([np.asarray(value, dtype=float) for value in stations.values()])
-        except ValueError:
-            position = np.zeros(0)
-        if position.ndim != 2 or position.shape[1] not in {2, 3}:
-            raise InvalidProblem(
-                "the stations are no positions of 2 or 3 coordinates", "stations", "give name: (x, y, z)"
-            )
-        stations = {"name": np.array(list(stations), dtype=object)} | dict(zip("xyz", position.T, strict=False))
-    return of_frame(stations, "stations", names)
+    return assemble(file, places, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem

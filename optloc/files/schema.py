@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass
 from datetime import date
@@ -13,15 +12,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
-from optloc.base.types import FormName
+from optloc.base.types import (
+    Amount,  # of a table: bare numbers are in its unit
+    FormName,
+)
 from optloc.base.units import (
-    LARGEST,
     SI_UNIT,
     SPEED_OF_LIGHT,
     AzimuthConvention,
     Conversion,
     Quantity,
     conversion,
+    example_of,
+    split_amount,
 )
 from optloc.models import MODELS, Model, kind_named
 
@@ -91,20 +94,11 @@ class Units:
         where : str
             Place to name.
         """
-        # A number that TOML read is spelled again: one way for both.
-        text, _, unit = str(value).strip().partition(" ")
-        try:
-            number = float(text)
-        except ValueError:
-            number = math.nan
-        # The example repeats the number that was written, so that it can be copied.
-        example = f'"{text if abs(number) <= LARGEST else 1.5} {SI_UNIT[self.quantity]}"'
-        if not abs(number) <= LARGEST:
-            what = f"{value!r} is beyond {LARGEST:g}" if math.isfinite(number) else f"{value!r} is no amount"
-            raise InvalidProblem(what, where, f"write a number and a unit, such as {example}")
-        if unit.strip():
-            return number, self.conversion(unit.strip(), where)
+        number, unit = split_amount(value, self.quantity, where)
+        if unit:
+            return number, self.conversion(unit, where)
         if default is None:
+            example = example_of(number, str(value).strip(), self.quantity)
             raise InvalidProblem(f"{value!r} has no unit", where, f"write it with its unit, such as {example}")
         return number, default
 
@@ -113,9 +107,6 @@ class Units:
         number, unit = self.amount(value, None if default is None else self.conversion(default, where), where)
         return float(unit.to_si(number))
 
-
-Amount = float | str
-"""A number in the unit of its table, or text such as "30 ns"."""
 
 Bound = Annotated[float, Field(allow_inf_nan=True)]
 """One coordinate of a box; infinite where there is no bound."""

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem, no_station
 from optloc.base.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic
 from optloc.base.inputs import at_most
 from optloc.base.types import Array, Stations
-from optloc.files.roles import worded
+from optloc.files.columns import stem
+from optloc.files.roles import WORDS, worded
 from optloc.files.schema import FrameTable, StationsTable, Units, join
-from optloc.files.table import Epochs, Table
+from optloc.files.table import Epochs, Table, of_frame
 from optloc.files.words import distinct
 
 _XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
+# Stems of columns of coordinates, by which a mapping is a table.
+_COLUMNS = {"x", *WORDS["lat_deg"].split(), "latdeg"}
 # Length of a quaternion beyond 1 that is more than the rounding of two or three written digits: another order of parts.
 _UNIT = 1e-2
 # Difference of axes from the frame's that is rounding of a rotation: such stations need no axes of their own.
@@ -62,6 +66,71 @@ class Survey:
     def moving(self) -> bool:
         """Return whether the table dates its rows."""
         return self.table.has("time") or self.table.has("epoch")
+
+
+def numbers_of(names: Sequence[str], stations: Sequence[str], where: str | Callable[[int], str]) -> Array:
+    """Return the number of each station (n,) by its name.
+
+    Parameters
+    ----------
+    names : sequence of n str
+        What a user wrote.
+    stations : sequence of s str
+        Stations that there are.
+    where : str, or function of int
+        Place of all names, or of each by its number.
+    """
+    number = {name: i for i, name in enumerate(stations)}
+    for i, name in enumerate(names):
+        if name not in number:
+            raise no_station(name, where if isinstance(where, str) else where(i), stations)
+    return np.array([number[name] for name in names], dtype=np.int64)
+
+
+def station_table(
+    given: Any, where: str, axes: Sequence[str] = ("x", "y", "z"), names: Mapping[str, str] | None = None
+) -> Table:
+    """Return the table of stations that a caller has in Python.
+
+    Parameters
+    ----------
+    given : Stations, data frame, mapping of name to coordinates or to a row, mapping of columns, or array (s, d)
+        Where stations are; without names they are called S0, S1 and so on.
+    where : str
+        Argument to name.
+    axes : sequence of str
+        Columns of coordinates that are an array.
+    names : mapping of str to str, optional
+        What a table calls its columns.
+    """
+    names = names or {}
+    if isinstance(given, Stations):
+        if given.position.shape[:-2] != (1,):
+            raise InvalidProblem("these stations move or are a batch", where, "give a table with a column 'time'")
+        given = dict(zip(given.names, given.position[0], strict=True))
+    if hasattr(given, "columns") and hasattr(given, "index"):
+        table = of_frame(given, where, names)
+        if table.has("name") or {stem(name) for name in table.columns} & set(WORDS["name"].split()):
+            return table
+        labels = np.array([str(label) for label in given.index], dtype=object)
+        return of_frame({"name": labels} | {name: table.columns[name] for name in table.columns}, where, names)
+    mapped = isinstance(given, Mapping)
+    if mapped and (names.get("name", "name") in given or {stem(str(key)) for key in given} & _COLUMNS):
+        return of_frame(given, where, names)
+    rows = list(given.values()) if mapped else given
+    if mapped and rows and all(isinstance(row, Mapping) for row in rows):
+        keys = dict.fromkeys(key for row in rows for key in row)
+        columns = {key: np.array([row.get(key) for row in rows], dtype=object) for key in keys}
+        return of_frame({"name": np.array([str(name) for name in given], dtype=object)} | columns, where, names)
+    try:
+        place = np.array([np.asarray(row, dtype=float) for row in rows])
+    except (TypeError, ValueError):
+        place = np.zeros(0)
+    if place.ndim != 2 or place.shape[1] not in (2, 3):
+        what = "these are no positions of 2 or 3 coordinates each"
+        raise InvalidProblem(what, where, "give name: (x, y, z), or an array with a row for each station")
+    labels = np.array([str(name) for name in given] if mapped else [f"S{i}" for i in range(len(place))], dtype=object)
+    return of_frame({"name": labels} | dict(zip(axes, place.T, strict=False)), where, names)
 
 
 def survey(section: StationsTable, table: Table, frame_table: FrameTable, where: str) -> tuple[Survey, Frame]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from csv import Error as CSVError, reader as lines_of
@@ -13,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from optloc.base.arrays import first_rows
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, check_once, nearest
 from optloc.base.inputs import at_most, decoded, has_controls, read_bytes, within
 from optloc.base.types import Array
 from optloc.base.units import LARGEST
@@ -22,6 +21,7 @@ from optloc.files.words import Words, distinct, objects, words_of
 
 _PARQUET = (".parquet", ".pq")
 _FILES = (".csv", ".txt", ".tsv", *_PARQUET)
+_TWICE = "column {!r} occurs twice"
 # What is repeated of a cell that is refused.
 _WORD = 40
 
@@ -275,9 +275,7 @@ def _header(line: str, separator: str, source: str) -> list[str]:
         raise _no_csv(str(error), join(source, "header")) from None
     if not any(header):
         raise InvalidProblem("the file is empty or has no header", source, "begin it with the names of its columns")
-    twice, count = Counter(header).most_common(1)[0]
-    if count > 1:
-        raise InvalidProblem(f"column {twice!r} occurs twice", join(source, "header"), "rename one of them")
+    check_once(header, _TWICE, join(source, "header"))
     return header
 
 
@@ -328,9 +326,7 @@ def _check_size(about: Any, schema: Any, source: str) -> None:
     at_most("bytes", sum(max(group.total_byte_size, 0) for group in groups), source)
     if sum(group.num_rows for group in groups) != about.num_rows:
         raise InvalidProblem("its parts have other numbers of rows than it says", source, "write it again")
-    twice, count = Counter(schema.names).most_common(1)[0] if len(schema) else ("", 0)
-    if count > 1:
-        raise InvalidProblem(f"column {twice!r} occurs twice", source, "rename one of them")
+    check_once(schema.names, _TWICE, source)
 
 
 def _fits(pa: Any, kind: Any) -> bool:

@@ -11,10 +11,9 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Amount, Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT, Conversion, Quantity
 from optloc.files.schema import (
-    Amount,
     BiasTable,
     ConstraintTable,
     FrameTable,
@@ -26,7 +25,7 @@ from optloc.files.schema import (
     Units,
     join,
 )
-from optloc.files.stations import spread, survey
+from optloc.files.stations import numbers_of, spread, survey
 from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, reported, speed, visible
 from optloc.problem.bias import family
@@ -526,15 +525,13 @@ def _sight(table: ConstraintTable, stations: Stations, frame: Frame, where: str)
     place = join(where, "key 'stations'")
     if isinstance(chosen, str):
         raise InvalidProblem(f"{chosen!r} is no list of stations", place, 'give "all" or a list of names')
-    unknown = [name for name in chosen if name not in stations.names]
-    if unknown or not chosen:
-        what = f"there is no station {unknown[0]!r}" if unknown else "no station is named"
-        raise InvalidProblem(what, place, nearest(unknown[0] if unknown else "", stations.names))
+    if not chosen:
+        raise InvalidProblem("no station is named", place, nearest("", stations.names))
+    index = numbers_of(chosen, stations.names, place)
     place = join(where, "key 'elevation'")
     elevation = Units("angle").plain(0.0 if table.elevation is None else table.elevation, "deg", place)
     if abs(elevation) > np.pi / 2:
         raise InvalidProblem("the elevation is outside -90 to 90 deg", place, "give degrees above the horizon")
-    index = [stations.names.index(name) for name in chosen]
     seen = visible(frame.to_ecef(stations.position[0, index]), elevation=elevation)
     return [replace(band, name=f"sight of {name}") for band, name in zip(seen, chosen, strict=True)]
 

@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import tangent
-from optloc.base.types import Array, Band, Motion, Polygon
+from optloc.base.types import Amount, Array, Band, Motion, Polygon
+from optloc.base.units import in_si
 from optloc.linear.courses import course_at, elapsed, height_at, to_ecef
 from optloc.models.primitives import Jet, Point
 from optloc.models.surfaces import SURFACES
@@ -25,36 +27,41 @@ TOLERANCE = 1e-6
 # How users state constraints.
 
 
-def box(lower: Sequence[float], upper: Sequence[float], *, target: int = 0) -> tuple[Band, ...]:
+def box(lower: Sequence[Amount] | Array, upper: Sequence[Amount] | Array, *, target: int = 0) -> tuple[Band, ...]:
     """Return the constraint that a target lies in a box; infinite bounds are none.
 
     Parameters
     ----------
-    lower, upper : sequence of d float
-        Least and greatest coordinates in the problem's frame, metres.
+    lower, upper : sequence of d float or str
+        Least and greatest coordinates in the problem's frame: metres, or text such as "2 km".
     target : int
         Which target.
     """
     d = len(lower)
     return tuple(
-        Band("plane", _number(low), _number(high), np.eye(d)[i], "xyz"[i], target)
+        Band("plane", _metres(low, "box"), _metres(high, "box"), np.eye(d)[i], "xyz"[i], target)
         for i, (low, high) in enumerate(zip(lower, upper, strict=True))
     )
 
 
 def height(
-    lower: float = -np.inf, upper: float = np.inf, *, exactly: Any = None, target: int = 0, along: bool = True
+    lower: Amount | Array = -np.inf,
+    upper: Amount | Array = np.inf,
+    *,
+    exactly: Amount | Array | None = None,
+    target: int = 0,
+    along: bool = True,
 ) -> tuple[Band, ...]:
-    """Return the constraint on a target's height above the WGS 84 ellipsoid, metres: a band, or one exact value.
+    """Return the constraint on a target's height above the WGS 84 ellipsoid: a band, or one exact value.
 
     A straight course leaves a height above the curved Earth: a target that moves needs ``Motion(order,
     over="ground")``, see also `reported`.
 
     Parameters
     ----------
-    lower, upper : float
-        Band; `lower` = 0 is "above ground".
-    exactly : float or array (...), optional
+    lower, upper : float or str
+        Band, metres or text such as "1640 ft"; `lower` = 0 is "above ground".
+    exactly : float, str or array (...), optional
         Known height, in the place of a band.
     target : int
         Which target.
@@ -62,11 +69,18 @@ def height(
         Whether it holds at every epoch, or at the reference time alone.
     """
     low, high = (lower, upper) if exactly is None else (exactly, exactly)
-    return (Band("height", _number(low), _number(high), np.zeros(0), "height", target, along),)
+    low, high = _metres(low, "height"), _metres(high, "height")
+    return (Band("height", low, high, np.zeros(0), "height", target, along),)
 
 
 def reported(
-    heights: Any, times: Any, *, within: float = 0.0, order: int = 1, reference: float | None = None, target: int = 0
+    heights: ArrayLike,
+    times: ArrayLike,
+    *,
+    within: Amount = 0.0,
+    order: int = 1,
+    reference: float | None = None,
+    target: int = 0,
 ) -> tuple[Motion, tuple[Band, ...]]:
     """Return motion and constraint of a target whose height is known at every epoch, as aircraft report theirs.
 
@@ -79,8 +93,8 @@ def reported(
         Above the WGS 84 ellipsoid at each epoch, metres.
     times : array (k,)
         Seconds of the epochs, ascending.
-    within : float
-        Half the width of the band, metres; zero: exact.
+    within : float or str
+        Half the width of the band: metres, or text such as "50 ft"; zero: exact.
     order : 1 or 2
         Of the motion.
     reference : float, optional
@@ -111,44 +125,50 @@ def reported(
     share = place - before
     level = heights[..., before] * (1.0 - share) + heights[..., min(before + 1, last)] * share
     rate = np.gradient(heights, times, axis=-1) if last else np.zeros_like(heights)
+    half = float(in_si(within, "length", "within"))
     rise = np.stack([heights - level[..., None], rate], axis=-1)
     motion = Motion(order, reference=reference, over="ground", rise=rise)
-    return motion, height(level - within, level + within, target=target)
+    return motion, height(level - half, level + half, target=target)
 
 
-def visible(points: Any, *, elevation: float = 0.0, target: int = 0) -> tuple[Band, ...]:
+def visible(points: ArrayLike, *, elevation: Amount = 0.0, target: int = 0) -> tuple[Band, ...]:
     """Return the constraint that points, for instance satellites, stand above the target's horizon.
 
     Parameters
     ----------
     points : array (v, 3)
         ECEF, metres.
-    elevation : float
-        Least elevation, radians.
+    elevation : float or str
+        Least elevation: radians, or text such as "5 deg".
     target : int
         Which target.
     """
     # Bounded is the sine, see `optloc.models.surfaces`; it grows with the elevation.
-    least = _number(np.sin(elevation))
+    least = _number(np.sin(in_si(elevation, "angle", "elevation")))
     return tuple(
         Band("visible", least, _number(np.inf), point, f"sight of point {i}", target)
         for i, point in enumerate(np.asarray(points, dtype=float))
     )
 
 
-def speed(upper: float, *, lower: float = 0.0, target: int = 0) -> tuple[Band, ...]:
-    """Return the constraint on a target's speed, metres per second."""
+def speed(upper: Amount, *, lower: Amount = 0.0, target: int = 0) -> tuple[Band, ...]:
+    """Return the constraint on a target's speed: metres per second, or text such as "90 km/h"."""
+    upper, lower = float(in_si(upper, "speed", "speed")), float(in_si(lower, "speed", "speed"))
     # No speed is negative: a lower bound of zero would be a side on which nothing can lie with a gradient.
     return (Band("speed", _number(lower if lower > 0.0 else -np.inf), _number(upper), np.zeros(0), "speed", target),)
 
 
-def polygon(vertices: Any, *, target: int = 0) -> tuple[Polygon, ...]:
+def polygon(vertices: ArrayLike, *, target: int = 0) -> tuple[Polygon, ...]:
     """Return the constraint that a target's plan position lies in a simple polygon (v, 2), metres."""
     return (Polygon(np.asarray(vertices, dtype=float), "polygon", target),)
 
 
 def _number(value: Any) -> Array:
     return np.asarray(value, dtype=float)
+
+
+def _metres(value: Any, where: str) -> Array:
+    return _number(in_si(value, "length", where))
 
 
 # Faces: the sides that hold with equality together, and how vectors are brought onto them.

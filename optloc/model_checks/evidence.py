@@ -22,7 +22,7 @@ from optloc.linear.normal import Linear, Normal, linearise, marginal, step
 from optloc.linear.walks import walks
 from optloc.model_checks.groups import Group
 from optloc.problem.arrival_times import as_arrivals, shared_places
-from optloc.problem.fix import Suspect
+from optloc.problem.explanations import Suspect
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 

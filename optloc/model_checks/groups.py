@@ -11,7 +11,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Bias
 from optloc.models import MODELS
 from optloc.problem.bias import family
-from optloc.problem.fix import GroupKind
+from optloc.problem.explanations import GroupKind
 from optloc.problem.problem import Problem
 
 KINDS: tuple[GroupKind, ...] = ("station", "row", "prior", "offset")

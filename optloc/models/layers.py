@@ -15,7 +15,7 @@ from optloc.base.types import Array
 from optloc.models.primitives import Components, Jet, Point, differential, subtract
 
 # Parts of a layer's turning rays in each of which at most one root is looked for: eight find the first arrivals that a
-# search a hundred times finer does, but for 1 of 2 000 places at the edge of a shadow (tests/test_medium.py).
+# search a hundred times finer does, but for 1 of 2 000 places at the edge of a shadow (tests/models/test_layers.py).
 _PARTS = 8
 # Newton steps, most of them for rays that leave nearly level: the tangent of their angle doubles at each.
 _STEPS = 60

@@ -8,6 +8,7 @@ from itertools import combinations, product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status, first_status
@@ -58,7 +59,7 @@ def separate(
     clutter: Clutter,
     *,
     count: int | None = None,
-    region: tuple[Any, Any] | None = None,
+    region: tuple[ArrayLike, ArrayLike] | None = None,
     penalty: float | None = None,
     boxes: int = 400_000,
 ) -> tuple[Emitters, ...]:

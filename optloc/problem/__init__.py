@@ -9,7 +9,9 @@ if TYPE_CHECKING:
         InvalidProblem as InvalidProblem,
         NoSolution as NoSolution,
         OptlocError as OptlocError,
+        check_once as check_once,
         nearest as nearest,
+        no_station as no_station,
     )
     from optloc.base.frames import (
         CARTESIAN as CARTESIAN,
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from optloc.base.types import (
         ANSWERED as ANSWERED,
         PRECEDENCE as PRECEDENCE,
+        Amount as Amount,
         Array as Array,
         Bias as Bias,
         Certificate as Certificate,
@@ -64,14 +67,8 @@ if TYPE_CHECKING:
         window as window,
         windows as windows,
     )
-    from optloc.problem.fix import (
-        Active as Active,
-        Alternatives as Alternatives,
-        Explanation as Explanation,
-        Fix as Fix,
-        Stage as Stage,
-        Suspect as Suspect,
-    )
+    from optloc.problem.explanations import Explanation as Explanation, Suspect as Suspect
+    from optloc.problem.fix import Active as Active, Alternatives as Alternatives, Fix as Fix, Stage as Stage
     from optloc.problem.forms import form_of as form_of
     from optloc.problem.layout import Layout as Layout, emission_name as emission_name, state_names as state_names
     from optloc.problem.loss import LOSSES as LOSSES, Loss as Loss

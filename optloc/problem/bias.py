@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.arrays import numbers
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array, Bias, FormName, Rows
+from optloc.base.types import Amounts, Array, Bias, FormName, Rows
+from optloc.base.units import Quantity, in_si
 from optloc.models import MODELS
 from optloc.models.primitives import rotate
 from optloc.problem.forms import FORMS, BiasForm, complete, form_of
@@ -32,11 +34,11 @@ def with_bias(
     form: FormName = "offset",
     kind: str | None = None,
     members: Members = None,
-    mean: Any = 0.0,
-    sigma: Any = None,
-    density: Any = None,
-    rate_density: Any = None,
-    knots: Any = None,
+    mean: Amounts = 0.0,
+    sigma: Amounts | None = None,
+    density: ArrayLike | None = None,
+    rate_density: ArrayLike | None = None,
+    knots: int | ArrayLike | None = None,
 ) -> Problem:
     """Return the problem with one more family of unknown systematic errors.
 
@@ -60,10 +62,10 @@ def with_bias(
         Stations (or pairs, "A-B", or targets, "0") that have one, all that measure by default; or groups of stations
         that share one, by the name of the group. Of differences alone, leave out the reference: what all stations
         share has no effect.
-    mean : float or array (q,) or (q, 3)
-        Prior mean of each member in the unit of the measurements, 1 for a scale, unit per second for a drift, radians
-        for a rotation (three angles in space), seconds for a time.
-    sigma : float or array like `mean`, optional
+    mean : float, str or array (q,) or (q, 3)
+        Prior mean of each member, or text such as "20 ns". Bare numbers are in the SI unit of the measurements, 1 for a
+        scale, unit per second for a drift, radians for a rotation (three angles in space), seconds for a time.
+    sigma : float, str or array like `mean`, optional
         Prior standard deviation; None: unknown. Of a walk they are those of its value at the first epoch.
     density : float or array (q,), optional
         Of a walk: spectral density of the white noise that it is the sum of, square of the unit of the rows per second:
@@ -84,11 +86,23 @@ def with_bias(
     bias = family(problem.rows, problem.stations.names, name, per=per, form=form, kind=kind, members=members)
     bias = complete(bias, problem.times, where, density=density, rate_density=rate_density, knots=knots)
     shape = FORMS[form].shape(bias, problem.dimension)
-    centre = _each(0.0 if mean is None else mean, shape, where, "mean")
-    spread = None if sigma is None else _each(sigma, shape, where, "sigma")
+    quantity = _quantity(problem, bias)
+    centre = _each(in_si(mean, quantity, f"{where}, mean"), shape, where, "mean")
+    spread = None if sigma is None else _each(in_si(sigma, quantity, f"{where}, sigma"), shape, where, "sigma")
     made = replace(problem, biases=(*problem.biases, replace(bias, mean=centre, sigma=spread)))
     check_unknowns(made)
     return made
+
+
+def _quantity(problem: Problem, bias: Bias) -> Quantity:
+    """Return the quantity of the values of a bias; plain where they have no unit, or are angles per second."""
+    form = form_of(bias)
+    if form.quantity is not None:
+        return form.quantity
+    kinds = [rows.kind for rows in problem.rows for _ in range(rows.count)]
+    touched = MODELS[kinds[int(bias.row[0])]].quantity
+    rates: dict[str, Quantity] = {"length": "speed"}
+    return rates.get(touched, "plain") if form.rate else cast("Quantity", touched)
 
 
 def family(
@@ -292,7 +306,7 @@ def _each(values: Any, shape: tuple[int, ...], where: str, what: str) -> Array:
 # Biases that were learnt elsewhere: taken as known, they leave the problem.
 
 
-def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
+def with_known_bias(problem: Problem, name: str, values: ArrayLike | Mapping[str, float]) -> Problem:
     """Return the problem with one of its families of biases taken as known.
 
     Learn on one run, apply to another: ``with_known_bias(later, "clock", fix.take("clock"))``.

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.arrays import numbers, positive, whole
 from optloc.base.cache import Cache, key_of
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Array, Bias, Motion, Prior, Rows, Stations
+from optloc.base.types import Amount, Amounts, Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations, Whole
+from optloc.base.units import Quantity, in_si
 from optloc.models import BEARING, MODELS, kind_named
 from optloc.models.medium import Medium
 from optloc.problem import noise as noises
@@ -47,6 +49,59 @@ class Measured:
     signal: Signal | None = None
 
 
+@overload
+def measured(
+    kind: str,
+    z: Amounts | None = None,
+    *,
+    a: Whole | None = None,
+    b: Whole | None = None,
+    sigma: Amounts,
+    arrival_sigma: Amounts | None = None,
+    epoch: Whole = 0,
+    target: Whole = 0,
+    weight: ArrayLike = 1.0,
+    correction: Amounts = 0.0,
+) -> Measured: ...
+@overload
+def measured(
+    kind: str,
+    z: Amounts | None = None,
+    *,
+    a: Whole | None = None,
+    b: Whole | None = None,
+    arrival_sigma: Amounts,
+    epoch: Whole = 0,
+    target: Whole = 0,
+    weight: ArrayLike = 1.0,
+    correction: Amounts = 0.0,
+) -> Measured: ...
+@overload
+def measured(
+    kind: str,
+    z: Amounts | None = None,
+    *,
+    a: Whole | None = None,
+    b: Whole | None = None,
+    covariance: ArrayLike,
+    epoch: Whole = 0,
+    target: Whole = 0,
+    weight: ArrayLike = 1.0,
+    correction: Amounts = 0.0,
+) -> Measured: ...
+@overload
+def measured(
+    kind: str,
+    z: Amounts | None = None,
+    *,
+    a: Whole | None = None,
+    b: Whole | None = None,
+    signal: Signal,
+    epoch: Whole = 0,
+    target: Whole = 0,
+    weight: ArrayLike = 1.0,
+    correction: Amounts = 0.0,
+) -> Measured: ...
 def measured(
     kind: str,
     z: Any = None,
@@ -56,7 +111,7 @@ def measured(
     sigma: Any = None,
     arrival_sigma: Any = None,
     covariance: Any = None,
-    signal: Any = None,
+    signal: Signal | None = None,
     epoch: Any = 0,
     target: Any = 0,
     weight: Any = 1.0,
@@ -69,12 +124,13 @@ def measured(
     kind : str
         A key of `optloc.models.MODELS`, for instance "tdoa", or one of its aliases.
     z : array (..., m), optional
-        Measured values: metres, metres per second, radians or ratios; None to be simulated.
+        Measured values: metres, metres per second, radians or ratios, or texts with a unit such as "20 ns"; None to be
+        simulated.
     a, b : int array (m,) or int
         Stations of each row, as indices.
-    sigma : float or array (..., m), optional
-        Standard deviation of each row; rows are then independent.
-    arrival_sigma : float or array (..., s), optional
+    sigma : float, str or array (..., m), optional
+        Standard deviation of each row, in SI units or text such as "20 ns"; rows are then independent.
+    arrival_sigma : float, str or array (..., s), optional
         Standard deviation of what each station measures by itself, in the unit of z: its arrival time (times c), its
         range rate; rows get the covariance D diag(sigma^2) D'. With `sigma` as well, the two add.
     covariance : array (..., m, m), optional
@@ -104,11 +160,13 @@ def measured(
         raise InvalidProblem("a bearing is degrees from north, and measurements in memory are not", "kind", advice)
     kind = kind_named(kind)
     model = MODELS[kind]
+    quantity = cast("Quantity", model.quantity)
+    correction = in_si(correction, quantity, "correction")
     # Everything becomes arrays first, so that what follows speaks of shapes and never of types.
     z, sigma, arrival_sigma = (
-        numbers(z, "z"),
-        positive(sigma, "sigma", kind),
-        positive(arrival_sigma, "arrival_sigma", kind),
+        numbers(in_si(z, quantity, "z"), "z"),
+        positive(in_si(sigma, quantity, "sigma"), "sigma", kind),
+        positive(in_si(arrival_sigma, quantity, "arrival_sigma"), "arrival_sigma", kind),
     )
     covariance, weight, correction = (
         numbers(v, name) for v, name in ((covariance, "covariance"), (weight, "weight"), (correction, "correction"))
@@ -175,15 +233,15 @@ def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -
 
 
 def assemble(
-    stations: Any,
+    stations: Stations | ArrayLike,
     *measurements: Measured,
-    times: Any = None,
+    times: Amounts | None = None,
     motions: Sequence[Motion] = (Motion(),),
     biases: Sequence[Bias] = (),
     priors: Sequence[Prior] = (),
     frame: Frame = CARTESIAN,
-    covariance: Any = None,
-    constraints: Sequence[Any] = (),
+    covariance: ArrayLike | None = None,
+    constraints: Sequence[Band | Polygon | Sequence[Band | Polygon]] = (),
     medium: Medium | None = None,
 ) -> Problem:
     """Return a problem, or a batch of problems where arrays have leading axes.
@@ -224,7 +282,7 @@ def assemble(
         stations if isinstance(stations, Stations) else station_array(stations),
         tuple(m.rows for m in measurements),
         noises.Noise(()),
-        np.arange(float(epochs)) if times is None else np.asarray(numbers(times, "times")),
+        np.arange(float(epochs)) if times is None else np.asarray(numbers(in_si(times, "time", "times"), "times")),
         tuple(motions),
         tuple(biases),
         tuple(priors),
@@ -291,7 +349,11 @@ def _complete(made: Problem, measurements: Sequence[Measured], full: Array | Non
 
 
 def station_array(
-    position: Any, names: Sequence[str] | None = None, *, velocity: Any = None, axes: Any = None
+    position: ArrayLike | Sequence[Sequence[Amount]],
+    names: Sequence[str] | None = None,
+    *,
+    velocity: ArrayLike | None = None,
+    axes: ArrayLike | None = None,
 ) -> Stations:
     """Return stations.
 
@@ -311,7 +373,7 @@ def station_array(
     InvalidProblem
         Where positions are no such array, or numbers are none.
     """
-    array = np.asarray(numbers(position, "stations"))
+    array = np.asarray(numbers(in_si(position, "length", "stations"), "stations"))
     if array.ndim < 2 or array.shape[-1] not in (2, 3):
         raise InvalidProblem(
             f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.problem.chart import basis
-from optloc.problem.epochs import by_epoch
-from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
 LEVEL = 0.95
@@ -265,33 +263,3 @@ class Source:
 
     problem: Problem
     found: Determined | None = None
-
-
-# Fixes of a batch that keep their problems: a person looks at no more of them one by one.
-_KEPT = 8
-
-
-def with_sources(problem: Problem, fix: Fix) -> Fix:
-    """Return fixes with the problems of those that are not `ok`, where they are few.
-
-    Parameters
-    ----------
-    problem : Problem
-        Of the fixes, or the run whose epochs they are of.
-    fix : Fix
-        Single, or a batch.
-    """
-    if not fix.shape and int(fix.code) == Status.OK:
-        return fix
-    if not fix.shape and not problem.batch_shape:  # a copy of the problem would take as long as the fix
-        own = np.empty((), dtype=object)
-        own[()] = Source(problem)
-        return replace(fix, source=own)
-    items = np.flatnonzero(fix.code.ravel() != Status.OK)
-    if not 0 < len(items) <= _KEPT:
-        return fix
-    flat = (problem if problem.batch_shape == fix.shape else by_epoch(problem)).flat()
-    source = np.empty(fix.code.size, dtype=object)
-    for i in items:
-        source[i] = Source(flat.take(np.array([i])))
-    return replace(fix, source=source.reshape(fix.shape))

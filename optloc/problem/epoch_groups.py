@@ -10,8 +10,9 @@ import numpy as np
 
 from optloc.base.arrays import first_rows
 from optloc.base.types import Array, Rows, Stations
-from optloc.problem.epochs import by_epoch, separable, states_by_epoch
-from optloc.problem.fix import Explanation, Fix
+from optloc.problem.epochs import by_epoch, rows_by_epoch, separable, states_by_epoch
+from optloc.problem.explanations import Explanation
+from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise, gathered, group
 from optloc.problem.problem import Problem, map_numbers
 
@@ -130,6 +131,21 @@ def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
     raise LookupError(epoch)
 
 
+def explanations_by_epoch(problem: Problem, explanations: Array) -> Array:
+    """Return explanations (k,) of fixes by `epoch_groups` with their rows numbered as in the batch of `by_epoch`."""
+    out, place = explanations.copy(), rows_by_epoch(problem)
+    for one in epoch_groups(problem):
+        if one.rows is not None:
+            for epoch, rows in zip(one.epochs, place[one.rows], strict=True):
+                out[epoch] = tuple(_renumbered(each, rows) for each in out[epoch])
+    return out
+
+
+def _renumbered(one: Explanation, rows: Array) -> Explanation:
+    suspects = (replace(s, rows=tuple(rows[np.array(s.rows, dtype=int)].tolist())) for s in one.suspects)
+    return replace(one, suspects=tuple(suspects))
+
+
 @dataclass(frozen=True, slots=True)
 class _RowTable:
     """The rows (m,) of all kinds by epoch: their block, stations, target, epoch, presence and group of noise.
@@ -226,7 +242,10 @@ def _stations_of(stations: Stations, own: Array) -> Stations:
     position = pick(stations.position)
     assert position is not None
     names = tuple(f"\ue000{i}\ue001" for i in range(own.shape[1]))
-    return replace(stations, position=position, velocity=pick(stations.velocity), names=names)
+    # Errors that are noise belong to their stations, as places do.
+    both = (stations.covariance, stations.velocity_covariance)
+    errors = [None if each is None else _once(each[own]) for each in both]
+    return Stations(position, names, pick(stations.velocity), None, errors[0], stations.span, errors[1])
 
 
 def _rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:

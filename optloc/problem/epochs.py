@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -62,9 +62,7 @@ def by_epoch(problem: Problem) -> Problem:
         tie = f"the bias {problem.biases[0].name!r} is" if problem.biases else "correlated noise is"
         raise InvalidProblem(f"{tie} shared by several epochs", "by_epoch", "solve them as one problem")
     places = [_places(rows) for rows in problem.rows]
-    sizes = [len(keys) for keys, _ in places]
-    starts = np.cumsum([0, *sizes])
-    where = np.concatenate([start + place for (_, place), start in zip(places, starts, strict=False)])
+    where, size = _joined(places)
     batch, k = problem.batch_shape, problem.epochs
     rows = []
     for old, (keys, place) in zip(problem.rows, places, strict=True):
@@ -88,8 +86,19 @@ def by_epoch(problem: Problem) -> Problem:
                 correction=spread(old.correction),
             )
         )
-    noise = _noise(problem, where, int(starts[-1]))
+    noise = _noise(problem, where, size)
     return replace(states_by_epoch(problem), rows=tuple(rows), noise=noise)
+
+
+def rows_by_epoch(problem: Problem) -> Array:
+    """Return the row of the batch of `by_epoch` that each row (m,) of a run becomes."""
+    return _joined([_places(rows) for rows in problem.rows])[0]
+
+
+def _joined(places: Sequence[tuple[Array, Array]]) -> tuple[Array, int]:
+    """Return the row of the batch of each row (m,) of all kinds, and the number of rows of the batch."""
+    starts = np.cumsum([0, *(len(keys) for keys, _ in places)])
+    return np.concatenate([start + place for (_, place), start in zip(places, starts, strict=False)]), int(starts[-1])
 
 
 def states_by_epoch(problem: Problem) -> Problem:

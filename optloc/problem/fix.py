@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution, status_named, too_weak, whole
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Status, statuses_of
+from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Certificate, Status, statuses_of
 from optloc.problem.chart import CARTESIAN, Chart, Extent, tail_probability
 from optloc.problem.claims import Claims
+from optloc.problem.determined import Determined
+from optloc.problem.explanations import Suspect
 from optloc.problem.layout import Layout
+from optloc.problem.problem import Problem
+from optloc.problem.state_order import components, in_order
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 TOLD = 0.95  # level up to which the regions of a fix with the finding `tails` hold
 _STATES = ("position", "velocity", "acceleration")
@@ -63,77 +70,6 @@ class Active:
     multiplier: float
 
 
-GroupKind = Literal["station", "row", "prior", "offset"]
-
-
-@dataclass(frozen=True, slots=True)
-class Suspect:
-    """Something that was left out of a fix because it contradicts the rest.
-
-    Parameters
-    ----------
-    name : str
-        In words, for instance "station S3" or "prior of position[2]".
-    group : "station", "row", "prior" or "offset"
-        What was left out: all rows of a station, one measurement, or a prior; or the offset that all lengths of a kind
-        were given.
-    rows : tuple of int
-        Global numbers of the rows it takes part in; empty for a prior.
-    error : array (q,)
-        Estimated error, measured less true: of the station's arrival time times c (positive: late) where the rows
-        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians (clockwise of
-        compass bearings) or ratios.
-    sigma : array (q,)
-        Standard deviations of `error`; infinite where nothing else tells how large it is.
-    p_with : float
-        Chi-square probability of the fit that has this back in and leaves the other suspects out; NaN without
-        redundancy.
-    p_without : float
-        The same of the fit that leaves all suspects out.
-    """
-
-    name: str
-    group: GroupKind
-    rows: tuple[int, ...]
-    error: Array
-    sigma: Array
-    p_with: float
-    p_without: float
-
-
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """One way to explain data that contradict each other: who to leave out, and what remains.
-
-    Parameters
-    ----------
-    suspects : tuple of Suspect
-        What was left out; nobody, where all data agree as well as the rest does.
-    x : array (size,)
-        Parameter vector of the fix to the rest, in the order of the problem's layout.
-    cost : float
-        Its weighted sum of squared residuals.
-    dof : int
-        Its degrees of freedom.
-    p_value : float
-        Its chi-square probability; NaN without redundancy.
-    score : float
-        The cost and a price for each suspect, 16 for one row: explanations weigh as exp(-score / 2).
-    """
-
-    suspects: tuple[Suspect, ...]
-    x: Array
-    cost: float
-    dof: int
-    p_value: float
-    score: float = float("nan")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of its suspects."""
-        return tuple(suspect.name for suspect in self.suspects)
-
-
 @dataclass(frozen=True, slots=True)
 class Alternatives:
     """Other minima of the cost that were found, cheapest first.
@@ -158,6 +94,10 @@ class Alternatives:
         from scipy.special import expit
 
         return np.asarray(expit(-0.5 * self.gap))
+
+
+Index: TypeAlias = int | np.integer[Any] | slice | list[int] | Array | tuple[int | slice | Array, ...]
+"""Chooses some fixes of a batch, as NumPy does."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -206,6 +146,8 @@ class Fix:
         Least cost of positions infinitely far away less that of the fix; NaN where nobody has looked.
     reach : array (...), optional
         Greatest distance of a station, and of a target without a chart, from the middle of the stations, metres.
+    labels : array (...), optional
+        Labels of the fixes, such as the index of the data frame that they come from.
     source : object array (...), optional
         A `Source` for `determined`; None for fixes that are `ok`, and where many are not.
     """
@@ -230,6 +172,7 @@ class Fix:
     infinity: Annotated[Array, Axes(0)] | None = None
     reach: Annotated[Array, Axes(0)] | None = None
     source: Annotated[Array, Axes(0, empty=None)] | None = None
+    labels: Annotated[Array, Axes(0, empty=None)] | None = None
     # told once: a program may ask for one after the other
     _certificates: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 
@@ -252,11 +195,16 @@ class Fix:
         return statuses_of(self.code)
 
     @property
-    def certificate(self) -> Any:
-        """Return the `Certificate` of a single fix, or the object array (...) of them of a batch."""
+    def certificate(self) -> Certificate:
+        """Return the certificate of a single fix; of a batch the same as `certificates`."""
+        return cast("Certificate", self.certificates[()])
+
+    @property
+    def certificates(self) -> Array:
+        """Return the certificates (...), an object array of `Certificate`."""
         if not self._certificates:
             self._certificates.append(self.claims.tell())
-        return self._certificates[0][()]
+        return self._certificates[0]
 
     @property
     def position(self) -> Array:
@@ -277,6 +225,21 @@ class Fix:
         slots = [slot.name for slot in (*self.layout.shared, *self.layout.local)]
         numbered = [slot for slot in slots if slot.partition("[")[0] == name]
         return numbered[0] if name in _STATES and len(numbered) == 1 else name
+
+    def state(self, order: str = "") -> tuple[Array, Array]:
+        """Return mean (..., m) and covariance (..., m, m) of the state [p, v, a] of the only unknown target.
+
+        Parameters
+        ----------
+        order : str
+            Names of components in another order, such as "x vx y vy"; all of x y z vx vy vz ax ay az by default.
+        """
+        parts = [self._slot(name) for name in _STATES]
+        slots = [slot for slot in self.layout.shared if slot.name in parts]
+        index = np.concatenate([np.arange(slot.start, slot.start + slot.size) for slot in slots])
+        mean, cov = self.x[..., index], self.cov[..., index[:, None], index]
+        d = slots[0].size
+        return in_order(order or components(d, len(index)), d, mean, cov)
 
     @property
     def bias(self) -> Mapping[str, Array]:
@@ -380,15 +343,15 @@ class Fix:
         return str(_TELLER[0]().html_of(self)) if _TELLER else ""
 
     @property
-    def determined(self) -> Any:
+    def determined(self) -> Determined | None:
         """Return the `Determined` of a single fix: directions, ranges and curves that the data know in its status.
 
         It is computed when it is read. None where the problem is not at hand, as in batches with many refused fixes:
         `optloc.model_checks.determined(problem, fix)` returns it then.
         """
-        return _TELLER[0]().determined_of(self)
+        return cast("Determined | None", _TELLER[0]().determined_of(self))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the fix as plain numbers, texts and lists, ready for JSON.
 
         Returns
@@ -399,17 +362,19 @@ class Fix:
         """
         return dict(_TELLER[0]().dict_of(self))
 
-    def to_dataframe(self) -> Any:
-        """Return a pandas data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes.
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes.
+
+        Its index is that of the data frame that the measurements come from, see `labels`.
 
         Raises
         ------
         InvalidProblem
             Where pandas is not installed.
         """
-        return _TELLER[0]().frame_of(self)
+        return cast("pd.DataFrame", _TELLER[0]().frame_of(self))
 
-    def to_geojson(self, problem: Any = None) -> dict[str, Any]:
+    def to_geojson(self, problem: Problem | None = None) -> dict[str, object]:
         """Return positions and what holds 95 % as a GeoJSON feature collection (RFC 7946).
 
         Parameters
@@ -434,8 +399,8 @@ class Fix:
         return mean, cov
 
     @property
-    def suspects(self) -> Any:
-        """Return what was left out of a single fix, a tuple of `Suspect`, or an object array (...) of them of a batch.
+    def suspects(self) -> tuple[Suspect, ...]:
+        """Return what was left out of a single fix; of a batch an object array (...) of such tuples.
 
         They are those of the first of `explanations`: where there are several, others are suspected as much.
         """
@@ -443,7 +408,7 @@ class Fix:
         for i in np.ndindex(self.shape):
             found = () if self.explanations is None else self.explanations[i]
             out[i] = found[0].suspects if found else ()
-        return out[()]
+        return cast("tuple[Suspect, ...]", out[()])
 
     @property
     def answered(self) -> Array:
@@ -456,7 +421,7 @@ class Fix:
         return np.asarray((self._all_marks & sum({one.mark for one in statuses})) != 0)
 
     @property
-    def unchecked(self) -> Any:
+    def unchecked(self) -> Array | bool:
         """Return the mask (...) of answered fixes without redundancy, which every measurement fits; a bool of one."""
         out = np.asarray(self.answered & (self.dof <= 0))
         return bool(out) if self.shape == () else out
@@ -468,8 +433,8 @@ class Fix:
         return np.asarray(marks | np.where(self.unchecked, Status.UNCHECKED.mark, 0))
 
     @property
-    def findings(self) -> Any:
-        """Return all that stands against a single fix, a tuple of `Status`, or an object array (...) of a batch.
+    def findings(self) -> tuple[Status, ...]:
+        """Return all that stands against a single fix; of a batch an object array (...) of such tuples.
 
         The most serious comes first: it is the status. Notes come last: an `ok` fix has nothing but these, `unchecked`
         where it has no redundancy.
@@ -479,7 +444,7 @@ class Fix:
         sets = np.empty(len(marks), dtype=object)
         for i, found in enumerate(marks.tolist()):
             sets[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and found & one.mark)
-        return sets[index.reshape(self.shape)] if self.shape else sets[0]
+        return cast("tuple[Status, ...]", sets[index.reshape(self.shape)] if self.shape else sets[0])
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
         """Return whether points lie in the regions that hold the target with a given probability.
@@ -567,7 +532,7 @@ class Fix:
         """Return the fixes of a flat batch with other batch axes."""
         return change(self, lambda array, core: array.reshape((*shape, *array.shape[array.ndim - core :])))
 
-    def __getitem__(self, index: Any) -> Fix:
+    def __getitem__(self, index: Index) -> Fix:
         """Return some fixes of a batch."""
         return change(self, lambda array, core: _as_array(array[index]))
 

@@ -25,9 +25,7 @@ def components(dimension: int, size: int) -> list[str]:
     return [f"{kind}{axis}" for kind in _DERIVATIVES for axis in "xyz"[:dimension]][:size]
 
 
-def in_order(
-    order: str | Sequence[str], dimension: int, mean: Array, cov: Array | None = None
-) -> tuple[Array, Array | None]:
+def in_order(order: str | Sequence[str], dimension: int, mean: Array, cov: Array) -> tuple[Array, Array]:
     """Return states and covariances with their components in another order.
 
     Parameters
@@ -38,12 +36,12 @@ def in_order(
         2 or 3.
     mean : array (..., n)
         States [p, v, a].
-    cov : array (..., n, n), optional
+    cov : array (..., n, n)
         Their covariances.
 
     Returns
     -------
-    tuple of array (..., m) and array (..., m, m) or None
+    tuple of array (..., m) and array (..., m, m)
         The m named components.
 
     Raises
@@ -58,4 +56,4 @@ def in_order(
         what = f"the state has no {unknown[0]!r}" if unknown else f"{order!r} is not an order of components"
         raise InvalidProblem(what, "order", f"name some of {' '.join(known)}, each once")
     index = np.array([known.index(name) for name in wanted])
-    return mean[..., index], None if cov is None else cov[..., index[:, None], index]
+    return mean[..., index], cov[..., index[:, None], index]

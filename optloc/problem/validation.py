@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, check_once, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import LARGEST
@@ -91,9 +91,7 @@ def _check_stations(problem: Problem) -> None:
         raise InvalidProblem(
             f"{stations.count} stations have {len(stations.names)} names", "stations", "give one name each"
         )
-    twice = [name for name, n in Counter(stations.names).items() if n > 1]
-    if twice:
-        raise InvalidProblem(f"station name {twice[0]!r} is used twice", "stations", "rename one of them")
+    check_once(stations.names, "station name {!r} is used twice", "stations")
     if problem.frame.kind == "ecef" and stations.dimension != 3:
         raise InvalidProblem("stations in ECEF need three coordinates", "stations", "give x, y and z")
     shape = (stations.count, stations.dimension, stations.dimension)

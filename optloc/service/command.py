@@ -466,7 +466,7 @@ def part_of(text: str) -> tuple[int, int]:
 
 
 def seconds_of(text: str, where: str) -> float:
-    """Return a time such as "50 ms" in seconds; a bare number is seconds."""
+    """Return a time such as "50 ms" in seconds; raise InvalidProblem for a number without a unit."""
     from optloc.files import Units
 
     value = Units("time").plain(text, None, where)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from zlib import crc32
 
 from optloc.files import has_controls
-from optloc.problem import LARGEST, InvalidProblem, nearest
+from optloc.problem import LARGEST, InvalidProblem, nearest, no_station
 from optloc.service.metrics import Metrics
 from optloc.service.site import Site, SiteRow, UnknownName
 
@@ -250,7 +250,7 @@ def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> Non
         what = "the site has neither toa nor tdoa rows, so that it cannot take arrivals"
         raise InvalidProblem(what, "station", "send values: kind, a, b, z")
     if type(station) is not str or station not in site.number:
-        raise UnknownName(f"there is no station {str(station)[:40]!r}", "station", nearest(str(station), site.number))
+        raise no_station(str(station)[:40], "station", site.number, UnknownName)
     given = [key for key in _DIGITS if key in found]
     if len(given) != 1:
         raise InvalidProblem("an arrival needs one time", "station", "give time_ns, time_ps or time")

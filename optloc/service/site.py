@@ -28,7 +28,7 @@ from optloc.files import (
     table_of,
 )
 from optloc.models import MODELS
-from optloc.problem import Array, Conversion, Frame, InvalidProblem, nearest
+from optloc.problem import Array, Conversion, Frame, InvalidProblem, nearest, no_station
 from optloc.solvers import Prepared, prepare
 
 FAST = "gtrs+lsr"
@@ -216,7 +216,7 @@ class Site:
                 what = "the station is missing" if needed else "there is a station too many"
                 raise InvalidProblem(what, key, f"{kind} rows name {count} of them")
             if needed and name not in self.number:
-                raise UnknownName(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
+                raise no_station(name[:40], key, self.stations, UnknownName)
         if a == b and count > 1:
             raise InvalidProblem(f"{kind} names station {a!r} twice", "b", "name two stations")
         return SiteRow(alike[0].section, -1, kind, a, b)

@@ -14,7 +14,8 @@ from optloc.base.types import Array, Status, statuses_of
 from optloc.bounds.rank import Observability
 from optloc.problem.chart import AXES, CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
-from optloc.problem.fix import Active, Explanation, Fix
+from optloc.problem.explanations import Explanation
+from optloc.problem.fix import Active, Fix
 from optloc.show.knowledge import is_shown
 
 Columns = dict[str, Array]
@@ -241,8 +242,9 @@ def _repeat(count: int, **texts: Sequence[str]) -> Columns:
 def _told_in_words(fix: Fix, constrained: bool) -> dict[str, list[str]]:
     """Return the proof of each fix, the constraints that hold it, and its suspects: "A; B" together, "A | B" either."""
     texts = {"proof": [PROOFS[number] for number in fix.claims.proof.tolist()]}
-    found = {each: "; ".join(one.label for one in each) for each in set(fix.findings)}
-    texts["findings"] = [found[each] for each in fix.findings]
+    findings: Any = fix.findings  # of a batch: one tuple for each fix
+    found = {each: "; ".join(one.label for one in each) for each in set(findings)}
+    texts["findings"] = [found[each] for each in findings]
     texts["chart"] = [""] * len(fix) if fix.chart is None else list(fix.chart.name)
     if constrained:
         held = [()] * len(fix) if fix.active is None else fix.active
@@ -318,7 +320,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
         "unchecked": bool(fix.unchecked),
         "gap_to_infinity": None if fix.infinity is None else fix.infinity,
         "chart": _chart_json(fix),
-        "determined": fix.determined.to_dict() if is_shown(fix) else None,
+        "determined": None if not is_shown(fix) or (known := fix.determined) is None else known.to_dict(),
         "alternatives": [
             {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
             for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)

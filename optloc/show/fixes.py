@@ -22,7 +22,8 @@ from optloc.model_checks.determine import determined, of_fix
 from optloc.problem.bias import estimated_speed
 from optloc.problem.chart import AXES, CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.determined import Determined
-from optloc.problem.fix import Active, Fix, Suspect
+from optloc.problem.explanations import Suspect
+from optloc.problem.fix import Active, Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import (
     RESCALED,
@@ -403,7 +404,11 @@ def frame_of(fix: Fix) -> Any:
         import pandas as pd
     except ImportError:
         raise InvalidProblem("pandas is not installed", "to_dataframe", "pip install pandas, or use to_dict") from None
-    return pd.DataFrame(fix_columns(fix))
+    table = pd.DataFrame(fix_columns(fix))
+    # a run has several rows for each fix
+    if fix.labels is None or fix.labels.size != len(table):
+        return table
+    return table.set_index(pd.Index(fix.labels.ravel().tolist()))
 
 
 def geojson_of(fix: Fix, problem: Problem | None = None) -> dict[str, Any]:

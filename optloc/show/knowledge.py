@@ -38,7 +38,8 @@ def known_rows(fix: Fix) -> list[tuple[str, str]]:
     """Return directions, numbers and curve of a single fix as labels and texts of its sheet."""
     if not is_shown(fix):
         return []
-    found: Determined = fix.determined
+    found = fix.determined
+    assert found is not None
     rows = []
     directions = shown_directions(fix, found)
     if directions and found.outside:
@@ -117,7 +118,8 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
 
     if not is_shown(fix):
         return []
-    found: Determined = fix.determined
+    found = fix.determined
+    assert found is not None
     told: list[tuple[dict[str, Any], dict[str, Any]]] = []
     for one, about in zip(shown_directions(fix, found), found.to_dict()["directions"], strict=False):
         kept = {name: value for name, value in about.items() if name not in ("vector", "outline")}

@@ -8,6 +8,7 @@ from math import prod
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.errors import NUMERICAL, InvalidProblem
 from optloc.base.types import Array
@@ -49,7 +50,7 @@ class Prepared:
     count: int
     short: Single | None
 
-    def __call__(self, z: Any) -> Fix:
+    def __call__(self, z: ArrayLike) -> Fix:
         """Return the fix of measurements, as `solve` does."""
         return self.solve(z)
 
@@ -57,7 +58,7 @@ class Prepared:
         """Return how another process prepares the same: what threads write into stays here."""
         return prepare, (self.problem, self.method)
 
-    def solve(self, z: Any) -> Fix:
+    def solve(self, z: ArrayLike) -> Fix:
         """Return the fix of new measurements.
 
         Parameters

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
-from optloc.problem.determined import with_sources
+from optloc.base.types import Array, Status
+from optloc.problem.determined import Source
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -18,7 +20,7 @@ from optloc.solvers.single import at_once
 from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
 
 
-def solve(problem: Problem, method: str = "auto", *, start: Any = None, refine: bool = True) -> Fix:
+def solve(problem: Problem, method: str = "auto", *, start: ArrayLike | None = None, refine: bool = True) -> Fix:
     """Return the fix of every problem of a batch, without a first guess.
 
     Parameters
@@ -49,7 +51,7 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None, refine: 
     run = Method.parse(method)
     fix = at_once(problem, run) if start is None else None
     fix = solve_in_stages(problem, run, start, refine=refine) if fix is None else fix
-    return with_sources(problem, fix)
+    return _with_sources(problem, fix)
 
 
 def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:
@@ -88,3 +90,25 @@ def _broadcast_start(problem: Problem, start: Any) -> Array:
         raise InvalidProblem(
             f"start has shape {vector.shape}, not {wanted}", "start", "order it by the layout"
         ) from None
+
+
+# Fixes of a batch that keep their problems: a person looks at no more of them one by one.
+_KEPT = 8
+
+
+def _with_sources(problem: Problem, fix: Fix) -> Fix:
+    """Return fixes with the problems of those that are not `ok`, where they are few."""
+    if not fix.shape and int(fix.code) == Status.OK:
+        return fix
+    if not fix.shape and not problem.batch_shape:  # a copy of the problem would take as long as the fix
+        own = np.empty((), dtype=object)
+        own[()] = Source(problem)
+        return replace(fix, source=own)
+    items = np.flatnonzero(fix.code.ravel() != Status.OK)
+    if not 0 < len(items) <= _KEPT:
+        return fix
+    flat = (problem if problem.batch_shape == fix.shape else by_epoch(problem)).flat()
+    source = np.empty(fix.code.size, dtype=object)
+    for i in items:
+        source[i] = Source(flat.take(np.array([i])))
+    return replace(fix, source=source.reshape(fix.shape))

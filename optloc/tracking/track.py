@@ -101,9 +101,7 @@ class Track:
         InvalidProblem
             For a component that the state does not have.
         """
-        mean, cov = in_order(order, self.dimension, self.mean, self.cov)
-        assert cov is not None
-        return mean, cov
+        return in_order(order, self.dimension, self.mean, self.cov)
 
     @property
     def last(self) -> State:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from benchmarks.kinds import BATCH, FAST, SIGMA, TDOA, TRIALS, Answers, Case, S, T, Way, generator, labels
 from benchmarks.opponents import Opponent, differences, shared_arrival
-from calibration_scenes import distances, hall
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
+from sites.calibration.scenes import distances, hall
 
 import optloc
 from optloc import Motion, Problem, assemble, measured, with_bias

@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, locate
+from optloc import InvalidProblem, from_table, locate
 from optloc.base.errors import nearest
-from optloc.base.types import Status
+from optloc.base.types import Stations, Status
 from optloc.cli import app
 from optloc.files import read
 from optloc.files.convert import understood
@@ -214,3 +214,21 @@ def test_rows_of_files_have_the_rule(name, tmp_path):
     (tmp_path / "p.toml").write_text(text)
     with pytest.raises(InvalidProblem, match=rf"row 3, column 'a': there is no station '{name}'"):
         read(tmp_path / "p.toml")
+
+
+@pytest.mark.parametrize("places", [(2, 4, 2), (3, 1, 4, 2)])
+def test_stations_that_move_or_are_a_batch_are_refused_by_every_call(places):
+    """A call that has no epochs cannot tell where such stations were."""
+    stations = Stations(np.random.default_rng(2).uniform(0.0, 9.0, places), ("A", "B", "C", "D"))
+    table = {"a": np.array(["A", "B", "C"]), "z": np.ones(3)}
+    with pytest.raises(InvalidProblem, match="these stations move or are a batch"):
+        locate(stations, ranges={"A": 5.0, "B": 6.0, "C": 5.0}, sigma=0.1)
+    with pytest.raises(InvalidProblem, match="these stations move or are a batch"):
+        from_table(table, stations, kind="range", sigma=0.1)
+
+
+def test_names_of_rows_name_stations_of_a_frame_in_every_call():
+    place = pd.DataFrame({"x": [0.0, 8.0, 0.0, 8.0], "y": [0.0, 0.0, 6.0, 6.0]}, index=["A", "B", "C", "D"])
+    table = {"a": np.array(["A", "B", "C", "D"]), "z": np.full(4, 5.0)}
+    assert from_table(table, place, kind="range", sigma=0.1).stations.names == ("A", "B", "C", "D")
+    assert locate(place, ranges=dict.fromkeys("ABCD", 5.0), sigma=0.1).position == pytest.approx([4.0, 3.0])

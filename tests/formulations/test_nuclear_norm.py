@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from calibration_scenes import hall
 from scipy.optimize import minimize
+from sites.calibration.scenes import hall
 
 from formulations.metric_upgrade import upgrade
 from formulations.nuclear_norm import affine_network, nuclear_offsets

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import CASES, STATIONS, TARGET, kitchen_sink, random_vector
+from linear.test_normal import regular_sink
 from runs import drawn, estimated, run, truth
-from test_normal import regular_sink
 
 from optloc import Motion, assemble, measured, simulate, station_array
 from optloc.kernels import sums as hooks

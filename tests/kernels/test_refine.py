@@ -6,8 +6,8 @@ from importlib import import_module
 import numpy as np
 import pytest
 from cases import CASES, STATIONS, TARGET, random_vector
+from linear.test_normal import regular_sink
 from runs import drawn, estimated, run, truth
-from test_normal import regular_sink
 
 from optloc import Motion, assemble, measured, simulate, station_array
 from optloc.base.linalg import inverse

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import DEGENERATE, HALL, degenerate, distances, hall, reflected
 from monte_carlo.tables import FOLDER, code_digest, ledger
 from scipy.stats import chi2
+from sites.calibration.scenes import DEGENERATE, HALL, degenerate, distances, hall, reflected
 
 from optloc import Status, calibrate
 from optloc.sites.calibration import network_of

@@ -383,7 +383,7 @@ def _lay(table: ScenarioTable, where: str, seed: int) -> Problem:
         a, b = (np.arange(s), None) if model.stations == 1 else (np.array([p[1] for p in pairs]), [p[0] for p in pairs])
         # Differences share the arrival at a station, and with it half their variance, unless the file says otherwise.
         shared = model.stations == 2 and model.ranges is not None and not layout.independent
-        rows.append(measured(kind, a=a, b=b, **({"arrival_sigma" if shared else "sigma": 1.0})))
+        rows.append(measured(kind, a=a, b=b, arrival_sigma=1.0) if shared else measured(kind, a=a, b=b, sigma=1.0))
     survey = None if layout.survey is None else metres([layout.survey], join(where, "survey"))[0] ** 2
     spread = None if survey is None else np.tile(survey * np.eye(layout.dimension), (s, 1, 1))
     place = place_stations(layout, where, rng, 1)

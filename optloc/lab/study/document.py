@@ -9,10 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from optloc.files import Units
 from optloc.models import MODELS
-from optloc.problem import InvalidProblem
-
-Amount = float | str
-"""A number in the SI unit, or text such as "30 ns"."""
+from optloc.problem import Amount, InvalidProblem
 
 Level = float | str | dict[str, Amount]
 """A factor on the noise of a file, the standard deviation of every row, or that of every kind."""

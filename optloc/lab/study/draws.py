@@ -15,8 +15,8 @@ import numpy as np
 
 from optloc.engine import arrays, simulate, walks, wander
 from optloc.files import Units, join
-from optloc.lab.study.document import Amount, LayoutTable, ScenarioTable, TruthTable, sigma_of
-from optloc.problem import Array, Bias, Frame, InvalidProblem, Problem, form_of, nearest, state_names, with_bias
+from optloc.lab.study.document import LayoutTable, ScenarioTable, TruthTable, sigma_of
+from optloc.problem import Amount, Array, Bias, Frame, InvalidProblem, Problem, form_of, nearest, state_names, with_bias
 
 Rng = np.random.Generator
 

@@ -321,7 +321,7 @@ def _check(fix: Any, drawn: DrawnCase) -> None:
         if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in kinds:
             what = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
             raise Nonsense(f"its {name} is {what}, and not an array {shape} of kind {kinds!r}")
-    if not all(isinstance(one, Certificate) for one in fix.certificate):
+    if not all(isinstance(one, Certificate) for one in fix.certificates):
         raise Nonsense("its certificates are none")
     if not all(0 <= code < len(Status) for code in fix.code):
         raise Nonsense("its status is unknown")

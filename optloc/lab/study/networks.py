@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from optloc.files import Units, join
-from optloc.lab.study.document import Amount, NetworkTable
-from optloc.problem import ANSWERED, Array, InvalidProblem, Status
+from optloc.lab.study.document import NetworkTable
+from optloc.problem import ANSWERED, Amount, Array, InvalidProblem, Status
 from optloc.sites.calibration.calibrated import Calibration, calibrate
 from optloc.sites.calibration.gauge import determined
 from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood, together

@@ -280,7 +280,7 @@ def _inset(panel: Axes, scene: PictureScene) -> None:
 
 def verdict(fix: Fix) -> str:
     """Return the status of a flat fix of one, and what is listed or proven."""
-    code, proof = int(fix.code[0]), fix.certificate[0].proof
+    code, proof = int(fix.code[0]), fix.certificates[0].proof
     if code == Status.AMBIGUOUS:
         return f"ambiguous: {1 + int(np.isfinite(fix.alternatives.gap[0]).sum())} places listed"
     proven = {"global": ": proven best everywhere", "region": ": proven best in its region"}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from optloc.engine import STRAIGHT
-from optloc.problem import PRECEDENCE, Array, InvalidProblem, NoSolution, Status, nearest, tail_probability
+from optloc.problem import PRECEDENCE, Array, InvalidProblem, NoSolution, Status, no_station, tail_probability
 from optloc.sites.calibration.agreement import AGREEING, NetworkSearchResult, frame_size, proven, search
 from optloc.sites.calibration.blocks import StationBlock, blocks, moved_pulses, place_pulses
 from optloc.sites.calibration.gauge import (
@@ -536,7 +536,7 @@ def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
         raise InvalidProblem(f"a frame needs {network.dimension} stations", "gauge", "name so many, each once")
     for name in gauge:
         if name not in network.names:
-            raise InvalidProblem(f"there is no station {name!r}", "gauge", nearest(name, list(network.names)))
+            raise no_station(name, "gauge", network.names)
     return tuple(network.names.index(name) for name in gauge)
 
 

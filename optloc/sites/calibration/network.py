@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.engine import numbers
 from optloc.models import MODELS, kind_named
-from optloc.problem import Array, InvalidProblem, nearest
+from optloc.problem import Array, InvalidProblem, check_once, nearest
 
 CLOCKED = ("toa", "tdoa")
 """Kinds that a station's clock enters; a two-way range has none."""
@@ -231,9 +231,7 @@ def checked(made: Network) -> Network:
     m, (n, r) = made.stations, made.z.shape
     if made.dimension not in (2, 3):
         raise InvalidProblem(f"a network has {made.dimension} dimensions", "dimension", "give 2 or 3")
-    if len(set(made.names)) < m:
-        twice = next(name for i, name in enumerate(made.names) if name in made.names[:i])
-        raise InvalidProblem(f"station name {twice!r} is used twice", "names", "rename one of them")
+    check_once(made.names, "station name {!r} is used twice", "names")
     if len(made.slots) != r or len(made.labels) != n or made.sigma.shape != (n, r):
         raise InvalidProblem("measurements, deviations and labels differ in number", "z", "give one for each")
     ends = np.array([[slot.a, slot.b] for slot in made.slots]).reshape(-1, 2)

@@ -9,25 +9,30 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from optloc.files import (
-    Amount,
+    Context,
     DataTable,
+    MeasurementsTable,
     ProblemFile,
     Table,
     Units,
     claim,
     conform,
     distinct,
+    ends_of,
     join,
     name_of,
     parse_toml,
+    positive_speed,
     read_text,
+    sigma_of,
     table_of,
     toml_text,
+    values_of,
     worded,
     write_text,
 )
 from optloc.models import MODELS, kind_named
-from optloc.problem import SPEED_OF_LIGHT, Array, InvalidProblem, nearest
+from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, nearest
 from optloc.sites.calibration.calibrated import Calibration
 from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked
 
@@ -98,7 +103,8 @@ def read_network(path: Path) -> Network:
         what = f"the key {foreign[0]!r} is that of a problem whose stations are known, not of a network"
         raise InvalidProblem(what, source, "use optloc fix, or see optloc new calibration")
     file = conform(NetworkFile, data, source)
-    speed = _speed(file.propagation_speed, source)
+    stated, where = file.propagation_speed, join(source, "key 'propagation_speed'")
+    speed = SPEED_OF_LIGHT if stated is None else positive_speed(stated, "speed", where)
     table = worded(table_of(file.stations, folder, where := join(source, "[stations]")), file.stations.unit)
     names = tuple(str(name) for name in table.labels("name"))
     place, place_sigma = _places(file.stations, table, where)
@@ -114,13 +120,9 @@ def read_network(path: Path) -> Network:
         kind = BETWEEN if between else kind_named(section.kind, place_of)
         if not between and kind not in KINDS:
             raise InvalidProblem(f"networks have no rows of kind {kind!r}", place_of, nearest(kind, [*KINDS, BETWEEN]))
-        z, sigma = _values(section, own, Units("length", speed), place_of)
-        a = _stations(own, "a", names)
-        two = between or MODELS[kind].stations == 2
-        b = _stations(own, "b", names) if two else np.full(own.count, -1)
-        if (a == b).any():
-            row = int(np.flatnonzero(a == b)[0])
-            raise InvalidProblem("the row names one station twice", own.where("b", row), "name two stations")
+        read = Context(MeasurementsTable(sigma=section.sigma), own, names, place_of, speed, values=True)
+        z, sigma = _values(read, section.unit)
+        a, b = ends_of(read, kind, 2 if between else MODELS[kind].stations)
         if between:
             apart.append((a, b, z, sigma))
         else:
@@ -146,14 +148,6 @@ def read_network(path: Path) -> Network:
     )
 
 
-def _speed(given: Amount | None, source: str) -> float:
-    where = join(source, "key 'propagation_speed'")
-    speed = SPEED_OF_LIGHT if given is None else Units("speed").plain(given, "m/s", where)
-    if not speed > 0.0:
-        raise InvalidProblem("the speed is not positive", where, "give metres per second")
-    return speed
-
-
 def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
     """Return what is known of places (M, d), and how well: infinite where a cell is empty."""
     unit = Units("length").conversion(section.unit, where)
@@ -173,27 +167,16 @@ def _optional(table: Table, key: str) -> Array:
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
 
 
-def _values(section: NetworkRows, table: Table, units: Units, where: str) -> tuple[Array, Array]:
-    unit = units.conversion(section.unit, where)
-    z = table.numbers("z") * unit.factor
-    if table.has("sigma"):
-        sigma = table.numbers("sigma") * unit.factor
-    elif section.sigma is not None:
-        sigma = np.full(table.count, units.plain(section.sigma, section.unit, where))
-    else:
-        raise InvalidProblem("the rows have no standard deviation", where, 'write sigma = "5 cm", or a column sigma')
-    if not (sigma > 0.0).all():
-        raise InvalidProblem("a standard deviation is not positive", where, "give one above zero")
+def _values(read: Context, name: str) -> tuple[Array, Array]:
+    """Return the values (m,) of rows and their standard deviations, metres; `name` is their unit."""
+    units = Units("length", read.speed)
+    unit = units.conversion(name, join(read.where, "key 'unit'"))
+    z = values_of(read, unit, np.ones(read.table.count))
+    sigma = sigma_of(read, units, unit, z)
+    if sigma is None:
+        advice = 'write sigma = "5 cm", or a column sigma'
+        raise InvalidProblem("the rows have no standard deviation", read.where, advice)
     return z, sigma
-
-
-def _stations(table: Table, key: str, names: tuple[str, ...]) -> Array:
-    labels, known = table.labels(key), {name: i for i, name in enumerate(names)}
-    for row, label in enumerate(labels):
-        if label not in known:
-            what = f"there is no station {label!r}"
-            raise InvalidProblem(what, table.where(key, row), nearest(label, list(names)))
-    return np.array([known[label] for label in labels], dtype=np.int64)
 
 
 def _by_pulse(

@@ -90,11 +90,27 @@ def region_of(ring: Array, low: float, high: float) -> PlacementRegion:
     return PlacementRegion(normal, (normal * ring).sum(1), low, high)
 
 
+def _crosses(ring: Array) -> bool:
+    """Return whether two edges of a ring (v, 2) cross at a point inside both; edges that touch do not."""
+    ends = np.roll(ring, -1, axis=0)
+    along = ends - ring
+
+    def side(points: Array) -> Array:
+        """Return on which side of the line through edge i (rows) each point (columns) is: -1, 0 or 1."""
+        away = points - ring[:, None]
+        return np.asarray(np.sign(along[:, :1] * away[..., 1] - along[:, 1:] * away[..., 0]))
+
+    apart = side(ring) * side(ends) < 0.0
+    return bool((apart & apart.T).any())
+
+
 def convex_parts(ring: Array) -> list[Array]:
     """Return convex rings that make up a simple one (v, 2): itself, or its triangles by cutting ears.
 
     G. H. Meisters, "Polygons have ears", Amer. Math. Monthly 82 (1975).
     """
+    if _crosses(ring):
+        raise InvalidProblem("the edges of a polygon cross each other", "polygon", "give a simple one")
     x, y = ring.T
     area = 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
     points = ring if area > 0.0 else ring[::-1]

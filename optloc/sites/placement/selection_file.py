@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from formulations.placement import PlacementGround, PlacementRegion
 from optloc.files import (
-    Amount,
     DataTable,
     FrameTable,
     MeasurementsTable,
@@ -40,7 +39,7 @@ from optloc.files import (
     within,
     write_text,
 )
-from optloc.problem import Array, Frame, InvalidProblem, Problem, nearest
+from optloc.problem import Amount, Array, Frame, InvalidProblem, Problem, check_once, nearest
 from optloc.sites.placement.areas import (
     convex_parts,
     corners_in_frame,
@@ -234,10 +233,7 @@ def read_selection(path: Path) -> LoadedSelection:
     if file.stations is not None:
         tables.append((table_of(_bare(file.stations), folder, join(source, "[stations]")), file.stations))
     names = [table.labels("name").tolist() for table, _ in tables]
-    all_names = [name for own in names for name in own]
-    twice = [name for i, name in enumerate(all_names) if name in all_names[:i]]
-    if twice:
-        raise InvalidProblem(f"station name {twice[0]!r} is used twice", source, "rename one of them")
+    check_once([name for own in names for name in own], "station name {!r} is used twice", source)
     settings = _settings(file, tables, folder, source)
     made = validate(settings, source)
     stations = of_rows(settings["stations"]["rows"], join(source, "[stations]"), {})

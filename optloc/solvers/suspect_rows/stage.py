@@ -20,7 +20,8 @@ from optloc.model_checks.noise_level import SEVERAL, common_level_at
 from optloc.problem.arrival_times import Arrivals, as_arrivals, restore_order, shared_places
 from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
-from optloc.problem.fix import Alternatives, Explanation, Fix, GroupKind, Stage, Suspect
+from optloc.problem.explanations import Explanation, GroupKind, Suspect
+from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.layout import Layout
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
@@ -213,9 +214,11 @@ def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
     if problem.epochs > 1 or len(fix.x) < SEVERAL:
         return None
     with np.errstate(invalid="ignore", divide="ignore"):
-        each = fix.cost / fix.dof
-        # a liar has a large cost relative to the other fixes, for noise of any size
-        kept = np.flatnonzero((fix.dof > 0) & (each <= _GROSS * np.median(each[np.isfinite(each) & (fix.dof > 0)])))
+        each = np.where(fix.dof > 0, fix.cost / fix.dof, np.inf)
+    if np.isfinite(each).sum() < SEVERAL:
+        return None
+    # a liar has a large cost relative to the other fixes, for noise of any size
+    kept = np.flatnonzero(each <= _GROSS * np.median(each[np.isfinite(each)]))
     if len(kept) < SEVERAL:
         return None
     batch = batch_of(problem.take(kept))

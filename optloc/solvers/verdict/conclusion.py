@@ -9,7 +9,8 @@ import numpy as np
 
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.problem.claims import claim
-from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
+from optloc.problem.explanations import Explanation, Suspect
+from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 
 _SHOWN = 4  # names in a sentence; more are not read

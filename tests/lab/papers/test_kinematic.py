@@ -31,7 +31,6 @@ from optloc.lab.papers.kinematic import (
     track_all,
     weighting,
 )
-from optloc.lab.papers.kinematic_tables import km
 from optloc.lab.papers.report import Study
 from optloc.problem.epochs import cut
 from optloc.show.sheet import ABSENT
@@ -295,10 +294,6 @@ def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     page = (tmp_path / "README.md").read_text(encoding="utf-8")
     assert all(f"({name})" in page for name in names if name.endswith(".png"))
     assert [text for text in ("seed 3", "10.618", "## What is wrong in the paper") if text not in page] == []
-
-
-def test_numbers_are_short():
-    assert [km(v) for v in (579.4, 10328.0, 336_900.0, 2.5e6, np.nan)] == ["0.579", "10.328", "337", "2500", "–"]
 
 
 def test_draws_depend_on_their_key_alone():

@@ -10,7 +10,6 @@ from doc_pages import DOCS
 from lab.study.texts import QUICK, design, run_here
 from recipes import files_of_the_page
 from scipy.optimize import minimize
-from scipy.stats import quantile_test
 from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
@@ -23,7 +22,7 @@ from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import part_files, progress, read_frame
 from optloc.lab.study.methods import added
 from optloc.lab.study.minimizers import Minimizer, baseline_of, cost_of
-from optloc.lab.study.paired import median_of, paired
+from optloc.lab.study.paired import paired
 from optloc.lab.study.summary import COLUMNS, judged
 
 RUN, HERE = CliRunner(), executor("processes", 1)
@@ -236,17 +235,6 @@ def test_nlopt_and_a_method_of_ones_own_are_one_file(mine, tmp_path):
 def test_the_file_of_the_page_is_short():
     assert len(NLOPT.splitlines()) <= 15
     assert "nlopt" in NLOPT
-
-
-@pytest.mark.parametrize("count", [1, 5, 6, 25, 200])
-def test_the_interval_of_a_median_is_that_of_order_statistics(count, seed):
-    values = np.random.default_rng(seed).standard_normal(count) + 0.2
-    found, test = median_of(values), quantile_test(values, q=0.0, p=0.5)
-    low, high = test.confidence_interval(0.95)
-    assert found.value == np.median(values)
-    expected = [-np.inf if np.isnan(low) else low, np.inf if np.isnan(high) else high]
-    assert [found.low, found.high] == pytest.approx(expected)
-    assert found.p == pytest.approx(test.pvalue, abs=1e-12)
 
 
 def test_pairs_count_who_is_right_alone(folder):
