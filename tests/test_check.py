@@ -8,7 +8,7 @@ from optloc import solve
 from optloc.cli import app
 from optloc.cli.check import _check_health
 from optloc.files.convert import understood
-from optloc.files.readings import Told
+from optloc.files.readings import ColumnHints
 from optloc.station_health import health
 
 RUN = CliRunner()
@@ -37,7 +37,7 @@ def tables(folder, counts, *, gap=(), wrong=(), bearing=False):
     places = [f"R{i},{x},{y},{z}" for i, (x, y, z) in enumerate(SITES.tolist())]
     (folder / "sites.csv").write_text("\n".join(["name,x_m,y_m,z_m", *places]) + "\n")
     sigma = "range=9 m,azimuth=0.2 deg" if bearing else "30 ns"
-    told = Told(stations=folder / "sites.csv", sigma=sigma, azimuth="north-clockwise" if bearing else None)
+    told = ColumnHints(stations=folder / "sites.csv", sigma=sigma, azimuth="north-clockwise" if bearing else None)
     return told, "message,station," + ("range_m,azimuth_deg" if bearing else "toa_ns"), events
 
 

@@ -6,13 +6,13 @@ from cases import CASES
 from engine.blocks import block_of
 
 from optloc.engine import memory, ranges
-from optloc.engine.memory import Answer, Found
+from optloc.engine.memory import Answer, EngineResult
 from optloc.engine.plan import blank_answer
 
 
 def test_columns_of_answers_have_the_order_of_their_names():
     answer = blank_answer(2, 3, 5, 4, 2)
-    answer.number[:] = [Found(1.0, 2.0, 1.0, 4.0, 0.1, 0.2), Found(1.5, 2.5, 0.0, 4.5, 0.3, np.nan)]
+    answer.number[:] = [EngineResult(1.0, 2.0, 1.0, 4.0, 0.1, 0.2), EngineResult(1.5, 2.5, 0.0, 4.5, 0.3, np.nan)]
     assert answer.cost.tolist() == [1.0, 1.5]
     assert answer.rival_cost.tolist() == [2.0, 2.5]
     assert answer.settled.tolist() == [True, False]

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from optloc import Motion, assemble, measured, with_bias
-from optloc.kernels.tables import GROUP_COLUMN, Entries, Groups, Sources, starts, tables
+from optloc.kernels.tables import GROUP_COLUMN, Entries, RowGroups, Sources, starts, tables
 
 PLACES = np.array([[0.0, 0.0], [9.0, 1.0], [10.0, 9.0], [1.0, 10.0]])
 
@@ -22,7 +22,7 @@ def test_parts_begin_where_those_before_them_end():
 
 
 def test_groups_are_in_the_order_of_their_epochs():
-    found = Groups.sorted(run(), (np.array([[0, 2, 1]]), np.array([[3], [4], [5]])))
+    found = RowGroups.sorted(run(), (np.array([[0, 2, 1]]), np.array([[3], [4], [5]])))
     assert found.epoch.tolist() == [0, 0, 0, 1]
     assert found.size.tolist() == [1, 1, 1, 3]
     assert found.number.tolist() == [1, 2, 3, 0]

@@ -8,7 +8,7 @@ from uncertainty.scenes import fixed
 from optloc.problem.chart import CURVED
 from optloc.uncertainty import samples, trace_arc
 from optloc.uncertainty.arc import student
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty.region import RegionSurface
 
 
 def test_points_of_a_student_distribution_have_its_quantiles_and_density():
@@ -51,7 +51,7 @@ def along_arcs(name, n):
     share, beside = [], []
     for item in range(n):
         problem, truth, fix = fixed(name, item)
-        if Surface.of(problem, fix).kind == CURVED:
+        if RegionSurface.of(problem, fix).kind == CURVED:
             found = trace_arc(problem, fix).locate(truth[None])
             share.append(found[0][0])
             beside.append(found[1][0])

@@ -9,7 +9,7 @@ from optloc import InvalidProblem, assemble, measured
 from optloc.problem.chart import INVERSE_RANGE
 from optloc.uncertainty import mixture, samples
 from optloc.uncertainty.posterior import moments, weighed
-from optloc.uncertainty.region import Surface
+from optloc.uncertainty.region import RegionSurface
 
 
 def gaussian():
@@ -36,7 +36,7 @@ def test_samples_of_a_gaussian_have_its_moments():
 def test_samples_of_a_far_emitter_are_those_of_the_integral(prior):
     """Against a sum over a grid in the chart: the share of the probability nearer than some ranges."""
     problem, _, fix = fixed("tdoa 2 5 100", 0)
-    surface, reach = Surface.of(problem, fix), 400e3
+    surface, reach = RegionSurface.of(problem, fix), 400e3
     assert surface.kind == INVERSE_RANGE
     sigma = np.sqrt(np.diag(surface.chart.spread))
     p = np.linspace(-6, 6, 201) * sigma[0]
