@@ -7,12 +7,13 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, Status, datasets, solve
+from optloc import InvalidProblem, Status, solve
 from optloc.base.frames import ECEF, Frame
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.cli import app
 from optloc.files import read
 from optloc.files.convert import convert
+from optloc.lab import datasets
 from optloc.problem import by_epoch
 
 RUN = CliRunner()

@@ -330,7 +330,7 @@ def test_a_wide_table_leaves_no_kind_out(tmp_path):
     ],
 )
 def test_errors_of_all_kinds_are_read(head, line, kinds, tmp_path):
-    from optloc import noise
+    from optloc.problem import noise
 
     if kinds is None:  # two plain columns of errors: the first one has no unit of an angle
         with pytest.raises(InvalidProblem, match="nothing is known of how accurate the readings of azimuth are"):

@@ -11,6 +11,9 @@ from optloc.cli import app
 from optloc.files import load
 from optloc.files.convert import convert, understood
 from optloc.files.readings import ColumnHints
+from optloc.files.roles import Roles
+from optloc.files.satellite_tables import pseudoranges, write_satellites
+from optloc.files.table import of_rows
 from optloc.problem import by_epoch
 
 RUN = CliRunner()
@@ -138,3 +141,38 @@ def test_turned_is_refused_where_there_are_no_satellites(tmp_path):
     path.write_text("lat,lon,range_m\n59.9,10.7,100\n59.91,10.7,900\n59.9,10.71,700\n")
     with pytest.raises(InvalidProblem, match="--turned: the table has no satellites"):
         understood(path, ColumnHints(sigma="1 m", turned=True))
+
+
+def sent(**change):
+    """Return the roles of a table of two satellites."""
+    rows = [
+        {"epoch": 0, "satellite": name, "x_km": 26e3, "y_km": y, "z_km": 0.0, "pseudorange_km": 2e4}
+        for name, y in (("G1", 0.0), ("G2", 1.0))
+    ]
+    return Roles.of(of_rows([row | change for row in rows], "t.csv", {}), {})
+
+
+def test_pseudoranges_are_arrivals_at_satellites_that_move(tmp_path):
+    found = pseudoranges(tmp_path / "t.csv", sent(), ColumnHints(sigma="2 m", turned=True))
+    (section,) = found.sections
+    assert (section.kind, section.unit, section.sigma) == ("toa", "km", "2 m")
+    assert section.columns["z"].tolist() == [2e4, 2e4]
+    assert found.places.columns["y"].tolist() == [0.0, 1.0]
+    assert (found.places.frame, found.places.unit) == ("ecef", "km")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"satellite": "G1"}, "'G1' occurs again at epoch '0', first in row 1"),
+        ({"x_km": 26.0}, "26 km from the centre"),
+    ],
+)
+def test_satellites_twice_or_within_the_earth_are_refused(change, words, tmp_path):
+    with pytest.raises(InvalidProblem, match=words):
+        pseudoranges(tmp_path / "t.csv", sent(**change), ColumnHints(sigma="2 m", turned=True))
+
+
+def test_orbits_are_wanted_at_times(tmp_path):
+    with pytest.raises(InvalidProblem, match="when the satellites are wanted"):
+        write_satellites(tmp_path / "a.tle", tmp_path / "a.csv", {}, None, None)

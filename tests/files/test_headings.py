@@ -1,6 +1,7 @@
 """Bearings from the bow of a vehicle in tables: its heading is added, once, from the right column and unit."""
 
 import json
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -10,8 +11,12 @@ from optloc import InvalidProblem, solve
 from optloc.base.frames import ECEF
 from optloc.cli import app
 from optloc.files import load
+from optloc.files.cells import Decimals
 from optloc.files.convert import convert, understood
-from optloc.files.readings import ColumnHints
+from optloc.files.headings import from_bow, heading_of, stations_turned
+from optloc.files.readings import BOW, COMPASS, ColumnHints, Readings, sort_named
+from optloc.files.roles import ColumnPlaces, Roles
+from optloc.files.table import of_rows
 
 RUN = CliRunner()
 TARGET = (59.912, 10.735)
@@ -172,3 +177,34 @@ def test_json_and_range_beside_the_bearing(tmp_path):
     path = tmp_path / "log.json"
     path.write_text(json.dumps(rows))
     assert off(fixed(path, sigma="range=1 m,bearing=1 deg")) < 0.5
+
+
+def bearings(kind="azimuth", heading=None):
+    """Return bearings of 350 and 30 degrees at stations A and B."""
+    names, none = np.array(["A", "B"], dtype=object), np.arange(2)
+    values = Decimals.of([Decimal(350), Decimal(30)])
+    return Readings(sort_named(kind), "deg", values, none, ("bearing",), np.zeros(2, dtype=int), names, heading=heading)
+
+
+def test_headings_are_added_within_a_turn():
+    roles = Roles.of(
+        of_rows([{"bearing": 350, "heading_deg": "20.5"}, {"bearing": 30, "heading_deg": 0}], "t.csv", {}), {}
+    )
+    assert heading_of(bearings(), roles, ColumnHints(azimuth=BOW)) == "heading_deg"
+    assert heading_of(bearings(), roles, ColumnHints(azimuth=COMPASS)) is None
+    found = from_bow(bearings(), roles, "heading_deg", ColumnHints())
+    assert found.values.tolist() == [Decimal("10.5"), Decimal(30)]
+    assert (found.azimuth, found.heading) == (COMPASS, "heading_deg")
+
+
+def test_stations_that_measure_bearings_have_a_heading():
+    columns = {"name": np.array(["A", "B"], dtype=object), "heading_deg": np.array([5.0, np.nan])}
+    place = ColumnPlaces(columns, "cartesian")
+    with pytest.raises(InvalidProblem, match="station 'B' has no heading"):
+        stations_turned(place, [bearings()])
+    kept, note = stations_turned(place, [bearings("range")])
+    assert ("heading_deg" in kept.columns, note) == (False, "")
+    sure = ColumnPlaces(columns | {"heading_deg": np.array([5.0, 7.0])}, "cartesian")
+    with pytest.raises(InvalidProblem, match="are both given"):
+        stations_turned(sure, [bearings(heading="heading_deg")])
+    assert stations_turned(sure, [bearings()])[0].columns["heading_deg"].tolist() == [5.0, 7.0]

@@ -283,7 +283,7 @@ def test_a_copy_of_the_shipped_files_is_all_it_needs(tmp_path):
     run("demo", "registration", "--plot", tmp_path / "d.png", "-q")
 
 
-PAGE = Path(__file__).parents[1] / "docs" / "registration.md"
+PAGE = Path(__file__).parents[2] / "docs" / "registration.md"
 
 
 def blocks(language):
