@@ -19,7 +19,7 @@ from optloc.models import MODELS
 from optloc.proof.nodes.dispatch import NODES, code_of, named, text_of
 from optloc.proof.nodes.node import RANGE
 
-HERE, STATIONS, SIGMA, TRIALS = Path(__file__).parent, 5, 2e5, 12
+HERE, STATIONS, SIGMA, TRIALS = Path(__file__).parents[1], 5, 2e5, 12
 
 # What another process does with the package installed: it asks for fixes like of any kind, and prints what is proven.
 SCRIPT = """

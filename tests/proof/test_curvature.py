@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from proof.costs import random_case
+from proof.nodes.test_range import bound_box, bounded, charted, drawn_box, ways
 from proof.sampling import many
-from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.proof.box import is_empty, uncut
 from optloc.proof.convex_boxes import set_convex

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from proof.sampling import many
-from proof.test_scaled import Look
+from proof.scaled.test_reduction import Look
 from scales import scales
 from scipy.optimize import least_squares, minimize, nnls
 from waves import air
