@@ -52,7 +52,7 @@ def test_constraints_are_not_checked_and_said(searched):
 
 def test_steps_are_measured_in_the_covariance_of_the_fix():
     problem = ranges_to(PLACE, 2.0, stations=SQUARE)
-    fix = solve(problem)
+    fix = solve(problem, "gtrs+lsr")
     step = np.array([[3.0, -2.0]])
     expected = step[0] @ np.linalg.solve(fix.cov[0], step[0])
     assert _squared(fix, step)[0] == pytest.approx(expected)
