@@ -6,12 +6,14 @@ import pickle
 
 import numpy as np
 import pytest
+from model_checks.small import PLACE, SQUARE as PLAIN, ranges_to
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import chi2
 
 import optloc
 from optloc.base.frames import Frame
 from optloc.base.types import Status
+from optloc.model_checks.determine import _ellipse, _hyperbola, of_fix
 from optloc.problem.determined import WITHOUT_PLACE
 from optloc.show.columns import fix_columns
 from optloc.show.formats.marks import Results
@@ -315,3 +317,26 @@ def test_a_fix_among_fixes_with_more_rows_has_its_own_rows():
     one, other = (optloc.model_checks.determined(problem, each).directions for each in (fix, padded))
     assert len(one) == len(other) > 0
     np.testing.assert_array_equal(one[0].vector, other[0].vector)
+
+
+def test_points_of_a_curve_have_its_difference_or_sum():
+    a, b = np.array([0.0, 0.0]), np.array([1000.0, 300.0])
+    ra, rb = (np.linalg.norm(_hyperbola(a, b, 400.0) - end, axis=1) for end in (a, b))
+    np.testing.assert_allclose(ra - rb, 400.0, rtol=1e-9)
+    ra, rb = (np.linalg.norm(_ellipse(a, b, 1500.0) - end, axis=1) for end in (a, b))
+    np.testing.assert_allclose(ra + rb, 1500.0, rtol=1e-9)
+    # longer than the distance of both: the ray behind the nearer one; shorter: the stretch between them
+    ray = _hyperbola(a, b, 2000.0)
+    np.testing.assert_allclose(ray[0], b)
+    np.testing.assert_allclose(np.linalg.norm(ray[1] - a) - np.linalg.norm(ray[1] - b), np.linalg.norm(b - a))
+    np.testing.assert_array_equal(_ellipse(a, b, 900.0), [a, b])
+
+
+def test_an_ok_fix_determines_its_coordinates_to_their_sigma():
+    fix = optloc.solve(ranges_to(PLACE, 2.0, np.array([0.5, -1.0, 2.0, -0.5, 1.0])))[0]
+    found = of_fix(fix)
+    for quantity, value, sigma in zip(found.quantities, fix.position, fix.sigma()[:2], strict=True):
+        assert quantity.value == pytest.approx(value)
+        assert quantity.high - quantity.value == pytest.approx(1.95996 * sigma, rel=1e-4)
+    unproven = optloc.solve(ranges_to(PLACE, 2.0, stations=PLAIN[:2]))[0]
+    assert of_fix(unproven) is None

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares, minimize
 import optloc
 from optloc import Status, assemble, constraints, measured, solve
 from optloc.models import Layers
+from optloc.solvers.layered import Strata, in_every_layer, strata_of
 
 # Own rays: a direct path through the layers between both ends, found by the tangent of the angle at the fastest speed.
 
@@ -204,3 +205,24 @@ def test_rays_that_graze_an_interface_give_the_depth_at_which_the_cost_is_larger
         for z in (-5e3 - 1e-6, -5e3 - fix.sigma()[2])
     ]
     assert 0.7 < found[1] - found[0] < 1.4
+
+
+def test_layers_are_told_by_the_third_coordinate():
+    strata = Strata(2, np.array([-100.0, -300.0, -np.inf]), np.array([0.0, -100.0, -300.0]))
+    assert strata.layer(np.array([-50.0, -150.0, -1e4, 20.0])).tolist() == [0, 1, 2, 0]
+    # off the ends by a quarter of the height, which is twice that of the others for the last
+    moved = strata.inside(np.array([-150.0, -250.0, 0.0]), np.array([0, 1, 2]))
+    assert moved.tolist() == [-75.0, -250.0, -450.0]
+    starts = in_every_layer(strata, np.array([[[7.0, 8.0, -150.0]]]))[0]
+    assert starts[:, 2].tolist() == [-150.0, -75.0, -150.0, -450.0]
+    assert (starts[:, :2] == [7.0, 8.0]).all()
+
+
+def test_only_an_interface_divides_a_problem():
+    stations = np.array([[0.0, 0.0, 0.0], [9e3, 0.0, 0.0], [0.0, 9e3, 0.0], [9e3, 9e3, 100.0]])
+    problem = assemble(stations, measured("toa", np.full(4, 9e3), a=np.arange(4), sigma=10.0)).flat()
+    assert strata_of(problem) is None
+    layered = problem.in_medium(Layers((0.0, 2e3), (3e3, 5e3), "constant", surface=500.0))
+    strata = strata_of(layered)
+    np.testing.assert_allclose(strata.high, [500.0, -1500.0], atol=1e-5)
+    assert strata_of(problem.in_medium(Layers((0.0,), (3e3,), "constant", surface=500.0))) is None

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cases import CASES, ENU, STATIONS, TARGET, pairs
 from hypothesis import given, settings, strategies as st
+from model_checks.small import PLACE, SQUARE, ranges_to
 
 from optloc import (
     InvalidProblem,
@@ -28,6 +29,7 @@ from optloc.linear.constraints import box, height
 from optloc.problem import Prior
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import in_parts
+from optloc.solvers.prepared import prepare as ready
 from optloc.solvers.solution import solve_in_stages
 from optloc.solvers.stages import gtrs, lsr_with_mirror
 from optloc.solvers.verdict.judge import verdict
@@ -411,3 +413,15 @@ def test_of_two_exact_positions_the_nearer_to_the_heard_stations_is_answered():
         assert np.allclose(fix.x, other.x, atol=1e-3)
         alone = solve(assemble(place[a], measured("range", r, a=a, sigma=5.0)))
         assert np.allclose(fix.x, alone.x, atol=1e-3)
+
+
+def test_what_is_prepared_fixes_measurements_as_solve_does():
+    first, error = ranges_to(PLACE, 2.0), np.array([0.5, -1.0, 2.0, -0.5, 1.0])
+    z = np.linalg.norm(PLACE - SQUARE, axis=1) + error * np.array([[1.0], [-2.0]])
+    prepared = ready(assemble(SQUARE, measured("range", a=np.arange(5), sigma=2.0)))
+    fix = prepared(z)
+    expected = solve(first.take(np.zeros(2, dtype=int)).with_rows(z=z), "gtrs+lsr")
+    np.testing.assert_allclose(fix.x, expected.x, atol=1e-3)
+    assert prepared(z[0]).shape == ()
+    with pytest.raises(InvalidProblem, match="the problem has 5 rows"):
+        prepared(z[:, :4])

@@ -9,6 +9,7 @@ import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Motion
 from optloc.problem.epochs import cut
+from optloc.solvers.running import _space_counts, growing
 
 
 @pytest.mark.parametrize("case", few(["moving", "eliminated", "fixed", "prior, gains"], 2))
@@ -58,3 +59,23 @@ def test_refusals():
     free = optloc.assemble([[0.0, 0.0], [1.0, 0.0]], rows, motions=(Motion(span="epoch"),))
     with pytest.raises(InvalidProblem, match="free at each epoch"):
         optloc.solvers.Running.begin(free, lost)
+
+
+def test_an_estimate_grows_into_that_of_the_whole_run():
+    problem = run(30)
+    problem = optloc.simulate(problem, truth=truth(problem), seed=7)
+    fix = optloc.solve(problem, "lsr", start=truth(problem))
+    found, n = growing(problem, fix, [10, 20, 30]), problem.layout.n_shared
+    np.testing.assert_allclose(found.x[-1], fix.x[:n], atol=1e-2)
+    _, sigma = found.take("position")
+    assert (np.diff(np.linalg.norm(sigma, axis=1)) < 0.0).all()
+    with pytest.raises(InvalidProblem, match="counts are not among 1 to 30"):
+        growing(problem, fix, [31])
+
+
+def test_answers_of_a_long_run_are_closer_together_at_its_start():
+    assert _space_counts(5).tolist() == [1, 2, 3, 4, 5]
+    far = _space_counts(10_000)
+    assert (far[0], far[-1]) == (1, 10_000)
+    assert len(far) <= 60
+    assert (np.diff(np.diff(far)) >= -1).all()

@@ -7,6 +7,7 @@ from proof.sampling import bounded, changes, curved, differences, numbers, remai
 
 from optloc.models import MODELS, Point
 from optloc.proof.box import bound_nodes, least_residual, linearise_rows
+from optloc.proof.nodes.log_range import bound_logarithm, curve_logarithm
 from optloc.proof.nodes.node import LOG_RANGE, RATIO
 from optloc.proof.search_space import empty_box
 
@@ -89,3 +90,15 @@ def test_what_has_no_end_bounds_a_residual_from_the_other_side(kind, shared):
         assert np.isfinite(low)
         told += low > 1.0
     assert told > 100
+
+
+def test_logarithm_and_slope_of_a_point_are_those_of_the_range(plainly):
+    line, sense, half, slope = np.array([3.0, 4.0, 0.0]), np.diag([1.0, 2.0, 0.0]), np.zeros(3), np.zeros(3)
+    value, low, high = bound_logarithm(np.zeros(WIDTH), line, sense, half, slope)
+    assert value == pytest.approx(np.log(5.0))
+    np.testing.assert_allclose(slope, [3.0 / 25.0, 8.0 / 25.0, 0.0])
+    assert low <= 0.0 <= high < 1e-12
+    hessian, turn = np.zeros((3, 3)), np.zeros(3)
+    assert curve_logarithm(np.zeros(WIDTH), line, sense, half, hessian, turn) < 1e-12
+    n = line[:2] / 5.0
+    np.testing.assert_allclose(hessian[:2, :2], sense[:2, :2] @ (np.eye(2) - 2.0 * np.outer(n, n)) @ sense[:2, :2] / 25)

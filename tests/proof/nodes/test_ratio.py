@@ -7,6 +7,7 @@ from proof.sampling import bounded, changes, curved, differences, numbers, remai
 
 from optloc.proof.nodes.angles import ALONE
 from optloc.proof.nodes.node import AZIMUTH, RANGE
+from optloc.proof.nodes.ratio import RATIO_OF_RANGES, bound_ratio
 from optloc.proof.position_costs import mark_alone
 
 pytestmark = pytest.mark.usefixtures("form")
@@ -69,3 +70,19 @@ def test_rows_that_nodes_share_are_told_from_rows_of_their_own():
         assert out[:, :, ALONE].tolist() == [[1.0, 0.0, 0.0, 0.0]]
     shifted = w + np.eye(4)[0]
     assert mark_alone(kinds, np.zeros((1, 4, WIDTH)), K[None], shifted)[0, 0, ALONE] == 0.0
+
+
+def test_ratio_and_slope_of_a_point_are_those_of_the_ranges(plainly):
+    a, b, sense, half, slope = np.array([3.0, 4.0, 0]), np.array([0.0, 4.0, 0]), np.eye(3), np.zeros(3), np.zeros(3)
+    value, low, high = bound_ratio(np.zeros(WIDTH), a, sense, b, sense, half, slope)
+    assert value == pytest.approx(5.0 / 4.0)
+    np.testing.assert_allclose(slope, a / (5.0 * 4.0) - 5.0 * b / 4.0**3, atol=1e-12)
+    assert low <= 0.0 <= high < 1e-12
+
+
+def test_points_twice_as_near_to_one_station_fill_the_ball_of_apollonius(plainly):
+    data = np.zeros(WIDTH)
+    data[3] = 3.0  # the other station
+    x, y, z, radius = RATIO_OF_RANGES.ball(data, 0.0, 0.5)
+    assert (x, y, z, radius) == pytest.approx((-1.0, 0.0, 0.0, 2.0))
+    assert RATIO_OF_RANGES.ball(data, 0.5, 2.0)[3] == np.inf

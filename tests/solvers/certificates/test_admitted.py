@@ -1,12 +1,18 @@
 """Proofs within what inequalities admit, against bounded searches by SciPy with residuals of their own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from model_checks.small import PLACE, ranges_to
 from often import few
 from scipy.optimize import minimize
 
 from optloc import Status, assemble, measured, solve
 from optloc.linear.constraints import box, faces, is_held, polygon
+from optloc.problem.claims import GLOBAL, REGION
+from optloc.solvers.certificates.admitted import certified
+from optloc.solvers.stages import gtrs, lsr
 
 SCALE = 1e4
 
@@ -138,3 +144,14 @@ def test_the_corners_of_a_polygon_hold_from_outside_alone():
     edge = next(face for face in faces(problem) if len(face) == 1 and face[0].side == 0)
     assert is_held(problem, edge, np.array([[2.0, 0.0]]), np.array([[0.0, -1.0]])).all()
     assert not is_held(problem, edge, np.array([[2.0, 0.0]]), np.array([[0.0, 1.0]])).any()
+
+
+def test_a_fix_inside_its_box_is_proven_and_the_claim_is_in_its_pool():
+    bounded = replace(
+        ranges_to(PLACE, 2.0, np.array([0.5, -1.0, 2.0, -0.5, 1.0])),
+        constraints=tuple(box([-5e3, -5e3], [5e3, 5e3])),
+    )
+    pool = lsr(bounded, gtrs(bounded, None))
+    told = certified(bounded, pool).proven
+    assert told.unique.tolist() == [True]
+    assert told.proof[0] in (GLOBAL, REGION)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from optloc import Motion, Problem, Stations, assemble, measured, solve
+from optloc.solvers.starts.moving import _apart, held, moves_at_once
 
 Array = np.ndarray
 SEED = 20261123
@@ -51,3 +52,17 @@ def test_moving_emitters_are_found_from_nothing(name, seed):
 def test_moving_emitters_are_found_from_nothing_in_full(name, seed):
     found = misses(name, 200, seed)
     assert len(found) <= 2, found
+
+
+def test_only_a_target_of_unknown_velocity_at_one_epoch_moves_at_once():
+    rows = measured("range_rate", np.zeros(6), a=np.arange(6), sigma=0.1)
+    stations = Stations(np.zeros((1, 6, 2)) + np.arange(6.0)[:, None], tuple("ABCDEF"), velocity=np.ones((1, 6, 2)))
+    moving = assemble(stations, rows, motions=(Motion(1),)).flat()
+    assert moves_at_once(moving)
+    assert held(moving).motions[0].order == 0
+    assert not moves_at_once(assemble(stations, rows, motions=(Motion(0),)).flat())
+
+
+def test_of_places_that_are_near_each_other_the_cheapest_is_kept():
+    met = [(3.0, (100.0, 0.0)), (1.0, (101.0, 0.0)), (2.0, (0.0, 100.0))]
+    np.testing.assert_array_equal(_apart(met, np.zeros(2)), [[101.0, 0.0], [0.0, 100.0]])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from model_checks.small import PLACE, SQUARE
 from often import few
 from scipy.optimize import least_squares
 
@@ -9,6 +10,7 @@ import optloc
 from optloc import Status, assemble, measured
 from optloc.base.types import Motion
 from optloc.problem.bias import with_bias
+from optloc.solvers.starts.orientation import Headings, headings, unwind
 
 # Rounds of a theodolite at three control points: directions from the first mark of each, degrees clockwise.
 CONTROL = np.array([[865.40, 4527.15], [2432.55, 2047.25], [2865.22, 27.15]])
@@ -112,3 +114,24 @@ def test_one_offset_of_all_stations_is_found_from_a_grid_of_turns(turn):
     fix = optloc.solve(with_bias(bare, "turn", kind="azimuth", per="kind"))
     assert np.linalg.norm(fix.position - place) < 20.0
     assert abs(fix.bias["turn"][0] - turn) < 1e-3
+
+
+def test_offsets_without_a_narrow_prior_are_headings():
+    bare = assemble(SQUARE, measured("azimuth", np.zeros(5), a=np.arange(5), sigma=0.01))
+    turned = with_bias(bare, "north", form="offset", per="station")
+    found = headings(turned.flat())
+    assert found.names == ("north",)
+    assert found.free.all()
+    np.testing.assert_array_equal(found.touch, np.eye(5))
+    assert headings(bare.flat()) is None
+    assert headings(with_bias(bare, "north", form="offset", per="station", sigma=0.01).flat()) is None
+
+
+def test_whole_turns_are_taken_off_offsets_without_a_prior():
+    free = np.array([True, False])
+    found = Headings(("north",), np.array([2, 3]), np.zeros((2, 1)), np.zeros(2), ~free, free)
+    x = np.array([[[*PLACE, 7.0, 7.0], [*PLACE, 3.6, 7.0]]])
+    out = unwind(found, x)[0]
+    assert out[0, 2] == pytest.approx(7.0 - 2.0 * np.pi)
+    assert abs(out[1, 2] - out[0, 2]) <= np.pi
+    np.testing.assert_array_equal(out[:, 3], 7.0)

@@ -7,6 +7,7 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
+from model_checks.small import PLACE, SQUARE, ranges_to
 from often import few
 from robust_cases import solve_apart, spoilt, wild_run
 from scipy.stats import binom, chi2
@@ -23,7 +24,9 @@ from optloc.problem import Prior
 from optloc.problem.arrival_times import as_arrivals, restore_order
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP
+from optloc.solvers.stages import gtrs, lsr
 from optloc.solvers.suspect_rows import subsets
+from optloc.solvers.suspect_rows.stage import _group_alike, suspect as stage
 from optloc.solvers.verdict.judge import judge
 
 RNG = np.random.default_rng(20251121)
@@ -580,3 +583,19 @@ def test_the_command_line_names_suspects(tmp_path):
     assert "Errors that go unnoticed" in out
     assert "Errors that go unnoticed" in command("crlb", file)
     assert "explanations" in json.loads(command("fix", file, "--json"))["fixes"][0]
+
+
+def test_the_stage_leaves_out_what_contradicts_the_rest():
+    places = np.concatenate([SQUARE, [[-400.0, 500.0], [1300.0, 300.0], [600.0, 1500.0]]])
+    one = ranges_to(PLACE, 1.0, np.array([0.5, -1.0, 60.0, -0.5, 1.0, 0.3, -0.8, 0.2]), places)
+    pool = stage(one, lsr(one, gtrs(one, None)), ("row",))
+    assert pool.asked
+    assert [suspect.rows for suspect in pool.conclusion[0].explanations[0].suspects] == [(2,)]
+    with pytest.raises(InvalidProblem, match="questions a fix"):
+        stage(one, None)
+
+
+def test_problems_with_the_same_rows_are_asked_together():
+    present = np.array([[True, True], [True, False], [True, True]])
+    assert sorted(group.tolist() for group in _group_alike(present)) == [[0, 2], [1]]
+    assert _group_alike(present[:0]) == []
