@@ -29,6 +29,11 @@ def test_a_difference_longer_than_its_baseline_is_impossible():
     assert "1000 m apart" in one.seen
 
 
+def test_a_difference_shorter_than_its_baseline_is_possible():
+    problem = assemble(SQUARE[:3], measured("tdoa", [900.0, 20.0], a=[1, 2], b=0, sigma=1.0)).flat()
+    assert not list(advise_on_values(problem, np.full((1, 2), np.nan)))
+
+
 @pytest.mark.parametrize("kind", ["range", "range_sum"])
 def test_a_length_less_than_any_place_has_is_impossible(kind):
     b = {"b": 0} if kind == "range_sum" else {}

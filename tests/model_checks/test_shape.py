@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 
-from optloc import assemble, measured
+from optloc import assemble, measured, with_bias
 from optloc.model_checks.shape import cost_at_infinity, departure, profile
 
 
@@ -23,6 +23,21 @@ def test_the_profile_over_an_emission_time_is_the_scatter_of_the_residuals():
     step = 1e-3 * np.eye(2)
     slope = [(plain(there[0] + one) - plain(there[0] - one)) / 2e-3 for one in step]
     np.testing.assert_allclose(-2.0 * vector[0, 0], slope, rtol=1e-6)
+
+
+def test_a_common_bias_is_projected_out_of_slope_and_information():
+    z = np.linalg.norm(PLACE - SQUARE, axis=1) + np.array([1.0, -2.0, 0.5, 3.0, -1.0])
+    problem = assemble(SQUARE, measured("range", z, a=np.arange(5), sigma=2.0))
+    problem = with_bias(problem, "late", form="offset", per="kind").flat()
+    there = np.array([350.0, 600.0])
+    cost, information, vector = profile(problem, np.append(there, 0.0)[None, None], np.zeros((1, 3)))
+    line = there - SQUARE
+    r = np.linalg.norm(line, axis=1)
+    J, left = line / r[:, None] / 2.0, (z - r) / 2.0
+    J, left = J - J.mean(0), left - left.mean()
+    assert cost[0, 0] == pytest.approx(left @ left)
+    np.testing.assert_allclose(information[0, 0], J.T @ J, rtol=1e-9)
+    np.testing.assert_allclose(vector[0, 0], J.T @ left, rtol=1e-9)
 
 
 def test_a_fine_fix_is_more_gaussian_than_a_coarse_one():

@@ -253,7 +253,7 @@ def test_solve_takes_the_short_way(method, monkeypatch):
     """To the last bit as a prepared problem, whatever was solved before."""
     problem, z = network(6), drawn(6, "inside", 20)
     ready = prepare(problem, method)
-    monkeypatch.setattr("optloc.solvers.solve_in_stages", None)
+    monkeypatch.setattr("optloc.solvers.solution.solve_in_stages", None)
     for one in (z[0], z[1], z[0]):
         fix, same = solve(problem.with_rows(z=one), method), ready.short(one)
         assert (fix.shape, fix.x.tobytes(), fix.cov.tobytes()) == (same.shape, same.x.tobytes(), same.cov.tobytes())
@@ -267,7 +267,7 @@ def test_few_that_differ_in_measurements_alone_take_the_short_way(method, axis, 
     place = bare.stations.position.reshape(*axis, *bare.stations.position.shape[-3:])
     problem, ready = replace(bare, stations=replace(bare.stations, position=place)), prepare(bare, method)
     many = prepare(problem, method)
-    monkeypatch.setattr("optloc.solvers.solve_in_stages", None)
+    monkeypatch.setattr("optloc.solvers.solution.solve_in_stages", None)
     monkeypatch.setattr("optloc.solvers.prepared.settle_directly", None)
     for fix in (solve(problem.with_rows(z=z), method), many(z)):
         assert fix.shape == (7,)

@@ -43,6 +43,7 @@ def test_costs_agree_with_their_own_problem_alone():
     fix, costs = solve(problem, "gtrs+lsr"), eliminate_nuisance(problem)
     assert agrees(problem, fix, costs).tolist() == [True]
     assert agrees(problem, fix, eliminate_nuisance(ranges_to(PLACE, 2.0, 1.1 * ERROR))).tolist() == [False]
+    assert agrees(problem, replace(fix, cost=fix.cost + 1.0), costs).tolist() == [False]
     assert is_free(problem, fix, np.array([0])).tolist() == [True]
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from model_checks.small import PLACE, SQUARE, ranges_to
 
+from optloc import assemble, measured
 from optloc.problem.loss import LOSSES
 from optloc.solvers.pool import begin
 from optloc.solvers.robust.starts import _graduate, _unite, flip_rows, robust_starts, subsets
@@ -19,6 +20,9 @@ def test_subsets_lack_one_station_or_more_and_keep_enough_rows():
     assert sorted((~kept).sum(1).tolist()) == [1] * 5 + [2] * 10 + [3] * 10
     assert (item == 0).all()
     assert len(np.unique(kept, axis=0)) == len(kept)
+    # with an unknown time of emission two rows are too few
+    arrivals = assemble(SQUARE, measured("toa", np.ones(5), a=np.arange(5), sigma=1.0)).flat()
+    assert (~subsets(arrivals, np.zeros(1, dtype=bool))[1]).sum(1).max() == 2
     _, clean = subsets(problem, np.ones(1, dtype=bool))
     assert (~clean).sum(1).tolist() == [1] * 5
 
