@@ -5,14 +5,14 @@ import pytest
 from model_checks.small import means
 
 from optloc.model_checks.overbound import tail_factors
-from optloc.model_checks.variance_components import Fitted, tested as told
+from optloc.model_checks.variance_components import VarianceFit, tested as told
 
 
 def found(made, variance):
     none = np.full(len(variance), np.nan)
     gross = np.zeros(made.of_effect.shape, dtype=bool)
     still = np.zeros(len(variance), dtype=bool)
-    return Fitted(np.array(variance), none, none, none, still, False, gross, told(made, np.ones(())))
+    return VarianceFit(np.array(variance), none, none, none, still, False, gross, told(made, np.ones(())))
 
 
 def test_normal_errors_of_the_stated_size_need_no_factor():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from proof.costs import differences, down_from
 
-from optloc.proof.batch import Answered, Asked, costs_at, empty_answer, plainly, present_in, prove_all
+from optloc.proof.batch import ProofRequest, ProofResult, costs_at, empty_answer, plainly, present_in, prove_all
 from optloc.proof.near import BETTER, STATIONARY, UNIQUE
 
 pytestmark = pytest.mark.usefixtures("plainly")
@@ -22,7 +22,7 @@ def asked(x, kappa=25.0):
     nowhere, none = np.full((n, 2, d), np.nan), np.zeros(n, dtype=np.int64)
     gaps = np.tile(down_from(kappa), (n, 1))
     region = np.stack([np.full((n, d), -1e4), np.full((n, d), 1e4)], axis=1)
-    return Asked(
+    return ProofRequest(
         x,
         np.zeros((n, 0, d)),
         none,
@@ -72,5 +72,5 @@ def test_answers_are_taken_item_by_item():
     out = empty_answer(3, 2)
     out.gap[:] = [1.0, 2.0, 3.0]
     assert out.take(np.array([2, 0])).gap.tolist() == [3.0, 1.0]
-    assert isinstance(out.take(slice(1)), Answered)
+    assert isinstance(out.take(slice(1)), ProofResult)
     assert plainly(np.arange(6.0).reshape(2, 3).T).flags.c_contiguous

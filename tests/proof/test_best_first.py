@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from proof.costs import random_case
 
-from optloc.proof.best_first import Aim, Places, _is_due, _least, find_minima
+from optloc.proof.best_first import FoundPlaces, SearchGoal, _is_due, _least, find_minima
 
 pytestmark = pytest.mark.usefixtures("plainly")
 
 
 def nowhere(x):
     region = np.stack([x - 1e5, x + 1e5])[None]
-    return Places(x[None], region, np.empty((1, 0, 3)), np.empty((1, 0)))
+    return FoundPlaces(x[None], region, np.empty((1, 0, 3)), np.empty((1, 0)))
 
 
 @pytest.mark.parametrize("kind", ["tdoa", "prior"])
@@ -32,6 +32,6 @@ def test_centres_descend_ever_more_seldom():
 
 
 def test_the_best_of_no_minima_costs_without_end():
-    aim = Aim(np.empty((0, 3)), np.empty(0), 9.0, 1e6, np.zeros((3, 2)), np.array([5.0, 2.0, 1.0]))
+    aim = SearchGoal(np.empty((0, 3)), np.empty(0), 9.0, 1e6, np.zeros((3, 2)), np.array([5.0, 2.0, 1.0]))
     assert _least(aim, 0) == np.inf
     assert _least(aim, 2) == 2.0

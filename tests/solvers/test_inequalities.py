@@ -7,7 +7,8 @@ import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 from scipy.optimize import minimize
 
-from optloc import ECEF, Status, assemble, constraints, measured
+from optloc import Status, assemble, constraints, measured
+from optloc.base.frames import ECEF
 from optloc.linear.constraints import faces
 from optloc.solvers.inequalities import bound_pool, is_hidden, is_minimum, lowest_sight, without_broken
 from optloc.solvers.pool import begin

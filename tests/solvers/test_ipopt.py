@@ -6,8 +6,8 @@ from cases import STATIONS, TARGET
 from model_checks.small import PLACE, SQUARE, ranges_to
 from scipy.optimize import least_squares
 
-from optloc.lab.papers.registration import SPATIAL, RegistrationSetting
 from optloc import InvalidProblem, assemble, measured, simulate, solve
+from optloc.lab.papers.registration import SPATIAL, RegistrationSetting
 from optloc.solvers.ipopt import nlp
 from optloc.solvers.pool import begin
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optloc.proof.nodes.node import Row, across, excess, lay_out, product, range_bend, range_form, reach, scaled
+from optloc.proof.nodes.node import NodeRow, across, excess, lay_out, product, range_bend, range_form, reach, scaled
 
 pytestmark = pytest.mark.usefixtures("plainly")
 
@@ -69,7 +69,7 @@ def test_a_row_reads_the_stations_of_its_own_epoch():
     position = np.arange(12.0).reshape(2, 3, 2)
     turned = np.array([[0.0, 1.0], [-1.0, 0.0]])
     stations = SimpleNamespace(position=position, velocity=10.0 * position[1:], axes=np.tile(turned, (1, 3, 1, 1)))
-    row = Row(SimpleNamespace(stations=stations, dimension=2), 1, -1, 1, np.zeros(1))
+    row = NodeRow(SimpleNamespace(stations=stations, dimension=2), 1, -1, 1, np.zeros(1))
     assert row.place(2).tolist() == [[10.0, 11.0]]
     assert row.velocity(0).tolist() == [[60.0, 70.0]]
     assert row.axes(0).tolist() == [[0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]

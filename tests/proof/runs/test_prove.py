@@ -7,7 +7,7 @@ from proof.runs.small import STATE, at_rest, course, residual, residual_at_rest
 from scipy.optimize import least_squares
 
 from optloc.kernels.jit import enabled, plain
-from optloc.proof.batch import Asked
+from optloc.proof.batch import ProofRequest
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import (
     ANOTHER,
@@ -21,7 +21,7 @@ from optloc.proof.near import (
     STATIONARY,
     UNIQUE,
     VALUE,
-    Aim,
+    Goal,
 )
 from optloc.proof.runs.prove import _verdict, prove_courses, prove_runs, runs_lack_code
 from optloc.proof.runs.run_costs import course_costs, run_costs
@@ -33,7 +33,7 @@ def asked(x, low, high):
     gaps, nothing = np.tile(down_from(9.0), (n, 1)), np.zeros((n, 0, d))
     planes, surface = np.zeros((n, 0, 3)), np.zeros((n, 0))
     eps, budget = np.full(n, 1e-6), np.full(n, 400)
-    return Asked(x, nothing, none, none, gaps, eps, region, region, budget, planes, surface)
+    return ProofRequest(x, nothing, none, none, gaps, eps, region, region, budget, planes, surface)
 
 
 @pytest.mark.skipif(not enabled(), reason="runs are proven by machine code")
@@ -66,7 +66,7 @@ def test_without_machine_code_nothing_is_claimed():
 
 def test_outcomes_of_a_search_are_verdicts_on_the_fix():
     with plain():
-        gap, value = Aim(9.0, 1.0, 1.0, False, 0, 0), Aim(1.0, 1.0, 1.0, False, 0, 0)
+        gap, value = Goal(9.0, 1.0, 1.0, False, 0, 0), Goal(1.0, 1.0, 1.0, False, 0, 0)
         assert (_verdict(CLEAR, gap), _verdict(CLEAR, value)) == (UNIQUE, VALUE)
         pairs = {SPENT: BUDGET, INFINITE: UNBOUNDED, CHEAPER: BETTER, ANOTHER: OTHER}
         assert {outcome: _verdict(outcome, gap) for outcome in pairs} == pairs

@@ -5,7 +5,7 @@ import pytest
 
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI
 from optloc.proof.runs.rows import (
-    Rows,
+    RunRows,
     blur_of,
     digits_of,
     greatest_length,
@@ -30,7 +30,7 @@ W, SPAN = np.array([3.0, -1.0, 2.0, 5.0]), np.array([1.0, 1.0, 1.0, 0.0]) / np.s
 def rows():
     row, column = np.nonzero(S)
     start = np.concatenate([[0], np.cumsum(np.bincount(row))])
-    return Rows(start, column, S[row, column], W, SPAN[None], np.linalg.norm(S, axis=0))
+    return RunRows(start, column, S[row, column], W, SPAN[None], np.linalg.norm(S, axis=0))
 
 
 def test_products_are_those_of_the_dense_matrix():

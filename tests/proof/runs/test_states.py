@@ -6,7 +6,7 @@ from proof.runs.small import EPOCHS, STATE, STATIONS, TIMES, course as problem, 
 
 from optloc.proof.nodes.node import PHI, SLOPE0
 from optloc.proof.runs.run_costs import course_costs
-from optloc.proof.runs.states import Axes, cost_of_state, floor_of, put, set_bends, set_box, table_of
+from optloc.proof.runs.states import StateAxes, cost_of_state, floor_of, put, set_bends, set_box, table_of
 
 pytestmark = pytest.mark.usefixtures("plainly")
 
@@ -19,7 +19,7 @@ def course():
 def boxed(course, half):
     rng = np.random.default_rng(1)
     turn = np.diag([10.0, 10.0, 0.1, 0.1]) @ rng.normal(size=(4, 4))
-    axes, table = Axes(STATE, turn, np.linalg.inv(turn), np.zeros((2, 4))), table_of(course)
+    axes, table = StateAxes(STATE, turn, np.linalg.inv(turn), np.zeros((2, 4))), table_of(course)
     put(table, np.array([0.5, -1.0, 0.0, 2.0]), np.full(4, half))
     set_box(course, axes, table)
     return rng, axes, table

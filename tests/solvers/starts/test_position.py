@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 
-from optloc import ECEF, Frame, Motion, assemble, constraints, measured
-from optloc.base.frames import geodetic_to_ecef
+from optloc import Frame, Motion, assemble, constraints, measured
+from optloc.base.frames import ECEF, geodetic_to_ecef
 from optloc.solvers.starts.position import (
     along_the_valley,
     distance_of,
