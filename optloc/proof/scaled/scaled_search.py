@@ -8,15 +8,20 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, with_constants
+from optloc.compute.jit import compiled, inlined, with_constants, zero
 from optloc.proof.atlas import Atlas, home_of, infinity
 from optloc.proof.box import (
     PIECE,
     bound_nodes,
+    cost_at,
     is_empty,
+    least_residual,
+    linearise_rows,
     pop,
     reaches,
+    rounding,
     share_left,
+    shrink,
     steepest_side,
     uncut,
     widest,
@@ -44,7 +49,7 @@ from optloc.proof.scaled.reduction import (
     reduce_rows,
     sheet_of,
 )
-from optloc.proof.search_space import Box, Chart, Cost, curve_at, empty_box, place, widen
+from optloc.proof.search_space import Box, Chart, Cost, cost_of, curve_at, empty_box, place, widen
 from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, set_nodes, set_place
 
 
@@ -248,13 +253,48 @@ def _grow(
 
 
 class Work(NamedTuple):
-    """A cost and working memory for its search; the tables hold `box` and `near` as well."""
+    """A cost and working memory for its search; the tables hold `box` and `near` as well.
+
+    Of costs whose factors may be negative `rest` are the rows that no factor touches. Where the columns of the factors
+    vanish, as those of a velocity do far away, these bound the cost alone. Of other costs it has no rows.
+    """
 
     scaled: Scaled
     tables: Tables
     floor: float
     box: Box
     near: Box
+    rest: Cost
+
+
+@compiled
+def rest_of(scaled: Scaled) -> Cost:
+    """Return the rows that no factor touches, over the first nodes: `optloc.proof.scaled.scaled_proof` orders both."""
+    K, first, count, nodes = scaled.cost.K, zero(), zero(), zero()
+    for i in range(K.shape[0] if scaled.free else 0):
+        last, own = zero(), True
+        for j in range(K.shape[1]):
+            if K[i, j] != 0.0:
+                last, own = j + 1, own and scaled.group[j] < 0
+        if not own:
+            count, nodes = 0, 0
+        elif last > 0:
+            first = i if count == 0 else first
+            count, nodes = i + 1 - first, max(nodes, last)
+    part = K[first : first + count, :nodes].copy()
+    return cost_of(scaled.cost.kinds[:nodes], scaled.cost.data[:nodes], part, scaled.cost.w[first : first + count])
+
+
+@inlined
+def _bound_rest(work: Work, space: Space, box: Box) -> float:
+    """Return a lower bound of the residual by the rows that no factor touches, negative where it says nothing."""
+    rest = work.rest
+    if rest.w.shape[0] == 0:
+        return -1.0
+    rows = box.rows[: rest.w.shape[0]]
+    set_nodes(space, rest, box)
+    linearise_rows(rest.K, rest.w, box.nodes, rows)
+    return float(least_residual(rest.K, rest.weight, work.floor, box.half, box.nodes, rows))
 
 
 @compiled
@@ -265,11 +305,14 @@ def _bound_row(work: Work, space: Space, stack: Array, row: int, level: float) -
     set_box(space, box, piece)
     if is_left(space.atlas, box, piece) if space.far else is_known(box.at, box.half, space.minima, space.sides):
         return inf, inf
+    least = _bound_rest(work, space, box)
+    if reaches(least, level):
+        return inf, inf
     set_nodes(space, scaled.cost, box)
     reduce_rows(scaled, work.floor, box, sheet)
     if not bound_factors(scaled, sqrt(max(level, 0.0)), box, sheet):
         return inf, inf
-    low = bound_rows(scaled, box, sheet)
+    low = max(bound_rows(scaled, box, sheet), least)
     return (inf, inf) if reaches(low, level) else (low, sheet.span[HERE])
 
 
@@ -277,8 +320,7 @@ def _bound_row(work: Work, space: Space, stack: Array, row: int, level: float) -
 def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: bool) -> int:
     scaled, box, sheet, d = work.scaled, work.box, work.tables.sheet, space.atlas.dimension
     if not is_bounded(sheet):
-        uncut(box.half, box.cut)
-        return int(widest(box.half))
+        return _side_of_rows(work, rho, d)
     clip_rows(scaled, rho, box, sheet)
     if is_empty(box.cut):
         return -1
@@ -298,6 +340,19 @@ def _side_of_rest(work: Work, space: Space, touching: bool, rho: float, sound: b
     return int(curved if curved >= 0 else side)
 
 
+@inlined
+def _side_of_rows(work: Work, rho: float, d: int) -> int:
+    """Clip a box whose factors have no bound by the rows without factors; return what `side_of_rest` does."""
+    rest, box = work.rest, work.box
+    uncut(box.half, box.cut)
+    if rest.w.shape[0] == 0:
+        return int(widest(box.half))
+    rows, flat = box.rows[: rest.w.shape[0]], box.half[2] == 0.0
+    noise = rounding(rest.K, rest.weight, work.floor, box.nodes)
+    shrink(rest.K, rest.weight, rho + noise, box.half, flat, box.nodes, rows, box.cut, box.solve)
+    return -1 if is_empty(box.cut) else int(steepest_side(box.half, rows, d))
+
+
 @compiled
 def _descend_near(work: Work, chart: Chart) -> float:
     return descend_scaled(work.scaled, chart, work.tables)
@@ -311,6 +366,8 @@ def _set_rival(work: Work, atlas: Atlas, chart: Chart, i: int, x: Array, value: 
 @compiled
 def _cost_set(work: Work, atlas: Atlas) -> float:
     bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
+    if work.scaled.free and not work.scaled.lift.any():  # their columns vanish at infinity
+        return float(cost_at(work.rest.K, work.rest.w, work.box.nodes))
     reduce_rows(work.scaled, work.floor, work.box, work.tables.sheet)
     return float(work.tables.sheet.span[HERE])
 
