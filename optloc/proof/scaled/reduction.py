@@ -312,8 +312,6 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> bool:
         if not sheet.best[g] > -inf:
             return True
     _swing(scaled, blur, box, sheet)
-    if scaled.free:
-        _forget_signs(sheet)
     if not _solve_swing(scaled.free, sheet, blur):
         return False
     for g in range(G):
@@ -370,15 +368,8 @@ def _swing(scaled: Scaled, blur: float, box: Box, sheet: Sheet) -> None:
         for h in range(G + 1):
             both = abs(slopes[h, 0]) * half[0] + abs(slopes[h, 1]) * half[1] + abs(slopes[h, 2]) * half[2] + rounded
             sheet.fall[g, h], sheet.rise[g, h] = sheet.fall[g, h] + both, sheet.rise[g, h] + both
-
-
-@inlined
-def _forget_signs(sheet: Sheet) -> None:
-    """Let decreases and increases of factors be the same: those of factors of any sign."""
-    G, fall, rise = sheet.best.shape[0], sheet.fall, sheet.rise
-    for g in range(G):
-        for h in range(G + 1):
-            fall[g, h] = rise[g, h] = max(fall[g, h], rise[g, h])
+            if scaled.free:  # of a factor of any sign a decrease may be an increase
+                sheet.fall[g, h] = sheet.rise[g, h] = max(sheet.fall[g, h], sheet.rise[g, h])
 
 
 @inlined
@@ -602,17 +593,3 @@ def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: Sheet) -> None:
         return
     noise, flat = blur_of(scaled, sheet), box.half[2] == 0.0
     shrink(sheet.K, sheet.weight, rho + noise, box.half, flat, sheet.nodes, sheet.rows, box.cut, box.solve)
-
-
-@compiled
-def look_at(scaled: Scaled, sheet: Sheet, box: Box, look: Cost) -> None:
-    """Write rows that are the cost, its slope and information at a point whose rows are reduced, without factors."""
-    J = box.nodes.shape[0]
-    for i in range(sheet.K.shape[0]):
-        total = sheet.w[i]
-        for j in range(J):
-            g = scaled.group[j]
-            factor = 1.0 if g < 0 else (sheet.best[g] if scaled.free else max(sheet.best[g], 0.0))
-            look.K[i, j] = factor * sheet.K[i, j]
-            total += look.K[i, j] * box.nodes[j, PHI]
-        look.w[i] = total

@@ -31,6 +31,7 @@ from optloc.proof.curvature import most_curved_side, sum_up
 from optloc.proof.descents import newton_step
 from optloc.proof.level_search import bound_row, cost_set, descend_near, search_levels, set_rival, side_of_rest
 from optloc.proof.nodes.dispatch import bound_pieces
+from optloc.proof.nodes.node import PHI
 from optloc.proof.pieces import (
     SHRUNK,
     end_at_infinity,
@@ -45,7 +46,6 @@ from optloc.proof.scaled.reduction import (
     bound_rows,
     clip_rows,
     is_bounded,
-    look_at,
     reduce_rows,
     sheet_of,
 )
@@ -72,6 +72,20 @@ def tables_of(scaled: Scaled) -> Tables:
 
 
 # The cost at a position, and descents.
+
+
+@compiled
+def look_at(scaled: Scaled, sheet: Sheet, box: Box, look: Cost) -> None:
+    """Write rows that are the cost, its slope and information at a point whose rows are reduced, without factors."""
+    J = box.nodes.shape[0]
+    for i in range(sheet.K.shape[0]):
+        total = sheet.w[i]
+        for j in range(J):
+            g = scaled.group[j]
+            factor = 1.0 if g < 0 else (sheet.best[g] if scaled.free else max(sheet.best[g], 0.0))
+            look.K[i, j] = factor * sheet.K[i, j]
+            total += look.K[i, j] * box.nodes[j, PHI]
+        look.w[i] = total
 
 
 @compiled

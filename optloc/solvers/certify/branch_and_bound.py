@@ -58,7 +58,7 @@ FINE = (
 )
 AROUND = "the region reaches around the Earth, and the proof is for one side of it"
 SCALED = "nothing bounds the position at all scales that the rows and priors allow"
-FAST = "far positions are not excluded at velocities that grow with the distance"
+FAST = "nothing bounds the position at all velocities that the rows and the prior allow"
 UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
 BARRED = "a position that costs less is not admitted: {}"
 LOST = "a position that costs less was met, and no minimum next to it was kept"
@@ -306,7 +306,7 @@ def _round(work: Work, items: Array) -> None:
     # Boxes ran out over all of the surface of a height before a region of it was tried.
     scaled = isinstance(work.costs, ScaledCosts)
     unbounded = (FAST if is_moment(work.problem) else SCALED) if scaled else _unfinished(work.costs, len(items))
-    _give_up(work, items[unclosed], AROUND if work.limited else unbounded)
+    _give_up(work, items[unclosed], AROUND if work.limited and not scaled else unbounded)
     _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
 
