@@ -93,7 +93,7 @@ class Columns:
     def with_velocity(self) -> Array:
         """Add what the target's velocity multiplies, components of lines of sight; return the group of each node (J,).
 
-        A range rate of a target that moves is that of one at rest plus ``u.v``, u the unit vector from the station.
+        A moving target has the range rate of a target at rest plus ``u.v``, u the unit vector from the station.
         """
         group, new = [-1] * len(self.kinds), dict[tuple[int, int], int]()
         for row, column, coefficient in list(zip(self.row, self.column, self.coefficient, strict=True)):
@@ -120,7 +120,7 @@ class Columns:
 
 
 def _along_axis(rate: Array, k: int) -> Array:
-    """Return the numbers (B, n) of one component of the unit vector from a station, by those of a rate of it."""
+    """Return the numbers (B, n) of one component of the unit vector from a station, by a rate of it."""
     out = np.zeros((len(rate), RATE_WIDTH))
     out[:, STATION:VELOCITY] = rate[:, STATION:VELOCITY]
     out[:, VELOCITY + k] = 1.0
@@ -376,7 +376,7 @@ def factors_of_rows(problem: Problem) -> Array:
 def _rows_of(problem: Problem, group: Array | None) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return kinds and numbers of the nodes, rows over them, measurements (N, q), levels (N,), and groups of nodes.
 
-    Groups of rows (m,); None: those of the components of the target's velocity.
+    Groups of rows (m,); None: the components of the target's velocity.
     """
     problem = weighed(problem)
     others = Others.of(problem)

@@ -92,7 +92,7 @@ def _beyond_moments(problem: Problem) -> Iterator[str]:
     if motion.over != "space" or motion.rise is not None:
         yield "the target moves over ground, and the proof of that needs several epochs"
     if problem.times[0] != problem.origin:
-        yield "the target moves, and its state holds at another time than that of the rows"
+        yield "the target moves, and its state holds at another time than the rows"
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.velocity and {node for _, node in model.nodes} != {"range_rate"}:

@@ -12,8 +12,8 @@ how much a factor may differ from the middle times the slopes of its nodes is on
 coordinate: its column is the projected derivative of the rows along that coordinate. The rows along U bound k. At each
 position the residual of the best factors is orthogonal to their columns. So their ranges shrink with the box.
 
-The components of a target's velocity at one epoch are such factors, which may be negative: those of the components of
-unit vectors from stations. What is said of ``k >= 0`` holds for their sizes then.
+The components of a target's velocity at one epoch are such factors, which may be negative. Their nodes are components
+of unit vectors from stations. Bounds of ``k >= 0`` hold for their sizes then.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def velocity_costs(problem: Problem) -> ScaledCosts:
     """Return the costs of a flat batch of problems of a target of unknown velocity at one epoch.
 
     Rates are linear in the velocity, whose components are factors of the components of unit vectors. The rows are
-    turned so that the last ones contain none of these: what the others say of the position whatever the velocity is.
+    turned so that the last rows contain none of these, and bound the position at every velocity.
     """
     costs, group = costs_of_velocity(problem)
     K, w, d = costs.K, costs.w, problem.dimension

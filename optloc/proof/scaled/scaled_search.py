@@ -270,7 +270,7 @@ class Work(NamedTuple):
     """A cost and working memory for its search; the tables hold `box` and `near` as well.
 
     Of costs whose factors may be negative `rest` are the rows that no factor touches. Where the columns of the factors
-    vanish, as those of a velocity do far away, these bound the cost alone. Of other costs it has no rows.
+    vanish, as with a velocity far away, these bound the cost alone. Of other costs it has no rows.
     """
 
     scaled: Scaled

@@ -78,7 +78,7 @@ def state_columns(problem: Problem) -> slice:
 
 
 def _state_size(problem: Problem) -> int:
-    """Return how many numbers the state has; a velocity at one epoch is linear, and projected out as a nuisance."""
+    """Return the size of the state, without a velocity at one epoch: it is linear, and projected out."""
     return problem.dimension * (1 if is_moment(problem) else problem.motions[0].order + 1)
 
 
