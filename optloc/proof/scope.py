@@ -82,8 +82,9 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
 def is_moment(problem: Problem) -> bool:
     """Return whether the rows are of one epoch, and show by rates how fast the target moves."""
     motion = problem.motions[0]
-    rates = any(MODELS[rows.kind].velocity for rows in problem.rows)
-    return rates and motion.order == 1 and motion.known is None and problem.epochs == 1
+    if motion.order != 1 or motion.known is not None or problem.epochs > 1:
+        return False
+    return any(MODELS[rows.kind].velocity for rows in problem.rows)
 
 
 def _beyond_moments(problem: Problem) -> Iterator[str]:
