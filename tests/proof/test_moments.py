@@ -110,7 +110,7 @@ class Flight:
         return sorted(found, key=lambda one: one[0])
 
 
-def scenes(d, n, kinds, prior, seed, count=3):
+def scenes(d, n, kinds, prior, seed, count=many(3, 1)):
     rng = np.random.default_rng([seed, d, n, len(kinds[0])])
     return rng, [Flight.drawn(rng, d, n, kinds, prior, 10.0 ** rng.uniform(0.0, 1.5)) for _ in range(count)]
 
@@ -147,7 +147,7 @@ def test_no_point_of_a_box_is_below_its_bound(d, n, kinds, prior, seed):
             bound = least_residual(rest.K, rest.weight, look.floor, box.half, box.nodes, rows)
             assert max(bound, 0.0) ** 2 <= cost.min() * (1.0 + 1e-9) + 1e-9
             by_rest += bound > 0.0
-    assert min(by_factors, by_rest) > COUNT // 3
+    assert min(by_factors, by_rest) > COUNT // 3 or not enabled()
 
 
 @pytest.mark.parametrize(("d", "n", "kinds", "prior"), KINDS)
@@ -176,7 +176,7 @@ def test_minima_are_never_clipped_and_convex_boxes_are_convex(d, n, kinds, prior
             if is_convex_scaled(look.scaled, 0.0, box, sheet):
                 convex += 1
                 _check_midpoints(flight, look, at, half, rho**2, rng)
-    assert min(convex, clipped) > COUNT // 3
+    assert min(convex, clipped) > COUNT // 3 or not enabled()
 
 
 def _check_midpoints(flight, look, at, half, level, rng):
