@@ -110,9 +110,9 @@ class Flight:
         return sorted(found, key=lambda one: one[0])
 
 
-def scenes(d, n, kinds, prior, seed, count=many(3, 1)):
+def scenes(d, n, kinds, prior, seed):
     rng = np.random.default_rng([seed, d, n, len(kinds[0])])
-    return rng, [Flight.drawn(rng, d, n, kinds, prior, 10.0 ** rng.uniform(0.0, 1.5)) for _ in range(count)]
+    return rng, [Flight.drawn(rng, d, n, kinds, prior, 10.0 ** rng.uniform(0.0, 1.5)) for _ in range(many(3, 1))]
 
 
 @pytest.mark.parametrize(("d", "n", "kinds", "prior"), KINDS)
