@@ -18,7 +18,8 @@ from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.dispatch import NODES, code_of, named, width
 from optloc.proof.nodes.level import linear_numbers
-from optloc.proof.nodes.node import LINEAR, Node, NodeRow
+from optloc.proof.nodes.node import LINEAR, RATE, Node, NodeRow
+from optloc.proof.nodes.rate import RATE_WIDTH, STATION, VELOCITY
 
 # From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
 
@@ -89,6 +90,22 @@ class CostColumns:
             out.touch(row, new[key], coefficient)
         return out, np.array([own for _, own in new])
 
+    def with_velocity(self) -> Array:
+        """Add what the target's velocity multiplies, components of lines of sight; return the group of each node (J,).
+
+        A moving target has the range rate of a target at rest plus ``u.v``, u the unit vector from the station.
+        """
+        group, new = [-1] * len(self.kinds), dict[tuple[int, int], int]()
+        for row, column, coefficient in list(zip(self.row, self.column, self.coefficient, strict=True)):
+            if self.kinds[column] != RATE:
+                continue
+            for k in range(self.problem.dimension):
+                if (column, k) not in new:
+                    new[column, k] = self.add(RATE, _along_axis(self.data[column], k))
+                    group.append(k)
+                self.touch(row, new[column, k], coefficient)
+        return np.array(group)
+
     @property
     def design(self) -> Array:
         """Return the matrix (m, J) of the rows over the nodes."""
@@ -100,6 +117,14 @@ class CostColumns:
     def numbers(self) -> Array:
         """Return the numbers (B, J, width) of all nodes."""
         return stack_numbers(self.kinds, self.data)
+
+
+def _along_axis(rate: Array, k: int) -> Array:
+    """Return the numbers (B, n) of one component of the unit vector from a station, by a rate of it."""
+    out = np.zeros((len(rate), RATE_WIDTH))
+    out[:, STATION:VELOCITY] = rate[:, STATION:VELOCITY]
+    out[:, VELOCITY + k] = 1.0
+    return out
 
 
 def stack_numbers(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
@@ -330,6 +355,13 @@ def costs_of_groups(problem: Problem, group: Array) -> tuple[PositionCosts, Arra
     return PositionCosts(kinds, numbers, K, w, level), own
 
 
+def costs_of_velocity(problem: Problem) -> tuple[PositionCosts, Array]:
+    """Return costs and groups as `costs_of_groups`: components of the target's velocity are factors of nodes."""
+    kinds, numbers, K, w, level, own = _rows_of(problem, None)
+    K, w = compress(K, w)
+    return PositionCosts(kinds, numbers, K, w, level), own
+
+
 def factors_of_rows(problem: Problem) -> Array:
     """Return the unknown factor (m,) of each row, -1 for none and -2 for several or another multiple."""
     out, first = np.full(problem.count, -1), 0
@@ -341,8 +373,11 @@ def factors_of_rows(problem: Problem) -> Array:
     return out
 
 
-def _rows_of(problem: Problem, group: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return kinds and numbers of the nodes, rows over them, measurements (N, q), levels (N,), and groups of nodes."""
+def _rows_of(problem: Problem, group: Array | None) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Return kinds and numbers of the nodes, rows over them, measurements (N, q), levels (N,), and groups of nodes.
+
+    Groups of rows (m,); None: the components of the target's velocity.
+    """
     problem = weighed(problem)
     others = OtherRows.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
@@ -350,7 +385,10 @@ def _rows_of(problem: Problem, group: Array) -> tuple[Array, Array, Array, Array
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
     made = columns_of(problem, known)
-    made, own = made.split(group) if len(set(group.tolist())) > 1 else (made, np.full(len(made.kinds), group[0]))
+    if group is None:
+        own = made.with_velocity()
+    else:
+        made, own = made.split(group) if len(set(group.tolist())) > 1 else (made, np.full(len(made.kinds), group[0]))
     others = others.with_stations(problem, made)
     value = np.where(counts_from_measured(problem), 0.0, known)
     K, w = _projected(problem, made, others, value)

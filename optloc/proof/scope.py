@@ -48,7 +48,7 @@ def _reasons(problem: Problem) -> Iterator[str]:
         yield from _beyond_courses(problem)
     yield from _beyond_rows(problem)
     yield from _beyond_biases(problem)
-    if is_scaled(problem):
+    if is_scaled(problem) and not is_moment(problem):
         yield from _beyond_scale(problem)
     yield from _beyond_stations(problem)
     yield from _beyond_constraints(problem)
@@ -65,6 +65,9 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
     motion = problem.motions[0]
     if motion.order > 1:
         yield "the target accelerates, and the proof is for one that stays or moves uniformly"
+    if is_moment(problem):
+        yield from _beyond_moments(problem)
+        return
     if problem.epochs < 2:
         yield "the target moves, and the proof of that needs several epochs"
     if problem.dimension > 2 and held_height(problem) is None:
@@ -74,6 +77,33 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
     for rows in problem.rows:
         if MODELS[rows.kind].velocity:
             yield f"the target moves, and {rows.kind} rows depend on how fast"
+
+
+def is_moment(problem: Problem) -> bool:
+    """Return whether the rows are of one epoch, and show by rates how fast the target moves."""
+    motion = problem.motions[0]
+    if motion.order != 1 or motion.known is not None or problem.epochs > 1:
+        return False
+    return any(MODELS[rows.kind].velocity for rows in problem.rows)
+
+
+def _beyond_moments(problem: Problem) -> Iterator[str]:
+    """Yield what of rates of one epoch is beyond the proof: they are linear in the velocity."""
+    motion = problem.motions[0]
+    if motion.over != "space" or motion.rise is not None:
+        yield "the target moves over ground, and the proof of that needs several epochs"
+    if problem.times[0] != problem.origin:
+        yield "the target moves, and its state holds at another time than the rows"
+    for rows in problem.rows:
+        model = MODELS[rows.kind]
+        if model.velocity and {node for _, node in model.nodes} != {"range_rate"}:
+            yield f"the target moves, and {rows.kind} rows depend on how fast"
+    if problem.constraints:
+        yield "the velocity at one epoch comes with constraints, and its proof is for all positions"
+    if any(form_of(bias).enters == "scales" for bias in problem.biases):
+        yield "the velocity at one epoch comes with unknown scales, and the proof takes either"
+    if is_run(problem):
+        yield f"the velocity at one epoch is of many rows, and the proof takes {MOST_DENSE} different ranges and rates"
 
 
 def held_height(problem: Problem) -> Band | None:
@@ -111,7 +141,7 @@ def crowded(problem: Problem) -> str:
     """Return why a problem is beyond what works with dense rows, in a sentence, or nothing where it is within."""
     number = _nodes(problem)
     if is_scaled(problem):
-        return "a factor of the rows is unknown"
+        return "the velocity is unknown" if is_moment(problem) else "a factor of the rows is unknown"
     return "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, over {MOST_DENSE}"
 
 
@@ -140,8 +170,8 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
 
 
 def is_scaled(problem: Problem) -> bool:
-    """Return whether unknown factors multiply rows; `optloc.proof.scaled` proves such fixes."""
-    return any(form_of(bias).enters == "scales" for bias in problem.biases)
+    """Return whether unknown factors multiply rows, or a velocity does; `optloc.proof.scaled` proves such fixes."""
+    return any(form_of(bias).enters == "scales" for bias in problem.biases) or is_moment(problem)
 
 
 def _beyond_scale(problem: Problem) -> Iterator[str]:

@@ -5,6 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from optloc.compute.jit import enabled
 from typer.testing import CliRunner
 
 from optloc import Status, solve
@@ -55,7 +56,7 @@ def test_it_is_fixed_as_it_is(name, tmp_path):
     truth = truth_of(STARTERS[name].text, problem)
     problem = by_epoch(problem) if problem.epochs > 1 and separable(problem) else problem
     fix = solve(problem)
-    proven = name != "tdoa_fdoa"
+    proven = enabled() or name != "tdoa_fdoa"  # plain Python has too few boxes for a velocity in space
     assert (np.asarray(fix.code) == (Status.OK if proven else Status.UNPROVEN)).all(), (fix.status, fix.reason)
     error = fix.position - truth
     d = error.shape[-1]

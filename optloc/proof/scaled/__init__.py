@@ -1,1 +1,1 @@
-"""Proofs of costs with one unknown factor of all rows, such as the speed of a wave."""
+"""Proofs of costs with unknown factors of rows: the speed of a wave, or the velocity of the target."""

@@ -4,8 +4,8 @@ The coordinates are offsets s and ``t = R (k - best - B s)``, with R and U as in
 the derivative of the best factors. So the Hessian at the centre has no entry between s and t, and its part along t is
 the identity.
 
-The statements are about points whose factors fit their position best, and are not zero. All minima are such points, and
-so is the cheapest point of each position.
+The statements are about points whose factors fit their position best, and are not zero or may be negative. All minima
+are such points, and so is the cheapest point of each position.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from optloc.kernels.systems import positive_along
 from optloc.proof.box import digits, is_empty, uncut
 from optloc.proof.curvature import C00, G0, LENGTH0, NOISE0, bends_down, clip_newton, entry
 from optloc.proof.nodes.node import CHI, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, SLOPE0, TURN0
-from optloc.proof.scaled.reduction import Scaled, ScaledWorkspace, blur_of, is_positive
+from optloc.proof.scaled.reduction import Scaled, ScaledWorkspace, blur_of, is_bounded, is_positive, size_of_factor
 from optloc.proof.search_space import Box
 
 # Share of the information that its rounding is below: sums over some tens of rows and nodes.
@@ -41,7 +41,7 @@ def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) 
     sheet : ScaledWorkspace
         Reduced rows with the ranges of the factors; derivatives and changes are written.
     """
-    if not is_positive(sheet):
+    if not (is_positive(sheet) or (scaled.free and is_bounded(sheet))):
         return inf
     for j in range(box.nodes.shape[0]):
         if not (box.nodes[j, HIGH] - box.nodes[j, LOW] < inf and box.curves[j, CHI] < inf):
@@ -73,8 +73,8 @@ def _range_of(sheet: ScaledWorkspace, g: int) -> float:
 
 @inlined
 def _greatest(sheet: ScaledWorkspace, g: int) -> float:
-    """Return the greatest value of a factor; 1 for no factor."""
-    return float(max(sheet.most[g], sheet.best[g])) if g >= 0 else 1.0
+    """Return the greatest size of a factor; 1 for no factor."""
+    return float(max(size_of_factor(sheet, g), abs(sheet.best[g]))) if g >= 0 else 1.0
 
 
 @inlined

@@ -11,6 +11,9 @@ All bounds of rows therefore hold for the projected rows, with nodes times the f
 how much a factor may differ from the middle times the slopes of its nodes is one more node without slopes for each
 coordinate: its column is the projected derivative of the rows along that coordinate. The rows along U bound k. At each
 position the residual of the best factors is orthogonal to their columns. So their ranges shrink with the box.
+
+The components of a target's velocity at one epoch are such factors, which may be negative. Their nodes are components
+of unit vectors from stations. Bounds of ``k >= 0`` hold for their sizes then.
 """
 
 from __future__ import annotations
@@ -47,11 +50,14 @@ class Scaled(NamedTuple):
         Constant parts of the columns of the factors: not zero only in rows of priors.
     group : int array (J,)
         The factor of each node, -1 for none.
+    free : bool
+        Whether factors may be negative.
     """
 
     cost: Cost
     lift: Array
     group: Array
+    free: bool
 
 
 class ScaledWorkspace(NamedTuple):
@@ -255,7 +261,7 @@ def _project(scaled: Scaled, sheet: ScaledWorkspace) -> None:
         here += w[i] * w[i]
         for j in range(J):
             sheet.K[i, j] = K[i, j]
-    sheet.span[HERE] = here + _forwards(sheet)
+    sheet.span[HERE] = here if scaled.free else here + _forwards(sheet)
     for j in range(J):
         for g in range(G):
             total = 0.0
@@ -299,28 +305,32 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) 
     """
     G, least, most, spin = sheet.best.shape[0], sheet.least, sheet.most, sheet.spin
     blur, bounded = digits(scaled.cost.K) * sheet.span[FLOOR], True
-    least[:], most[:], spin[:] = 0.0, inf, rho + blur
-    _bound_by_priors(scaled, rho, sheet)
+    least[:], most[:], spin[:] = -inf if scaled.free else 0.0, inf, rho + blur
+    if not scaled.free:
+        _bound_by_priors(scaled, rho, sheet)
     for g in range(G):
         if not sheet.best[g] > -inf:
             return True
     _swing(scaled, blur, box, sheet)
-    if not _solve_swing(sheet, blur):
+    if not _solve_swing(scaled.free, sheet, blur):
         return False
     for g in range(G):
         bounded = bounded and most[g] < inf
     if not bounded:
         most[:] = inf
         return True
-    if not _narrow(sheet, blur):
+    if scaled.free:
+        for g in range(G):
+            least[g] = -most[g]
+    if not _narrow(scaled.free, sheet, blur):
         return False
     _set_slopes(scaled, box, sheet)
     for g in range(G):
-        if not least[g] > 0.0:
+        if not (least[g] > 0.0 or scaled.free):
             return True
     # Best factors: the residual is orthogonal to their columns, which are the less oblique to U the smaller the box is.
     _turn(scaled, rho + blur, box, sheet)
-    return _narrow(sheet, blur)
+    return _narrow(scaled.free, sheet, blur)
 
 
 @inlined
@@ -358,6 +368,14 @@ def _swing(scaled: Scaled, blur: float, box: Box, sheet: ScaledWorkspace) -> Non
         for h in range(G + 1):
             both = abs(slopes[h, 0]) * half[0] + abs(slopes[h, 1]) * half[1] + abs(slopes[h, 2]) * half[2] + rounded
             sheet.fall[g, h], sheet.rise[g, h] = sheet.fall[g, h] + both, sheet.rise[g, h] + both
+            if scaled.free:  # of a factor of any sign a decrease may be an increase
+                sheet.fall[g, h] = sheet.rise[g, h] = max(sheet.fall[g, h], sheet.rise[g, h])
+
+
+@inlined
+def size_of_factor(sheet: ScaledWorkspace, g: int) -> float:
+    """Return the greatest size of a factor in its range."""
+    return float(max(sheet.most[g], -sheet.least[g]))
 
 
 @inlined
@@ -370,19 +388,25 @@ def _reach_of(sheet: ScaledWorkspace, g: int, blur: float) -> float:
 
 
 @inlined
-def _narrow(sheet: ScaledWorkspace, blur: float) -> bool:
+def _narrow(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
     """Narrow the ranges of the factors, which are bounded; return False where one is empty."""
     G, least, most, fall, rise = sheet.best.shape[0], sheet.least, sheet.most, sheet.fall, sheet.rise
     for g in range(G):
         reach = _reach_of(sheet, g, blur)
         high, low = sheet.best[g] + reach + fall[g, G], sheet.best[g] - reach - rise[g, G]
         for h in range(G):
-            if h != g:
+            if free:
+                change = fall[g, h] * size_of_factor(sheet, h)
+                high, low = high + change, low - change
+            elif h != g:
                 high += fall[g, h] * most[h] if fall[g, h] > 0.0 else 0.0
                 low -= rise[g, h] * most[h] if rise[g, h] > 0.0 else 0.0
-        if fall[g, g] < 1.0:
+        if free:
+            slack = _ROUNDED * (abs(high) + abs(low))
+            most[g], least[g] = min(most[g], high + slack), max(least[g], low - slack)
+        elif fall[g, g] < 1.0:
             most[g] = min(most[g], high / (1.0 - fall[g, g]) * (1.0 + _ROUNDED))
-        if low > 0.0:
+        if not free and low > 0.0:
             least[g] = max(least[g], low / (1.0 + rise[g, g]) * (1.0 - _ROUNDED))
         if not most[g] > least[g]:
             return False
@@ -390,15 +414,18 @@ def _narrow(sheet: ScaledWorkspace, blur: float) -> bool:
 
 
 @inlined
-def _solve_swing(sheet: ScaledWorkspace, blur: float) -> bool:
+def _solve_swing(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
     """Bound the greatest factors by ``(1 - N) k <= best + reach``; return False where that has no solution k >= 0.
+
+    Of factors that may be negative these are sizes.
 
     With positive pivots the inverse of 1 - N has no negative entry (an M-matrix). Elimination without pivoting.
     """
     G, most = sheet.best.shape[0], sheet.most
     matrix, right = sheet.cross, sheet.reach  # memory that is free
     for g in range(G):
-        right[g] = sheet.best[g] + _reach_of(sheet, g, blur) + sheet.fall[g, G]
+        start = abs(sheet.best[g]) if free else sheet.best[g]
+        right[g] = start + _reach_of(sheet, g, blur) + sheet.fall[g, G]
         for h in range(G):
             matrix[g, h] = (1.0 if g == h else 0.0) - sheet.fall[g, h]
     for p in range(G):
@@ -470,6 +497,10 @@ def bound_rows(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> float:
         for k in range(3):
             out[j, SLOPE0 + k] = middle * nodes[j, SLOPE0 + k]
         out[j, LOW], out[j, HIGH] = most * min(nodes[j, LOW], 0.0), most * max(nodes[j, HIGH], 0.0)
+        if scaled.free and g >= 0:
+            wide = 0.5 * (most - sheet.least[g]) * max(abs(nodes[j, LOW]), abs(nodes[j, HIGH]))
+            first, last = middle * nodes[j, LOW], middle * nodes[j, HIGH]
+            out[j, LOW], out[j, HIGH] = min(first, last) - wide, max(first, last) + wide
         sheet.weight[j] = scaled.cost.weight[j] if out[j, LOW] > -inf else _length_of(sheet, j)
     for g in range(G):
         _add_range(g, box, sheet)
@@ -544,7 +575,7 @@ def size_of(sheet: ScaledWorkspace) -> float:
     """Return the sizes that limit the accuracy of residuals at any factors of a box."""
     most = 1.0
     for g in range(sheet.best.shape[0]):
-        most = max(most, sheet.most[g] if sheet.most[g] < inf else abs(sheet.best[g]))
+        most = max(most, size_of_factor(sheet, g) if sheet.most[g] < inf else abs(sheet.best[g]))
     return float(most * sheet.span[FLOOR])
 
 
@@ -562,17 +593,3 @@ def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> N
         return
     noise, flat = blur_of(scaled, sheet), box.half[2] == 0.0
     shrink(sheet.K, sheet.weight, rho + noise, box.half, flat, sheet.nodes, sheet.rows, box.cut, box.solve)
-
-
-@compiled
-def look_at(scaled: Scaled, sheet: ScaledWorkspace, box: Box, look: Cost) -> None:
-    """Write rows that are the cost, its slope and information at a point whose rows are reduced, without factors."""
-    J = box.nodes.shape[0]
-    for i in range(sheet.K.shape[0]):
-        total = sheet.w[i]
-        for j in range(J):
-            g = scaled.group[j]
-            factor = max(sheet.best[g], 0.0) if g >= 0 else 1.0
-            look.K[i, j] = factor * sheet.K[i, j]
-            total += look.K[i, j] * box.nodes[j, PHI]
-        look.w[i] = total

@@ -8,15 +8,20 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.kernels.jit import compiled, inlined, with_constants
+from optloc.kernels.jit import compiled, inlined, with_constants, zero
 from optloc.proof.atlas import Atlas, home_of, infinity
 from optloc.proof.box import (
     PIECE,
     bound_nodes,
+    cost_at,
     is_empty,
+    least_residual,
+    linearise_rows,
     pop,
     reaches,
+    rounding,
     share_left,
+    shrink,
     steepest_side,
     uncut,
     widest,
@@ -26,6 +31,7 @@ from optloc.proof.curvature import most_curved_side, sum_up
 from optloc.proof.descents import newton_step
 from optloc.proof.level_search import bound_row, cost_set, descend_near, search_levels, set_rival, side_of_rest
 from optloc.proof.nodes.dispatch import bound_pieces
+from optloc.proof.nodes.node import PHI
 from optloc.proof.pieces import (
     SHRUNK,
     end_at_infinity,
@@ -40,11 +46,10 @@ from optloc.proof.scaled.reduction import (
     bound_rows,
     clip_rows,
     is_bounded,
-    look_at,
     reduce_rows,
     sheet_of,
 )
-from optloc.proof.search_space import Box, Cost, LocalAxes, curve_at, empty_box, place, widen
+from optloc.proof.search_space import Box, Cost, LocalAxes, cost_of, curve_at, empty_box, place, widen
 from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, set_nodes, set_place
 
 
@@ -67,6 +72,20 @@ def tables_of(scaled: Scaled) -> ScaledTables:
 
 
 # The cost at a position, and descents.
+
+
+@compiled
+def look_at(scaled: Scaled, sheet: ScaledWorkspace, box: Box, look: Cost) -> None:
+    """Write rows that are the cost, its slope and information at a point whose rows are reduced, without factors."""
+    J = box.nodes.shape[0]
+    for i in range(sheet.K.shape[0]):
+        total = sheet.w[i]
+        for j in range(J):
+            g = scaled.group[j]
+            factor = 1.0 if g < 0 else (sheet.best[g] if scaled.free else max(sheet.best[g], 0.0))
+            look.K[i, j] = factor * sheet.K[i, j]
+            total += look.K[i, j] * box.nodes[j, PHI]
+        look.w[i] = total
 
 
 @compiled
@@ -256,13 +275,48 @@ def _grow(
 
 
 class ScaledSearchWorkspace(NamedTuple):
-    """A cost and working memory for its search; the tables hold `box` and `near` as well."""
+    """A cost and working memory for its search; the tables hold `box` and `near` as well.
+
+    Of costs whose factors may be negative `rest` are the rows that no factor touches. Where the columns of the factors
+    vanish, as with a velocity far away, these bound the cost alone. Of other costs it has no rows.
+    """
 
     scaled: Scaled
     tables: ScaledTables
     floor: float
     box: Box
     near: Box
+    rest: Cost
+
+
+@compiled
+def rest_of(scaled: Scaled) -> Cost:
+    """Return the rows that no factor touches, over the first nodes: `optloc.proof.scaled.scaled_proof` orders both."""
+    K, first, count, nodes = scaled.cost.K, zero(), zero(), zero()
+    for i in range(K.shape[0] if scaled.free else 0):
+        last, own = zero(), True
+        for j in range(K.shape[1]):
+            if K[i, j] != 0.0:
+                last, own = j + 1, own and scaled.group[j] < 0
+        if not own:
+            count, nodes = 0, 0
+        elif last > 0:
+            first = i if count == 0 else first
+            count, nodes = i + 1 - first, max(nodes, last)
+    part = K[first : first + count, :nodes].copy()
+    return cost_of(scaled.cost.kinds[:nodes], scaled.cost.data[:nodes], part, scaled.cost.w[first : first + count])
+
+
+@inlined
+def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
+    """Return a lower bound of the residual by the rows that no factor touches, negative where it says nothing."""
+    rest = work.rest
+    if rest.w.shape[0] == 0:
+        return -1.0
+    rows = box.rows[: rest.w.shape[0]]
+    set_nodes(space, rest, box)
+    linearise_rows(rest.K, rest.w, box.nodes, rows)
+    return float(least_residual(rest.K, rest.weight, work.floor, box.half, box.nodes, rows))
 
 
 @compiled
@@ -273,11 +327,14 @@ def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int
     set_box(space, box, piece)
     if is_left(space.atlas, box, piece) if space.far else is_known(box.at, box.half, space.minima, space.sides):
         return inf, inf
+    least = _bound_rest(work, space, box)
+    if reaches(least, level):
+        return inf, inf
     set_nodes(space, scaled.cost, box)
     reduce_rows(scaled, work.floor, box, sheet)
     if not bound_factors(scaled, sqrt(max(level, 0.0)), box, sheet):
         return inf, inf
-    low = bound_rows(scaled, box, sheet)
+    low = max(bound_rows(scaled, box, sheet), least)
     return (inf, inf) if reaches(low, level) else (low, sheet.span[HERE])
 
 
@@ -285,8 +342,7 @@ def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int
 def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
     scaled, box, sheet, d = work.scaled, work.box, work.tables.sheet, space.atlas.dimension
     if not is_bounded(sheet):
-        uncut(box.half, box.cut)
-        return int(widest(box.half))
+        return _side_of_rows(work, rho, d)
     clip_rows(scaled, rho, box, sheet)
     if is_empty(box.cut):
         return -1
@@ -304,6 +360,19 @@ def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho
         return -1
     curved = most_curved_side(box.half, box.sums, d)
     return int(curved if curved >= 0 else side)
+
+
+@inlined
+def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
+    """Clip a box whose factors have no bound by the rows without factors; return what `side_of_rest` does."""
+    rest, box = work.rest, work.box
+    uncut(box.half, box.cut)
+    if rest.w.shape[0] == 0:
+        return int(widest(box.half))
+    rows, flat = box.rows[: rest.w.shape[0]], box.half[2] == 0.0
+    noise = rounding(rest.K, rest.weight, work.floor, box.nodes)
+    shrink(rest.K, rest.weight, rho + noise, box.half, flat, box.nodes, rows, box.cut, box.solve)
+    return -1 if is_empty(box.cut) else int(steepest_side(box.half, rows, d))
 
 
 @compiled
@@ -328,6 +397,8 @@ def _set_rival(
 @compiled
 def _cost_set(work: ScaledSearchWorkspace, atlas: Atlas) -> float:
     bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
+    if work.scaled.free and not work.scaled.lift.any():  # their columns vanish at infinity
+        return float(cost_at(work.rest.K, work.rest.w, work.box.nodes))
     reduce_rows(work.scaled, work.floor, work.box, work.tables.sheet)
     return float(work.tables.sheet.span[HERE])
 

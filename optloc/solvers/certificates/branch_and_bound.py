@@ -23,7 +23,7 @@ from optloc.proof.batch import ProofRequest, ProofResult
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, UNIQUE, VALUE
 from optloc.proof.scaled.scaled_proof import ScaledCosts
-from optloc.proof.scope import unsupported
+from optloc.proof.scope import is_moment, unsupported
 from optloc.proof.search_space import HIDDEN_REACH
 from optloc.solvers.certificates.position_cost import (
     Costs,
@@ -58,6 +58,7 @@ FINE = (
 )
 AROUND = "the region reaches around the Earth, and the proof is for one side of it"
 SCALED = "nothing bounds the position at all scales that the rows and priors allow"
+FAST = "nothing bounds the position at all velocities that the rows and the prior allow"
 UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
 BARRED = "a position that costs less is not admitted: {}"
 LOST = "a position that costs less was met, and no minimum next to it was kept"
@@ -303,8 +304,9 @@ def _round(work: BoundWorkspace, items: Array) -> None:
     fine, unclosed = answer.verdict == COARSE, answer.verdict == OPEN
     _give_up(work, items[fine], FINE)
     # Boxes ran out over all of the surface of a height before a region of it was tried.
-    unbounded = SCALED if isinstance(work.costs, ScaledCosts) else _unfinished(work.costs, len(items))
-    _give_up(work, items[unclosed], AROUND if work.limited else unbounded)
+    scaled = isinstance(work.costs, ScaledCosts)
+    unbounded = (FAST if is_moment(work.problem) else SCALED) if scaled else _unfinished(work.costs, len(items))
+    _give_up(work, items[unclosed], AROUND if work.limited and not scaled else unbounded)
     _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
 

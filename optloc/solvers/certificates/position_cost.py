@@ -23,8 +23,9 @@ from optloc.proof.scaled.scaled_proof import (
     prove_all_scaled,
     scaled_costs,
     scaled_lack_code,
+    velocity_costs,
 )
-from optloc.proof.scope import held_height, is_run, is_scaled
+from optloc.proof.scope import held_height, is_moment, is_run, is_scaled
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 from optloc.solvers.starts.position import spread_of
 
@@ -36,6 +37,8 @@ Costs = PositionCosts | ScaledCosts | Runs | CourseCosts
 
 def eliminate_nuisance(problem: Problem) -> Costs:
     """Return the costs of a flat batch of problems over the target's state, all other unknowns at their best values."""
+    if is_moment(problem):
+        return velocity_costs(problem)
     if problem.motions[0].order > 0:
         return course_costs(problem)
     if is_scaled(problem):
@@ -71,7 +74,12 @@ def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
 def state_columns(problem: Problem) -> slice:
     """Return where in parameter vectors the state stands that a proof is about."""
     slot, _ = problem.layout.find("position")
-    return slice(slot.start, slot.start + problem.dimension * (problem.motions[0].order + 1))
+    return slice(slot.start, slot.start + _state_size(problem))
+
+
+def _state_size(problem: Problem) -> int:
+    """Return the size of the state, without a velocity at one epoch: it is linear, and projected out."""
+    return problem.dimension * (1 if is_moment(problem) else problem.motions[0].order + 1)
 
 
 # Equalities: planes and surfaces along which a proof looks.
@@ -154,9 +162,9 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
     """
     size, n = state.shape
     out = np.full((size, 2, n), np.nan) if n == problem.dimension else around(problem, state)
-    given = 0 if region is None else region.shape[-1]
+    given = 0 if region is None else min(region.shape[-1], n)
     if region is not None:
-        out[..., :given] = region
+        out[..., :given] = region[..., :given]
     if n == problem.dimension:
         return out, given > 0
     limits = admitted(problem, n)
@@ -169,7 +177,7 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
 
 def unlimited(problem: Problem) -> str:
     """Return why a proof of a moving target is worth nothing unless somebody asks for a region, or nothing."""
-    n = problem.dimension * (problem.motions[0].order + 1)
+    n = _state_size(problem)
     if n == problem.dimension or np.isfinite(np.delete(admitted(problem, n), _across(problem), axis=1)).all():
         return ""
     return "the target could be anywhere at any speed; state a box and a greatest speed as constraints"

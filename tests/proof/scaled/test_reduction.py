@@ -48,9 +48,9 @@ def profiled(scene, x):
 class Look:
     """A cost with its atlas, and boxes at random places of it."""
 
-    def __init__(self, scene):
+    def __init__(self, scene, costs=scaled_costs):
         self.scene, self.d = scene, scene.place.shape[1]
-        self.scaled = scaled_costs(scene.problem.flat()).one(0)
+        self.scaled = costs(scene.problem.flat()).one(0)
         cost = self.scaled.cost
         self.tables, (middle, radius) = tables_of(self.scaled), cube(cost.kinds, cost.data, scene.truth)
         self.atlas = atlas_of(middle, radius, self.d, 1)
