@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from files.test_constraint_files import ranges, ranging, run
 from linear.test_constraints import ENU, PLANE, SPACE, above, drawn, moving
 from often import few
 from scipy.optimize import minimize
-from test_constraint_files import ranges, ranging, run
 from verdicts import alone
 
 from optloc import Status, assemble, measured, simulate, solve

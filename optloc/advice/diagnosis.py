@@ -26,16 +26,16 @@ _ADVISED = 20
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What the checks of a fix found; ``print`` shows it as sentences.
+    """Findings of the checks of a fix; ``print`` shows them as sentences.
 
     Parameters
     ----------
     status : tuple of str
         The label of each status that occurs, with its number of fixes where there are several.
     advice : tuple of Advice
-        What may be wrong and what would help. Of a batch: for the first twenty fixes that are not ``ok``, each once.
+        Possible causes, and remedies. Of a batch: for the first twenty fixes that are not ``ok``, each once.
     observability : Observability, optional
-        What data and priors determine. None for a batch, and where there is no fix.
+        Unknowns that data and priors determine. None for a batch, and where there is no fix.
     reliability : Reliability, optional
         The error of each station that goes unnoticed, and what it does. None for a batch, and where there is no fix.
     health : Health, optional
@@ -59,7 +59,7 @@ class Diagnosis:
 
 
 def diagnose(problem: Problem, fix: Fix) -> Diagnosis:
-    """Return why a fix is not ``ok``, what its data determine, and which errors it would not notice.
+    """Return the causes of a status, the unknowns that the data determine, and the errors that go unnoticed.
 
     Parameters
     ----------

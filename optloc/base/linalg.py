@@ -200,7 +200,9 @@ def root(matrix: Array, cut: float = 1e-12) -> tuple[Array, Array]:
 
 
 def whitening(covariance: Array) -> Array:
-    """Return W with ``W' W`` the inverse of a covariance, or its pseudo-inverse where it is singular.
+    """Return W with ``W' W`` the inverse of a covariance, or a generalised inverse where it is singular.
+
+    The generalised inverse is the scaled pseudo-inverse of the correlation matrix.
 
     Parameters
     ----------

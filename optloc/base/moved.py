@@ -67,7 +67,7 @@ _SHORT = {"constraints": "linear.constraints", "datasets": "lab.datasets", "unit
 
 
 def moved(name: str) -> Any:
-    """Return what an old name of optloc meant, with a warning."""
+    """Return the object of an old name of optloc, with a warning."""
     place = _PLACES[name]
     _warn(f"optloc.{name}", place, 4)
     package, _, inner = place.rpartition(".")

@@ -1,4 +1,4 @@
-"""What neighbours of the core add to the command line: commands, lists, pictures, kernels and facts of the machine."""
+"""Extensions of the command line by neighbours: commands, lists, pictures, kernels and facts of the machine."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NEIGHBOURS = ("optloc.sites", "optloc.service", "optloc.lab")
 
 @dataclass(frozen=True, slots=True)
 class PictureRequest:
-    """What a picture is drawn of.
+    """A problem or study to be drawn.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class KernelPart:
 
 @dataclass(frozen=True, slots=True)
 class Extension:
-    """What one neighbour adds.
+    """The additions of one neighbour.
 
     Parameters
     ----------
@@ -71,9 +71,9 @@ class Extension:
     pictures : mapping
         Drawings of ``optloc plot NAME``.
     kernels : callable
-        Returns what ``optloc compile`` compiles.
+        Returns kernels for ``optloc compile``.
     facts : mapping
-        Facts of this machine for ``optloc doctor``: a name, and what returns words.
+        Facts of this machine for ``optloc doctor``, by name.
     """
 
     commands: Callable[[typer.Typer], None]
@@ -85,7 +85,7 @@ class Extension:
 
 @cache
 def extensions() -> tuple[Extension, ...]:
-    """Return what the installed neighbours add."""
+    """Return the extensions of the installed neighbours."""
     return tuple(_found())
 
 

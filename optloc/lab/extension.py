@@ -1,4 +1,4 @@
-"""What the lab adds to the command line: studies, papers, data sets, and their lists and pictures."""
+"""Commands, lists and pictures of the lab: studies, papers and data sets."""
 
 from __future__ import annotations
 

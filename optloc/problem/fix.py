@@ -365,7 +365,7 @@ class Fix:
     def to_dataframe(self) -> pd.DataFrame:
         """Return a data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes.
 
-        Its index is that of the data frame that the measurements come from, see `labels`.
+        Its index comes from the data frame of the measurements, see `labels`.
 
         Raises
         ------

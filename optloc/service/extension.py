@@ -1,4 +1,4 @@
-"""What the service adds to the command line: `optloc live` and `optloc serve`."""
+"""Commands of the service: `optloc live` and `optloc serve`."""
 
 from __future__ import annotations
 

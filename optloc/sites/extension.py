@@ -1,4 +1,4 @@
-"""What sites add to the command line: `optloc place`, `optloc calibrate` and their kernels."""
+"""Commands and kernels of sites: `optloc place` and `optloc calibrate`."""
 
 from __future__ import annotations
 

@@ -15,9 +15,9 @@ from optloc.problem.problem import Problem
 
 
 def differences(run: Problem) -> Problem:
-    """Return the run of one target with the differences of its arrivals, epoch by epoch, in the place of the arrivals.
+    """Return the run of one target with differences of arrivals in each epoch instead of the arrivals.
 
-    A tracker's state has no emission times, and differences with their covariance say all that arrivals say of places.
+    A tracker's state has no emission times, and differences with their covariance hold all information about positions.
     """
     scans = [reduce(cut(run, k, k + 1)) for k in range(run.epochs)]
     kinds = dict.fromkeys(rows.kind for scan in scans for rows in scan.rows)

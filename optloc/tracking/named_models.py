@@ -52,7 +52,7 @@ def motion_named(name: str, noise: float | None = None, memory: float = 10.0, wh
     name : str
         See `MOTIONS`.
     noise : float, optional
-        Standard deviation of the driving noise, SI units; by default that of the table.
+        Standard deviation of the driving noise, SI units; by default from the table.
     memory : float
         Seconds over which an acceleration lasts (``singer`` and ``csm``).
     where : str

@@ -1,4 +1,4 @@
-"""A whole run as a track: started without a guess, gated, and begun anew where the model cannot follow."""
+"""A whole run as a track: started without a guess, gated, and restarted where the model cannot follow."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def track(
     start : State, optional
         Known state at or before the first scan.
     rules : Rules, optional
-        When rows are left out and tracks begin anew.
+        When rows are left out and tracks restart.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def track(
     Raises
     ------
     InvalidProblem
-        For an unknown model or filter, times that do not increase, a run of several targets, and a start that does not
+        For an unknown model or filter, times that do not increase, several targets, and a start that does not
         fit. Several targets are separated by `optloc.tracking.alone`.
     """
     dynamics = motion_named(model) if isinstance(model, str) else model
@@ -115,7 +115,7 @@ def tracked(
     start : State, optional
         Known state at or before the first scan, in the place of a fix.
     rules : Rules, optional
-        When rows are left out and tracks begin anew.
+        When rows are left out and tracks restart.
 
     Raises
     ------
@@ -361,7 +361,7 @@ class Follower:
     update : callable or str
         A filter, or its name in `UPDATES`.
     rules : Rules, optional
-        When rows are left out and tracks begin anew.
+        When rows are left out and tracks restart.
     """
 
     def __init__(self, dynamics: Dynamics, update: Update | str = "iekf", rules: Rules | None = None) -> None:

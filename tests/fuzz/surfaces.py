@@ -113,7 +113,7 @@ def phone():
         "Raw,utcTimeMillis,TimeNanos,LeapSecond,FullBiasNanos,BiasNanos,Svid,TimeOffsetNanos,State,ReceivedSvTimeNanos,"
     )
     head += "ReceivedSvTimeUncertaintyNanos,CarrierFrequencyHz,ConstellationType,HardwareClockDiscontinuityCount"
-    seen, week = read_observations(HERE.parent / "gnss" / "kamakura.rnx", "G"), 604_800 * 10**9
+    seen, week = read_observations(HERE.parent / "files" / "kamakura.rnx", "G"), 604_800 * 10**9
     noon = round(float(seen.time[0]))
     bias, lines = 5_000_000_000 - noon * 10**9, ["# ", f"# {head}", "# "]
     for time, satellite, way in zip(seen.time.tolist(), seen.satellite, seen.pseudorange.tolist(), strict=True):
@@ -127,7 +127,7 @@ def phone():
 @cache
 def foreign():
     """Return the files and the options of each table by name."""
-    gnss = HERE.parent / "gnss"
+    gnss = HERE.parent / "files"
     nav = {"k.nav": (gnss / "kamakura.nav").read_bytes()}
     kraken = "\n".join(
         KRAKEN.format(1_700_000_000_000 + 1000 * k, 150 - 60 * k, name, 47.9 - 0.1 * k, 11.2 - 0.2 * k, 30)

@@ -5,7 +5,7 @@ import typer
 from lab.study.rows import hand_made
 
 from optloc.base.errors import InvalidProblem
-from optloc.cli import Asked
+from optloc.cli import PictureRequest
 from optloc.lab import extension
 from optloc.lab.datasets import NAMES
 from optloc.lab.extension import EXTENSION
@@ -31,7 +31,7 @@ def test_lists_have_one_line_for_each_entry_of_their_table(monkeypatch):
 
 
 def asked(place, epoch=None):
-    return Asked(place, place / "out.png", "auto", epoch)
+    return PictureRequest(place, place / "out.png", "auto", epoch)
 
 
 def test_the_picture_of_accuracy_is_of_one_case_of_a_study(tmp_path, monkeypatch):

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bad_input import write
+from files.test_constraint_files import ENU as HEAD, rows as inline
 from often import few
 from scipy.integrate import solve_ivp
-from test_constraint_files import ENU as HEAD, rows as inline
 
 from optloc import Frame, InvalidProblem, Motion, Status, assemble, constraints, measured, simulate, solve
 from optloc.base.frames import ECEF, ecef_to_geodetic, geodetic_to_ecef

@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from model_checks.small import SQUARE, ranges_to
 from scipy.optimize import least_squares
 
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
+from optloc.model_checks.coplanar import Across, is_coplanar
 
 JOINED = 3.8414588206941236  # chi-square of one degree of freedom, 95 %
 
@@ -150,3 +152,20 @@ def test_the_interval_of_the_distance_holds_the_truth(late: bool, far: float) ->
     assert not told["stalled"] + told["max iterations"]
     # a count that is less is one in ten thousand under the promise of 95 %
     assert inside >= 108, (inside, told)
+
+
+def test_a_place_is_turned_to_its_distance_from_the_plane_and_back():
+    floor = np.column_stack([SQUARE, np.full(5, 70.0)])
+    problem, x = ranges_to([300.0, 650.0, 100.0], 1.0, stations=floor), np.array([[300.0, 650.0, 100.0]])
+    assert is_coplanar(problem).tolist() == [True]
+    assert is_coplanar(ranges_to([300.0, 650.0, 100.0], 1.0, stations=floor * [1.0, 1.0, 0.0])).tolist() == [True]
+    lifted = floor + np.outer(np.arange(5.0), [0.0, 0.0, 90.0])
+    assert is_coplanar(ranges_to([300.0, 650.0, 100.0], 1.0, stations=lifted)).tolist() == [False]
+    across = Across.of(problem)
+    flat = across.to_plane(x)
+    assert flat[0, 2] == pytest.approx(30.0)
+    images = [across.to_space(flat, np.array([side]))[0] for side in (1.0, -1.0)]
+    assert sorted(image[2] for image in images) == pytest.approx([40.0, 100.0])
+    end, cost, _ = across.refine(flat + np.array([20.0, -10.0, 5.0]), held=False)
+    np.testing.assert_allclose(end, flat, atol=1e-3)
+    assert cost[0] == pytest.approx(0.0, abs=1e-6)

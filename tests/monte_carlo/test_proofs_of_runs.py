@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from monte_carlo.tables import ledger
 from proof.doppler import registration
-from proof.test_moving_targets import drawn as moving_target, limits
-from proof.test_targets_over_ground import drawn as over_ground
+from proof.runs.test_ground import drawn as over_ground
+from proof.runs.test_state_bounds import drawn as moving_target, limits
 
 from optloc import Problem, Status, simulate, solve
 from optloc.kernels.jit import enabled

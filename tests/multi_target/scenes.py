@@ -12,6 +12,8 @@ TURN = 2.0 * np.pi * np.arange(6) / 6
 RING = RADIUS * np.stack([np.cos(TURN), 0.9 * np.sin(TURN)], axis=-1)
 HEIGHTS = np.array([0.0, 800.0, 100.0, 1500.0, 300.0, 1000.0])
 STAR = [(i, 0) for i in range(1, 6)]
+# An epoch of bearings, for `drawn`.
+AZIMUTHS = {"kind": "azimuth", "channels": [0, 1, 2, 3, 4]}
 EVERY = [(i, j) for i in range(6) for j in range(i)]
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from bad_input import write
-from test_constraint_files import rows as inline
+from files.test_constraint_files import rows as inline
 
 from optloc import InvalidProblem, assemble, measured
 from optloc.base.units import SPEED_OF_LIGHT

@@ -14,3 +14,10 @@ def form(request):
     # numbers beyond all, and none, are numbers to machine code
     with plain() if request.param == "plain" else nullcontext(), np.errstate(all="ignore"):
         yield request.param
+
+
+@pytest.fixture
+def plainly():
+    """Run a piece as the Python that it is, in every run."""
+    with plain(), np.errstate(all="ignore"):
+        yield

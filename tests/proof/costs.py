@@ -6,7 +6,8 @@ import numpy as np
 
 from optloc.proof.nodes.dispatch import NODES
 from optloc.proof.nodes.node import LINEAR, RANGE
-from optloc.proof.search_space import KnownMinima
+from optloc.proof.position_costs import PositionCosts
+from optloc.proof.search_space import KnownMinima, cost_of, empty_box
 
 Array = np.ndarray
 
@@ -42,6 +43,16 @@ class Case:
     @property
     def d(self):
         return self.stations.shape[1]
+
+    @property
+    def tables(self):
+        """Return the cost as the proof takes it, and a box with room for its nodes."""
+        return cost_of(self.kinds, self.data, self.K, self.w), empty_box(*self.K.shape)
+
+    @property
+    def batch(self):
+        """Return the cost as a batch of one."""
+        return PositionCosts(self.kinds, self.data[None], self.K[None], self.w[None], np.full(1, np.inf))
 
     @property
     def kinds(self):

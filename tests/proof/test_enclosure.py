@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from proof.costs import WIDTH, random_case
+from proof.nodes.test_range import charted
 from proof.sampling import many
-from proof.test_ranges import charted
 
 from optloc.proof.curvature import sum_up
 from optloc.proof.enclosure import around_node, around_rays, enclose

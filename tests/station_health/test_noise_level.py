@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from often import few
 from station_health.rings import FREE, RING, ranged
-from station_health.test_health import RUN, written
+from station_health.test_stations import RUN, written
 
 from optloc import assemble, measured, solve
 from optloc.cli import app

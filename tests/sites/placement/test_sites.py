@@ -8,7 +8,8 @@ from sites.placement.scenes import hall
 
 from optloc import InvalidProblem, assemble, measured
 from optloc.sites.placement import SiteSelection
-from optloc.sites.placement.sites import Group, candidates_of
+from optloc.sites.placement.counts import CountGroup
+from optloc.sites.placement.sites import candidates_of
 
 
 @pytest.fixture
@@ -43,7 +44,11 @@ def test_what_is_out_of_sight_or_reach_has_no_row_and_what_is_dim_a_smaller_one(
 def test_rules_count_cost_and_group_the_free_sites(selection):
     names = selection.problem.stations.names
     asked = replace(
-        selection, choose=2, kept=(names[0],), forbidden=(names[5],), groups=(Group(names[1:3], most=1, least=None),)
+        selection,
+        choose=2,
+        kept=(names[0],),
+        forbidden=(names[5],),
+        groups=(CountGroup(names[1:3], most=1, least=None),),
     )
     found = candidates_of(asked)
     assert found.state.tolist() == [1, -1, -1, -1, -1, 0]

@@ -1,0 +1,42 @@
+"""Curves of errors and estimates: lines hold the numbers that they are given, and limits hold the last estimates."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from optloc import InvalidProblem
+from optloc.show.pictures.runs import _window, plot_accuracy, plot_biases
+
+NOISE = np.array([0.1, 1.0, 10.0])
+
+
+def test_errors_and_bound_are_drawn_over_the_noise():
+    (panel,) = plot_accuracy(NOISE, {"gtrs": 2.0 * NOISE}, NOISE, unit="m").axes
+    lines = {line.get_label(): line.get_xydata() for line in panel.lines}
+    assert np.array_equal(lines["gtrs"], np.column_stack([NOISE, 2.0 * NOISE]))
+    assert np.array_equal(lines["Cramer-Rao bound"], np.column_stack([NOISE, NOISE]))
+    assert (panel.get_xscale(), panel.get_yscale()) == ("log", "log")
+
+
+@pytest.mark.parametrize(
+    ("noise", "errors", "words"), [(NOISE, NOISE[:2], "gtrs has 2 values for 3"), (NOISE - 0.1, NOISE, "not positive")]
+)
+def test_numbers_that_are_no_curve_are_refused(noise, errors, words):
+    with pytest.raises(InvalidProblem, match=words):
+        plot_accuracy(noise, {"gtrs": errors}, NOISE)
+
+
+def test_the_axis_holds_the_last_estimates_and_their_early_errors():
+    limits = []
+    panel = SimpleNamespace(set_ylim=lambda *both: limits.append(both))
+    _window(panel, np.array([[900.0], [3.0], [2.0], [np.nan]]), np.array([[100.0], [1.0], [0.5], [np.nan]]))
+    assert limits == [(2.0 - 8.0, 2.0 + 8.0)]
+
+
+def test_a_run_without_biases_has_no_picture_of_them():
+    slot = SimpleNamespace(name="position", members=())
+    found = SimpleNamespace(layout=SimpleNamespace(shared=(slot,)))
+    with pytest.raises(InvalidProblem, match="no biases to draw") as refused:
+        plot_biases(found)
+    assert refused.value.advice == "choose from position"
