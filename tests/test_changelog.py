@@ -45,13 +45,35 @@ def test_sections_have_the_titles_and_types_that_towncrier_writes():
     assert CHANGELOG.count("<!-- towncrier release notes start -->\n") == 1  # new sections are written behind it
 
 
-@pytest.mark.parametrize("path", FRAGMENTS, ids=lambda path: path.name)
-def test_every_fragment_is_one_short_entry_of_a_known_type(path):
-    name, kind, ending = path.name.split(".")
-    assert re.fullmatch(r"[a-z0-9-]+", name)
-    assert kind in TYPES
-    assert ending == "md"
-    text = path.read_text(encoding="utf-8")
-    assert text.strip()
-    assert len(text.strip().splitlines()) == 1  # towncrier adds the bullet, and breaks the line
-    assert too_long([text]) == []
+def mistakes(path):
+    """Return what is wrong with the name or the text of a fragment."""
+    parts = path.name.split(".")
+    lines = path.read_text(encoding="utf-8").strip().splitlines()
+    found = {
+        "name": len(parts) != 3 or not re.fullmatch(r"[a-z0-9-]+", parts[0]) or parts[-1] != "md",
+        "type": parts[1] not in TYPES,
+        "lines": len(lines) != 1,  # towncrier adds the bullet, and breaks the line
+        "words": bool(too_long(lines)),
+    }
+    return [what for what, wrong in found.items() if wrong]
+
+
+def test_every_fragment_is_one_short_entry_of_a_known_type():
+    assert {path.name: mistakes(path) for path in FRAGMENTS if mistakes(path)} == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "wrong"),
+    [
+        ("tracks.added.md", "`optloc track` reads tables.\n", []),
+        ("tracks.added.txt", "`optloc track` reads tables.\n", ["name"]),
+        ("tracks.feature.md", "`optloc track` reads tables.\n", ["type"]),
+        ("tracks.fixed.md", "", ["lines"]),
+        ("tracks.fixed.md", "- one\n- two\n", ["lines"]),
+        ("tracks.changed.md", "word " * 31, ["words"]),
+    ],
+)
+def test_mistakes_in_fragments_are_found(tmp_path, name, text, wrong):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    assert mistakes(path) == wrong
