@@ -22,7 +22,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # MathJax and its fonts lie beside the pages
 ]
-exclude_patterns = ["_build", "examples"]
+exclude_patterns = ["_build", "changes", "examples"]  # changes are parts of CHANGELOG.md
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]

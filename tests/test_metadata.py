@@ -22,7 +22,7 @@ def test_project_package_and_citation_agree():
     assert citation["license"] == project["license"] == "MIT"
     assert citation["version"] == project["version"] == optloc.__version__
     assert "MIT License" in (ROOT / "LICENSE").read_text(encoding="utf-8")
-    assert project["version"] in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"## [{project['version']}] - " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_the_lowest_python_is_that_of_the_linter():
