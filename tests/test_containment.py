@@ -171,7 +171,7 @@ def test_what_fails_for_good_takes_nobody_with_it(monkeypatch, method):
         return entry.run(some, pool)
 
     monkeypatch.setitem(SOLVERS, word, replace(entry, stage=stage))
-    monkeypatch.setattr("optloc.solvers.at_once", lambda *_: None)  # which goes past the stages
+    monkeypatch.setattr("optloc.solvers.solution.at_once", lambda *_: None)  # which goes past the stages
     fix = solve(many, method)
     assert fix[2].status == Status.NUMERICAL
     assert fix[2].reason == f"{word}: divided by zero"

@@ -258,7 +258,10 @@ def _speed(given: Any) -> float | Medium:
             )
         _speed(given[1])  # as positive as the speed
         return _speed(given[0])
-    given = in_si(given, "speed", "speed")
+    try:
+        given = in_si(given, "speed", "speed")
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, "speed", f"{error.advice}, or give optloc.models.Layers") from None
     if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
         advice = "give metres per second, optloc.models.Layers or optloc.models.Atmosphere"
         raise InvalidProblem("the speed is no positive number", "speed", advice)

@@ -310,7 +310,7 @@ def test_a_problem_file_of_another_folder_is_whole(tmp_path):
 
 
 def test_code_comes_in_by_name_on_the_command_line_alone(tmp_path, monkeypatch):
-    (tmp_path / "mine.py").write_text("import optloc\noptloc.LOSSES['mine'] = optloc.problem.LOSSES['cauchy']\n")
+    (tmp_path / "mine.py").write_text("from optloc.problem import LOSSES\nLOSSES['mine'] = LOSSES['cauchy']\n")
     site = document(tmp_path, tdoa())
     fix = ["fix", str(site), "--method", "mine", "--quiet"]
     plain = RUN.invoke(app, fix)

@@ -79,7 +79,7 @@ def test_a_table_is_a_dictionary_that_grows():
     assert dict(table) == {"abs": abs}
     with pytest.raises(KeyError):
         table["max"]
-    assert repr(table) == "Table('optloc.none': abs)"
+    assert repr(table) == "Registry('optloc.none': abs)"
 
 
 def test_the_names_of_optloc_need_no_look_at_packages():

@@ -127,7 +127,7 @@ BAD = {
     "time of pairs": ({"form": "time", "per": "pair"}, "a time along a course is one of a station"),
     "time of stations that stay": ({"form": "time"}, "needs velocities"),
     "prior of another size": ({"sigma": [1.0, 2.0]}, "sigma has 2 entries for 4 members"),
-    "prior that is no number": ({"sigma": "200 m"}, "'200 m'.*sigma|sigma.*'200 m'"),
+    "prior that is no number": ({"sigma": "much"}, "sigma: 'much' is no amount"),
 }  # fmt: skip
 
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from descent import levenberg
 from optloc.compute.jit import enabled
-from optloc.solvers.certify.position_cost import agrees
 from proof.sampling import many
-from proof.test_scaled import Look
+from proof.scaled.test_reduction import Look
 
 from optloc import Motion, Stations, assemble, measured, solve, with_bias
 from optloc.linear.constraints import speed
@@ -20,6 +19,7 @@ from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, velocity_costs
 from optloc.proof.scaled.scaled_search import rest_of
 from optloc.proof.scope import unsupported
+from optloc.solvers.certificates.position_cost import agrees
 
 PAIRS, ARRIVALS, RANGES = (("tdoa", "fdoa"), ("toa", "range_rate"), ("range", "range_rate"))
 # Dimension, stations, kinds of rows, standard deviation of a prior on the velocity.

@@ -276,7 +276,7 @@ def test_two_targets_in_clutter_are_two_tracks_by_bounded_work(clutter, seed, mo
         calls.append(chains.ChainWork(left))
         return calls[-1]
 
-    monkeypatch.setattr(initiator, "Work", counted)
+    monkeypatch.setattr(initiator, "ChainWork", counted)
     for module in (initiator, chains):
         monkeypatch.setattr(module, "solve", lambda *problem: solved.append(len(calls)) or solve(*problem))
     tracks, found, _ = in_clutter(seed, clutter, 8)

@@ -24,7 +24,7 @@ def test_a_place_costs_least_over_factor_and_emission(prior):
 def test_priors_on_the_factor_are_the_last_rows():
     scene = plate(np.random.default_rng(2), 2, 6, 0.1)
     costs = scaled_costs(scene.problem.flat())
-    assert costs.lift[-1].tolist() == [pytest.approx(10.0)]
+    assert costs.lift[0, -1].tolist() == [pytest.approx(10.0)]
     assert costs.w[0, -1] == pytest.approx(10.0)
     assert not costs.K[0, -1].any()
     assert costs.dense == len(costs.kinds) == len(scene.place)

@@ -61,7 +61,7 @@ def test_a_pulse_that_one_station_measures_twice_has_two_columns(path):
     [
         ('a = "B", z = 20.0', 'a = "D", z = 20.0', "there is no station 'D'"),
         ('kind = "toa"', 'kind = "azimuth"', "networks have no rows of kind 'azimuth'"),
-        ('b = "C", z = 7.0', 'b = "A", z = 7.0', "the row names one station twice"),
+        ('b = "C", z = 7.0', 'b = "A", z = 7.0', "names station 'A' twice"),
         ('sigma = "1 ns"\n', "", "the rows have no standard deviation"),
         ('{ epoch = "p", a = "A", z = 10.0 }', '{ a = "A", z = 10.0 }', "epoch"),
         ("format = 1", "format = 1\ntarget = {}", "the key 'target' is that of a problem whose stations are known"),

@@ -268,4 +268,4 @@ def test_a_weak_place_is_told_by_the_share_of_its_prior():
 
 
 def test_the_front_page_has_it():
-    assert {"place", "SiteSelection", "Placement"} <= {*optloc.__all__}
+    assert "place" in optloc.__all__

@@ -165,7 +165,7 @@ def test_a_spent_budget_says_so_and_changes_nothing(monkeypatch):
 @pytest.mark.parametrize(
     ("problem", "word"),
     [
-        (lambda: CASES["tdoa+fdoa-3d"].problem, "moves"),
+        (lambda: replace(CASES["tdoa+fdoa-3d"].problem, constraints=box([-9e4] * 3, [9e4] * 3)), "constraints"),
         (
             lambda: with_bias(CASES["range-3d"].problem, "scale", per="station", form="scale", sigma=1e-3),
             "several scales",

@@ -5,7 +5,7 @@ import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 
 from optloc import Status, solve
-from optloc.problem.fix import Explanation, Suspect
+from optloc.problem.explanations import Explanation, Suspect
 from optloc.solvers.verdict.conclusion import Conclusion, conclude, list_names
 
 MORE = np.concatenate([SQUARE, [[-400.0, 500.0], [1300.0, 300.0], [600.0, 1500.0]]])
