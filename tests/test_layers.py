@@ -183,6 +183,27 @@ def test_no_two_classes_have_one_name():
     assert [name for name, count in found.items() if count > 1] == []
 
 
+def test_a_module_with_functions_has_its_test_in_the_mirrored_folder():
+    """A package that defines functions has the test of its name: `models/__init__.py` has `models/test_models.py`."""
+    missing = []
+    for name, path in modules(ROOT).items():
+        inside = path.relative_to(ROOT).parts
+        tree = nodes(path)
+        exports = path.name == "__init__.py" and all(
+            f.name.startswith("__") for f in tree if isinstance(f, ast.FunctionDef)
+        )
+        if (
+            inside[0] != "optloc"
+            or exports
+            or not any(isinstance(f, ast.FunctionDef | ast.AsyncFunctionDef) for f in tree)
+        ):
+            continue
+        stem = inside[-2] if path.name == "__init__.py" else path.stem
+        if not ROOT.joinpath("tests", *inside[1:-1], f"test_{stem}.py").exists():
+            missing.append(name)
+    assert missing == []
+
+
 # Words with one meaning, and the module that may define them: the plan of the engine, and the function that returns a
 # problem of optimisation.
 RESERVED = {"Plan": "optloc.engine", "pose": "optloc.pose"}
