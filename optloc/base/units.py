@@ -299,6 +299,11 @@ def example_of(number: float, text: str, quantity: Quantity) -> str:
     return f'"{text if abs(number) <= LARGEST else 1.5} {SI_UNIT[quantity]}"'
 
 
+def _holds_text(value: Any) -> bool:
+    """Return whether a list, or a list in it, holds text."""
+    return isinstance(value, list | tuple) and any(isinstance(each, str) or _holds_text(each) for each in value)
+
+
 def in_si(value: Any, quantity: Quantity, where: str) -> Any:
     """Return numbers in SI units, where a number may be text with a unit.
 
@@ -327,7 +332,7 @@ def in_si(value: Any, quantity: Quantity, where: str) -> Any:
             example = example_of(number, value.strip(), quantity)
             raise InvalidProblem(f"{value!r} has no unit", where, f"write it with its unit, such as {example}")
         return float(conversion(unit, quantity, where=where).to_si(number))
-    if isinstance(value, list | tuple) and any(isinstance(each, str) for each in value):
+    if _holds_text(value):
         return np.array([in_si(each, quantity, where) for each in value], dtype=float)
     if isinstance(value, np.ndarray) and value.dtype.kind == "U":
         return np.reshape([in_si(str(each), quantity, where) for each in value.flat], value.shape)
