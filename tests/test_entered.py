@@ -46,4 +46,4 @@ def test_a_simple_fix_enters_few_modules():
     assert run.returncode == 0, run.stderr
     entered = run.stdout.split()
     assert len(entered) <= MOST, "\n".join(entered)
-    assert {"optloc.cli.fix", "optloc.files.reader", "optloc.solvers"} <= set(entered)
+    assert {"optloc.cli.fix", "optloc.files.reader", "optloc.solvers.solution"} <= set(entered)
