@@ -24,8 +24,7 @@ from optloc import InvalidProblem, Motion, NoSolution, Status, assemble, crlb, m
 from optloc.solvers import METHODS
 
 STARTED = sorted(name for name, case in CASES.items() if case.start)
-# Targets with a velocity.
-WITHOUT_PROOF = {f"tdoa+fdoa-{d}d" for d in (2, 3)}
+
 TRIALS, STARTS = 4, 8
 TOLERANCE = 1e-5
 
@@ -108,7 +107,7 @@ def test_alternatives_are_other_minima_cheapest_first(name):
 @pytest.mark.parametrize("name", STARTED)
 def test_the_covariance_is_the_inverse_information_at_the_estimate(name):
     case, fix = CASES[name], fixed(name)
-    assert fix.status == (Status.UNPROVEN if name in WITHOUT_PROOF else Status.OK)
+    assert fix.status == Status.OK
     assert np.allclose(fix.cov, crlb(case.problem, fix.x), rtol=1e-9)
     assert fix.p_value > 1e-6
     bound = np.sqrt(np.diag(crlb(case.problem, case.truth)))

@@ -102,6 +102,10 @@ class _OldPackages(MetaPathFinder):
         """Return a spec that loads the module of today; None for all other names."""
         root, _, rest = fullname.partition(".")
         old, _, inner = rest.partition(".")
+        if root == "optloc" and old == "track":
+            raise ModuleNotFoundError(
+                "optloc.track is a function now; its modules are in optloc.tracking", name=fullname
+            )
         if root != "optloc" or old not in _PACKAGES | _SHORT:
             return None
         place = ".".join(filter(None, ("optloc", (_PACKAGES | _SHORT)[old], inner)))

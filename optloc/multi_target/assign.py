@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Status, first_status
+from optloc.base.types import Array, Status
 from optloc.kernels.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.multi_target.answer import Emitters, Ghost
+from optloc.multi_target.assignment_findings import Assigned, spell, verdict
 from optloc.multi_target.pricing_search import TOLERANCE, PricedRegion, PricingResult, search
 from optloc.multi_target.set_packing import Prices, cheapest_sets, price_rows
 from optloc.multi_target.sets import (
@@ -44,9 +45,6 @@ _TRIED, _FOLLOWED = 800, 800
 _FITS = 100.0
 # Ghosts that are listed at most; squared distance from which a place is another one, four sigmas.
 _LISTED, _APART = 12, 16.0
-# Cost above its bound from which an assignment is not called proven: above what the tolerance of the search leaves for
-# dozens of emitters, and far below the gap of an ambiguity.
-_PROVEN = 2.0
 # Turns of prices and searches; and those after which a number of emitters that nobody found is given up: four times
 # the best columns of the whole region did not make it possible.
 _ROUNDS, _HOPELESS = 80, 4
@@ -319,34 +317,9 @@ def _verdict(
     scene: Scene, solved: Solved, fixes: tuple[Fix, ...], ghosts: tuple[Ghost, ...], costs: Array, count: int | None
 ) -> tuple[Status, str]:
     """Return status and reason."""
-    rows, n = int(np.isfinite(scene.z).sum()), len(fixes)
-    present = int(np.isfinite(scene.z).any(1).sum())
-    if count is not None and not np.isfinite(solved.cost):
-        return Status.INFEASIBLE, f"no {count} emitters were found that share no row"
-    if n == 0 and present < scene.least:
-        what = "none can" if scene.least > len(scene.z) else f"an emitter takes {scene.least}"
-        return Status.TOO_FEW_ROWS, f"rows in {present} channels cannot tell an emitter from false rows: {what}"
-    doubts = [
-        f"{_spell(k)} would cost only {costs[k] - solved.cost:.1f} more"
-        for k in (n - 1, n + 1)
-        if count is None and k >= 0 and costs[k] - solved.cost < AMBIGUOUS_GAP
-    ]
-    near = [ghost for ghost in ghosts if ghost.gap < AMBIGUOUS_GAP]
-    if near:
-        doubts.append(f"another place costs only {near[0].gap:.1f} more, {len(near)} such in all")
-    marks = Status.AMBIGUOUS.mark if doubts else 0
-    # what stands against one of the emitters stands against all of them together
-    for i, fix in enumerate(fixes):
-        if fix.status != Status.OK:
-            marks |= fix.status.mark
-            doubts.append(f"emitter {i}: {fix.status.label}")
-    if solved.cost - solved.bound > _PROVEN:
-        marks |= Status.UNPROVEN.mark
-        doubts.append(f"not proven: another assignment may cost {solved.cost - solved.bound:.1f} less")
-    if doubts:
-        return Status(int(first_status(np.array(marks)))), "; ".join(doubts)
-    return Status.OK, f"{_spell(n)}; false rows: {rows - int((solved.tuples.picks[solved.taken] >= 0).sum())}"
-
-
-def _spell(emitters: int) -> str:
-    return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")
+    heard = np.isfinite(scene.z)
+    gaps = tuple(ghost.gap for ghost in ghosts)
+    size = int(heard.any(1).sum()), len(scene.z), scene.least
+    false = int(heard.sum()) - int((solved.tuples.picks[solved.taken] >= 0).sum())
+    found = Assigned(fixes, gaps, costs, solved.cost, solved.bound, count, *size)
+    return verdict(found, f"{spell(len(fixes))}; false rows: {false}")

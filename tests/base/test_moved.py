@@ -59,6 +59,12 @@ def test_a_module_of_an_old_package_is_the_module_of_today():
     assert old is importlib.import_module("optloc.multi_target.sets")
 
 
+def test_the_old_package_of_tracks_names_its_place_of_today():
+    with pytest.raises(ModuleNotFoundError, match=r"optloc\.track is a function now; .* optloc\.tracking"):
+        importlib.import_module("optloc.track.updates")
+    assert callable(optloc.track)
+
+
 def test_short_paths_of_public_modules_import():
     assert importlib.import_module("optloc.units") is importlib.import_module("optloc.base.units")
     assert importlib.import_module("optloc.constraints") is optloc.constraints

@@ -16,7 +16,7 @@ from optloc.problem import Prior
 from optloc.proof.box import least_residual, linearise_rows
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled
 from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_rows
-from optloc.proof.scaled.scaled_proof import costs_at_scaled, velocity_costs
+from optloc.proof.scaled.scaled_proof import costs_at_scaled, largest_rate, velocity_costs
 from optloc.proof.scaled.scaled_search import rest_of
 from optloc.proof.scope import unsupported
 from optloc.solvers.certificates.position_cost import agrees
@@ -129,6 +129,7 @@ def test_no_point_of_a_box_is_below_its_bound(d, n, kinds, prior, seed):
             box, sheet = look.fill(piece, at, half), look.tables.sheet
             inside = half * np.concatenate([rng.uniform(-1, 1, (8, 3)), rng.choice([-1.0, 1.0], (8, 3)), [[0, 0, 0]]])
             cost, v = flight.profiled(look.places(piece, at, inside))
+            v = v / largest_rate(flight.problem.flat())  # factors are in this unit
             if not np.isfinite(cost).all():
                 continue
             assert sheet.span[HERE] == pytest.approx(cost[-1], rel=1e-6, abs=1e-6)

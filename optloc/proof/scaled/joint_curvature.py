@@ -179,7 +179,7 @@ def _add_information(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorksp
         blur = 0.0
         for j in range(weight.shape[0]):
             g = scaled.group[j]
-            size = factor_of(scaled, sheet, j) * abs(box.nodes[j, SLOPE0 + k])
+            size = abs(factor_of(scaled, sheet, j) * box.nodes[j, SLOPE0 + k])
             size += abs(sheet.lean[g, k] * box.nodes[j, PHI]) if g >= 0 else 0.0
             blur += share * weight[j] * size
         sums[NOISE0 + k] = sums[LENGTH0 + k] * noise + blur * (longest + noise)

@@ -11,6 +11,7 @@ from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, enabled, plain, put, usable, worth_loading, zero
 from optloc.linear.normal import prior_parts
+from optloc.models import MODELS
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, with_minima
@@ -120,14 +121,27 @@ def _priors(problem: Problem, count: int) -> tuple[Array, Array]:
 _NOTHING = 1e-12
 
 
+def largest_rate(problem: Problem) -> float:
+    """Return the largest size of a measured rate or of a station's velocity, metres per second; 1 without any."""
+    moving = problem.stations.velocity
+    own = [] if moving is None else [np.abs(moving).max(initial=0.0)]
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        if MODELS[rows.kind].velocity:
+            rates = problem.observed[..., start : start + rows.count]
+            own.append(np.abs(rates, where=np.isfinite(rates), out=np.zeros(rates.shape)).max(initial=0.0))
+    return float(max(own, default=0.0)) or 1.0
+
+
 def velocity_costs(problem: Problem) -> ScaledCosts:
     """Return the costs of a flat batch of problems of a target of unknown velocity at one epoch.
 
     Rates are linear in the velocity, whose components are factors of the components of unit vectors. The rows are
-    turned so that the last rows contain none of these, and bound the position at every velocity.
+    turned so that the last rows contain none of these, and bound the position at every velocity. The factors are in
+    units of the largest rate: bounds of rounding then do not depend on the unit of length.
     """
     costs, group = costs_of_velocity(problem)
-    K, w, d = costs.K, costs.w, problem.dimension
+    w, d, speed = costs.w, problem.dimension, largest_rate(problem)
+    K = np.where(group >= 0, speed, 1.0) * costs.K
     basis, size, _ = np.linalg.svd(K[:, :, group >= 0])
     back = np.swapaxes(basis, -1, -2)
     K, w = back @ K, (back @ w[..., None])[..., 0]
@@ -139,7 +153,7 @@ def velocity_costs(problem: Problem) -> ScaledCosts:
     known = [(roots(precision), mean) for name, mean, precision in prior_parts(problem) if name == "velocity"]
     lift = np.zeros((1, K.shape[1], d))
     for root, mean in known:
-        whole = root if root.ndim == 3 else root[None]
+        whole = speed * (root if root.ndim == 3 else root[None])
         lift = np.concatenate([np.zeros((len(whole), K.shape[1], d)), whole], axis=1)
         K = np.concatenate([K, np.zeros((len(K), d, K.shape[2]))], axis=1)
         w = np.concatenate([w, np.broadcast_to((root @ mean[..., None])[..., 0], (len(w), d))], axis=1)

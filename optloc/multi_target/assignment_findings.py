@@ -1,0 +1,106 @@
+"""Findings against an assignment of rows to emitters: one table of status, test and sentence."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import PRECEDENCE, Array, Status
+from optloc.problem.fix import Fix
+from optloc.solvers.policy import AMBIGUOUS_GAP
+from optloc.solvers.verdict.findings import Finding, objections
+
+# Cost above its bound from which an assignment is not called proven. The tolerance of the search leaves less for dozens
+# of emitters, and the gap of an ambiguity is far larger.
+_PROVEN = 2.0
+
+
+class Assigned(NamedTuple):
+    """The numbers that decide about an assignment.
+
+    Parameters
+    ----------
+    fixes : tuple of Fix
+        Fixes of the emitters.
+    gaps : tuple of float
+        Costs of other places less the cost of the assignment, ascending.
+    costs : array (n,)
+        Least cost with 0, 1, 2 ... emitters.
+    cost, bound : float
+        Cost of the assignment, and a lower bound of the cost of all others.
+    wanted : int, optional
+        The number of emitters, where it is given.
+    present, channels, least : int
+        Channels with a row, all channels, and the channels of an emitter at least.
+    """
+
+    fixes: tuple[Fix, ...]
+    gaps: tuple[float, ...]
+    costs: Array
+    cost: float
+    bound: float
+    wanted: int | None
+    present: int
+    channels: int
+    least: int
+
+
+def verdict(found: Assigned, clean: str) -> tuple[Status, str]:
+    """Return status and reason of an assignment; `clean` is the reason if nothing is found."""
+    against = objections(_FINDINGS, found)
+    if not against:
+        return Status.OK, clean
+    # Nothing else counts where there is no assignment.
+    status = against[0][0]
+    alone = status in (Status.INFEASIBLE, Status.TOO_FEW_ROWS) and not found.fixes
+    return status, against[0][1] if alone else "; ".join(words for _, words in against)
+
+
+def spell(emitters: int) -> str:
+    """Return a number of emitters in words."""
+    return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")
+
+
+def _near(found: Assigned) -> list[str]:
+    """Return sentences on other numbers of emitters and other places within the gap of an ambiguity."""
+    n = len(found.fixes)
+    words = [
+        f"{spell(k)} would cost only {found.costs[k] - found.cost:.1f} more"
+        for k in (n - 1, n + 1)
+        if found.wanted is None and k >= 0 and found.costs[k] - found.cost < AMBIGUOUS_GAP
+    ]
+    near = [gap for gap in found.gaps if gap < AMBIGUOUS_GAP]
+    return [*words, f"another place costs only {near[0]:.1f} more, {len(near)} such in all"] if near else words
+
+
+def _too_few(found: Assigned) -> list[str]:
+    what = "none can" if found.least > found.channels else f"an emitter takes {found.least}"
+    return [f"rows in {found.present} channels cannot tell an emitter from false rows: {what}"]
+
+
+def _of_emitters(status: Status) -> Finding:
+    """Return the finding that an emitter has a status: it counts against all of them together."""
+    return Finding(
+        status,
+        lambda found: any(fix.status == status for fix in found.fixes),
+        lambda found: [f"emitter {i}: {fix.status.label}" for i, fix in enumerate(found.fixes) if fix.status == status],
+    )
+
+
+_FINDINGS = (
+    Finding(
+        Status.INFEASIBLE,
+        lambda found: found.wanted is not None and not np.isfinite(found.cost),
+        lambda found: [f"no {found.wanted} emitters were found that share no row"],
+    ),
+    Finding(Status.TOO_FEW_ROWS, lambda found: not found.fixes and found.present < found.least, _too_few),
+    Finding(Status.AMBIGUOUS, lambda found: bool(_near(found)), _near),
+    *(_of_emitters(status) for status in PRECEDENCE if status is not Status.OK),
+    Finding(
+        Status.UNPROVEN,
+        lambda found: found.cost - found.bound > _PROVEN,
+        lambda found: [f"not proven: another assignment may cost {found.cost - found.bound:.1f} less"],
+    ),
+)
+"""All findings against an assignment."""
