@@ -146,7 +146,7 @@ def layers() -> str:
                 f'<g><title>{escape(about)}</title><rect x="{x:.1f}" y="{y}" width="{wide:.1f}" height="{height}" '
                 f'rx="4" fill="none" stroke="currentColor"/><text x="{x + 8:.1f}" y="{y + 19}" font-weight="bold" '
                 f'fill="currentColor">{room}</text><text x="{x + 8:.1f}" y="{y + 37}" font-size="11" '
-                f'fill="currentColor">{escape(_short(about, int(wide / 5.6)))}</text></g>'
+                f'fill="currentColor">{escape(_short(about, int(wide / 6.2)))}</text></g>'
             )
     return "\n".join([*parts, "</svg>"])
 
