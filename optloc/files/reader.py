@@ -6,9 +6,10 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
@@ -55,6 +56,9 @@ from optloc.problem.signal import Signal
 from optloc.problem.validation import checked
 from optloc.station_health.levels import NoiseLevels
 from optloc.station_health.structure import with_estimated_noise
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LOG = logging.getLogger("optloc.read")
 
@@ -494,21 +498,21 @@ def _follows(problem: Problem) -> bool:
 
 
 def from_table(
-    table: Any,
-    stations: Any,
+    table: pd.DataFrame | Mapping[str, ArrayLike],
+    stations: pd.DataFrame | Mapping[str, ArrayLike] | Stations,
     *,
     kind: str | None = None,
     unit: str | Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
     sigma: float | str | None = None,
     motion: str | None = None,
-    frame: str | Mapping[str, Any] = "cartesian",
+    frame: str | Mapping[str, object] = "cartesian",
     window: str | None = None,
     propagation_speed: float | None = None,
-    station_options: Mapping[str, Any] | None = None,
-    constraints: Sequence[Mapping[str, Any]] = (),
+    station_options: Mapping[str, object] | None = None,
+    constraints: Sequence[Mapping[str, object]] = (),
     values: bool = True,
-    **options: Any,
+    **options: object,
 ) -> Problem:
     """Return the problem of a long table with one row for each measurement.
 
@@ -555,15 +559,16 @@ def from_table(
         Naming the row and column.
     """
     names = dict(columns or {})
+    own: Any = station_options or {}
     place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
-    places = station_table(stations, "stations", names=(station_options or {}).get("columns"))
+    places = station_table(stations, "stations", names=own.get("columns"))
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
     # The arguments as a problem file: one reader serves both, and complaints name "arguments".
     settings = {
         "format": 1,  # of arguments: azimuths are counted as they always were
         "propagation_speed": propagation_speed,
         "frame": place,
-        "stations": dict(station_options or {}),
+        "stations": dict(own),
         "measurements": [{key: value for key, value in measured.items() if value is not None}],
         "epochs": {"window": window},
         "target": {"motion": motion},
