@@ -140,7 +140,7 @@ def network_of(
     kind: str = "toa",
     pairs: Sequence[tuple[int, int]] | None = None,
     names: Sequence[str] | None = None,
-    dimension: int = 3,
+    dimension: int | None = None,
     place: Any = None,
     place_sigma: Any = None,
     synchronised: bool = True,
@@ -162,8 +162,8 @@ def network_of(
         Stations of each column of differences ``r_a - r_b``.
     names : sequence of M str, optional
         Stations; "A1", "A2" and so on by default.
-    dimension : 2 or 3
-        Of space.
+    dimension : 2 or 3, optional
+        Of space; by default the columns of `place`, or 3.
     place, place_sigma : array (M, d), optional
         What is known of the stations' places, metres: sigma zero is exact, infinite (or a place that is NaN) is free.
         By default everything is.
@@ -199,8 +199,10 @@ def network_of(
     else:
         slots = tuple(NetworkSlot(kind, int(a), int(b)) for a, b in pairs)
     deviations = np.where(np.isnan(z), np.inf, np.broadcast_to(np.asarray(sigma, dtype=float), values.shape))
-    free = np.full((len(names), dimension), np.nan)
-    known = free if place is None else np.asarray(place, dtype=float)
+    known = np.full((len(names), dimension or 3), np.nan) if place is None else np.asarray(place, dtype=float)
+    if known.ndim != 2 or dimension not in (None, known.shape[-1]):
+        what = f"places of shape {known.shape} for {len(names)} stations in {dimension or 3} dimensions"
+        raise InvalidProblem(what, "place", "give one row for each station, and a column for each axis")
     if place_sigma is None:
         place_sigma = np.where(np.isnan(known), np.inf, 0.0)
     spread = np.where(np.isnan(known), np.inf, np.broadcast_to(np.asarray(place_sigma, dtype=float), known.shape))

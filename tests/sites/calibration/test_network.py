@@ -52,3 +52,10 @@ def test_what_cannot_be_is_one_sentence(arguments, said):
     _, z = hall(1, 5, 4, 0.0)
     with pytest.raises(InvalidProblem, match=said):
         network_of(**({"z": z, "sigma": 0.1} | arguments))
+
+
+def test_places_of_another_dimension_are_refused():
+    _, z = hall(1, 5, 7, 0.0)
+    with pytest.raises(InvalidProblem, match=r"places of shape \(5, 3\) for 5 stations in 2 dimensions"):
+        network_of(z, 0.1, dimension=2, place=np.zeros((5, 3)))
+    assert network_of(z, 0.1, place=np.zeros((5, 2))).dimension == 2
