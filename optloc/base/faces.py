@@ -33,6 +33,8 @@ def exported(package: str, file: str, own: tuple[str, ...] = ()) -> Exported:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, original = homes[name]
+        if module == package:
+            return import_module(f"{package}.{original}")
         try:
             found = getattr(import_module(module), original)
         except AttributeError:

@@ -62,7 +62,7 @@ class Frame:
     @classmethod
     def enu(cls, *, lat_deg: float, lon_deg: float, height: Amount = 0.0) -> Frame:
         """Return the east-north-up frame at a geodetic point: degrees, and metres or text such as "1640 ft"."""
-        metres = float(in_si(height, "length", "height"))
+        metres = float(in_si(height, "length", "height", place=True))
         return cls("enu", (math.radians(lat_deg), math.radians(lon_deg), metres))
 
     @property

@@ -304,7 +304,7 @@ def _holds_text(value: Any) -> bool:
     return isinstance(value, list | tuple) and any(isinstance(each, str) or _holds_text(each) for each in value)
 
 
-def in_si(value: Any, quantity: Quantity, where: str) -> Any:
+def in_si(value: Any, quantity: Quantity, where: str, *, deviation: bool = False, place: bool = False) -> Any:
     """Return numbers in SI units, where a number may be text with a unit.
 
     Parameters
@@ -315,6 +315,10 @@ def in_si(value: Any, quantity: Quantity, where: str) -> Any:
         What the numbers measure.
     where : str
         Argument to name.
+    deviation : bool
+        The numbers are standard deviations: decibels of a ratio are refused, because their size depends on the ratio.
+    place : bool
+        The numbers are coordinates or heights: units of time are refused.
 
     Returns
     -------
@@ -331,11 +335,19 @@ def in_si(value: Any, quantity: Quantity, where: str) -> Any:
         if not unit:
             example = example_of(number, value.strip(), quantity)
             raise InvalidProblem(f"{value!r} has no unit", where, f"write it with its unit, such as {example}")
-        return float(conversion(unit, quantity, where=where).to_si(number))
+        if place and unit in _TIME:
+            raise InvalidProblem(f"{value!r} is a time", where, 'give a length, such as "1.5 km"')
+        found = conversion(unit, quantity, where=where)
+        return float(found.sigma_to_si(number) if deviation else found.to_si(number))
     if _holds_text(value):
-        return np.array([in_si(each, quantity, where) for each in value], dtype=float)
+        numbers = [in_si(each, quantity, where, deviation=deviation, place=place) for each in value]
+        try:
+            return np.array(numbers, dtype=float)
+        except ValueError:
+            raise InvalidProblem("the numbers are not an array", where, "give numbers of one shape") from None
     if isinstance(value, np.ndarray) and value.dtype.kind == "U":
-        return np.reshape([in_si(str(each), quantity, where) for each in value.flat], value.shape)
+        numbers = [in_si(str(each), quantity, where, deviation=deviation, place=place) for each in value.flat]
+        return np.reshape(numbers, value.shape)
     return value
 
 

@@ -360,7 +360,7 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
         return ()
     try:
         ends = (height, height) if isinstance(height, str) or not np.ndim(height) else height
-        low, high = (float(in_si(end, "length", "height")) for end in ends)
+        low, high = (float(in_si(end, "length", "height", place=True)) for end in ends)
     except InvalidProblem:
         raise
     except (TypeError, ValueError):

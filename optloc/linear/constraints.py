@@ -125,7 +125,7 @@ def reported(
     share = place - before
     level = heights[..., before] * (1.0 - share) + heights[..., min(before + 1, last)] * share
     rate = np.gradient(heights, times, axis=-1) if last else np.zeros_like(heights)
-    half = float(in_si(within, "length", "within"))
+    half = float(in_si(within, "length", "within", place=True))
     rise = np.stack([heights - level[..., None], rate], axis=-1)
     motion = Motion(order, reference=reference, over="ground", rise=rise)
     return motion, height(level - half, level + half, target=target)
@@ -168,7 +168,7 @@ def _number(value: Any) -> Array:
 
 
 def _metres(value: Any, where: str) -> Array:
-    return _number(in_si(value, "length", where))
+    return _number(in_si(value, "length", where, place=True))
 
 
 # Faces: the sides that hold with equality together, and how vectors are brought onto them.

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from optloc.base.faces import exported
+from optloc.base.faces import exported as exported
 
 if TYPE_CHECKING:
     from optloc.base.errors import (

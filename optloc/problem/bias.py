@@ -88,7 +88,11 @@ def with_bias(
     shape = FORMS[form].shape(bias, problem.dimension)
     quantity = _quantity(problem, bias)
     centre = _each(in_si(mean, quantity, f"{where}, mean"), shape, where, "mean")
-    spread = None if sigma is None else _each(in_si(sigma, quantity, f"{where}, sigma"), shape, where, "sigma")
+    spread = (
+        None
+        if sigma is None
+        else _each(in_si(sigma, quantity, f"{where}, sigma", deviation=True), shape, where, "sigma")
+    )
     made = replace(problem, biases=(*problem.biases, replace(bias, mean=centre, sigma=spread)))
     check_unknowns(made)
     return made

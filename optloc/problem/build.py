@@ -125,7 +125,7 @@ def measured(
         A key of `optloc.models.MODELS`, for instance "tdoa", or one of its aliases.
     z : array (..., m), optional
         Measured values: metres, metres per second, radians or ratios, or texts with a unit such as "20 ns"; None to be
-        simulated.
+        simulated. A time is multiplied by the speed of light.
     a, b : int array (m,) or int
         Stations of each row, as indices.
     sigma : float, str or array (..., m), optional
@@ -165,8 +165,8 @@ def measured(
     # Everything becomes arrays first, so that what follows speaks of shapes and never of types.
     z, sigma, arrival_sigma = (
         numbers(in_si(z, quantity, "z"), "z"),
-        positive(in_si(sigma, quantity, "sigma"), "sigma", kind),
-        positive(in_si(arrival_sigma, quantity, "arrival_sigma"), "arrival_sigma", kind),
+        positive(in_si(sigma, quantity, "sigma", deviation=True), "sigma", kind),
+        positive(in_si(arrival_sigma, quantity, "arrival_sigma", deviation=True), "arrival_sigma", kind),
     )
     covariance, weight, correction = (
         numbers(v, name) for v, name in ((covariance, "covariance"), (weight, "weight"), (correction, "correction"))
@@ -373,7 +373,7 @@ def station_array(
     InvalidProblem
         Where positions are no such array, or numbers are none.
     """
-    array = np.asarray(numbers(in_si(position, "length", "stations"), "stations"))
+    array = np.asarray(numbers(in_si(position, "length", "stations", place=True), "stations"))
     if array.ndim < 2 or array.shape[-1] not in (2, 3):
         raise InvalidProblem(
             f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"

@@ -1,1 +1,11 @@
 """Where stations stand: networks of unknown places, and the choice of sites."""
+
+from typing import TYPE_CHECKING
+
+from optloc.problem import exported
+
+if TYPE_CHECKING:
+    from optloc.sites import calibration as calibration, placement as placement
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -126,3 +126,32 @@ def test_the_state_of_a_moving_target_comes_in_any_order():
     assert mean.tolist() == [fix.position[0], fix.velocity[0], fix.position[1], fix.velocity[1]]
     np.testing.assert_array_equal(cov[:2, :2], fix.cov[np.ix_([0, 2], [0, 2])])
     np.testing.assert_array_equal(fix.state()[0], np.concatenate([fix.position, fix.velocity]))
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        lambda: optloc.constraints.box(["1 km"], ["2 s"]),
+        lambda: optloc.constraints.height("10 ms"),
+        lambda: optloc.station_array([["1 km", 0.0], ["3 us", 0.0]]),
+        lambda: optloc.Frame.enu(lat_deg=47.0, lon_deg=8.0, height="1 ns"),
+    ],
+)
+def test_a_time_is_no_coordinate(stated):
+    with pytest.raises(optloc.InvalidProblem, match="is a time"):
+        stated()
+
+
+def test_decibels_are_no_deviation_of_a_ratio_of_unknown_size():
+    with pytest.raises(optloc.InvalidProblem, match="dB has no fixed size"):
+        optloc.measured("groa", a=[0, 1], b=[1, 0], sigma="1 dB")
+
+
+def test_text_in_rows_of_different_lengths_is_refused():
+    with pytest.raises(optloc.InvalidProblem, match="stations: the numbers are not an array"):
+        optloc.station_array([["1 km", 0.0], ["2 km"]])
+
+
+def test_packages_of_neighbours_are_attributes():
+    assert callable(optloc.sites.calibration.network_of)
+    assert callable(optloc.lab.datasets.available)
