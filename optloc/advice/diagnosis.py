@@ -101,7 +101,7 @@ def _advice(problem: Problem, fix: Fix) -> Iterator[Advice]:
             f"fixes of shape {fix.shape} for problems of shape {problem.batch_shape}", "fix", "give its own"
         )
     flat, fixes = problem.flat(), fix.flat()
-    doubtful = np.flatnonzero(~fixes.has(Status.OK))[:_ADVISED]
+    doubtful = np.flatnonzero(fixes.code != Status.OK)[:_ADVISED]
     found = advise(flat.take(doubtful), fixes[doubtful]) if len(doubtful) else []
     yield from dict.fromkeys(one for each in found for one in each)
 

@@ -16,18 +16,16 @@ from typing import Any
 Exported = tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]
 
 
-def exported(package: str, file: str, own: tuple[str, ...] = ()) -> Exported:
+def exported(package: str, file: str) -> Exported:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
 
     Parameters
     ----------
     package, file : str
         Its ``__name__`` and ``__file__``. All imports under ``if TYPE_CHECKING:`` of the file are exported.
-    own : tuple of str
-        Names that the file defines itself.
     """
     homes = dict(_imports(ast.parse(Path(file).read_text(encoding="utf-8"))))
-    names = sorted({*homes, *own})
+    names = sorted(homes)
 
     def find(name: str) -> Any:
         if name not in homes:

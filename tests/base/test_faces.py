@@ -24,12 +24,12 @@ def face(tmp_path, monkeypatch):
     (tmp_path / "face.py").write_text(FACE)
     package = ModuleType("face")
     monkeypatch.setitem(sys.modules, "face", package)
-    return *exported("face", str(tmp_path / "face.py"), ("own",)), package
+    return *exported("face", str(tmp_path / "face.py")), package
 
 
-def test_the_imports_for_type_checkers_and_the_own_names_are_the_exports(face):
+def test_the_imports_for_type_checkers_are_the_exports(face):
     _, listed, names, _ = face
-    assert names == ["dom", "loads", "own", "written"] == listed()
+    assert names == ["dom", "loads", "written"] == listed()
 
 
 def test_a_name_loads_under_its_alias_or_as_a_module_and_is_kept_in_the_package(face):
