@@ -89,7 +89,7 @@ class _Alias(Loader):
         return None
 
     def exec_module(self, module: ModuleType) -> None:
-        """Put the module of today in the place of an empty one."""
+        """Replace the empty module by the present module."""
         sys.modules[module.__name__] = import_module(self._place)
 
 
@@ -99,7 +99,7 @@ class _OldPackages(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a spec that loads the module of today; None for all other names."""
+        """Return a spec that loads the present module; None for all other names."""
         root, _, rest = fullname.partition(".")
         old, _, inner = rest.partition(".")
         if root == "optloc" and old == "track":
@@ -117,4 +117,4 @@ class _OldPackages(MetaPathFinder):
 def watch_old_packages() -> None:
     """Let Python find packages by their old names."""
     if not any(isinstance(finder, _OldPackages) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _OldPackages())  # before a module is found inside the package of today
+        sys.meta_path.insert(0, _OldPackages())  # first, so that no module is loaded twice under two names

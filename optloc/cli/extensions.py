@@ -43,7 +43,7 @@ class PictureRequest:
 
 @dataclass(frozen=True, slots=True)
 class KernelPart:
-    """What one process compiles: how that is had, and the kernels that Python calls."""
+    """Kernels that one process compiles: calls that compile them, and the kernels that Python calls."""
 
     summary: str
     package: str
@@ -51,7 +51,7 @@ class KernelPart:
     entries: tuple[str, ...]
 
     def missing(self) -> list[str]:
-        """Return the kernels of which there is no machine code on disk."""
+        """Return the kernels without machine code on disk."""
         from optloc.kernels.jit import named
         from optloc.kernels.kept import is_kept
 
