@@ -43,7 +43,7 @@ class PictureRequest:
 
 @dataclass(frozen=True, slots=True)
 class KernelPart:
-    """Kernels that one process compiles: calls that compile them, and the kernels that Python calls."""
+    """Kernels that a process compiles: calls that compile them, and the kernels that Python calls."""
 
     summary: str
     package: str
