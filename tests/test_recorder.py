@@ -25,7 +25,7 @@ FIX = {
     "dof": 3,
     "certificate": {
         "proof": "global",
-        "reason": "no position costs less",
+        "reason": "proven best",
         "method": "branch and bound",
         "bound": 2.499997,
         "gap": 3e-6,

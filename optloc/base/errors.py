@@ -188,5 +188,5 @@ def too_weak(fix: Any, weak: Any, wanted: int) -> str:
     means = "a wrong measurement would not be noticed" if found <= 0 else "a wrong measurement could not be named"
     return (
         f"{which} has a redundancy of {found}, and {wanted} is required{more}: {means}; "
-        "add a row, a station or what is known, such as a height."
+        "add a station, a measurement or a known height."
     )

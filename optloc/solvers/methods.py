@@ -113,7 +113,7 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _claim(cost: float, bound: float, tight: bool, name: str) -> Claims:
-    reason = "no position costs less" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
+    reason = "no position has a lower chi-square" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"
     proof = "global" if tight else "local"
     return claim(Certificate(proof, text, f"{name.removesuffix('s')} relaxation", bound, cost - bound))
@@ -149,7 +149,7 @@ _STAGES: dict[str, SolverEntry] = {
     "lsr": _refinement(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", batched=True),
     "nlp": _refinement(_nlp, "the maximum-likelihood cost by IPOPT from every candidate"),
     "certify": _refinement(
-        certified, "branch and bound: no position costs less, and no other minimum comes near", batched=True
+        certified, "branch and bound: proven best, and no other minimum has a similar chi-square", batched=True
     ),
     "value": _refinement(value_certified, "the same for the cost alone, without other minima: quicker", batched=True),
     "bound": _refinement(compare_bounds, "compares the cost with the bound of a relaxation (Clarabel): angles, ranges"),

@@ -12,7 +12,7 @@ from optloc.problem import Certificate
 from optloc.problem.claims import alike, choose, claim, untried
 
 GIVEN = [
-    Certificate("global", "no position costs less", "branch and bound", 1.0, 1e-9, True, 9.0, 57),
+    Certificate("global", "proven best", "branch and bound", 1.0, 1e-9, True, 9.0, 57),
     Certificate("region", "none of these", "branch and bound", 2.0, 1e-9, boxes=3, region=((0.0, 1.0), (2.0, 3.0))),
     Certificate("local", "a minimum", "refinement"),
     Certificate("unknown", "no answer", "none"),
