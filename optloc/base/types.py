@@ -387,8 +387,8 @@ _SENTENCES: dict[Status, str] = {
     "interval, or optloc.uncertainty.likelihood_region.",
     Status.UNREFINED: "This is the estimate of a start, without refinement and verdict; append '+lsr+certify' to the "
     "method.",
-    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a station, a measurement or a known "
-    "height.",
+    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a station, a measurement or a "
+    "known height.",
     Status.TAILS: "Repeats of the measurement confirm the 95 % figures, but not the 99.9 % region.",
     Status.ROBUST: "The rows that keep their weight prove the position; that no other choice of rejected rows explains "
     "the data is searched, not proven.",
