@@ -55,13 +55,16 @@ def folder_of(path: Path) -> str:
     return "/".join(parts[:2]) or "top"
 
 
+def pages_and_modules() -> list[Path]:
+    """Return the paths of all modules and pages, without pages that tools generate."""
+    paths = [*ROOT.glob("optloc/**/*.py"), *ROOT.glob("formulations/**/*.py"), *ROOT.glob("docs/**/*.md")]
+    return [path for path in [*paths, ROOT / "README.md"] if not {"_build", "gallery"} & set(path.parts)]
+
+
 def counts() -> dict[str, dict[str, int]]:
     """Return the number of places of each habit in each folder."""
-    paths = [*ROOT.glob("optloc/**/*.py"), *ROOT.glob("formulations/**/*.py"), *ROOT.glob("docs/**/*.md")]
     found: dict[str, Counter[str]] = {}
-    for path in [*paths, ROOT / "README.md"]:
-        if "_build" in path.parts or "gallery" in path.parts:
-            continue
+    for path in pages_and_modules():
         here = found.setdefault(folder_of(path), Counter())
         for text in texts(path):
             here.update({habit: len(re.findall(pattern, text)) for habit, pattern in HABITS.items()})
