@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from optloc.base.faces import exported
 from optloc.base.moved import MOVED, moved, watch_old_packages
-from optloc.problem.fix import told_by
+from optloc.problem.fix import set_renderer
 from optloc.problem.problem import Problem
 
 # Everything else loads when its name is first used: solvers, proofs and tables take half a second together.
@@ -77,7 +77,7 @@ if not TYPE_CHECKING:
 
 
 watch_old_packages()
-told_by(lambda: import_module("optloc.show.fixes"))
+set_renderer(lambda: import_module("optloc.show.fixes"))
 
 
 def _from_table(*args: Any, **options: Any) -> Problem:

@@ -6,7 +6,7 @@ from runs import drawn, run, truth
 
 import optloc
 from optloc.kernels.least_squares import refine
-from optloc.linear.normal import weighed
+from optloc.linear.normal import with_station_noise
 from optloc.problem.noise import dense
 from optloc.solvers.starts.block_averages import average_blocks
 
@@ -15,7 +15,9 @@ def test_blocks_of_one_epoch_are_the_run():
     problem = run(20)
     blocks = average_blocks(problem, 30)
     assert blocks.epochs == 20
-    np.testing.assert_allclose(dense(blocks.noise, np.arange(8)), dense(weighed(problem).noise, np.arange(8)))
+    np.testing.assert_allclose(
+        dense(blocks.noise, np.arange(8)), dense(with_station_noise(problem).noise, np.arange(8))
+    )
 
 
 @pytest.mark.parametrize(("epochs", "blocks", "length"), [(600, 30, 20), (700, 30, 23), (200, 33, 6), (95, 31, 3)])

@@ -237,7 +237,7 @@ def test_prepared_fixes_are_contained_too(monkeypatch):
     def fail(*args):
         raise np.linalg.LinAlgError("injected")
 
-    monkeypatch.setattr("optloc.solvers.prepared.settle_directly", fail)
+    monkeypatch.setattr("optloc.solvers.prepared.settle_by_plan", fail)
     fix = ready(many.z)
     np.testing.assert_allclose(fix.x, solve(many, "gtrs+lsr").x, atol=1e-3)
 

@@ -28,12 +28,12 @@ def library(array: Any) -> Any:
     return np if own is None else own()
 
 
-def foreign(array: Any) -> bool:
+def is_other_library(array: Any) -> bool:
     """Return whether an array belongs to another library than numpy."""
     return library(array) is not np
 
 
-def placed(numbers: Any, like: Any) -> Any:
+def as_array_like(numbers: Any, like: Any) -> Any:
     """Return numbers as an array of the library, device and float type of another array.
 
     Parameters
@@ -44,7 +44,7 @@ def placed(numbers: Any, like: Any) -> Any:
         Says where; for a numpy array the numbers stay as they are.
     """
     xp = library(like)
-    if xp is np or foreign(numbers):
+    if xp is np or is_other_library(numbers):
         return numbers
     values = np.array(numbers, dtype=np.float64)  # a copy: some libraries refuse arrays that cannot be written
     if type(like).__module__.startswith("jax"):  # what JAX traces has no device; it places arrays itself
@@ -80,13 +80,13 @@ def gather(array: Any, index: Array, axis: int = -1) -> Any:
 
 def eye(n: int, like: Any) -> Any:
     """Return the unit matrix (n, n) in the library of an array."""
-    return placed(np.eye(n), like)
+    return as_array_like(np.eye(n), like)
 
 
 def as_number(mask: Any, like: Any) -> Any:
     """Return a mask as zeros and ones of an array's float type."""
     xp = library(mask)
-    return xp.where(mask, placed(np.ones(()), like), placed(np.zeros(()), like))
+    return xp.where(mask, as_array_like(np.ones(()), like), as_array_like(np.zeros(()), like))
 
 
 # Arguments of any type become arrays of numbers, or a sentence that says which of them cannot.
@@ -115,7 +115,7 @@ def numbers(values: Any, name: str) -> Array | None:
         raise InvalidProblem(f"{short(values)} is not an array of numbers", name, "give numbers of one shape") from None
 
 
-def whole(values: Any, name: str) -> Array | None:
+def as_integers(values: Any, name: str) -> Array | None:
     """Return values as an integer array, None for None; refuse what would have to be rounded."""
     if isinstance(values, int | np.ndarray) and np.asarray(values).dtype.kind == "i":
         return np.asarray(values, dtype=np.int64)
@@ -129,7 +129,7 @@ def whole(values: Any, name: str) -> Array | None:
     return array.astype(np.int64)
 
 
-def positive(values: Any, name: str, kind: str) -> Array | None:
+def as_deviations(values: Any, name: str, kind: str) -> Array | None:
     """Return standard deviations as a float array, None for None; refuse one that is not positive and finite."""
     array = numbers(values, name)
     if array is None:

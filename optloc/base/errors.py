@@ -173,7 +173,7 @@ def status_named(label: str) -> Status:
 # The redundancy that a fix must have.
 
 
-def whole(redundancy: Any) -> int:
+def whole_redundancy(redundancy: Any) -> int:
     """Return a redundancy that is asked for; raise InvalidProblem where it is no whole number."""
     if isinstance(redundancy, bool) or not isinstance(redundancy, int | np.integer) or redundancy < 0:
         raise InvalidProblem(f"{redundancy!r} is no redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")

@@ -29,8 +29,8 @@ __all__ = [
     "Access",
     "Budget",
     "access",
-    "at_most",
     "budget_of",
+    "check_budget",
     "files_read",
     "has_controls",
     "json_of",
@@ -128,7 +128,7 @@ def access(*, outside: bool | None = None, budget: Budget | None = None, anew: b
         _ACCESS.reset(token)
 
 
-def relax(*, outside: bool | None = None, budget: Budget | None = None) -> None:
+def relax_budget(*, outside: bool | None = None, budget: Budget | None = None) -> None:
     """Do as `access` for the rest of the one that is open; a command line learns of its options one by one."""
     old = _now()
     more = {key: value for key, value in (("outside", outside), ("budget", budget)) if value is not None}
@@ -168,7 +168,7 @@ def budget_of(text: str, where: str) -> Budget:
     return Budget(**found)
 
 
-def at_most(what: str, count: int, where: str) -> None:
+def check_budget(what: str, count: int, where: str) -> None:
     """Raise InvalidProblem where a count is above the budget of its name: "rows", "columns", "cells" ..."""
     limit = getattr(_now().budget, what)
     if count > limit:
@@ -377,7 +377,7 @@ def _check_data(data: Any, source: str) -> None:
     """Refuse data that are nested too deep, whose words hold control characters or whose numbers are too large."""
     level, depth = [data], 0
     while level:
-        at_most("nesting", depth, source)
+        check_budget("nesting", depth, source)
         inner: list[Any] = []
         for outer in level:
             if isinstance(outer, dict):

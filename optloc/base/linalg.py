@@ -36,7 +36,7 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
         Whether the matrix is numerically positive definite.
     """
     n = matrix.shape[-1]
-    if arrays.foreign(matrix):
+    if arrays.is_other_library(matrix):
         # Arrays of some libraries cannot be written; in numpy, writing column by column is the quicker way.
         return _factor(matrix, least)
     lower = np.zeros(matrix.shape)
@@ -55,7 +55,7 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
 def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
     """Return what `factor` does without writing into an array: column by column, the rest less what each explains."""
     xp, n = arrays.library(matrix), matrix.shape[-1]
-    below = arrays.placed(np.tril(np.ones((n, n))), matrix)
+    below = arrays.as_array_like(np.tril(np.ones((n, n))), matrix)
     # The first comparison makes a mask of the batch's shape on the array's own device; a NaN there is not ok.
     rest, columns, ok = matrix, [], matrix[..., 0, 0] == matrix[..., 0, 0]
     for j in range(n):
@@ -107,7 +107,7 @@ def _substitute(lower: Any, right: Any, order: range) -> Array:
 
 
 def _forward(lower: Array, right: Array) -> Array:
-    if arrays.foreign(lower):
+    if arrays.is_other_library(lower):
         return _substitute(lower, right, range(lower.shape[-1]))
     out = np.empty(np.broadcast_shapes(lower.shape[:-2], right.shape[:-2]) + right.shape[-2:])
     for j in range(lower.shape[-1]):
@@ -117,7 +117,7 @@ def _forward(lower: Array, right: Array) -> Array:
 
 
 def _backward(lower: Array, right: Array) -> Array:
-    if arrays.foreign(lower):
+    if arrays.is_other_library(lower):
         return _substitute(lower.mT, right, range(lower.shape[-1])[::-1])
     out = np.empty(right.shape)
     for j in reversed(range(lower.shape[-1])):
@@ -222,7 +222,7 @@ def whitening(covariance: Array) -> Array:
     if covariance.shape[-1] == 1:
         single: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
         return single
-    if covariance.shape[-1] > _MANY and not arrays.foreign(covariance):
+    if covariance.shape[-1] > _MANY and not arrays.is_other_library(covariance):
         most = max(int((~absent).sum(-1).max(initial=0)), 1)
         if most < covariance.shape[-1]:
             return _whitening_of_present(covariance, absent, most)

@@ -14,7 +14,7 @@ from typing import Any
 # Names that were attributes of optloc, by the package that exports them now.
 _NAMES = {
     "optloc.bounds": "Course Observability crlb_course observability",
-    "optloc.engine": "Linear Normal gauss_newton linearise normal predict reduce wander",
+    "optloc.engine": "Linear Normal gauss_newton linearise normal predict reduce",
     "optloc.files": "Budget satellites",
     "optloc.model_checks": (
         "Advice CommonLevel LateSignals Reliability advise determined distance_from_plane explained reliability"
@@ -39,7 +39,7 @@ _NAMES = {
 }
 # Modules that were attributes of optloc.
 _MODULES = {"epochs": "optloc.problem.epochs", "frames": "optloc.base.frames", "noise": "optloc.problem.noise"}
-_RENAMED = {"Plan": "optloc.sites.placement.SiteSelection"}
+_RENAMED = {"Plan": "optloc.sites.placement.SiteSelection", "wander": "optloc.engine.simulate_walks"}
 _PLACES = (
     {name: f"{package}.{name}" for package, names in _NAMES.items() for name in names.split()} | _MODULES | _RENAMED
 )

@@ -172,7 +172,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 @contextmanager
-def together() -> Iterator[None]:
+def replace_together() -> Iterator[None]:
     """Give the files that are written in the block their names at its end, when all are whole; none where one fails."""
     waiting: list[tuple[Path, Path, Path]] = []
     outer = _WAITING.set(waiting)

@@ -70,7 +70,7 @@ def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> L
     return lock
 
 
-def mapped(
+def map_on_threads(
     function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int | None = None, *, least: float = 0.0
 ) -> list[_Result]:
     """Return the function of every item, in the order of the items whatever the number of threads.
@@ -100,7 +100,7 @@ def mapped(
     if least > 0.0:
         # Two, because the first call may build what the others share; the quicker one tells.
         begun, seconds = _time(function, work[:2])
-        some = mapped(function, work[2:], 1 if seconds < least else count)
+        some = map_on_threads(function, work[2:], 1 if seconds < least else count)
         return begun + some
     results: dict[int, _Result] = {}
     errors: dict[int, BaseException] = {}
@@ -126,7 +126,7 @@ def mapped(
     return [results[i] for i in range(len(work))]
 
 
-def flow(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
+def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
     """Yield the function of every item in their order, several worked on side by side: for large parts of a batch.
 
     Unlike `mapped` it serves work whose Python takes as long as its machine code, since one part's is done while the

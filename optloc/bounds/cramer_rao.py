@@ -14,7 +14,7 @@ from optloc.kernels.sums import equations_at, summed
 from optloc.linear.constraints import exact, levels, tangent_at
 from optloc.linear.normal import Linear, Normal, covariance, linearise, marginal, normal, prior_parts, with_priors
 from optloc.linear.walks import walks
-from optloc.problem.epochs import cut, tied, windows
+from optloc.problem.epochs import cut, has_correlated_epochs, windows
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
@@ -124,7 +124,7 @@ def crlb_course(
     S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), sections 3.7 and 8.4.
     """
     x, layout, k = np.asarray(truth, dtype=float), problem.layout, problem.epochs
-    if tied(problem):
+    if has_correlated_epochs(problem):
         advice = "ask for the bound of the whole run"
         raise InvalidProblem("noise correlates the epochs, so that what they say does not add up", "noise", advice)
     chosen = np.arange(1, k + 1) if counts is None else np.asarray(counts, dtype=np.int64)

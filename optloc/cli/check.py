@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import together
+from optloc.base.outputs import replace_together
 from optloc.base.types import Array, Bias, Stations
 from optloc.cli.file_fixes import fix_epochs, table_json
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
@@ -27,7 +27,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.reader import Loaded
-from optloc.files.readings import ColumnHints
+from optloc.files.table_import import ColumnHints
 from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
 from optloc.model_checks.elements import By, batch_of
 from optloc.model_checks.geometry import Advice
@@ -393,7 +393,7 @@ def _told(value: float, error: float, unit: str) -> str:
 
 def _write_health(health: Health, title: str, asked: CheckOptions) -> None:
     """Write the table and the picture of health that were asked for: both, or none."""
-    with together():
+    with replace_together():
         if asked.out is not None:
             write_table(asked.out, _health_columns(health))
         if asked.plot is not None:

@@ -27,9 +27,9 @@ from optloc.base.frames import Frame
 from optloc.base.types import Array, Motion, Stations
 from optloc.cli.extensions import KernelPart, extensions
 from optloc.cli.output import Screen, dumps, meter
+from optloc.kernels.code_cache import CALLEES, folder_in_use, is_checkout, sole_compiler
 from optloc.kernels.filter import filter_scan
-from optloc.kernels.jit import REPORTER, compiling, enabled, insist_on, names_in, plain
-from optloc.kernels.kept import CALLEES, alone, is_checkout, kept_in
+from optloc.kernels.jit import REPORTER, compiling, enabled, names_in, plain, require_code
 from optloc.kernels.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
@@ -76,7 +76,7 @@ def _fix_tapes() -> None:
 
 
 def _filter() -> None:
-    insist_on(filter_scan)
+    require_code(filter_scan)
     scan = simulate(assemble(_STATIONS, measured("range", a=np.arange(6), sigma=1.0)), TARGET, 1)
     ekf(scan, TARGET, np.eye(3))
 
@@ -186,7 +186,7 @@ _PARTS: Mapping[str, KernelPart] = {
     "searches": KernelPart(
         "searches for starts", "optloc.proof", (_search,), ("optloc.proof.best_first.search_minima",)
     ),
-    "regions": KernelPart("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.cover.cover",)),
+    "regions": KernelPart("cells of regions", "optloc.proof", (_cover,), ("optloc.proof.subpaving.cover_region",)),
 }
 
 
@@ -282,7 +282,7 @@ def _compile(part: KernelPart) -> None:
 
 def run_compile(check: bool, as_json: bool, *, quiet: bool = False) -> int:
     """Compile what is not on disk, and print what is; the exit code is 1 where something is missing at the end."""
-    place = kept_in() if enabled() else None
+    place = folder_in_use() if enabled() else None
     if place is not None and not check:
         with meter("making machine code", quiet) as tell:
             make(tell)
@@ -318,7 +318,7 @@ def _print(found: dict[str, int], place: str | None) -> None:
 
 def _make_alone() -> None:
     """Make all behind whatever else the computer does, unless another process is at it."""
-    with alone() as only:
+    with sole_compiler() as only:
         if only:
             if hasattr(os, "nice"):
                 os.nice(10)  # what answers in plain Python meanwhile goes first

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import at_most
+from optloc.base.inputs import check_budget
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
 from optloc.bounds.cramer_rao import Course, crlb_course
@@ -22,7 +22,7 @@ from optloc.files.reader import Loaded, read
 from optloc.files.schema import Units
 from optloc.model_checks.evidence import Reliability, reliability
 from optloc.models import MODELS
-from optloc.problem.epochs import by_epoch, separable, tied
+from optloc.problem.epochs import by_epoch, has_correlated_epochs, separable
 from optloc.problem.explanations import Suspect
 from optloc.problem.layout import Layout, Slot, state_names
 from optloc.problem.problem import Problem
@@ -226,7 +226,7 @@ def _length(value: float) -> str:
 def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
     """Return the bound against time with biases unknown and, if there are some, known; None where it has none."""
     n, k = problem.layout.n_shared, problem.epochs
-    if k == 1 or not 0 < n <= _UNKNOWNS or tied(problem) or problem.batch_shape:
+    if k == 1 or not 0 < n <= _UNKNOWNS or has_correlated_epochs(problem) or problem.batch_shape:
         return None
     counts = np.arange(1, k + 1) if k <= _POINTS else np.unique(np.geomspace(1, k, _POINTS).round().astype(int))
     # Families of biases have members; states of targets have not.
@@ -479,7 +479,7 @@ def run_simulate(
 
     claim_outputs(out, inputs=[file])
     problem = read(file, values=False).problem
-    at_most("rows", trials * problem.count, "--trials")  # what is written can be read
+    check_budget("rows", trials * problem.count, "--trials")  # what is written can be read
     x = vector(problem, truth, velocity, geodetic)
     # A spread in decibels depends on the values: the noise is that of the true ones.
     with TemporaryDirectory() as folder:

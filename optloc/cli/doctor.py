@@ -98,10 +98,10 @@ def machine_code() -> dict[str, Any]:
     if not enabled():
         return {"folder": None, "made_for": None, "installed": False, "parts": {}}
     from optloc.cli.compile import parts
-    from optloc.kernels.kept import kept_in
+    from optloc.kernels.code_cache import folder_in_use
     from optloc.kernels.manifest import installed, of_this_process
 
-    place = kept_in()
+    place = folder_in_use()
     return {
         "folder": None if place is None else str(place),
         "made_for": of_this_process().processor,

@@ -52,10 +52,10 @@ class KernelPart:
 
     def missing(self) -> list[str]:
         """Return the kernels without machine code on disk."""
+        from optloc.kernels.code_cache import is_cached
         from optloc.kernels.jit import named
-        from optloc.kernels.kept import is_kept
 
-        return [name for name in self.entries if not is_kept(named(name))]
+        return [name for name in self.entries if not is_cached(named(name))]
 
 
 @dataclass(frozen=True, slots=True)

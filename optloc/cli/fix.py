@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.outputs import claim, together
+from optloc.base.outputs import claim, replace_together
 from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
     FileFixes,
@@ -33,8 +33,8 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.reader import Loaded
-from optloc.files.readings import ColumnHints
 from optloc.files.schema import ConstraintTable
+from optloc.files.table_import import ColumnHints
 from optloc.model_checks.advice import advise, advise_at, explained_at
 from optloc.model_checks.elements import GROUPINGS, By, batch_of
 from optloc.model_checks.geometry import Advice
@@ -55,7 +55,7 @@ from optloc.show.fixes import (
     with_sigma,
 )
 from optloc.show.formats.marks import geojson
-from optloc.solvers.policy import REFUTED
+from optloc.solvers.policy import P_MISFIT
 from optloc.station_health.levels import (
     NoiseLevels,
     common_level,
@@ -134,7 +134,7 @@ def run_fix(
 
 def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: Path | None, html: Path | None) -> None:
     """Write the files that were asked for: all of them, or none."""
-    with together():
+    with replace_together():
         if out is not None:
             write_results(out, results_of(found))
         if geojson_path is not None:
@@ -264,7 +264,7 @@ def _are_refuted(fix: Fix) -> bool:
     from scipy.special import bdtrc
 
     refuted = np.isin(fix.code, [Status.MISFIT, Status.CONTRADICTORY])
-    by_chance = bdtrc(int(refuted.sum()) - 1, len(fix), REFUTED)
+    by_chance = bdtrc(int(refuted.sum()) - 1, len(fix), P_MISFIT)
     return bool(refuted.any() and by_chance < _BY_CHANCE) or fix.explanations is not None
 
 

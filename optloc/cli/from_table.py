@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from optloc.files.reader import Loaded
-    from optloc.files.readings import ColumnHints
     from optloc.files.schema import ConstraintTable
+    from optloc.files.table_import import ColumnHints
     from optloc.files.table_problem import Converted, TableProblem
 
 _TABLES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".parquet", ".pq", ".rnx", ".obs")
@@ -46,7 +46,7 @@ def _flag(text: str, flag: str) -> Any:
 
 
 _TEXT = str | None
-# Field of `optloc.files.readings.ColumnHints`: its option. All commands that take tables use this one list.
+# Field of `optloc.files.table_import.ColumnHints`: its option. All commands that take tables use this one list.
 _OPTIONS: dict[str, Any] = {
     "stations": Annotated[
         Path | None, _option("FILE", "Where the stations are: GeoJSON, CSV, Parquet or JSON.", "--stations")
@@ -184,12 +184,12 @@ def columns_of(pairs: Sequence[str] | None) -> dict[str, str]:
 def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, quiet: bool) -> int:
     """Convert a file, say what is understood before it is written, and return the exit code."""
     from optloc.cli.output import Screen, dumps, write_text
-    from optloc.files.convert import convert as written, understood
-    from optloc.files.readings import ColumnHints
+    from optloc.files.convert import convert as written, interpret_table
+    from optloc.files.table_import import ColumnHints
 
     told, console = ColumnHints(**given), Screen(quiet=quiet or as_json)
     if out is None:
-        table_problem = understood(file, told)
+        table_problem = interpret_table(file, told)
         _tell(table_problem, console)
         table_problem.read()
         say_next(console, f"Nothing is written: --out names the problem file, and optloc fix {file} fixes it as it is.")
@@ -243,7 +243,7 @@ def _json(found: Converted) -> dict[str, Any]:
 
 def table_told(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
     """Return what is said of a table, None of a problem file; raise InvalidProblem where something is said of that."""
-    from optloc.files.readings import ColumnHints
+    from optloc.files.table_import import ColumnHints
 
     if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
         return ColumnHints(**given)
@@ -284,8 +284,8 @@ def read_problem(
     if told is None:
         return read(file, values=values, more=more)
     from optloc.cli.output import Screen
-    from optloc.files.convert import understood
+    from optloc.files.convert import interpret_table
 
-    table_problem = understood(file, told)
+    table_problem = interpret_table(file, told)
     _tell(table_problem, Screen(quiet=quiet, stderr=on_error))
     return table_problem.read(more or {})

@@ -20,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 
 from optloc.base.errors import InvalidProblem, nearest, status_named
-from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
+from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax_budget
 from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.base.units import LARGEST
@@ -235,7 +235,7 @@ Outside = Annotated[
     bool,
     typer.Option(
         "--outside",
-        callback=lambda wanted: relax(outside=wanted),
+        callback=lambda wanted: relax_budget(outside=wanted),
         help="Let the file name files that are not beneath its own folder.",
     ),
 ]
@@ -244,7 +244,7 @@ Budget = Annotated[
     typer.Option(
         "--budget",
         metavar="NAME=N,...",
-        callback=lambda text: text and relax(budget=budget_of(text, "--budget")),
+        callback=lambda text: text and relax_budget(budget=budget_of(text, "--budget")),
         help="Let files hold more: bytes, text (bytes of a document), rows, columns, cells, nesting, unknowns.",
     ),
 ]

@@ -32,7 +32,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.reader import Loaded
-from optloc.files.readings import ColumnHints
+from optloc.files.table_import import ColumnHints
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, covariance_columns, geodetic_columns, join_tables, records

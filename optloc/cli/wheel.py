@@ -17,8 +17,8 @@ import typer
 from optloc.base.errors import InvalidProblem
 from optloc.cli.compile import environment, make
 from optloc.cli.output import dumps, meter
+from optloc.kernels.code_cache import files_of, folder
 from optloc.kernels.jit import enabled, named, names_in
-from optloc.kernels.kept import files_of, folder
 from optloc.kernels.manifest import FILE, INSTALLED, is_chosen, of_this_process
 
 # What wheels are made for: processors of the last ten years. The same bits come out on all of them, since no kernel has

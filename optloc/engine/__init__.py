@@ -9,16 +9,16 @@ if TYPE_CHECKING:
     from optloc.base.arrays import numbers as numbers
     from optloc.base.cache import Cache as Cache
     from optloc.base.linalg import centre_and_spread as centre_and_spread
-    from optloc.base.threads import WORTH as WORTH, mapped as mapped
+    from optloc.base.threads import WORTH as WORTH, map_on_threads as map_on_threads
     from optloc.engine.shape import STRAIGHT as STRAIGHT
     from optloc.kernels.equations import normal_at as normal_at, normal_block as normal_block
     from optloc.kernels.jit import (
         FEW as FEW,
         compiled as compiled,
         enabled as enabled,
+        may_use_code as may_use_code,
         put as put,
         put_rows as put_rows,
-        usable as usable,
     )
     from optloc.kernels.least_squares import WEIGHINGS as WEIGHINGS, Refined as Refined, refine as refine
     from optloc.kernels.pack import pack as pack
@@ -46,13 +46,13 @@ if TYPE_CHECKING:
         normal as normal,
         prior_parts as prior_parts,
         step as step,
-        weighed as weighed,
         with_priors as with_priors,
+        with_station_noise as with_station_noise,
     )
     from optloc.linear.redundancy import degrees_of_freedom as degrees_of_freedom
     from optloc.linear.simulate import simulate as simulate
     from optloc.linear.vectors import vectors as vectors
-    from optloc.linear.walks import walks as walks, wander as wander
+    from optloc.linear.walks import simulate_walks as simulate_walks, walks as walks
 
 if not TYPE_CHECKING:
     __getattr__, __dir__, __all__ = exported(__name__, __file__)

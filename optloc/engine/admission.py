@@ -181,7 +181,7 @@ def coarsen(model: EngineModel, room: EngineWorkspace) -> None:
 
 
 @compiled
-def hold(model: EngineModel, room: EngineWorkspace) -> None:
+def project_step(model: EngineModel, room: EngineWorkspace) -> None:
     """Take from the step in MOVE what leads off the exact surfaces; the information is factored in LOWER."""
     a, d, move = model.admission, room.d, room.vector[MOVE]
     if a.exact == 0:
@@ -214,7 +214,7 @@ def _keep_off(room: EngineWorkspace, move: Array, p: int) -> None:
 
 
 @compiled
-def hold_covariance(model: EngineModel, room: EngineWorkspace) -> None:
+def project_covariance(model: EngineModel, room: EngineWorkspace) -> None:
     """Make the covariance in the lower half of H_TRIAL that along the exact surfaces."""
     a, d, cov, column = model.admission, room.d, room.matrix[H_TRIAL], room.vector[MOVE]
     if a.exact == 0:
@@ -261,7 +261,7 @@ def find_multipliers(model: EngineModel, room: EngineWorkspace) -> None:
 
 
 @compiled
-def admit(model: EngineModel, room: EngineWorkspace, out: Array) -> None:
+def check_constraints(model: EngineModel, room: EngineWorkspace, out: Array) -> None:
     """Write 0.0 to `out` (W,) where row X breaks a constraint, or where the Earth hides it from a used station."""
     a = model.admission
     sides = room.side.shape[1]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.engine.admission import admit, restore
+from optloc.engine.admission import check_constraints, restore
 from optloc.engine.evaluator import complete, costs
 from optloc.engine.images import LISTED, NEAR
 from optloc.engine.memory import (
@@ -73,7 +73,7 @@ def refine_candidates(model: EngineModel, rows: Any, room: EngineWorkspace, spot
         refine(model, rows, room, _TOLERANCE, _STEPS)
         for lane in range(LANES):
             scalar[GOOD, lane] *= 1.0 - scalar[ALIVE, lane]
-        admit(model, room, scalar[GOOD])
+        check_constraints(model, room, scalar[GOOD])
         _keep(room, spot[k])
     _choose(model, room, spot)
 

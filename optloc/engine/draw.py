@@ -30,9 +30,9 @@ from optloc.kernels.pack import pack
 from optloc.linear.constraints import is_exact
 from optloc.linear.evaluate import block_links, columns
 from optloc.linear.least_squares_ranges import Ranges, ranges
-from optloc.linear.normal import weighed
+from optloc.linear.normal import with_station_noise
 from optloc.linear.redundancy import degrees_of_freedom, largest
-from optloc.linear.vectors import hold_still, vectors
+from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.models import MODELS
 from optloc.problem.forms import form_of
 from optloc.problem.noise import variances, whiten, whiten_rows
@@ -67,7 +67,7 @@ def draw_ranges(one: Problem, admission: Admission) -> SimulatedBatch | None:
     model = _model(one, found, node, admission)
     if model is None or _start_of(one, found, admission, 0) != BY_SQUARES:
         return None
-    turned, made = _range_rows(weighed(one), node[1])
+    turned, made = _range_rows(with_station_noise(one), node[1])
     if offset is not None:
         assert one.stations.covariance is not None
         first = offset.reshape(-1, one.dimension)[node[1], 0]
@@ -83,7 +83,7 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch |
     if model is None:
         return None
     places = {(int(station), int(epoch)): i for i, (epoch, station) in enumerate(node.T)}
-    lifts = lift(hold_still(one.flat()).take(np.zeros(1, dtype=int)), found, places, model.reference >= 0)
+    lifts = lift(problem_at_rest(one.flat()).take(np.zeros(1, dtype=int)), found, places, model.reference >= 0)
     make = partial(_tape_rows, one.correction, vectors(one.flat(), None)[0], lifts, _is_bounded(one))
     start = _start_of(one, found, admission, len(lifts.sigma))
     if start is None or make(one) is None:
@@ -98,10 +98,10 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch |
 
 def _find_ranges(one: Problem) -> Ranges | None:
     """Return the least-squares ranges of one problem as maps: of measurements that are unit vectors."""
-    return ranges(weighed(_probe(hold_still(one.flat()))))
+    return ranges(with_station_noise(_probe(problem_at_rest(one.flat()))))
 
 
-# Probability of the chi-square test below which a better place is looked for, as `optloc.solvers.policy.DOUBT`.
+# Probability of the chi-square test below which a better place is looked for, as `optloc.solvers.policy.P_SUSPECT`.
 _POOR = 1e-3
 # Ranges that are known up to one unknown, with a height: they determine a position.
 _THREE = 3
@@ -179,7 +179,7 @@ def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission
         part = slice(start, start + rows.count)
         gain[part], added[part] = links.gains.total(base, rows.count)[0], links.adds.total(base, rows.count)[0]
     present = one.weight > 0.0
-    precision = np.where(present, 1.0 / np.where(present, variances(weighed(one).noise, count), 1.0), 0.0)
+    precision = np.where(present, 1.0 / np.where(present, variances(with_station_noise(one).noise, count), 1.0), 0.0)
     linear, station, reference = np.zeros((s, count)), np.zeros((SEEN + 1, s)), -1
     if found is not None:
         linear[: len(known)] = found.offset[:, known].T
@@ -263,7 +263,7 @@ def _design(one: Problem, station: Array) -> tuple[Array, Array]:
 def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, problem: Problem) -> TapeRows | None:
     """Return the rows of problems as tapes, or None where they have none."""
     bare = problem.with_rows(z=np.zeros(problem.count))
-    found = pack(bare, whiten(weighed(bare).noise, bare.weight))
+    found = pack(bare, whiten(with_station_noise(bare).noise, bare.weight))
     scaled = any(form_of(bias).enters == "scales" for bias in problem.biases)
     return None if found is None else TapeRows(found.tables, found.numbers, correction, base, lifts, bounded, scaled)
 

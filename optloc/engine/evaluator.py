@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from optloc.base.types import Array
 from optloc.engine.memory import EngineModel, EngineWorkspace
-from optloc.kernels.jit import compiled, with_constants
+from optloc.kernels.jit import compiled, specialise
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
@@ -139,7 +139,7 @@ def evaluated_by(kernel: _Kernel, rows: ModuleType, mark: str, **constants: Any)
     mark : str
         Distinguishes the names of machine code.
     constants : object
-        As of `optloc.kernels.jit.with_constants`.
+        As of `optloc.kernels.jit.specialise`.
     """
     own = {kernel: getattr(rows, kernel.__name__) for kernel in _INTERFACE}
-    return with_constants(kernel, mark, own, **constants)
+    return specialise(kernel, mark, own, **constants)

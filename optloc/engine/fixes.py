@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.engine import ranges, tapes
-from optloc.engine.admission import admit, evaluate, find_multipliers, hold_covariance, restore
+from optloc.engine.admission import check_constraints, evaluate, find_multipliers, project_covariance, restore
 from optloc.engine.evaluator import (
     count_lifted,
     count_unknowns,
@@ -24,7 +24,7 @@ from optloc.engine.evaluator import (
     measure_infinity,
     search_infinity,
 )
-from optloc.engine.images import LISTED, confirm, find_plane, follow, keep_fix, reflect
+from optloc.engine.images import LISTED, confirm_rivals, find_plane, keep_fix, refine_images, reflect
 from optloc.engine.memory import (
     ALIVE,
     AT_INFINITY,
@@ -72,7 +72,7 @@ from optloc.engine.memory import (
 )
 from optloc.engine.refinement import refine
 from optloc.engine.shape import STRAIGHT, find_even, measure_shape
-from optloc.engine.start import begin, read, stand
+from optloc.engine.start import begin, load_measurements, load_stations
 from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES, factor_plain, solve_plain
@@ -176,9 +176,11 @@ def _see(model: EngineModel, rows: Any, z: Array, station: Array, room: EngineWo
         for lane in range(LANES):
             at = room.item[lane] if len(level) > 1 else 0
             room.side[LOWER_BOUND, k, lane], room.side[UPPER_BOUND, k, lane] = level[at, k, 0], level[at, k, 1]
-    read(z, room.item, model.row, model.anchor, model.linear, room.seen, room.value, scalar[BLUR], scalar[GOOD])
+    load_measurements(
+        z, room.item, model.row, model.anchor, model.linear, room.seen, room.value, scalar[BLUR], scalar[GOOD]
+    )
     if anew:
-        stand(
+        load_stations(
             station,
             room.item,
             model.reference,
@@ -217,9 +219,9 @@ def _write_fixes(model: EngineModel, rows: Any, z: Array, room: EngineWorkspace,
     """Write unknowns, covariances and costs of the first lanes, and to FIX_GOOD which are settled."""
     scalar = room.scalar
     _invert(room)
-    hold_covariance(model, room)
+    project_covariance(model, room)
     find_multipliers(model, room)
-    admit(model, room, scalar[SOLVABLE])
+    check_constraints(model, room, scalar[SOLVABLE])
     for lane in range(LANES):
         good = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
         scalar[FIX_GOOD, lane] = 1.0 if good else 0.0
@@ -303,7 +305,7 @@ def _examine(
         return images
     keep_fix(room)
     reflect(model, room)
-    follow(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
+    refine_images(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
     return _end_images(model, rows, z, room, size, answer, look, hidden, images, course)
 
 
@@ -379,7 +381,7 @@ def _pursue(
                 scalar[GOOD, lane], scalar[ALIVE, lane] = 1.0, 1.0
                 scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
                 scalar[STEPS, lane] = course[2, i]
-            follow(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
+            refine_images(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
             # waiting problems are written before the blocks that follow
             images = _end_images(model, rows, z, room, size, answer, look, hidden, images, course)
 
@@ -409,7 +411,7 @@ def _end_images(
             course[2, i] = scalar[STEPS, lane]
     if images > before:
         _place(room.vector, item, answer.rival, scalar[ALIVE], True, size)
-    if confirm(model, rows, room) == 0.0:
+    if confirm_rivals(model, rows, room) == 0.0:
         return images
     _place(room.vector, item, answer.rival, scalar[GOOD], True, size)
     finish(rows, z, room, size, scalar[GOOD], True, answer.rival)

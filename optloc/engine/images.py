@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.engine.admission import admit, coarsen, evaluate, hold, restore
+from optloc.engine.admission import check_constraints, coarsen, evaluate, project_step, restore
 from optloc.engine.evaluator import bend, bow_of, note_nearest
 from optloc.engine.memory import (
     ALIVE,
@@ -131,7 +131,9 @@ def reflect(model: EngineModel, room: EngineWorkspace) -> None:
 
 
 @compiled
-def follow(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: float, fewest: int, every: bool) -> None:
+def refine_images(
+    model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: float, fewest: int, every: bool
+) -> None:
     """Refine the unknowns of lanes that are alive, until fewer of them are left than are worth a block.
 
     Parameters
@@ -157,7 +159,7 @@ def follow(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: floa
     bow = bow_of(rows, room)
     while True:
         propose(model, room)
-        if watch(bow, room, nearest, every) < fewest:
+        if stop_hopeless(bow, room, nearest, every) < fewest:
             return
         evaluate(model, rows, room, 1)
         going = decide(room, tolerance)
@@ -176,7 +178,7 @@ def _note_nearest(rows: Any, room: EngineWorkspace, nearest: Array, every: bool)
 
 
 @compiled
-def watch(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> float:
+def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> float:
     """Give up refinements that lead to no rival, and return how many lanes are alive.
 
     Two reasons end one. Within a ball of radius D about it no position costs as little as a rival. Over a step of
@@ -224,7 +226,7 @@ def watch(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> flo
 
 
 @compiled
-def confirm(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
+def confirm_rivals(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
     """Leave good only the lanes that arrived at a rival, and return how many did.
 
     Where a damped refinement ends is no minimum yet: the undamped step must be short there, too, and the curvature of
@@ -248,7 +250,7 @@ def confirm(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
         scalar[GOOD, lane] = scalar[GOOD, lane] if spare[lane] >= SAME else 0.0
     _require_rest(model, room)
     bend(rows, room)
-    admit(model, room, scalar[GOOD])
+    check_constraints(model, room, scalar[GOOD])
     _require_positive(vector, matrix, scalar[GOOD], matrix[H_TRIAL])
     found = 0.0
     for lane in range(LANES):
@@ -266,7 +268,7 @@ def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
         for lane in range(LANES):
             move[i, lane] = vector[G, i, lane]
     solve_plain(matrix[LOWER], vector[INVERSE], move)
-    hold(model, room)
+    project_step(model, room)
     for lane in range(LANES):
         length[lane] = 0.0
     for i in range(d):

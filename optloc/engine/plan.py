@@ -14,7 +14,7 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.frames import Frame
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array, Band
 from optloc.engine.admission import admission_of, levels_of
 from optloc.engine.draw import draw_ranges, draw_tapes
@@ -26,7 +26,7 @@ from optloc.engine.memory import (
     EngineModel,
 )
 from optloc.engine.tapes import TapeRows
-from optloc.kernels.jit import enabled, ready, usable
+from optloc.kernels.jit import enabled, is_in_use, may_use_code
 from optloc.linear.constraints import exact, face_names, is_exact
 from optloc.linear.normal import depends_on_place
 from optloc.linear.redundancy import degrees_of_freedom
@@ -113,12 +113,12 @@ class Plan:
             Whether such a call comes again and again, and is worth loading what serves it best.
         """
         few, many, most = _BY_RANGES if self.ranged else _BY_TAPES
-        narrow = count <= most and (ready(few) or ((often or not ready(many)) and usable(few, count)))
+        narrow = count <= most and (is_in_use(few) or ((often or not is_in_use(many)) and may_use_code(few, count)))
         return few if narrow else many
 
     def at_hand(self, count: int) -> bool:
         """Return whether a number of problems may be run: machine code exists, or they may wait for it."""
-        return usable(self.kernel(count, often=True), count)
+        return may_use_code(self.kernel(count, often=True), count)
 
     def run(self, load: Load, z: Array, threads: int | None = None, start: Array | None = None) -> tuple[Answer, int]:
         """Return the answers to N problems, and the greatest number of steps.
@@ -147,7 +147,7 @@ class Plan:
             own, some = load.take(part), Answer(*(array[part] for array in answer))
             return int(kernel(own.model, own.rows, _owned(z[part]), _owned(own.place), TOLERANCE, LIMIT, given, some))
 
-        return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
+        return answer, max(map_on_threads(work, range(0, count, _CHUNK), threads), default=0)
 
 
 class Load(NamedTuple):

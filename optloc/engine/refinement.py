@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.linalg import PIVOT
-from optloc.engine.admission import coarsen, evaluate, hold, restore
+from optloc.engine.admission import coarsen, evaluate, project_step, restore
 from optloc.engine.memory import (
     ALIVE,
     BLUR,
@@ -98,7 +98,7 @@ def propose(model: EngineModel, room: EngineWorkspace) -> None:
             move[i, lane] = right[i, lane]
     factor_plain(information, diagonal, matrix[LOWER], inverse)
     solve_plain(matrix[LOWER], inverse, move)
-    hold(model, room)
+    project_step(model, room)
     x, trial = vector[X], vector[TRIAL]
     for i in range(d):
         for lane in range(LANES):

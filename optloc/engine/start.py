@@ -41,7 +41,7 @@ def begin(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
     if model.start != BY_SQUARES:
         scout(model, rows, room)
         return
-    square(
+    square_ranges(
         room.value[:s],
         model.station,
         model.reference,
@@ -53,7 +53,7 @@ def begin(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
     )
     # near to maximum likelihood, and no guess
     for turn in range(2):
-        weigh(room.squared, room.place, room.y, scalar[SCALE], model.white, turn == 0, room.rows, scalar[SPARE])
+        weigh_rows(room.squared, room.place, room.y, scalar[SCALE], model.white, turn == 0, room.rows, scalar[SPARE])
         minimise_start(model, rows, room, turn == 0)
         meet(room.rows, model.reference >= 0, room.y, room.second, scalar[SOLVABLE], scalar[SECOND], room.work)
         _accept(room.y, scalar[SOLVABLE], scalar[GOOD], scalar[SCALE], room.vector[X])
@@ -65,7 +65,7 @@ def begin(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
 
 
 @compiled
-def read(
+def load_measurements(
     z: Array, item: Array, row: Array, anchor: Array, linear: Array, out: Array, value: Array, blur: Array, good: Array
 ) -> None:
     """Take the measurements of a block of problems, and everything that is linear in them.
@@ -124,7 +124,7 @@ def read(
 
 
 @compiled
-def stand(
+def load_stations(
     station: Array, item: Array, reference: int, place: Array, origin: Array, centre: Array, spread: Array, spare: Array
 ) -> None:
     """Take the stations of a block of problems.
@@ -174,7 +174,7 @@ def stand(
 
 
 @compiled
-def square(
+def square_ranges(
     c: Array,
     station: Array,
     reference: int,
@@ -235,7 +235,7 @@ def square(
 
 
 @compiled
-def weigh(
+def weigh_rows(
     rows: Array, place: Array, y: Array, scale: Array, white: Array, equal: bool, out: Array, spare: Array
 ) -> None:
     """Divide squared-range rows by twice the ranges, so that their errors become range errors, and whiten them.

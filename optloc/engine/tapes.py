@@ -33,9 +33,17 @@ from optloc.engine.memory import (
     X,
 )
 from optloc.engine.start import NEAR
+from optloc.kernels.batched_rows import (
+    LaneCells,
+    cell_layout,
+    load as load_lane,
+    memory,
+    rounding_of_residuals,
+    write_cost,
+    write_equations,
+)
 from optloc.kernels.gtrs import minimise
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import LaneCells, arrange, blur_of, gather, load as load_lane, memory, price
 from optloc.kernels.pack import Numbers
 from optloc.kernels.polynomial import DEGREE
 from optloc.kernels.systems import LANES, eliminate_last, factor_plain, solve_plain
@@ -111,7 +119,7 @@ def count_lifted(rows: TapeRows) -> int:
 @compiled
 def keep(model: EngineModel, rows: TapeRows, stations: int, d: int, size: int) -> TapeBlock:
     """Return the rows with the memory for a block of problems."""
-    at = arrange(rows.tables, rows.numbers, size)
+    at = cell_layout(rows.tables, rows.numbers, size)
     m, r = memory(rows.tables, at, LANES)
     if rows.lifts.tapes.registers > len(r):
         r = np.empty((rows.lifts.tapes.registers, r.shape[1]))
@@ -128,7 +136,7 @@ def load(block: TapeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
         load_lane(m, lane, i, c.source, c.white, c.prior, c.observed, c.present)
         for j in range(z.shape[1]):
             m[at.observed + j, lane] = z[i, j] - block.rows.correction[j]
-        room.scalar[BLUR, lane] = blur_of(c.sigma, c.size, m, at, lane, i)
+        room.scalar[BLUR, lane] = rounding_of_residuals(c.sigma, c.size, m, at, lane, i)
 
 
 @compiled
@@ -295,7 +303,7 @@ def equations(block: TapeBlock, room: EngineWorkspace, shift: int) -> None:
 def _evaluate(block: TapeBlock, room: EngineWorkspace, shift: int) -> Any:
     """Write the equations at row X, or at TRIAL with shift 1, into the memory of the lanes, which is returned."""
     m = _enter_place(block, room, shift)
-    gather(block.rows.tables, block.rows.numbers, m, block.r, block.at, True, LANES)
+    write_equations(block.rows.tables, block.rows.numbers, m, block.r, block.at, True, LANES)
     return m
 
 
@@ -315,7 +323,7 @@ def costs(block: TapeBlock, room: EngineWorkspace) -> None:
     p, d, at = room.vector.shape[1], room.d, block.at.after
     if p == d:
         m = _enter_place(block, room, 1)
-        price(block.rows.tables, block.rows.numbers, m, block.r, block.at, LANES)
+        write_cost(block.rows.tables, block.rows.numbers, m, block.r, block.at, LANES)
     else:
         m = _evaluate(block, room, 1)
     for lane in range(LANES):

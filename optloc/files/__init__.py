@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         claim as claim,
         is_stream as is_stream,
         make_folder as make_folder,
-        together as together,
+        replace_together as replace_together,
         visible as visible,
         write_text as write_text,
         written as written,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         load as load,
         read as read,
     )
-    from optloc.files.roles import worded as worded
+    from optloc.files.roles import with_standard_columns as with_standard_columns
     from optloc.files.schema import (
         DataTable as DataTable,
         FrameTable as FrameTable,
@@ -53,13 +53,13 @@ if TYPE_CHECKING:
         SpeedTable as SpeedTable,
         StationsTable as StationsTable,
         Units as Units,
-        conform as conform,
         join as join,
         kind_model as kind_model,
         name_of as name_of,
         parse_toml as parse_toml,
         read_document as read_document,
         validate as validate,
+        validated as validated,
     )
     from optloc.files.stations import survey as survey
     from optloc.files.table import Table as Table, of_rows as of_rows, table_of as table_of

@@ -186,7 +186,7 @@ def check_unit(role: str, column: str) -> None:
 
 def sigma_kind(column: str) -> str | None:
     """Return the kind whose standard deviation a column holds, such as "range" of "range_std_m"; None for others."""
-    words = tokens(bare(column))
+    words = tokens(without_unit(column))
     rest = [word for word in words if word not in _SIGMA.split()]
     if len(rest) == len(words) or not rest:
         return None
@@ -203,7 +203,7 @@ def is_sigma(word: str) -> bool:
 
 def stem(column: str) -> str:
     """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
-    return re.sub(r"[^a-z0-9]", "", bare(_PREFIX.sub("", column.strip())).lower())
+    return re.sub(r"[^a-z0-9]", "", without_unit(_PREFIX.sub("", column.strip())).lower())
 
 
 def tokens(text: str) -> tuple[str, ...]:
@@ -211,7 +211,7 @@ def tokens(text: str) -> tuple[str, ...]:
     return tuple(re.findall(r"[^\W\d_]+|\d+", text.lower()))
 
 
-def bare(column: str) -> str:
+def without_unit(column: str) -> str:
     """Return a column's name without its unit."""
     return _SUFFIX.sub("", column.strip())
 

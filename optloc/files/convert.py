@@ -16,15 +16,19 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import claim
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.cells import Decimals
+from optloc.files.cell_text import Decimals
 from optloc.files.columns import PLACE, role_named, role_of
+from optloc.files.csv_formats import read_table
 from optloc.files.declination import declination_of
-from optloc.files.foreign import read_table
 from optloc.files.headings import stations_turned
 from optloc.files.measurements import ESTIMATE
 from optloc.files.pseudoranges import is_gnss
-from optloc.files.reading_report import about, check_receivers, left_over, uses_of
-from optloc.files.readings import (
+from optloc.files.reading_report import check_receivers, reading_lines, unused_columns, uses_of
+from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
+from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
+from optloc.files.schema import Units
+from optloc.files.shapes import epochs_of, read_inline, read_long, read_wide
+from optloc.files.table_import import (
     CONVENTIONS,
     ColumnHints,
     Named,
@@ -35,12 +39,8 @@ from optloc.files.readings import (
     sigmas_by_kind,
     sort_named,
     sorts_of,
-    without,
+    without_ignored_columns,
 )
-from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
-from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
-from optloc.files.schema import Units
-from optloc.files.shapes import epochs_of, inline, long, wide
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
 from optloc.files.words import equal_rows
 from optloc.files.writer import write_csv
@@ -98,7 +98,7 @@ def convert(
         return _write_stations(source, out, told.columns, told.frame)
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the problem file must end in .toml", str(out), "let the name behind --out end in it")
-    table_problem = understood(source, told)
+    table_problem = interpret_table(source, told)
     tell(table_problem)
     claim(*table_problem.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
     # Read before it is there: what cannot be read is not written.
@@ -132,7 +132,7 @@ def _sort(word: str) -> str:
     return "arrivals" if kind == "toa" else kind
 
 
-def understood(source: Path, told: ColumnHints) -> TableProblem:
+def interpret_table(source: Path, told: ColumnHints) -> TableProblem:
     """Return what a table of readings or pseudoranges is, with what it does not say itself.
 
     Raises
@@ -152,7 +152,7 @@ def understood(source: Path, told: ColumnHints) -> TableProblem:
 
 def _of_table(source: Path, told: ColumnHints) -> TableProblem:
     """Return what a table is."""
-    table = without(read_table(source), told.ignore)
+    table = without_ignored_columns(read_table(source), told.ignore)
     own = {role: name for role, name in told.columns.items() if told.stations is None or role not in PLACE}
     roles = Roles.of(table, own)
     satellites = all(roles.find(role) for role in ("toa", "satellite", "x"))
@@ -166,7 +166,7 @@ def _of_table(source: Path, told: ColumnHints) -> TableProblem:
         chosen = [one for one in named if _may_be(one, told)]
         if len(chosen) > 1 and not _is_long(roles, told, place):
             roles = Roles.of(table, own, [one.column for one in chosen]).without_stations()
-            return _plan(roles, told, place, source, wide(roles, told, chosen, place), named)
+            return _plan(roles, told, place, source, read_wide(roles, told, chosen, place), named)
     roles = as_angles(roles, told)
     sorts, heard = sorts_of(roles, told), None
     if not sorts:
@@ -175,9 +175,11 @@ def _of_table(source: Path, told: ColumnHints) -> TableProblem:
         if roles.find("lat") is None and roles.find("x") is None:
             advice = "name a table or GeoJSON file with --stations"
             raise InvalidProblem("nothing is known of where the stations are", "--stations", advice)
-        place, heard = inline(roles, told)
+        place, heard = read_inline(roles, told)
     forms = [sort_named(name) for name in sorts]
-    return _plan(roles, told, place, source, [long(roles, form, told, place, heard, forms) for form in forms], named)
+    return _plan(
+        roles, told, place, source, [read_long(roles, form, told, place, heard, forms) for form in forms], named
+    )
 
 
 def _of_receivers(roles: Roles, place: ColumnPlaces) -> list[Named]:
@@ -243,7 +245,7 @@ def _plan(
     sigmas = _sigmas(told, found)
     uses = uses_of(roles, told, found, epochs, sigmas)
     check_receivers(roles.table, uses, named, place.names)
-    rest = left_over(roles, uses, named)
+    rest = unused_columns(roles, uses, named)
     parts = zip(found, sigmas, strict=True)
     sections = tuple(_with_declination(_section(one, epochs, sigma), one, told) for one, sigma in parts)
     notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
@@ -259,7 +261,7 @@ def _plan(
         after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
     height, note = _height(found, place)
     notes += [*_few(sections, told), *([note] if note else [])]
-    read = [*about(roles, told, place, found, epochs, uses), *([("not used", ", ".join(rest))] if rest else [])]
+    read = [*reading_lines(roles, told, place, found, epochs, uses), *([("not used", ", ".join(rest))] if rest else [])]
     return TableProblem(source, sections, place, tuple(read), tuple(notes), lines, after, height, uses)
 
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.units import UNITS
-from optloc.files.cells import Decimals, numbers
+from optloc.files.cell_text import Decimals, numbers
 from optloc.files.columns import stem, unit_of
-from optloc.files.readings import BOW, COMPASS, ColumnHints, Readings, in_unit, marks_of
 from optloc.files.roles import ColumnPlaces, Roles
+from optloc.files.table_import import BOW, COMPASS, ColumnHints, Readings, in_unit, marks_of
 
 # A turn in each unit, and the radians of one: an angle without unit that is larger is in degrees.
 _TURNS = {"deg": Decimal(360)}

@@ -326,7 +326,7 @@ def with_declination(chunk: RowChunk, epoch: Array, stations: Stations, frame: F
     return replace(chunk, correction=chunk.correction + east, declination=east[used])
 
 
-def declination_told(chunks: Sequence[RowChunk]) -> str:
+def declination_text(chunks: Sequence[RowChunk]) -> str:
     """Return the declination that the date of a file stands for, in words; empty where no date gives one."""
     found = [chunk.declination for chunk in chunks if chunk.declination is not None and len(chunk.declination)]
     if not found:

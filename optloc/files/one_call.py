@@ -21,10 +21,10 @@ from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Qua
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
 from optloc.files.declination import declination_of, declinations
 from optloc.files.propagation import is_time
-from optloc.files.readings import CARTESIAN, COMPASS
-from optloc.files.roles import worded
+from optloc.files.roles import with_standard_columns
 from optloc.files.schema import FrameTable, StationsTable, Units
 from optloc.files.stations import station_table, survey
+from optloc.files.table_import import CARTESIAN, COMPASS
 from optloc.linear import constraints
 from optloc.models import MODELS
 from optloc.models.medium import Medium
@@ -333,7 +333,7 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     if frame not in ("cartesian", "ecef"):
         raise InvalidProblem(f"there is no frame {frame!r}", "frame", 'use "cartesian" or "ecef", or latlon=')
     where, axes = ("stations", "xyz") if latlon is None else ("latlon", ("lat_deg", "lon_deg", "height"))
-    table = worded(station_table(stations if latlon is None else latlon, where, axes), "m")
+    table = with_standard_columns(station_table(stations if latlon is None else latlon, where, axes), "m")
     globe = table.has("lat_deg") or table.has("lon_deg")
     if latlon is not None and not globe:
         raise InvalidProblem("there are no latitudes", "latlon", "call the columns lat and lon, or use stations=")

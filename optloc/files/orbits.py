@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.inputs import Budget, access, at_most, has_controls, json_of, read_text
+from optloc.base.inputs import Budget, access, check_budget, has_controls, json_of, read_text
 from optloc.base.types import Array, Stations
 from optloc.files.table import csv, of_frame
 
@@ -118,7 +118,7 @@ def satellites(
         orbits = read_orbits(Path(path))
         seconds = of_frame({"time": np.ravel(times)}, "times", {}).times("time", 1.0)
         chosen = tuple(orbits.courses if names is None else names)
-        at_most("cells", 6 * len(chosen) * len(seconds), "times")
+        check_budget("cells", 6 * len(chosen) * len(seconds), "times")
         places = [orbits.at(name, seconds) for name in chosen]
     position, velocity = (np.stack(parts, axis=1) for parts in zip(*places, strict=True))
     return Stations(position, chosen, velocity)
@@ -288,7 +288,7 @@ def _from_lines(name: str, one: str, two: str, where: str) -> Any:
 def _json_sets(text: str, source: str) -> list[_Set]:
     data = json_of(text, source)
     messages = data if isinstance(data, list) else [data]
-    at_most("rows", len(messages), source)
+    check_budget("rows", len(messages), source)
     for i, fields in enumerate(messages, 1):
         if not isinstance(fields, dict):
             what = "this is no orbit mean-elements message"

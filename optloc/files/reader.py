@@ -13,20 +13,20 @@ from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
-from optloc.base.inputs import Budget, access, at_most
+from optloc.base.inputs import Budget, access, check_budget
 from optloc.base.types import Array, Bias, Rows, Stations
 from optloc.files.measurements import (
     ESTIMATE,
     RowChunk,
     check_repeats,
     chunks_of,
-    declination_told,
+    declination_text,
     square,
     with_baseline,
     with_declination,
 )
 from optloc.files.propagation import medium_in, speed_bias, speed_of
-from optloc.files.roles import ASSUMED, azimuths_of, in_our_words
+from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
 from optloc.files.schema import (
     ConstraintTable,
     ProblemFile,
@@ -50,7 +50,7 @@ from optloc.files.unknowns import (
 )
 from optloc.models import MODELS
 from optloc.models.medium import Medium
-from optloc.problem.noise import Block, Noise, arrivals, group, together
+from optloc.problem.noise import Block, Noise, arrivals, group, group_members
 from optloc.problem.problem import Problem
 from optloc.problem.signal import Signal
 from optloc.problem.validation import checked
@@ -223,7 +223,7 @@ def assemble(
         As `read`.
     """
     stated = file
-    file, station_table, tables = in_our_words(file, station_table, tables, source)
+    file, station_table, tables = with_standard_names(file, station_table, tables, source)
     azimuths = azimuths_of(stated, file)
     if ASSUMED in azimuths:
         LOG.warning("%s: azimuths are counted by %s", source, azimuths)
@@ -246,7 +246,7 @@ def assemble(
     chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
     if azimuths:
-        azimuths += declination_told(chunks)
+        azimuths += declination_text(chunks)
     rows, numbers = _rows(chunks, index, target)
     noise = _noise(file, chunks, numbers, index, target, source)
     written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
@@ -285,7 +285,7 @@ def _problem(
     demands |= more
     constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
-    at_most("unknowns", made.layout.n_shared, source)
+    check_budget("unknowns", made.layout.n_shared, source)
     return _check(made, source, medium_in(file, source))
 
 
@@ -397,10 +397,10 @@ def noise_of(
             blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
         elif chunk.arrival is not None:
             # Arrivals are common to the rows of one epoch and one target: another pulse has other errors.
-            members = together(epoch * (target.max(initial=0) + 1) + target)
+            members = group_members(epoch * (target.max(initial=0) + 1) + target)
             blocks += [Block(number[m], _arrivals(chunk, m)) for m in members]
         elif chunk.signal is not None:
-            members = together(epoch * (target.max(initial=0) + 1) + target)
+            members = group_members(epoch * (target.max(initial=0) + 1) + target)
             blocks += [Block(number[m], _by_signal(chunk, chunk.signal, m)) for m in members]
         elif chunk.covariance is not None:
             blocks.append(_per_epoch_block(chunk, number, epoch, chunk.covariance))
@@ -451,7 +451,7 @@ def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: s
     first : int
         Row that the first stands in.
     """
-    groups = together(epoch)
+    groups = group_members(epoch)
     # One matrix for every epoch: absent rows keep their place with weight 0.
     wrong = [g for g in groups if g.shape[1] != len(matrix)]
     if wrong:

@@ -12,8 +12,10 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.columns import any_unit, bare, is_sigma, role_of, tokens
-from optloc.files.readings import (
+from optloc.files.columns import any_unit, is_sigma, role_of, tokens, without_unit
+from optloc.files.roles import ColumnPlaces, Roles, check_column_hints, place_roles
+from optloc.files.table import Table
+from optloc.files.table_import import (
     CARTESIAN,
     COMPASS,
     COUNTER,
@@ -24,8 +26,6 @@ from optloc.files.readings import (
     sort_named,
     unused_measurement,
 )
-from optloc.files.roles import ColumnPlaces, Roles, check_told, place_roles
-from optloc.files.table import Table
 from optloc.files.words import numbered
 
 # Names of columns that one line repeats of a list.
@@ -87,7 +87,7 @@ def uses_of(
     return out
 
 
-def left_over(
+def unused_columns(
     roles: Roles, uses: Mapping[str, str], named: Sequence[Named] = (), *, lengths: bool = False
 ) -> list[str]:
     """Return the columns that are not used; refuse those that could be measurements, and roles that are not used.
@@ -108,7 +108,7 @@ def left_over(
     InvalidProblem
         Naming the column, and the option that leaves it out.
     """
-    check_told(roles, {role for role, name in roles.by_role.items() if set(name.split("+")) <= set(uses)})
+    check_column_hints(roles, {role for role, name in roles.by_role.items() if set(name.split("+")) <= set(uses)})
     columns = [*roles.table.columns, *roles.table.others]
     rest = [name for name in columns if name not in uses]
     forms = {one.column: one.form for one in named if one.form is not None and not one.sigma}
@@ -121,7 +121,7 @@ def left_over(
     return rest
 
 
-def about(
+def reading_lines(
     roles: Roles,
     told: ColumnHints,
     place: ColumnPlaces,
@@ -142,7 +142,7 @@ def about(
         out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {text}"))
         if one.b is not None and one.form.kind != "range_sum":
             sign = "above 1" if one.form.quantity == "ratio" and one.unit == "1" else "positive"
-            out.append(("sign", f"{sign} where the {farther(one)} is farther"))
+            out.append(("sign", f"{sign} where the {farther_station(one)} is farther"))
     errors = {name: role.removeprefix("sigma_") for name, role in uses.items() if role.startswith("sigma_")}
     out += [("sigma", f"of {kind}, from column {name}") for name, kind in errors.items()]
     if "epoch" in epochs:
@@ -162,7 +162,7 @@ def about(
     return out
 
 
-def farther(found: Readings) -> str:
+def farther_station(found: Readings) -> str:
     """Return which station is farther where a difference is positive, "first" or "second"."""
     # The level at the nearer station is higher, so a positive difference of levels has the farther station second.
     turned = (found.positive == "b-farther") != (found.form.quantity == "level")
@@ -216,7 +216,7 @@ def check_receivers(table: Table, uses: Mapping[str, str], named: Sequence[Named
     patterns = dict.fromkeys(_pattern(one) for one in used)
     others = {one.column for one in named} | {*uses}
     for column in table.columns:
-        if column in others or any(map(is_sigma, tokens(bare(column)))):
+        if column in others or any(map(is_sigma, tokens(without_unit(column)))):
             continue
         name = next((found for each in patterns if (found := _name_in(column, each, stations))), None)
         if name is not None and _holds_numbers(table, column):
@@ -225,7 +225,7 @@ def check_receivers(table: Table, uses: Mapping[str, str], named: Sequence[Named
 
 
 def _pattern(one: Named) -> _Pattern:
-    words, ends = tokens(bare(one.column)), [tokens(end) for end in one.ends]
+    words, ends = tokens(without_unit(one.column)), [tokens(end) for end in one.ends]
     places = [_find(words, end) for end in (ends[0], ends[-1])]
     first, last = min(places), max(place + len(end) for place, end in zip(places, (ends[0], ends[-1]), strict=True))
     return _Pattern(words[:first], words[last:], len(ends), any_unit(one.column))
@@ -238,7 +238,7 @@ def _find(words: Sequence[str], part: Sequence[str]) -> int:
 
 def _name_in(column: str, pattern: _Pattern, stations: Sequence[str]) -> str | None:
     """Return what stands in the place of a station in the name of a column; None where it is named otherwise."""
-    text = bare(column)
+    text = without_unit(column)
     words, around = tokens(text), len(pattern.before) + len(pattern.behind)
     inner = range(len(pattern.before), len(words) - len(pattern.behind))
     if len(words) <= around or words[: inner.start] != pattern.before or words[inner.stop :] != pattern.behind:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import at_most, read_bytes
+from optloc.base.inputs import check_budget, read_bytes
 from optloc.base.types import Array
 from optloc.files.broadcast import Ephemeris
 
@@ -165,7 +165,7 @@ def read_observations(path: Path, system: str) -> Observations:
         raise InvalidProblem(what, file.source, "name another system with --system, or another file")
     old = file.version < 3.0  # the number of a version
     records = list(_records_of_2(file, len(types)) if old else _records_of_3(file))
-    at_most("rows", len(records), file.source)
+    check_budget("rows", len(records), file.source)
     time, satellite, z, others = [], [], [], 0
     for i, seconds, name, text in records:
         start = _FIELD * types.index(code)

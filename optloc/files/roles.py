@@ -15,7 +15,7 @@ from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
 from optloc.files.columns import any_unit, check_unit, rank, role_named, role_of, stem, unit_of
-from optloc.files.foreign import read_table, records
+from optloc.files.csv_formats import read_table, records
 from optloc.files.schema import MeasurementsTable, ProblemFile, join
 from optloc.files.table import Table
 from optloc.files.words import Words, equal_rows, numbered, objects
@@ -164,7 +164,7 @@ def _epoch_role(name: str) -> str:
 # Other words for kinds and columns of problem files, and what is left to the format.
 
 
-def in_our_words(
+def with_standard_names(
     file: ProblemFile, stations: Table, tables: Sequence[Table], source: str
 ) -> tuple[ProblemFile, Table, list[Table]]:
     """Return a problem file and its tables with kinds and columns by our names, and with nothing left to the format.
@@ -180,7 +180,7 @@ def in_our_words(
     source : str
         Name to call the settings.
     """
-    stations = worded(stations, file.stations.unit)
+    stations = with_standard_columns(stations, file.stations.unit)
     frame = file.frame
     if "kind" not in frame.model_fields_set and (stations.has("lat_deg") or stations.has("lon_deg")):
         frame = frame.model_copy(update={"kind": "enu" if frame.origin or frame.dimension == 2 else "geodetic"})
@@ -197,7 +197,7 @@ def in_our_words(
     return file, stations, [table for _, table in read]
 
 
-def worded(table: Table, unit: str) -> Table:
+def with_standard_columns(table: Table, unit: str) -> Table:
     """Return a table of stations with its columns by our names; coordinates become those of the table's unit."""
     words = {key: WORDS[key] for key in ("name", "lat_deg", "lon_deg", "height")}
     found = {key: name for key, word in words.items() if (name := _column(table, word))}
@@ -357,7 +357,7 @@ def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> ColumnP
         factor = UNITS["angle"][unit_of(column, UNITS["angle"]) or "deg"] / UNITS["angle"]["deg"]
         headings = {"heading_deg": factor * roles.table.numbers(column, optional=True)}
         found = replace(found, columns={**found.columns, **headings})
-    check_told(roles, ("name", "heading", *place_roles(roles)))
+    check_column_hints(roles, ("name", "heading", *place_roles(roles)))
     return found
 
 
@@ -367,7 +367,7 @@ def place_roles(roles: Roles) -> tuple[str, ...]:
     return (*across, *[role for role in ups if roles.find(role) is not None][:1])
 
 
-def check_told(roles: Roles, used: Collection[str]) -> None:
+def check_column_hints(roles: Roles, used: Collection[str]) -> None:
     """Raise InvalidProblem where the user names a role that a table of this form does not use."""
     for role in sorted(roles.told - set(used)):
         what = f"the role {role} of the column {roles.by_role[role]!r} is not used in {roles.table.source}"

@@ -9,19 +9,19 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import ECEF
-from optloc.base.inputs import at_most
+from optloc.base.inputs import check_budget
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.cells import moments
+from optloc.files.cell_text import column_times
 from optloc.files.columns import PLACE, unit_of
-from optloc.files.foreign import read_table
+from optloc.files.csv_formats import read_table
 from optloc.files.orbits import read_orbits
 from optloc.files.pseudoranges import at_reception, received
-from optloc.files.reading_report import left_over
-from optloc.files.readings import ColumnHints, sort_named
-from optloc.files.roles import ColumnPlaces, Roles, check_told, places_of, scaled
+from optloc.files.reading_report import unused_columns
+from optloc.files.roles import ColumnPlaces, Roles, check_column_hints, places_of, scaled
 from optloc.files.schema import Units
 from optloc.files.shapes import sigma_column, sigma_of
+from optloc.files.table_import import ColumnHints, sort_named
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
 from optloc.files.words import distinct
 from optloc.files.writer import write_csv
@@ -55,14 +55,14 @@ def pseudoranges(source: Path, roles: Roles, told: ColumnHints) -> TableProblem:
     columns = {"epoch": epoch, "a": satellite, "z": z}
     when = roles.find("time")
     if when is not None:
-        seconds = moments(roles, when, told.zone, told.time_unit)
+        seconds = column_times(roles, when, told.zone, told.time_unit)
         columns["time"] = roles.numbers("time") if seconds is None else seconds
     uses = {roles.column(role): role for role in ("satellite", "toa", *"xyz")}
     uses |= dict.fromkeys(roles.column(by).split("+"), by) | ({} if when is None else {when: "time"})
     if own is not None:
         columns["sigma"] = sigma_of(roles.table, own, form, unit, np.arange(len(z)))
         uses[own] = "sigma_toa"
-    rest = left_over(roles, uses, (), lengths=True)
+    rest = unused_columns(roles, uses, (), lengths=True)
     satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
     section = Section("toa", columns, unit, told.sigma, "the range and the receiver's clock")
     when_ = "reception" if told.turned else "transmission"
@@ -125,11 +125,11 @@ def write_satellites(
         raise InvalidProblem(what, str(out), "let the name behind --out end in .csv")
     own = {role: name for role, name in told.items() if stations is None or role not in PLACE}
     orbits, roles = read_orbits(source), Roles.of(read_table(times), own)
-    check_told(roles, ("time", "satellite"))
+    check_column_hints(roles, ("time", "satellite"))
     written, seconds = roles.table.raw(roles.column("time")), roles.table.times(roles.column("time"), 1.0)
     whose = roles.labels("satellite") if roles.find("satellite") is not None else None
     wanted = distinct(whose)[0] if whose is not None else list(orbits.courses)
-    at_most("cells", 7 * len(wanted) * len(seconds), roles.table.source)
+    check_budget("cells", 7 * len(wanted) * len(seconds), roles.table.source)
     parts: list[tuple[Array, ...]] = []
     for name in wanted:
         rows = np.arange(len(seconds)) if whose is None else np.flatnonzero(whose == name)

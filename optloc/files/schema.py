@@ -472,10 +472,10 @@ def parse_toml(text: str, source: str, formats: tuple[int, ...] = (1,)) -> dict[
 
 def validate(data: dict[str, Any], source: str) -> ProblemFile:
     """Return data as a problem file; `source` is the place to name."""
-    return conform(ProblemFile, data, source)
+    return validated(ProblemFile, data, source)
 
 
-def conform(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
+def validated(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
     """Return data as a table of a schema; raise InvalidProblem with the first complaint.
 
     Parameters

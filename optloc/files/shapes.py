@@ -12,10 +12,13 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
-from optloc.files.cells import Decimals, NumberColumn, instants, is_dated, moments, numbers
+from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_seconds, is_dated, numbers
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
-from optloc.files.readings import (
+from optloc.files.roles import ColumnPlaces, Roles, placed
+from optloc.files.schema import Units
+from optloc.files.table import Table
+from optloc.files.table_import import (
     CARTESIAN,
     COMPASS,
     ColumnHints,
@@ -23,15 +26,12 @@ from optloc.files.readings import (
     Named,
     Readings,
     in_unit,
-    sigma_told,
     sort_named,
+    stated_sigma,
     unit_for,
     without_gaps,
     without_repeats,
 )
-from optloc.files.roles import ColumnPlaces, Roles, placed
-from optloc.files.schema import Units
-from optloc.files.table import Table
 from optloc.files.words import equal_rows, numbered
 from optloc.models import BEARING
 
@@ -42,7 +42,7 @@ _SHOWN = 4
 # A column for each receiver, or for each pair.
 
 
-def wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
+def read_wide(roles: Roles, told: ColumnHints, columns: Sequence[Named], place: ColumnPlaces) -> list[Readings]:
     """Return the readings of a table that has a column for each receiver, one set for each sort."""
     sorts: dict[str, list[Named]] = {}
     for one in columns:
@@ -77,7 +77,7 @@ def _wide_sort(
     first, empty = "", 0
     for one in columns:
         dated = form.quantity == "length" and is_dated(table, one.column)
-        held = instants(table, one.column, told.zone) if dated else numbers(table, one.column)
+        held = date_seconds(table, one.column, told.zone) if dated else numbers(table, one.column)
         unit, note = ("s", "") if dated else unit_for(one.column, form, told, held.values, table.source)
         first = first or unit
         notes += [note] if note else []
@@ -86,7 +86,7 @@ def _wide_sort(
         rows.append(held.row)
         ends.append(_ends(one, form, told, table.source))
         own = next((each.column for each in errors if _is_error_of(each, one, form)), None)
-        own = None if sigma_told(told, form.kind) is not None else own
+        own = None if stated_sigma(told, form.kind) is not None else own
         own = own or sigma_column(roles, form, told, list(forms.values()))
         if own is not None:
             deviations.append(sigma_of(table, own, form, first, held.row))
@@ -144,7 +144,7 @@ def sigma_column(roles: Roles, form: Form, told: ColumnHints, forms: Sequence[Fo
     InvalidProblem
         Where a column may belong to several sorts.
     """
-    if sigma_told(told, form.kind) is not None:
+    if stated_sigma(told, form.kind) is not None:
         return None
     named = roles.by_role.get(f"sigma_{form.kind}")
     named = named or next((name for name in roles.table.columns if sigma_kind(name) == form.kind), None)
@@ -195,7 +195,7 @@ def _ends(one: Named, form: Form, told: ColumnHints, source: str) -> tuple[str, 
 # One reading a row.
 
 
-def inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
+def read_inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
     """Return the stations of a table that says in each row where its station was, and the name of each row's."""
     count = roles.table.count
     role = next((role for role in ("station", "name") if roles.find(role)), None)
@@ -216,7 +216,7 @@ def inline(roles: Roles, told: ColumnHints) -> tuple[ColumnPlaces, Array]:
     return replace(every, columns=columns), np.array(heard, dtype=object)
 
 
-def long(
+def read_long(
     roles: Roles, form: Form, told: ColumnHints, place: ColumnPlaces, heard: Array | None, forms: Sequence[Form]
 ) -> Readings:
     """Return the readings of one sort of a table that has one a row.
@@ -241,7 +241,7 @@ def long(
         return _picks(roles, told, place)
     column = roles.column(form.value)
     dated = form.quantity == "length" and is_dated(table, column)
-    held = instants(table, column, told.zone) if dated else numbers(table, column)
+    held = date_seconds(table, column, told.zone) if dated else numbers(table, column)
     unit, note = ("s", "") if dated else unit_for(column, form, told, held.values, table.source)
     pick = held.row
     if not len(pick):
@@ -279,7 +279,7 @@ def _picks(roles: Roles, told: ColumnHints, place: ColumnPlaces) -> Readings:
     def times(role: str) -> list[Decimal | None]:
         column, unit = roles.column(role), "s"
         dated = is_dated(table, column)
-        held = instants(table, column, zone) if dated else numbers(table, column)
+        held = date_seconds(table, column, zone) if dated else numbers(table, column)
         if not dated:
             unit, _ = unit_for(column, sort_named("sp"), told, held.values, table.source)
         out: list[Decimal | None] = [None] * table.count
@@ -417,7 +417,7 @@ def epochs_of(roles: Roles, told: ColumnHints, found: Sequence[Readings]) -> dic
         raise _no_times()
     if message is not None and told.window is None:
         out["epoch"] = roles.labels("message")
-    time = None if when is None else moments(roles, when, told.zone, told.time_unit)
+    time = None if when is None else column_times(roles, when, told.zone, told.time_unit)
     if time is not None:
         out["time"] = time
     elif when is not None and told.window is not None:

@@ -10,10 +10,10 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, no_station
 from optloc.base.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic
-from optloc.base.inputs import at_most
+from optloc.base.inputs import check_budget
 from optloc.base.types import Array, Stations
 from optloc.files.columns import stem
-from optloc.files.roles import WORDS, worded
+from optloc.files.roles import WORDS, with_standard_columns
 from optloc.files.schema import FrameTable, StationsTable, Units, join
 from optloc.files.table import Epochs, Table, of_frame
 from optloc.files.words import distinct
@@ -135,7 +135,7 @@ def station_table(
 
 def survey(section: StationsTable, table: Table, frame_table: FrameTable, where: str) -> tuple[Survey, Frame]:
     """Return the stations of a table and the frame of the problem."""
-    table = worded(table, section.unit)
+    table = with_standard_columns(table, section.unit)
     labels = table.labels("name")
     found, first, index = distinct(labels)
     order = np.argsort(first)
@@ -284,7 +284,7 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
         Pairs (epoch, station) whose position is needed.
     """
     if found.moving:
-        position, velocity, axes = spread(found, section, epochs, np.concatenate(used))
+        position, velocity, axes = stations_over_epochs(found, section, epochs, np.concatenate(used))
     else:
         order = np.argsort(found.index)
         position = found.position[order][None]
@@ -300,7 +300,7 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
 # Stations that move: their rows are matched to epochs by label, or interpolated in time.
 
 
-def spread(
+def stations_over_epochs(
     found: Survey, section: StationsTable, epochs: Epochs, used: Array
 ) -> tuple[Array, Array | None, Array | None]:
     """Return position (k, s, d), velocity (k, s, d) and axes (k, s, d, d) of stations at the epochs.
@@ -346,7 +346,7 @@ def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
     known, _, place = distinct(labels)
     number = {label: i for i, label in enumerate(known)}
     at = np.array([number.get(label, -1) for label in epochs.labels])
-    at_most("cells", max(len(known), epochs.count) * len(found.names), found.table.source)
+    check_budget("cells", max(len(known), epochs.count) * len(found.names), found.table.source)
     # Row of each label and station; the last line, -1, is that of labels that the table lacks.
     grid = np.full((len(known) + 1, len(found.names)), -1)
     grid[place, found.index] = np.arange(len(labels))
@@ -368,7 +368,7 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
             "the stations move in time, but the measurements are not dated", found.table.source, advice
         )
     # Every station has a place at every epoch, used or not.
-    at_most("cells", k * len(found.names), found.table.source)
+    check_budget("cells", k * len(found.names), found.table.source)
     low = np.full((k, len(found.names)), -1)
     high, share = low.copy(), np.zeros(low.shape)
     order = np.lexsort((times, found.index))

@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.arrays import first_rows
 from optloc.base.errors import InvalidProblem, check_once, nearest
-from optloc.base.inputs import at_most, decoded, has_controls, read_bytes, within
+from optloc.base.inputs import check_budget, decoded, has_controls, read_bytes, within
 from optloc.base.types import Array
 from optloc.base.units import LARGEST
 from optloc.files.schema import DataTable, join
@@ -257,7 +257,7 @@ def csv(path: Path, separator: str | None, names: Mapping[str, str]) -> Table:
     except pa.ArrowInvalid as error:
         decoded(data, path.name)  # what is not UTF-8 is told with its line
         raise _no_csv(str(error), path.name) from None
-    at_most("cells", read.num_rows * len(header), path.name)
+    check_budget("cells", read.num_rows * len(header), path.name)
     columns = {name: _text_column(pa, read.column(name)) for name in header}
     count = read.num_rows
     del read, data
@@ -268,7 +268,7 @@ def csv(path: Path, separator: str | None, names: Mapping[str, str]) -> Table:
 
 def _header(line: str, separator: str, source: str) -> list[str]:
     """Return the names of the columns; pyarrow would go on where one is empty or stands twice."""
-    at_most("columns", line.count(separator) + 1, source)
+    check_budget("columns", line.count(separator) + 1, source)
     try:
         header = [name.strip() for name in next(lines_of([line], delimiter=separator, strict=True), [])]
     except CSVError as error:
@@ -319,11 +319,11 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
 
 def _check_size(about: Any, schema: Any, source: str) -> None:
     """Hold what a Parquet file says of itself against the budget."""
-    at_most("columns", len(schema), source)
-    at_most("rows", about.num_rows, source)
-    at_most("cells", about.num_rows * len(schema), source)
+    check_budget("columns", len(schema), source)
+    check_budget("rows", about.num_rows, source)
+    check_budget("cells", about.num_rows * len(schema), source)
     groups = [about.row_group(i) for i in range(about.num_row_groups)]
-    at_most("bytes", sum(max(group.total_byte_size, 0) for group in groups), source)
+    check_budget("bytes", sum(max(group.total_byte_size, 0) for group in groups), source)
     if sum(group.num_rows for group in groups) != about.num_rows:
         raise InvalidProblem("its parts have other numbers of rows than it says", source, "write it again")
     check_once(schema.names, _TWICE, source)

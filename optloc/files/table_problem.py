@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import together, write_text
+from optloc.base.outputs import replace_together, write_text
 from optloc.base.types import Array
-from optloc.files.cells import Decimals
+from optloc.files.cell_text import Decimals
 from optloc.files.reader import Loaded, assemble
 from optloc.files.roles import ColumnPlaces
 from optloc.files.schema import ConstraintTable, document_of
@@ -99,7 +99,7 @@ class TableProblem:
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file with its tables beside it, and return their paths."""
         tables = self.tables(out)
-        with together():
+        with replace_together():
             for path, columns in zip(tables, (self.places.columns, *(s.columns for s in self.sections)), strict=True):
                 write_csv(path, {name: _written(column) for name, column in columns.items()})
             write_text(out, self.text([path.name for path in tables]))

@@ -25,13 +25,13 @@ from optloc.files.schema import (
     Units,
     join,
 )
-from optloc.files.stations import numbers_of, spread, survey
+from optloc.files.stations import numbers_of, stations_over_epochs, survey
 from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, reported, speed, visible
 from optloc.problem.bias import family
 from optloc.problem.clocks import clock_densities
 from optloc.problem.forms import FORMS, BiasForm, complete, form_of
-from optloc.problem.validation import check_polygon, like
+from optloc.problem.validation import bands_by_quantity, check_polygon
 
 # Derivatives of the position that a motion estimates.
 _ORDERS = {"static": 0, "free": 0, "free_velocity": 1, "constant_velocity": 1, "constant_acceleration": 2}
@@ -130,7 +130,7 @@ def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard
     position, velocity = found.position[:, None], None if found.velocity is None else found.velocity[:, None]
     if dated:
         used = np.stack([heard, np.zeros_like(heard)], axis=-1)
-        position, velocity, _ = spread(found, units, epochs, used)
+        position, velocity, _ = stations_over_epochs(found, units, epochs, used)
     return position if velocity is None else np.concatenate([position, velocity], axis=-2)
 
 
@@ -539,7 +539,7 @@ def _sight(table: ConstraintTable, stations: Stations, frame: Frame, where: str)
 def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
     """Yield the intersection of the bands on each quantity, and every polygon once."""
     # Two bands on one quantity may contradict each other: that is found by the problem's own check, not hidden here.
-    for bands in like(constraints):
+    for bands in bands_by_quantity(constraints):
         lower, upper = np.max([band.lower for band in bands], axis=0), np.min([band.upper for band in bands], axis=0)
         if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
             yield replace(bands[0], lower=lower, upper=upper)

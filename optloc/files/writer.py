@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import read_bytes
-from optloc.base.outputs import GrowingFile, claim, together, write_text, written
+from optloc.base.outputs import GrowingFile, claim, replace_together, write_text, written
 from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
 from optloc.files.table import Table, is_empty
@@ -147,7 +147,7 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
             copies |= _keep(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
     tables = [out.with_name(f"{out.stem}-{i + 1}.csv") for i in range(len(made.tables))]
     claim(out, *copies, *tables, inputs=[source])
-    with together():
+    with replace_together():
         for path, original in copies.items():
             with written(path) as file:
                 file.write_bytes(read_bytes(original))

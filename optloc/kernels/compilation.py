@@ -10,7 +10,7 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-from optloc.kernels.borrowing import borrowing
+from optloc.kernels.no_refcount_pass import borrowing
 
 
 def options(*, callee: bool, taken_in: bool) -> dict[str, Any]:

@@ -7,15 +7,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.threads import mapped, thread_count
+from optloc.base.threads import map_on_threads, thread_count
 from optloc.base.types import Array
+from optloc.kernels.batched_rows import (
+    LaneCells,
+    add_groups,
+    add_priors,
+    blocks,
+    cell_layout,
+    clear,
+    load,
+    memory,
+    write_equations,
+)
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import LaneCells, add_groups, add_priors, arrange, blocks, clear, gather, load, memory
 from optloc.kernels.pack import Numbers, Packed
 from optloc.kernels.tables import Tables
 from optloc.linear.normal import Normal
 
-# Starts that are worth a thread of their own: one block of lanes, see `optloc.kernels.lanes`.
+# Starts that are worth a thread of their own: one block of lanes, see `optloc.kernels.batched_rows`.
 _SHARE = 64
 
 
@@ -63,7 +73,7 @@ def normal_at(packed: Packed, x: Array, item: Array, *, priors: bool = False) ->
         np.empty(count),
     )
     at = np.require(x, np.float64, ["C", "W"])
-    mapped(lambda part: normal_block(packed, at, item, part[0], part[1], priors, sums), chunks(count))
+    map_on_threads(lambda part: normal_block(packed, at, item, part[0], part[1], priors, sums), chunks(count))
     return Normal(*sums)
 
 
@@ -72,7 +82,7 @@ def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, p
     """Write the normal equations at the vectors first <= i < last."""
     t, c = packed
     size = x.shape[1]
-    lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
+    lanes, room = blocks(packed, size, last - first), cell_layout(t, c, size)
     m, r = memory(t, room, lanes)
     width = t.shared + t.local + 1
     for begin in range(first, last, lanes):
@@ -86,7 +96,7 @@ def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, p
         if t.local > 0 and t.epochs > 1:
             _epochs(t, c, m, r, room, begin, used, priors, out.local, out.cross, out.local_vector)
         else:
-            gather(t, c, m, r, room, priors, used)
+            write_equations(t, c, m, r, room, priors, used)
             _own(m, room.after, t.shared, t.local, begin, 0, used, out.local, out.cross, out.local_vector)
         _whole(m, room.after, t.shared, width, begin, used, out.shared, out.shared_vector, out.cost)
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array, Status
+from optloc.kernels.batched_rows import LaneCells, cell_layout, load, memory, write_derivatives
 from optloc.kernels.jit import compiled, put
-from optloc.kernels.lanes import LaneCells, arrange, load, measure, memory
 from optloc.kernels.pack import Numbers
 from optloc.kernels.systems import cholesky, solve_factored, substitute
 from optloc.kernels.tables import FIRST, GROUP_COLUMN, Tables
@@ -186,7 +186,7 @@ def _space(rows: ScanRows, item: int, n: int) -> _Space:
     t, m, none = rows.tables, rows.z.shape[2], np.zeros((1, 0))
     place, observed = np.zeros((0, 4), np.int64), np.zeros((1, m))
     c = Numbers(rows.common, place, rows.source, none, none, observed, none, none, none[0])
-    room = arrange(t, c, n)
+    room = cell_layout(t, c, n)
     cells, r = memory(t, room, 1)
     load(cells, 0, item, rows.source, none, none, observed, none)
     S, A, v = np.zeros((3, n, n)), np.zeros((2, m, n + 1)), np.zeros((5, n))
@@ -310,7 +310,7 @@ def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
     t, n = rows.tables, len(x)
     for i in range(n):
         s.m[s.room.trial + i, 0] = x[i]
-    measure(t, rows.common, s.m, s.r, s.room, 0, s.room.trial, 1)
+    write_derivatives(t, rows.common, s.m, s.r, s.room, 0, s.room.trial, 1)
     begin = t.table[t.group, GROUP_COLUMN]
     columns = t.table[t.group + 1, GROUP_COLUMN] - begin
     for i in range(len(s.used)):

@@ -15,9 +15,9 @@ from typing import Any, TypeAlias, TypeVar, cast
 from optloc.base.errors import InvalidProblem
 from optloc.base.threads import held_by_forks
 from optloc.base.types import Array
+from optloc.kernels.code_cache import code_cache_of, folder, is_cached, locked, name_of, start_background_compiler
 from optloc.kernels.compilation import options
 from optloc.kernels.digests import Compilable, callers, closure
-from optloc.kernels.kept import begin_child, folder, is_kept, kept, locked, name_of
 from optloc.kernels.progress import Reporter
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -100,7 +100,7 @@ class _Kernel(Compilable):
                     if callee:
                         _take_as_variables(made, self.function)
                     # What numba's own option `cache` sets; where nothing can be written, machine code is not kept.
-                    made._cache = kept(self, callee=callee) or made._cache  # noqa: SLF001
+                    made._cache = code_cache_of(self, callee=callee) or made._cache  # noqa: SLF001
                     self._forms[callee] = made
         return made
 
@@ -223,7 +223,7 @@ FEW = 16
 _VARIABLE, _WAYS = "OPTLOC_COMPILE", ("wait", "child", "never")
 
 
-def way() -> str:
+def compile_mode() -> str:
     """Return what OPTLOC_COMPILE says of machine code that has to be made first: wait, child, never, or nothing."""
     given = os.environ.get(_VARIABLE, "").strip()
     if given and given not in _WAYS:
@@ -231,7 +231,7 @@ def way() -> str:
     return given
 
 
-def usable(kernel: Callable[..., Any], count: int) -> bool:
+def may_use_code(kernel: Callable[..., Any], count: int) -> bool:
     """Return whether machine code is the way for a number of problems: it is at hand, or they may wait for it.
 
     Raises
@@ -242,12 +242,12 @@ def usable(kernel: Callable[..., Any], count: int) -> bool:
     assert isinstance(kernel, _Kernel)
     if not enabled():
         return False
-    kernel.seen = kernel.seen or ready(kernel) or is_kept(kernel)  # to look into the folder takes a millisecond
+    kernel.seen = kernel.seen or is_in_use(kernel) or is_cached(kernel)  # to look into the folder takes a millisecond
     if kernel.seen:
         return True
-    chosen = way()
+    chosen = compile_mode()
     if chosen == "child" and count > FEW:
-        begin_child()
+        start_background_compiler()
     return chosen == "wait" or (not chosen and count > FEW)
 
 
@@ -258,21 +258,21 @@ def worth_loading(kernel: Callable[..., Any], count: int) -> bool:
     """
     assert isinstance(kernel, _Kernel)
     kernel.asked += count
-    return ready(kernel) or (kernel.asked > FEW and usable(kernel, count))
+    return is_in_use(kernel) or (kernel.asked > FEW and may_use_code(kernel, count))
 
 
-def ready(kernel: Callable[..., Any]) -> bool:
+def is_in_use(kernel: Callable[..., Any]) -> bool:
     """Return whether machine code of a kernel has been used in this process: the next call need not load it."""
     return bool(getattr(kernel, "ready", False))
 
 
-def insist_on(kernel: Callable[..., Any]) -> None:
+def require_code(kernel: Callable[..., Any]) -> None:
     """Let a kernel count as at hand, so that its next use compiles it where there is no machine code on disk."""
     assert isinstance(kernel, _Kernel)
     kernel.ready = True
 
 
-def at_hand(kernel: Callable[..., Any]) -> bool:
+def is_available(kernel: Callable[..., Any]) -> bool:
     """Return whether machine code of a kernel was used in this process, or was on disk when that was first asked."""
     assert isinstance(kernel, _Kernel)
     return enabled() and (kernel.ready or _was_kept(kernel))
@@ -280,7 +280,7 @@ def at_hand(kernel: Callable[..., Any]) -> bool:
 
 @cache  # to look into the folder takes longer than what it is asked for
 def _was_kept(kernel: _Kernel) -> bool:
-    return is_kept(kernel)
+    return is_cached(kernel)
 
 
 def replace(functions: Mapping[Callable[..., Any], Callable[..., Any]]) -> None:
@@ -334,7 +334,7 @@ def put_rows(values: Array, out: Array) -> None:
 _COPIES: dict[tuple[_Kernel, str], _Kernel] = {}
 
 
-def with_constants(
+def specialise(
     kernel: _Function,
     mark: str,
     replaced: Mapping[Callable[..., Any], Callable[..., Any]] | None = None,

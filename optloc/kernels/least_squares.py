@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array, Status
 from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, StopRules, judge
 from optloc.kernels.pack import PackedRuns, coarseness
@@ -16,9 +16,9 @@ from optloc.kernels.sums import equations_at, packed, serves, sums_at
 from optloc.linear.constraints import Face, is_height
 from optloc.linear.equalities import Equalities
 from optloc.linear.mirror import Folded
-from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
+from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, whitener_at, with_station_noise
 from optloc.models.primitives import WGS84_A
-from optloc.problem.epochs import whole, windows
+from optloc.problem.epochs import is_one_window, windows
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
 
@@ -170,8 +170,8 @@ class _Weights:
     @classmethod
     def of(cls, problem: Problem, start: Array) -> _Weights:
         at = start if depends_on_place(problem) else None
-        one = whole(problem, len(start))
-        return cls(whiten(weighed(problem, at).noise, problem.weight) if one else None, at)
+        one = is_one_window(problem, len(start))
+        return cls(whiten(with_station_noise(problem, at).noise, problem.weight) if one else None, at)
 
     def take(self, items: Array) -> _Weights:
         matrices = None if self.matrices is None else tuple(w.take(items) for w in self.matrices)
@@ -361,7 +361,7 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
         return None
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
     if not depends_on_place(problem):
-        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules)
+        return _at_once(problem, start, own, whiten(with_station_noise(problem).noise, problem.weight), rules)
     width = problem.layout.n_shared + offsets_of(problem)
     # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
@@ -369,7 +369,7 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
     def work(part: Array) -> Refined | None:
         return _anew(problem.take(own[part]), start[part], rules)
 
-    done = mapped(work, parts) if len(parts) > 1 else [work(parts[0])]
+    done = map_on_threads(work, parts) if len(parts) > 1 else [work(parts[0])]
     found = [one for one in done if one is not None]
     return _join(found) if len(found) == len(parts) else None
 

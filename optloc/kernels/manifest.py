@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 """The folder of optloc."""
 
 # How kernels are compiled. Their own code is known by digests of each (`optloc.kernels.digests`).
-COMPILERS = ("kernels/borrowing.py", "kernels/compilation.py")
+COMPILERS = ("kernels/no_refcount_pass.py", "kernels/compilation.py")
 
 PREFIX = "optloc-"
 """How the names of folders of machine code begin."""

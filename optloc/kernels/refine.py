@@ -10,24 +10,24 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.linalg import PIVOT
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array, Status
-from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, StopRules, judge_lane
-from optloc.kernels.equations import chunks, normal_at
-from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import (
+from optloc.kernels.batched_rows import (
     LaneCells,
     add_groups,
     add_priors,
-    arrange,
     blocks,
-    blur_of,
+    cell_layout,
     clear,
-    gather,
     load,
     memory,
-    price,
+    rounding_of_residuals,
+    write_cost,
+    write_equations,
 )
+from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, StopRules, judge_lane
+from optloc.kernels.equations import chunks, normal_at
+from optloc.kernels.jit import compiled
 from optloc.kernels.pack import Numbers, Packed
 from optloc.kernels.systems import backward, complete, eliminate, factor, factor_local, forward, step
 from optloc.kernels.tables import Tables
@@ -59,7 +59,7 @@ _TAGS = 4
 EMPTY = 2
 
 
-def answers(start: Array, kept: int | None = None) -> Answers:
+def new_answers(start: Array, kept: int | None = None) -> Answers:
     """Return room for the answers of starts (M, p), which are copied, and equations of `kept` unknowns (all)."""
     count, size = len(start), start.shape[1] if kept is None else kept
     return Answers(
@@ -96,7 +96,7 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Stop
     """
     t, c = packed
     size, runs = out.x.shape[1], is_run(t)
-    lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
+    lanes, room = blocks(packed, size, last - first), cell_layout(t, c, size)
     m, r = memory(t, room, lanes)
     tag, used, following = np.zeros((_TAGS, lanes), np.int64), lanes, first + lanes
     for b in range(lanes):
@@ -104,9 +104,9 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Stop
     while used > 0:
         begin(c, m, room, tag, used, item, out.x)
         if runs:
-            price(t, c, m, r, room, used)
+            write_cost(t, c, m, r, room, used)
         else:
-            gather(t, c, m, r, room, True, used)
+            write_equations(t, c, m, r, room, True, used)
         _judge(m, room, size, runs, t.shared + t.local + 1, tag, rules, used)
         for b in range(used):
             if is_over(tag, b, rules.limit):
@@ -157,7 +157,7 @@ def begin(c: Numbers, m: Array, room: LaneCells, tag: Array, used: int, item: Ar
             for i in range(x.shape[1]):
                 m[room.trial + i, b] = x[start, i]
             m[room.state + DAMPING, b], m[room.state + GROWTH, b] = FIRST_DAMPING, FIRST_GROWTH
-            m[room.state + BLUR, b] = blur_of(c.sigma, c.size, m, room, b, item[start])
+            m[room.state + BLUR, b] = rounding_of_residuals(c.sigma, c.size, m, room, b, item[start])
 
 
 @compiled
@@ -354,9 +354,9 @@ def refined(packed: Packed, item: Array, start: Array, rules: StopRules) -> tupl
     rules : StopRules
         When to stop.
     """
-    out = answers(start, 0 if is_run(packed.tables) else None)
+    out = new_answers(start, 0 if is_run(packed.tables) else None)
     item = np.ascontiguousarray(item)  # machine code would be made anew for entries that lie apart
-    mapped(lambda part: refine_block(packed, item, part[0], part[1], rules, out), chunks(len(start)))
+    map_on_threads(lambda part: refine_block(packed, item, part[0], part[1], rules, out), chunks(len(start)))
     return out, np.asarray(out.status == LEFT_OPEN)
 
 

@@ -12,14 +12,24 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.linalg import PIVOT
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array, Status
+from optloc.kernels.batched_rows import (
+    LaneCells,
+    add_priors,
+    blocks,
+    cell_layout,
+    clear,
+    load,
+    memory,
+    rounding_of_residuals,
+    write_equations,
+)
 from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH, StopRules, judge_lane
 from optloc.kernels.equations import Sums
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import LaneCells, add_priors, arrange, blocks, blur_of, clear, gather, load, memory
 from optloc.kernels.pack import Packed, PackedRuns
-from optloc.kernels.refine import CLOSED, DAMPING, LIMIT, NUMERICAL, SOLVABLE, Answers, answers
+from optloc.kernels.refine import CLOSED, DAMPING, LIMIT, NUMERICAL, SOLVABLE, Answers, new_answers
 from optloc.kernels.systems import backward, complete, eliminate, factor, factor_local, forward
 from optloc.linear.normal import OPEN, Normal
 
@@ -73,7 +83,7 @@ def _evaluate(
                 m[room.trial + i, b] = x[i]
             for i in range(local):
                 m[room.trial + n + i, b] = x[n + (first + b) * local + i]
-        gather(t, c, m, r, room, False, used)
+        write_equations(t, c, m, r, room, False, used)
         if priors:
             add_priors(t, c, m, room, room.trial, True, 0, used)
         _keep(m, room.after + n * line, last + n, local * line, local, out.own[part], used)
@@ -90,7 +100,7 @@ def _blur(packed: Packed, m: Array, room: LaneCells, item: int, epochs: int) -> 
     c, squares = packed.numbers, 0.0
     for i in range(item * epochs, (item + 1) * epochs):
         load(m, 0, i, c.source, c.white, c.prior, c.observed, c.present)
-        blur = blur_of(c.sigma, c.size, m, room, 0, i)
+        blur = rounding_of_residuals(c.sigma, c.size, m, room, 0, i)
         squares += blur * blur
     return float(np.sqrt(squares))
 
@@ -348,7 +358,7 @@ def refine_runs(
     """
     t, c = packed
     n, local = t.shared, t.local
-    lanes, room = blocks(packed, n + local, epochs), arrange(t, c, n + local)
+    lanes, room = blocks(packed, n + local, epochs), cell_layout(t, c, n + local)
     m, r = memory(t, room, lanes)
     parts = (epochs + lanes - 1) // lanes
     now, after = _share(n, local, parts, lanes), _share(n, local, parts, lanes)
@@ -391,7 +401,7 @@ def sum_runs(
     """Write the normal equations of runs at the vectors first <= i < last, x (M, n + k l)."""
     t, c = packed
     n, local = t.shared, t.local
-    lanes, room = blocks(packed, n + local, epochs), arrange(t, c, n + local)
+    lanes, room = blocks(packed, n + local, epochs), cell_layout(t, c, n + local)
     m, r = memory(t, room, lanes)
     line = n + local + 1
     now = _share(n, local, (epochs + lanes - 1) // lanes, lanes)
@@ -427,7 +437,7 @@ def fixed_runs(
     runs: PackedRuns, item: Array, start: Array, rules: StopRules, size: int | None
 ) -> tuple[Answers, Spread]:
     """Return the ends of refinements and the covariances there, of the first unknowns of an epoch, `size` of them."""
-    n, out, item = runs.packed.tables.shared, answers(start, 0), np.ascontiguousarray(item)
+    n, out, item = runs.packed.tables.shared, new_answers(start, 0), np.ascontiguousarray(item)
     count, wanted = len(start), 0 if size is None else len(start)
     spread = Spread(
         np.empty((wanted, n, n)),
@@ -440,7 +450,7 @@ def fixed_runs(
     def work(i: int) -> None:
         refine_runs(runs.packed, item, runs.epochs, i, i + 1, rules, out, spread)
 
-    mapped(work, range(count))
+    map_on_threads(work, range(count))
     return out, spread
 
 
@@ -456,5 +466,5 @@ def sums_of_runs(runs: PackedRuns, x: Array, item: Array, *, priors: bool = Fals
         np.empty(count),
     )
     at, item = np.require(x, np.float64, ["C", "W"]), np.ascontiguousarray(item)
-    mapped(lambda i: sum_runs(runs.packed, at, item, k, i, i + 1, priors, sums), range(count))
+    map_on_threads(lambda i: sum_runs(runs.packed, at, item, k, i, i + 1, priors, sums), range(count))
     return Normal(*sums)

@@ -9,9 +9,9 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.kernels.jit import enabled, usable
+from optloc.kernels.jit import enabled, may_use_code
 from optloc.kernels.pack import Packed, PackedRuns, folding, pack, pack_runs
-from optloc.linear.evaluate import fitting
+from optloc.linear.evaluate import checked_vectors
 from optloc.linear.normal import Normal, depends_on_place, linearise, normal, total, whitener_at, with_priors
 from optloc.linear.walks import walks
 from optloc.problem.epochs import windows
@@ -49,7 +49,7 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
     """Return the normal equations of the measurements alone; arguments as of `equations_at`."""
     if x.shape[-1] == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
-    quick = _by_machine_code(problem, fitting(problem, x), noise) if at is None else None
+    quick = _by_machine_code(problem, checked_vectors(problem, x), noise) if at is None else None
     if quick is not None:
         return quick
     parts = []
@@ -109,5 +109,5 @@ def serves(problem: Problem, starts: int) -> bool:
 
     count = prod(problem.batch_shape)
     if is_run(problem) and folding(problem) is not None:
-        return all(usable(kernel, count * problem.epochs) for kernel in (sum_runs, refine_runs))
-    return problem.count <= _LONGEST and all(usable(kernel, count) for kernel in (normal_block, refine_block))
+        return all(may_use_code(kernel, count * problem.epochs) for kernel in (sum_runs, refine_runs))
+    return problem.count <= _LONGEST and all(may_use_code(kernel, count) for kernel in (normal_block, refine_block))

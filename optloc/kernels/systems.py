@@ -14,8 +14,8 @@ import numpy as np
 
 from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
+from optloc.kernels.batched_rows import LaneCells
 from optloc.kernels.jit import compiled, inlined
-from optloc.kernels.lanes import LaneCells
 
 # Scaled systems in the memory of a block of lanes.
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
+from optloc.kernels.batched_rows import run_operations
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import run
 from optloc.kernels.tables import starts
 from optloc.kernels.trace import Tape
 
@@ -66,4 +66,4 @@ def run_tape(t: TapeTable, k: int, r: Array, count: int) -> None:
         value = t.value[i - table[0, CONSTANT]]
         for lane in range(count):
             r[table[i, 0], lane] = value
-    run(table, table[k, CODE], table[k + 1, CODE], r, count)
+    run_operations(table, table[k, CODE], table[k + 1, CODE], r, count)

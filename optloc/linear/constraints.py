@@ -202,11 +202,11 @@ def exact(problem: Problem) -> Face:
         Level(i, "equal", epoch)
         for i, c in enumerate(problem.constraints)
         if is_exact(c)
-        for epoch in decisive(problem, c)
+        for epoch in decisive_epochs(problem, c)
     )
 
 
-def decisive(problem: Problem, constraint: Band | Polygon) -> list[int | None]:
+def decisive_epochs(problem: Problem, constraint: Band | Polygon) -> list[int | None]:
     """Return the epochs at which a constraint along a course decides about all of them; None is the reference time.
 
     What is bounded is a polynomial of time of the motion's order: it is constant if it is at one epoch more than that,
@@ -229,7 +229,9 @@ def faces(problem: Problem) -> list[Face]:
     """Return every set of constraints that can hold with equality together; the equalities alone come first."""
     found = [exact(problem)]
     for i, constraint in enumerate(problem.constraints):
-        sides = [] if is_exact(constraint) else _meetings(list(_sides(i, constraint)), decisive(problem, constraint))
+        sides = (
+            [] if is_exact(constraint) else _meetings(list(_sides(i, constraint)), decisive_epochs(problem, constraint))
+        )
         # More sides than dimensions meet in no point; speeds bound other unknowns, and do not count.
         wider = [(*face, *side) for face in found for side in sides]
         found += [face for face in wider if _most_at_once(problem, face) <= problem.dimension]
@@ -463,7 +465,7 @@ def violation(problem: Problem, x: Array) -> Array:
             worst = np.maximum(worst, _outside(c, _horizontal(problem, c.target, x)))
             continue
         with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
-            values = [_quantity(problem, c, x, epoch)[0].value for epoch in decisive(problem, c)]
+            values = [_quantity(problem, c, x, epoch)[0].value for epoch in decisive_epochs(problem, c)]
         for value in values:
             worst = np.maximum(worst, _short(c, value))
     return worst

@@ -40,7 +40,7 @@ def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
     )
 
 
-def turned_back(problem: Problem, vector: tuple[Any, ...]) -> tuple[Any, ...]:
+def from_ecef_axes(problem: Problem, vector: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return a vector of ECEF components in the axes of the problem's frame."""
     turn = problem.frame.rotation_to_ecef()
     if problem.frame.kind == "ecef":
@@ -50,7 +50,7 @@ def turned_back(problem: Problem, vector: tuple[Any, ...]) -> tuple[Any, ...]:
     )
 
 
-def carried(
+def place_and_rate(
     problem: Problem,
     start: Components,
     straight: Components,
@@ -100,7 +100,9 @@ def course_at(problem: Problem, target: int, states: list[Components], since: An
     """
     place = _straight(states, since)
     return (
-        carried(problem, states[0], place, rise=(rise, 0.0))[0] if problem.motions[target].over == "ground" else place
+        place_and_rate(problem, states[0], place, rise=(rise, 0.0))[0]
+        if problem.motions[target].over == "ground"
+        else place
     )
 
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.arrays import Portable, foreign, gather, library, placed
+from optloc.base.arrays import Portable, as_array_like, gather, is_other_library, library
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias, Rows
-from optloc.linear.courses import carried, elapsed, over_ground, to_ecef, turned_back
+from optloc.linear.courses import elapsed, from_ecef_axes, over_ground, place_and_rate, to_ecef
 from optloc.models import MODELS, Model, Point
 from optloc.models.medium import Atmosphere
 from optloc.models.primitives import Jet, geodetic_normal, rotate, wrap
@@ -78,9 +78,9 @@ class Terms:
 
     def total(self, x: Array, count: int) -> Any:
         """Return the sums (..., count) of every row at vectors x (..., size)."""
-        out: Any = placed(np.zeros(count), x)
+        out: Any = as_array_like(np.zeros(count), x)
         for column, coefficient in self.tables(count):
-            out = out + gather(x, column) * placed(coefficient, x)
+            out = out + gather(x, column) * as_array_like(coefficient, x)
         return out
 
     def tables(self, count: int) -> list[tuple[Array, Array]]:
@@ -259,7 +259,7 @@ def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> li
 # How the points of a measurement come out of the parameter vector, as values or with derivatives.
 
 
-def fitting(problem: Problem, x: Array) -> Array:
+def checked_vectors(problem: Problem, x: Array) -> Array:
     """Return parameter vectors (..., size) of a problem; refuse those of another length."""
     size = problem.layout.size
     if x.shape[-1:] != (size,):
@@ -282,7 +282,7 @@ def points(problem: Problem, links: BlockLinks, x: Array, differentiate: bool) -
         Whether fed inputs become `Jet` values seeded with one.
     """
     # Data first, then what unknowns add: an offset of a station adds to its surveyed place.
-    inputs = {seed: placed(value, x) for seed, value in given(problem, links).items()}
+    inputs = {seed: as_array_like(value, x) for seed, value in given(problem, links).items()}
     for feed in links.feeds:
         inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, links.block.count)
     if isinstance(x, Portable):  # what is data only is computed like what the vector feeds
@@ -290,8 +290,8 @@ def points(problem: Problem, links: BlockLinks, x: Array, differentiate: bool) -
     if differentiate:
         fed = {feed.seed for feed in links.feeds}
         # Arrays of other libraries need not hand arithmetic with a Jet on the right to the Jet: there all are jets.
-        for seed in inputs if foreign(x) else fed:
-            inputs[seed] = Jet(inputs[seed], {seed: placed(np.ones(1), x)} if seed in fed else {})
+        for seed in inputs if is_other_library(x) else fed:
+            inputs[seed] = Jet(inputs[seed], {seed: as_array_like(np.ones(1), x)} if seed in fed else {})
     return join(problem, links.model, inputs)
 
 
@@ -325,11 +325,13 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
         if not isinstance(medium, Atmosphere):
             return Point(place, rate, axes, to_ecef(problem, place) if model.ecef else None, medium=medium)
         ecef = to_ecef(problem, place)
-        return Point(place, rate, axes, ecef, turned_back(problem, geodetic_normal(ecef)), medium)
+        return Point(place, rate, axes, ecef, from_ecef_axes(problem, geodetic_normal(ecef)), medium)
 
     place, rate = vector(TARGET), vector(TARGET_RATE) if model.velocity else None
     if START in inputs:
-        place, rate = carried(problem, vector(START), place, rate, (inputs.get(RISE, 0.0), inputs.get(RISE + 1, 0.0)))
+        place, rate = place_and_rate(
+            problem, vector(START), place, rate, (inputs.get(RISE, 0.0), inputs.get(RISE + 1, 0.0))
+        )
     target = seen(place, rate)
     # A kind without stations gets the target in their place, which its h does not look at.
     a = station(A, RATE_A, AXES_A) if model.stations else target
@@ -350,13 +352,13 @@ def given(problem: Problem, links: BlockLinks) -> dict[int, Any]:
         rows = np.flatnonzero(block.target == i)
         if motion.rise is not None and motion.over == "ground" and len(rows):
             for c in range(2 if model.velocity else 1):
-                shape = placed(1.0 * (block.target == i), motion.rise) * gather(motion.rise[..., c], block.epoch)
+                shape = as_array_like(1.0 * (block.target == i), motion.rise) * gather(motion.rise[..., c], block.epoch)
                 inputs[RISE + c] = inputs.get(RISE + c, 0.0) + shape
         if motion.known is None or not len(rows):
             continue
         epoch = block.epoch if motion.known.shape[-3] > 1 else np.zeros_like(block.epoch)
         # Every row gets a sum over targets in which its own counts: no scatter, which some libraries lack.
-        mine = placed(1.0 * (block.target == i), motion.known)
+        mine = as_array_like(1.0 * (block.target == i), motion.known)
         for seed, order in ((TARGET, 0), (TARGET_RATE, 1)):
             for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
                 values = mine * gather(motion.known[..., order, c], epoch)
@@ -381,7 +383,7 @@ def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
     column, gain = feed.table(count)
     part = gather(x, column)
     # Most unknowns enter as they are; a product with ones would cost as much as the rest.
-    return value + (part if np.all(gain == 1.0) else part * placed(gain, x))
+    return value + (part if np.all(gain == 1.0) else part * as_array_like(gain, x))
 
 
 # Values and derivatives of all rows: those of a kind together, then what biases do to them.
@@ -394,9 +396,9 @@ _undefined = np.errstate(divide="ignore", invalid="ignore")
 @_undefined
 def predict(problem: Problem, x: Array) -> Array:
     """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
-    values, x, xp = [], fitting(problem, x), library(x)
+    values, x, xp = [], checked_vectors(problem, x), library(x)
     for links in block_links(problem):
-        value = placed(links.model.h(*points(problem, links, x, differentiate=False)), x)
+        value = as_array_like(links.model.h(*points(problem, links, x, differentiate=False)), x)
         value = xp.broadcast_to(value, np.broadcast_shapes(value.shape, (links.block.count,)))
         values.append(_bias(links, x, value)[0])
     return _joined(values)
@@ -420,11 +422,11 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     jacobian : array (..., m, n + l)
         Derivatives of h with respect to the shared unknowns and to the local ones of each row's epoch.
     """
-    layout, x, xp = problem.layout, fitting(problem, x), library(x)
+    layout, x, xp = problem.layout, checked_vectors(problem, x), library(x)
     width = layout.n_shared + layout.n_local
     batch = np.broadcast_shapes(problem.batch_shape, x.shape[:-1])
     # In numpy derivatives are written where they belong; other libraries stack columns.
-    place = None if foreign(x) else np.zeros((*batch, problem.count, width))
+    place = None if is_other_library(x) else np.zeros((*batch, problem.count, width))
     residuals, jacobians = [], []
     for links, block, start in zip(block_links(problem), problem.rows, problem.starts, strict=True):
         m = block.count
@@ -451,7 +453,7 @@ def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]
     )
     # A kind that nothing moves (known targets and stations) has a value without derivatives.
     if not isinstance(jet, Jet):
-        jet = Jet(placed(np.asarray(jet), x), {})
+        jet = Jet(as_array_like(np.asarray(jet), x), {})
     value, gain = _bias(links, x, jet.value)
     terms: _Terms = []
     for feed in links.feeds:
@@ -459,7 +461,7 @@ def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]
         if partial is not None:
             column, coefficient = feed.table(m)
             terms.append((fold(column), coefficient, partial if gain is None else partial * gain))
-    unit = placed(np.ones(1), x)
+    unit = as_array_like(np.ones(1), x)
     for found, factor in ((links.gains, jet.value), (links.adds, unit)):
         terms += [(fold(column), coefficient, factor) for column, coefficient in found.tables(m)]
     return value, terms
@@ -486,12 +488,12 @@ def _bias(links: BlockLinks, x: Array, value: Any) -> tuple[Any, Any]:
 
 def _residual(block: Rows, value: Any, periodic: bool) -> Any:
     """Return what is measured less the values of one block; absent rows count as met."""
-    residual = placed(block.z - block.correction, value) - value
+    residual = as_array_like(block.z - block.correction, value) - value
     residual = wrap(residual) if periodic else residual
     # Absent rows may hold NaN, which zero times would keep.
-    if not foreign(block.weight) and np.all(block.weight > 0.0):
+    if not is_other_library(block.weight) and np.all(block.weight > 0.0):
         return residual
-    return library(residual).where(placed(block.weight, residual) > 0.0, residual, 0.0)
+    return library(residual).where(as_array_like(block.weight, residual) > 0.0, residual, 0.0)
 
 
 def _add(terms: _Terms, jacobian: Array) -> None:
@@ -511,9 +513,9 @@ def _stack(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
     columns: dict[int, Any] = {}
     for column, coefficient, factor in terms:
         for j in np.unique(column[coefficient != 0.0]):
-            part = factor * placed(np.where(column == j, coefficient, 0.0), x)
+            part = factor * as_array_like(np.where(column == j, coefficient, 0.0), x)
             columns[int(j)] = columns[int(j)] + part if int(j) in columns else part
-    zero, xp = placed(np.zeros(1), x), library(x)
+    zero, xp = as_array_like(np.zeros(1), x), library(x)
     return xp.stack([xp.broadcast_to(columns.get(j, zero), shape) for j in range(width)], axis=-1)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from optloc.base.arrays import foreign, library, placed
+from optloc.base.arrays import as_array_like, is_other_library, library
 from optloc.base.errors import InvalidProblem
 from optloc.linear.normal import Normal, covariance, depends_on_place, linearise, normal, step, whitener_at, with_priors
 from optloc.problem.noise import Whitener
@@ -74,7 +74,7 @@ def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 
     noise = whiteners(problem, x)
     equations = _equations(problem, x, noise)
     # Of the shape and library of the cost, whatever they are.
-    factor = placed(damping, equations.cost) + 0.0 * equations.cost
+    factor = as_array_like(damping, equations.cost) + 0.0 * equations.cost
     # True but for NaN, as a mask on the array's own device.
     regular: Any = equations.cost == equations.cost
     for _ in range(steps):
@@ -90,7 +90,7 @@ def whiteners(problem: Problem, x: Any) -> tuple[Whitener, ...] | None:
     """Return the whitening matrices of a problem where they do not depend on `x`, else None; refuse foreign arrays."""
     if not depends_on_place(problem):
         return whitener_at(problem, x)
-    if foreign(x):
+    if is_other_library(x):
         raise InvalidProblem(
             f"station errors that depend on the target, with arrays of {library(x).__name__}",
             "stations",

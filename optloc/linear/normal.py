@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.arrays import as_number, eye, gather, library, placed
+from optloc.base.arrays import as_array_like, as_number, eye, gather, library
 from optloc.base.types import Array, Rows
 from optloc.linear import chain
 from optloc.linear.evaluate import differentiate
 from optloc.linear.walks import chain_at, walks
 from optloc.models import MODELS
 from optloc.problem.forms import form_of
-from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, together, whiten
+from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, group_members, whiten
 from optloc.problem.problem import Problem
 
 # Station errors that are drawn anew at each epoch and not estimated: they enlarge the noise of the rows.
 
 
-def weighed(problem: Problem, x: Array | None = None) -> Problem:
+def with_station_noise(problem: Problem, x: Array | None = None) -> Problem:
     """Return the problem with its station errors of span "noise" moved into the noise of its rows.
 
     The covariance of the rows of an epoch becomes R = Q + G P G', with G the derivative of the rows with respect to
@@ -74,7 +74,7 @@ def depends_on_place(problem: Problem) -> bool:
 
 def whitener_at(problem: Problem, x: Array) -> tuple[Whitener, ...]:
     """Return the whitening matrices of a problem's rows, station errors of span "noise" included, at vectors x."""
-    return whiten(weighed(problem, x).noise, problem.weight)
+    return whiten(with_station_noise(problem, x).noise, problem.weight)
 
 
 def with_offsets(problem: Problem, x: Array, offsets: Array) -> tuple[Problem, Array]:
@@ -109,7 +109,7 @@ def _groups(problem: Problem) -> list[Array]:
     epoch = problem.epoch
     if any((epoch[block.row] != epoch[block.row[:, :1]]).any() for block in problem.noise.blocks):
         return [np.arange(problem.count)[None]]
-    return together(epoch)
+    return group_members(epoch)
 
 
 def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
@@ -278,7 +278,7 @@ def normal(linear: Linear, epochs: int) -> Normal:
     # Jacobian and residual as one matrix: its Gram matrix holds information, vector and cost.
     stacked = xp.concat([linear.shared, linear.local, linear.residual[..., None]], axis=-1)
     single = epochs == 1 or length == 0
-    gram: Any = placed(np.zeros(()), linear.residual)
+    gram: Any = as_array_like(np.zeros(()), linear.residual)
     for whitener in linear.noise:
         white = whitener.apply(stacked)
         if not single:
@@ -309,7 +309,7 @@ def _by_epoch(white: Any, epoch: Array, epochs: int) -> Any:
     used = slot < sizes[:, None]
     table = order[np.where(used, (np.cumsum(sizes) - sizes)[:, None] + slot, 0)]
     rows = gather(white, table, -2)
-    return rows if used.all() else rows * placed(1.0 * used, white)[..., None]
+    return rows if used.all() else rows * as_array_like(1.0 * used, white)[..., None]
 
 
 def marginal(equations: Normal) -> tuple[Array, Array, Array]:
@@ -498,9 +498,11 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
         slot, is_shared = layout.find(name)
         width = layout.n_shared if is_shared else layout.n_local
         # Columns of the unit matrix put a block where it belongs: some libraries cannot write into an array.
-        pick = placed(np.eye(width)[:, slot.start : slot.start + slot.size], x)
-        precision = placed(precision, x)  # noqa: PLW2901  # the same numbers, elsewhere
-        error = placed(mean, x) - (at_shared if is_shared else at_local)[..., slot.start : slot.start + slot.size]
+        pick = as_array_like(np.eye(width)[:, slot.start : slot.start + slot.size], x)
+        precision = as_array_like(precision, x)  # noqa: PLW2901  # the same numbers, elsewhere
+        error = (
+            as_array_like(mean, x) - (at_shared if is_shared else at_local)[..., slot.start : slot.start + slot.size]
+        )
         pull = (precision @ error[..., None])[..., 0]
         penalty = xp.sum(error * pull, axis=-1)
         if is_shared:
@@ -553,6 +555,6 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
 
 def _block_diagonal(blocks: Array) -> Array:
     s, d = blocks.shape[-3], blocks.shape[-1]
-    apart = placed(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
+    apart = as_array_like(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
     whole: Array = library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))
     return whole

@@ -10,7 +10,7 @@ from scipy.special import gammainccinv
 
 from optloc.base.types import Array
 from optloc.linear.constraints import exact
-from optloc.linear.walks import free_of, walk_names
+from optloc.linear.walks import count_free_unknowns, walk_names
 from optloc.models import MODELS
 from optloc.problem.epochs import windows
 from optloc.problem.layout import emission_name, state_names
@@ -42,7 +42,7 @@ def degrees_of_freedom(problem: Problem) -> Array:
         local = local + _local_unknowns(part, states, emissions)
     shared = sum(slot.size for slot in problem.layout.shared if slot.name not in known)
     # The steps of a walk add as many rows as unknowns: only the unknowns that begin it are left.
-    unknowns = shared + local + free_of(problem)
+    unknowns = shared + local + count_free_unknowns(problem)
     return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
 
 

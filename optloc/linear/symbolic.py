@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.linear.constraints import bounded, conjunction, decisive
+from optloc.linear.constraints import bounded, conjunction, decisive_epochs
 from optloc.linear.evaluate import Terms, block_links, given, join
 from optloc.models.primitives import wrap
 from optloc.models.surfaces import SURFACES
@@ -94,7 +94,7 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
         lower, upper = p[used + count], p[used + count + 1]
         used += count + 2
         unit = length if surface.unit == "m" else 1.0
-        for epoch in decisive(problem, band):
+        for epoch in decisive_epochs(problem, band):
             value = bounded(problem, band, _states(problem, band.target, x), c, epoch)
             # Which side exists is part of the structure; where it lies is a parameter.
             if np.all(band.lower == band.upper):

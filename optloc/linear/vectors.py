@@ -72,7 +72,7 @@ def emission_columns(problem: Problem) -> Array:
     return np.concatenate([columns(problem.layout, name, np.arange(problem.epochs)).ravel() for name in names])
 
 
-def hold_still(problem: Problem) -> Problem:
+def problem_at_rest(problem: Problem) -> Problem:
     """Return the problem of the position alone: one static target, nothing else unknown but emission times."""
     motions = tuple(replace(motion, order=0) for motion in problem.motions)
     return replace(without_biases(problem), motions=motions)

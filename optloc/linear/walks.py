@@ -25,7 +25,7 @@ def walk_names(problem: Problem) -> tuple[str, ...]:
     return tuple(name for bias in walks(problem) for name in state_of(bias))
 
 
-def free_of(problem: Problem) -> int:
+def count_free_unknowns(problem: Problem) -> int:
     """Return how many unknowns of all walks nothing is known of beforehand: what begins them, not their steps."""
     return sum(len(b.members) * len(state_of(b)) - (0 if b.sigma is None else np.size(b.sigma)) for b in walks(problem))
 
@@ -89,16 +89,18 @@ def _steps(problem: Problem) -> Iterator[tuple[Bias, Array, Array, Array]]:
     for bias in problem.biases:
         steps = form_of(bias).steps
         if steps is not None:
-            yield bias, places(problem.layout, bias), *steps(bias, problem.times)
+            yield bias, state_columns(problem.layout, bias), *steps(bias, problem.times)
 
 
-def places(layout: Layout, bias: Bias) -> Array:
+def state_columns(layout: Layout, bias: Bias) -> Array:
     """Return the local columns (q, o) of the states of a walk."""
     starts = [layout.find(name)[0].start for name in state_of(bias)]
     return np.stack([start + np.arange(len(bias.members)) for start in starts], axis=1)
 
 
-def wander(problem: Problem, truth: Array, seed: int | np.random.SeedSequence, trials: int | None = None) -> Array:
+def simulate_walks(
+    problem: Problem, truth: Array, seed: int | np.random.SeedSequence, trials: int | None = None
+) -> Array:
     """Return true parameter vectors whose walks are drawn: they begin where the given ones do.
 
     Parameters

@@ -10,10 +10,10 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
 from optloc.model_checks.geometry import Advice, advise_on_geometry
-from optloc.model_checks.misread import advise_on_values
 from optloc.model_checks.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
+from optloc.model_checks.unit_mistakes import advise_on_values
 from optloc.problem.bias import family
-from optloc.problem.epochs import by_epoch, separable, thinned, tied
+from optloc.problem.epochs import by_epoch, has_correlated_epochs, separable, some_epochs
 from optloc.problem.fix import Fix
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
@@ -178,14 +178,14 @@ def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
 
     Errors grow with the run: its first epochs alone would not show a slow drift, nor what begins late.
     """
-    if problem.count <= _ROWS or problem.epochs == 1 or tied(problem):
+    if problem.count <= _ROWS or problem.epochs == 1 or has_correlated_epochs(problem):
         return problem, x
     kept = max(2, int(problem.epochs * _ROWS / problem.count))
     chosen = np.unique(np.linspace(0, problem.epochs - 1, kept).round().astype(int))
     chosen = chosen[np.isin(chosen, problem.epoch)]
     n, length = problem.layout.n_shared, problem.layout.n_local
     own = x[:, n:].reshape(len(x), problem.epochs, length)[:, chosen]
-    return thinned(problem, chosen), np.concatenate([x[:, :n], own.reshape(len(x), -1)], axis=1)
+    return some_epochs(problem, chosen), np.concatenate([x[:, :n], own.reshape(len(x), -1)], axis=1)
 
 
 def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:

@@ -12,7 +12,7 @@ from optloc.base.frames import CARTESIAN
 from optloc.base.types import Array, Status
 from optloc.linear.mirror import plane_of_stations
 from optloc.model_checks.coplanar import Across, information_in_square, interval_across, is_coplanar
-from optloc.model_checks.directions import INFINITY, View, directions_of, extent_of, has_directions, minima_of
+from optloc.model_checks.directions import INFINITY, DirectionCost, directions_of, extent_of, has_directions, minima_of
 from optloc.models import MODELS
 from optloc.problem.chart import AXES, Extent, quantile
 from optloc.problem.determined import LEVEL, Determined, Quantity
@@ -92,7 +92,7 @@ def _is_complete(problem: Problem) -> bool:
 
 def _of_one(flat: Problem, dof: int) -> Determined:
     """Return the `Determined` of a flat batch of one problem, with directions if it has enough rows for them."""
-    view, north = View.of(flat), flat.frame.geodetic
+    view, north = DirectionCost.of(flat), flat.frame.geodetic
     level = _level(flat, view.centre)
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
@@ -131,7 +131,7 @@ def _about_line(flat: Problem) -> Problem | None:
 
 def _along_line(problem: Problem) -> tuple[Quantity, ...]:
     """Return angle to a line of stations, place along it and distance from it, of a problem with the line as x axis."""
-    view, rise = View.of(problem), quantile(LEVEL, 1)
+    view, rise = DirectionCost.of(problem), quantile(LEVEL, 1)
     minima = minima_of(view, rise)
     if not np.isfinite(minima.cost[0]):
         return ()
@@ -171,7 +171,7 @@ def _endless(values: Array, limit: float) -> tuple[float, float]:
 # Stations in a plane: the side is open.
 
 
-def _in_plane(flat: Problem, view: View) -> tuple[Quantity, ...]:
+def _in_plane(flat: Problem, view: DirectionCost) -> tuple[Quantity, ...]:
     """Return the place in the plane of all stations and the distance from it; nothing where either has no end."""
     if (flat.weight > 0.0).sum() < flat.dimension:
         return ()

@@ -23,7 +23,7 @@ from optloc.linear.vectors import vectors
 from optloc.model_checks.scaled_rows import has_scales, profile_by_rows
 from optloc.model_checks.shape import profile
 from optloc.problem.chart import basis, jacobian, quantile
-from optloc.problem.determined import LEVEL, Direction, holds
+from optloc.problem.determined import LEVEL, Direction, is_in_cone
 from optloc.problem.problem import Problem
 
 INFINITY = 1e-6
@@ -67,7 +67,7 @@ _OPEN = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class DirectionCost:
     """The cost over direction and inverse range, all other unknowns at their best.
 
     Parameters
@@ -94,7 +94,7 @@ class View:
     most: float = _NEAR
 
     @classmethod
-    def of(cls, problem: Problem) -> View:
+    def of(cls, problem: Problem) -> DirectionCost:
         """Return the view of a flat batch of one problem."""
         centre, _, _, size = plane_of_stations(problem)
         spread = float(size[0]) if size[0] > 0.0 else 1.0
@@ -203,7 +203,7 @@ class DirectionMinima:
         return DirectionMinima(self.u[items], self.v[items], self.cost[items])
 
 
-def minima_of(view: View, rise: float) -> DirectionMinima:
+def minima_of(view: DirectionCost, rise: float) -> DirectionMinima:
     """Return the minima that cost no more than a rise above the least."""
     d = len(view.centre)
     spot = spread_directions(_TRIED[d], d)
@@ -220,7 +220,7 @@ def minima_of(view: View, rise: float) -> DirectionMinima:
     return _distinct(u, v, cost, rise)
 
 
-def _lowest(view: View, u: Array, v: Array, cost: Array) -> tuple[Array, Array, Array]:
+def _lowest(view: DirectionCost, u: Array, v: Array, cost: Array) -> tuple[Array, Array, Array]:
     """Return minima with the better of their inverse range and of infinity."""
     there, other, flat = view.descend(u, np.full(len(v), INFINITY), True, True, _STEPS)
     better = flat < cost
@@ -244,7 +244,9 @@ def _distinct(u: Array, v: Array, cost: Array, rise: float) -> DirectionMinima:
 Profile = Callable[[Array, Array], tuple[Array, Array]]
 
 
-def edge(view: View, start: tuple[Array, Array], ways: Array, least: float, rise: Array) -> tuple[Array, Array]:
+def edge(
+    view: DirectionCost, start: tuple[Array, Array], ways: Array, least: float, rise: Array
+) -> tuple[Array, Array]:
     """Return the angles (k,) at which cones end along rays, and the directions (k, d) there; NaN beyond the widest.
 
     Parameters
@@ -287,7 +289,7 @@ def _root(cost: Array, least: float) -> Array:
     return np.sqrt(np.maximum(cost - least, 0.0))
 
 
-def _first(view: View, u: Array, v: Array, ways: Array, wanted: Array) -> Array:
+def _first(view: DirectionCost, u: Array, v: Array, ways: Array, wanted: Array) -> Array:
     """Return angles (k,) at which a Gaussian cone would end."""
     _, information, _ = view.look(u[None], np.atleast_1d(v))
     across = ways @ basis(u)
@@ -322,7 +324,7 @@ def _false_position(at: Profile, low: tuple[Array, Array], high: tuple[Array, Ar
     return np.asarray(middle)
 
 
-def ends_of_range(view: View, minima: DirectionMinima, least: float, rise: float) -> tuple[float, float]:
+def ends_of_range(view: DirectionCost, minima: DirectionMinima, least: float, rise: float) -> tuple[float, float]:
     """Return the least and the greatest inverse range, in spreads, at which a direction near minima costs little.
 
     All directions may follow: the profile of the cost over the inverse range.
@@ -355,7 +357,7 @@ def ends_of_range(view: View, minima: DirectionMinima, least: float, rise: float
 # Cones.
 
 
-def directions_of(view: View, level: Array, few: bool = False) -> tuple[Direction, ...]:
+def directions_of(view: DirectionCost, level: Array, few: bool = False) -> tuple[Direction, ...]:
     """Return the directions that the data allow with their cones; none where no few cones hold them.
 
     Parameters
@@ -400,7 +402,7 @@ def _is_valley(u: Array) -> bool:
     return len(kept) > _CONES
 
 
-def _is_image(view: View, one: Array, other: Array) -> bool:
+def _is_image(view: DirectionCost, one: Array, other: Array) -> bool:
     """Return whether a direction is the mirror image of another in the plane of the stations.
 
     Cones of images that touch have a waist, and rays from one of them miss much of the other.
@@ -409,7 +411,7 @@ def _is_image(view: View, one: Array, other: Array) -> bool:
     return bool(np.abs(image - other).max() < _ALIKE and np.abs(image - one).max() > _ALIKE)
 
 
-def _cone(view: View, minima: DirectionMinima, i: int, rises: Array, level: Array) -> Direction | None:
+def _cone(view: DirectionCost, minima: DirectionMinima, i: int, rises: Array, level: Array) -> Direction | None:
     """Return the cone about a minimum without a range, or None where it is no cone."""
     u, v, least = minima.u[i], minima.v[i], float(minima.cost[0])
     usable, across = rises > minima.cost[i] - least, _principal(view, minima.u[i], minima.v[i])
@@ -434,7 +436,7 @@ def _cone(view: View, minima: DirectionMinima, i: int, rises: Array, level: Arra
     return Direction(u, azimuth, elevation, half, axes, edges[0], (np.inf, 0.0, np.inf), float(minima.cost[i]) - least)
 
 
-def _principal(view: View, u: Array, v: float) -> Array:
+def _principal(view: DirectionCost, u: Array, v: float) -> Array:
     """Return unit vectors (d, d - 1) across a direction along which the information on it is least and greatest."""
     _, information, _ = view.look(u[None], np.atleast_1d(v))
     return np.asarray(basis(u) @ np.linalg.eigh(_of_turns(information[0], v))[1])
@@ -479,14 +481,14 @@ def _angles(u: Array, edges: Array, level: Array) -> tuple[tuple[float, float, f
     if len(u) == 2:
         return (middle, *ends), ()
     height = np.arcsin(np.clip(rim[:, 2], -1.0, 1.0))
-    up, down = (bool(holds(u, edges, side * level[2])) for side in (1.0, -1.0))
+    up, down = (bool(is_in_cone(u, edges, side * level[2])) for side in (1.0, -1.0))
     low, high = -0.5 * np.pi if down else float(height.min()), 0.5 * np.pi if up else float(height.max())
     # about a cone that holds the vertical every azimuth is possible
     ends = (middle - np.pi, middle + np.pi) if up or down else ends
     return (middle, *ends), (float(np.arcsin(np.clip(own[2], -1.0, 1.0))), low, high)
 
 
-def _ranged(view: View, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
+def _ranged(view: DirectionCost, cone: Direction, minima: DirectionMinima, least: float, rise: float) -> Direction:
     """Return a cone with its range: the inverse ranges of all minima in it."""
     near = minima[minima.cost <= least + rise]
     if not len(near.cost):
@@ -513,7 +515,7 @@ def has_directions(problem: Problem) -> bool:
 _AROUND = 64
 
 
-def extent_of(view: View, u: Array, v: float, least: float, rise: float) -> Array:
+def extent_of(view: DirectionCost, u: Array, v: float, least: float, rise: float) -> Array:
     """Return positions (k, 2) on the edge of the region in the plane whose cost is less than a rise above the least.
 
     Parameters

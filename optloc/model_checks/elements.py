@@ -12,7 +12,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.linear.constraints import exact, tangent_at
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import prior_parts, weighed
+from optloc.linear.normal import prior_parts, with_station_noise
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.layout import emission_name
@@ -258,7 +258,7 @@ def _ungrouped_noise(problem: Problem, x: Array) -> Array:
     """Return the covariance (N, m, m) that station errors and weights between 0 and 1 add to the noise."""
     rows = np.arange(problem.count)[None]
     stated = gathered(problem.noise, rows)[..., 0, :, :]
-    whole = gathered(weighed(problem, x).noise, rows)[..., 0, :, :]
+    whole = gathered(with_station_noise(problem, x).noise, rows)[..., 0, :, :]
     weight = np.where(problem.weight > 0.0, problem.weight, 1.0)
     # A row of weight w has 1/w of its variance: the rest belongs to no group.
     own = (1.0 / weight - 1.0) * np.diagonal(whole, axis1=-2, axis2=-1)

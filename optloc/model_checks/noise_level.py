@@ -11,7 +11,7 @@ from optloc.base.types import Array
 from optloc.model_checks.elements import Elements, elements, kinds_of
 from optloc.model_checks.groups import ROW_PRICE
 from optloc.model_checks.score import descend
-from optloc.model_checks.variance_components import Tested, fit, shown, snooped, tested, total, without
+from optloc.model_checks.variance_components import Tested, error_sizes, fit, snooped, tested, total, without
 from optloc.problem.loss import LATE
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
@@ -411,14 +411,14 @@ def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, in
 def _without_others(tests: Tested, late: Array) -> tuple[Array, Array]:
     """Return the error (N, q) of each row, and its sigma, that the others show which are not late."""
     items, q = np.arange(len(late)), tests.errors
-    shift, sigma = shown(without(tests, late), slice(0, q))
+    shift, sigma = error_sizes(without(tests, late), slice(0, q))
     order = np.argsort(~late, axis=1, kind="stable")[:, : int(late.sum(1).max(initial=0))]
     for column in order.T:
         own = late[items, column]
         others = late.copy()
         others[items, column] = False
         # of a late row all the other late ones are left out, not itself
-        one, error = shown(without(tests, others), slice(0, q))
+        one, error = error_sizes(without(tests, others), slice(0, q))
         shift[items[own], column[own]] = one[items[own], column[own]]
         sigma[items[own], column[own]] = error[items[own], column[own]]
     return shift, sigma

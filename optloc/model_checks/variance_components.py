@@ -521,7 +521,7 @@ def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | N
     none is beyond it: data snooping (Baarda 1968, section 4).
     """
     n, first = len(tests.vector), range(tests.vector.shape[1])[columns].start
-    shift, sigma = shown(tests, columns)
+    shift, sigma = error_sizes(tests, columns)
     gross = np.zeros(shift.shape, dtype=bool)
     while True:
         size = np.abs(tests.sigmas[:, columns])
@@ -531,7 +531,7 @@ def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | N
             beyond = np.where(shared | (size**2 > most**2 + _MARGIN), beyond, 0.0)
         worst = beyond.argmax(1)
         hit = np.flatnonzero(beyond[np.arange(n), worst] > 1.0)
-        now = shown(tests, columns)
+        now = error_sizes(tests, columns)
         shift, sigma = (np.where(gross, old, new) for old, new in zip((shift, sigma), now, strict=True))
         if not len(hit):
             return Snooped(gross, shift, sigma, tests)
@@ -542,7 +542,7 @@ def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | N
         tests = tests.without(column)
 
 
-def shown(tests: Tested, columns: slice) -> tuple[Array, Array]:
+def error_sizes(tests: Tested, columns: slice) -> tuple[Array, Array]:
     """Return the size of an error along each column that the rest shows, and its standard deviation; NaN for none."""
     size, vector = tests.size[:, columns], tests.vector[:, columns]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -16,7 +16,7 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.multi_target.answer import Emitters, Ghost
-from optloc.multi_target.assignment_findings import Assigned, spell, verdict
+from optloc.multi_target.assignment_findings import Assigned, count_in_words, verdict
 from optloc.multi_target.pricing_search import TOLERANCE, PricedRegion, PricingResult, search
 from optloc.multi_target.set_packing import Prices, cheapest_sets, price_rows
 from optloc.multi_target.sets import (
@@ -29,7 +29,7 @@ from optloc.multi_target.sets import (
     row_worth,
     scenes,
     sets_near,
-    thin,
+    without_one_row,
 )
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -109,7 +109,7 @@ def separate(
         raise InvalidProblem(f"a penalty of {penalty}", "penalty", "give a finite number, or None")
     within = _region(problem, region)
     return tuple(
-        report(problem, scene, _solve_epoch(scene, within, count, boxes), count)
+        emitters_of(problem, scene, _solve_epoch(scene, within, count, boxes), count)
         for scene in scenes(problem, clutter, penalty)
     )
 
@@ -161,8 +161,8 @@ def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: i
     limit = AMBIGUOUS_GAP + (scene.penalty if count is not None else 0.0)
     # No assignment has more emitters than its rows can speak for.
     most = int(np.isfinite(scene.z).sum()) // scene.least
-    tuples, total = _keep_paying(propose(scene), limit), 0
-    fresh, bound = thin(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
+    tuples, total = _keep_paying(propose_sets(scene), limit), 0
+    fresh, bound = without_one_row(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
     for turn in range(_ROUNDS):
         tuples = _keep_paying(merge(tuples, fresh), limit)
         taken, cost = cheapest_sets(tuples, scene.z.shape[1], count)
@@ -190,7 +190,7 @@ def _fresh_sets(scene: Scene, prices: Prices, found: PricingResult) -> Tuples:
     sets = merge(own, more)
     fresh = sets.take(prices.reduced(sets) < -0.5 * TOLERANCE)
     # Prices that are too high for one set are too high for its neighbours as well.
-    return merge(fresh, thin(scene, fresh))
+    return merge(fresh, without_one_row(scene, fresh))
 
 
 def _keep_paying(tuples: Tuples, limit: float) -> Tuples:
@@ -200,7 +200,7 @@ def _keep_paying(tuples: Tuples, limit: float) -> Tuples:
 # Places where emitters may be: closed-form fixes of as few rows as it takes.
 
 
-def propose(scene: Scene, seed: int = 0) -> Tuples:
+def propose_sets(scene: Scene, seed: int = 0) -> Tuples:
     """Return sets of rows around the closed-form fixes of d rows each; all of them, or a seeded draw where many."""
     picks = _few(scene, np.random.default_rng(seed))
     if not len(picks):
@@ -261,7 +261,7 @@ def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
 # From the best assignment to the emitters: fixes, ghosts, and how sure their number is.
 
 
-def report(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
+def emitters_of(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
     """Return the emitters of an assignment of one epoch."""
     # The emitter whose rows speak loudest first.
     taken = solved.taken[np.argsort(solved.tuples.cost[solved.taken], kind="stable")]
@@ -322,4 +322,4 @@ def _verdict(
     size = int(heard.any(1).sum()), len(scene.z), scene.least
     false = int(heard.sum()) - int((solved.tuples.picks[solved.taken] >= 0).sum())
     found = Assigned(fixes, gaps, costs, solved.cost, solved.bound, count, *size)
-    return verdict(found, f"{spell(len(fixes))}; false rows: {false}")
+    return verdict(found, f"{count_in_words(len(fixes))}; false rows: {false}")

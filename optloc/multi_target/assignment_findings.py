@@ -57,7 +57,7 @@ def verdict(found: Assigned, clean: str) -> tuple[Status, str]:
     return status, against[0][1] if alone else "; ".join(words for _, words in against)
 
 
-def spell(emitters: int) -> str:
+def count_in_words(emitters: int) -> str:
     """Return a number of emitters in words."""
     return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")
 
@@ -66,7 +66,7 @@ def _near(found: Assigned) -> list[str]:
     """Return sentences on other numbers of emitters and other places within the gap of an ambiguity."""
     n = len(found.fixes)
     words = [
-        f"{spell(k)} would cost only {found.costs[k] - found.cost:.1f} more"
+        f"{count_in_words(k)} would cost only {found.costs[k] - found.cost:.1f} more"
         for k in (n - 1, n + 1)
         if found.wanted is None and k >= 0 and found.costs[k] - found.cost < AMBIGUOUS_GAP
     ]

@@ -10,7 +10,15 @@ from optloc.base import linalg
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
 from optloc.multi_target.set_packing import Prices
-from optloc.multi_target.sets import Scene, around, changes, cheapest_rows, correlation, of_picks, own_variance
+from optloc.multi_target.sets import (
+    Scene,
+    cheapest_rows,
+    correlation,
+    of_picks,
+    own_variance,
+    value_changes,
+    values_in_balls,
+)
 from optloc.tracking.associate import misfits
 
 TOLERANCE = 0.05
@@ -144,8 +152,8 @@ def _bound_all(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bou
 
 def _bound(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
     radius = np.sqrt((half**2).sum(-1))
-    value, slope, remainder = around(scene.scan, centre, radius)
-    change = changes(scene.scan, slope, remainder, half)
+    value, slope, remainder = values_in_balls(scene.scan, centre, radius)
+    change = value_changes(scene.scan, slope, remainder, half)
     apart = misfits(scene.scan, scene.z, value)
     s, (own, shrink, _) = scene.sigma[:, None], _errors(scene)
     # A lower bound of what a row costs beside its chi-square, whichever others are taken with it.

@@ -171,8 +171,8 @@ def _check(problem: Problem) -> None:
     if problem.batch_shape:
         raise InvalidProblem("the problem has batch axes", "problem", "give its problems one by one")
     for block in problem.rows:
-        if block.kind not in served():
-            raise InvalidProblem(f"{block.kind} rows cannot be told apart", "kind", f"use {', '.join(served())}")
+        if block.kind not in bounded_kinds():
+            raise InvalidProblem(f"{block.kind} rows cannot be told apart", "kind", f"use {', '.join(bounded_kinds())}")
     for name, given in (
         ("biases", problem.biases),
         ("priors", problem.priors),
@@ -303,7 +303,7 @@ def cheapest_rows(scene: Scene, option: Array) -> Array:
     return np.where(seen, best, -1)
 
 
-def thin(scene: Scene, tuples: Tuples) -> Tuples:
+def without_one_row(scene: Scene, tuples: Tuples) -> Tuples:
     """Return sets with each one of their rows left out."""
     which, channel = np.nonzero(tuples.picks >= 0)
     picks = tuples.picks[which]
@@ -328,7 +328,7 @@ def row_worth(scene: Scene, tuples: Tuples) -> Array:
 # How far measurements can be from their values at the centre of a box of positions.
 
 
-def around(scan: Problem, centre: Array, radius: Array) -> tuple[Array, Array, Array]:
+def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array, Array, Array]:
     """Return values, derivatives and remainders of the rows of a scan in balls.
 
     Within the ball |h(x) - h - J (x - centre)| <= remainder: half the squared radius times a bound of the second
@@ -366,7 +366,7 @@ def around(scan: Problem, centre: Array, radius: Array) -> tuple[Array, Array, A
     return value, slope, np.where(np.isnan(remainder), np.inf, remainder)
 
 
-def changes(scan: Problem, slope: Array, remainder: Array, half: Array) -> Array:
+def value_changes(scan: Problem, slope: Array, remainder: Array, half: Array) -> Array:
     """Return how far the rows can be from their values at the centres of boxes, (q, m).
 
     Parameters
@@ -448,7 +448,7 @@ def value_width(problem: Problem, block: Rows) -> Array | None:
     return np.asarray(2.0 * np.sqrt((apart**2).sum(-1)))
 
 
-def served() -> list[str]:
+def bounded_kinds() -> list[str]:
     """Return the kinds whose curvature is bounded here: sums of ranges without an emission time, and the two angles."""
     sums = [kind for kind, model in MODELS.items() if model.ranges is not None and not model.emission]
     return [*sums, *_ANGLES]

@@ -61,9 +61,9 @@ if TYPE_CHECKING:
     from optloc.problem.epochs import (
         by_epoch as by_epoch,
         cut as cut,
+        has_correlated_epochs as has_correlated_epochs,
         joined as joined,
         separable as separable,
-        tied as tied,
         window as window,
         windows as windows,
     )

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optloc.base.arrays import numbers, positive, whole
+from optloc.base.arrays import as_deviations, as_integers, numbers
 from optloc.base.cache import Cache, key_of
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
@@ -165,13 +165,15 @@ def measured(
     # Everything becomes arrays first, so that what follows speaks of shapes and never of types.
     z, sigma, arrival_sigma = (
         numbers(in_si(z, quantity, "z"), "z"),
-        positive(in_si(sigma, quantity, "sigma", deviation=True), "sigma", kind),
-        positive(in_si(arrival_sigma, quantity, "arrival_sigma", deviation=True), "arrival_sigma", kind),
+        as_deviations(in_si(sigma, quantity, "sigma", deviation=True), "sigma", kind),
+        as_deviations(in_si(arrival_sigma, quantity, "arrival_sigma", deviation=True), "arrival_sigma", kind),
     )
     covariance, weight, correction = (
         numbers(v, name) for v, name in ((covariance, "covariance"), (weight, "weight"), (correction, "correction"))
     )
-    a, b, epoch, target = (whole(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target")))
+    a, b, epoch, target = (
+        as_integers(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target"))
+    )
     count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
 
     def index(values: Array | None, needed: bool, name: str) -> Array:
@@ -412,7 +414,7 @@ def _signal_blocks(m: Measured, start: int, stations: int, signal: Signal) -> li
         what = f"there are {len(signal.snr)} signal-to-noise ratios for {stations} stations"
         raise InvalidProblem(what, "signal", "give one for each station, NaN for those that take no part")
     rows = m.rows
-    groups = noises.together(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target)
+    groups = noises.group_members(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target)
     return [noises.Block(start + g, signal.covariance(rows.kind, rows.a[g], rows.b[g])) for g in groups]
 
 
@@ -424,7 +426,7 @@ def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Blo
         raise InvalidProblem(what, "arrival_sigma", "give sigma or covariance")
     blocks = []
     # Each epoch and target has arrivals of its own; a key for each pair of them, -1 (no target) included.
-    for members in noises.together(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target):
+    for members in noises.group_members(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target):
         # D diag(sigma^2) D' of the members: a station that two rows share correlates them, by the product of its
         # signs.
         covariance = noises.arrivals([(rows.a[members], signs[0]), (rows.b[members], signs[1])], variance)

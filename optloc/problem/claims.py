@@ -80,26 +80,26 @@ class Claims:
 
 def claim(certificate: Certificate) -> Claims:
     """Return a certificate as claims without batch axes."""
-    out = untried(1)
+    out = empty_claims(1)
     out.proof[0] = PROOFS.index(certificate.proof)
     for each in fields(out)[1:]:
         getattr(out, each.name)[0] = getattr(certificate, each.name)
     return Claims(*(getattr(out, each.name).reshape(()) for each in fields(out)))
 
 
-def untried(count: int) -> Claims:
+def empty_claims(count: int) -> Claims:
     """Return claims (count,) about fixes of which nobody has tried to prove anything, to be written."""
     empty = (UNTRIED, "", "", np.nan, np.nan, False, 0.0, 0, None, False)
     kinds = (np.int8, object, object, float, float, np.bool_, float, np.int64, object, np.bool_)
     return Claims(*(np.full(count, value, dtype=kind) for value, kind in zip(empty, kinds, strict=True)))
 
 
-def alike(one: Claims, shape: int | tuple[int, ...]) -> Claims:
+def repeated_claims(one: Claims, shape: int | tuple[int, ...]) -> Claims:
     """Return claims (...) that are all the same; nobody can write into them."""
     return Claims(*(np.broadcast_to(getattr(one, each.name), shape) for each in fields(one)))
 
 
-def choose(chosen: Array, one: Claims, other: Claims) -> Claims:
+def merged_claims(chosen: Array, one: Claims, other: Claims) -> Claims:
     """Return claims (N,) of which those chosen are from one, and the rest from another, each (N,) or ()."""
     pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
     return Claims(*(np.where(chosen, *pair) for pair in pairs))

@@ -34,7 +34,7 @@ def coefficients(knots: Array) -> int:
     return len(knots) + DEGREE - 1
 
 
-def pieces(knots: Array, times: Array) -> tuple[Array, Array]:
+def spline_weights(knots: Array, times: Array) -> tuple[Array, Array]:
     """Return which coefficients (n, 4) of a spline count at times (n,), and how much (n, 4).
 
     Parameters

@@ -103,12 +103,12 @@ class Direction:
 
     def covers(self, vectors: Array) -> Array:
         """Return whether vectors (..., d) point into the cone, (...)."""
-        return holds(self.vector, self.outline, vectors)
+        return is_in_cone(self.vector, self.outline, vectors)
 
 
-def holds(axis: Array, outline: Array, vectors: Array) -> Array:
+def is_in_cone(axis: Array, outline: Array, vectors: Array) -> Array:
     """Return whether vectors (..., d) are in the cone about an axis (d,) whose edge goes through an outline (k, d)."""
-    rim, flat = flattened(axis, outline), flattened(axis, np.asarray(vectors, dtype=float))
+    rim, flat = angles_off_axis(axis, outline), angles_off_axis(axis, np.asarray(vectors, dtype=float))
     if len(axis) == 2:
         return np.asarray((flat[..., 0] >= rim.min()) & (flat[..., 0] <= rim.max()))
     turn = np.arctan2(rim[:, 1], rim[:, 0])
@@ -119,7 +119,7 @@ def holds(axis: Array, outline: Array, vectors: Array) -> Array:
     return np.asarray(along[..., 0] * away[..., 1] - along[..., 1] * away[..., 0] >= 0.0)
 
 
-def flattened(axis: Array, vectors: Array) -> Array:
+def angles_off_axis(axis: Array, vectors: Array) -> Array:
     """Return the angles (..., d - 1) by which vectors (..., d) are off an axis (d,), along two axes across it."""
     unit = vectors / np.sqrt((vectors**2).sum(-1, keepdims=True))
     across = unit @ basis(axis)

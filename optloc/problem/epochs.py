@@ -21,10 +21,16 @@ def separable(problem: Problem) -> bool:
     run_long_errors = problem.stations.unknown_for == "run"
     # A target that is known for the run ties nothing, and counts as free only where its span says so.
     free = all(motion.span == "epoch" for motion in problem.motions)
-    return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not tied(problem)
+    return (
+        problem.epochs > 1
+        and free
+        and not problem.biases
+        and not run_long_errors
+        and not has_correlated_epochs(problem)
+    )
 
 
-def tied(problem: Problem) -> bool:
+def has_correlated_epochs(problem: Problem) -> bool:
     """Return whether the noise of rows of different epochs is correlated."""
     epoch = problem.epoch
     for block in problem.noise.blocks:
@@ -58,7 +64,7 @@ def by_epoch(problem: Problem) -> Problem:
         Where biases or the noise tie the epochs together.
     """
     # One more batch axis has no room for what several of its problems share.
-    if problem.biases or tied(problem):
+    if problem.biases or has_correlated_epochs(problem):
         tie = f"the bias {problem.biases[0].name!r} is" if problem.biases else "correlated noise is"
         raise InvalidProblem(f"{tie} shared by several epochs", "by_epoch", "solve them as one problem")
     places = [_places(rows) for rows in problem.rows]
@@ -145,7 +151,7 @@ def _spread(c: Band | Polygon, rise: Array | None) -> Band | Polygon:
     return replace(c, lower=lower, upper=upper, coefficients=_same(c.coefficients, 1))
 
 
-def untied(problem: Problem) -> Problem:
+def without_epoch_correlation(problem: Problem) -> Problem:
     """Return the problem with noise blocks of one epoch each; correlation between epochs is dropped."""
     epoch = problem.epoch
     if all((epoch[block.row] == epoch[block.row[:, :1]]).all() for block in problem.noise.blocks):
@@ -281,14 +287,14 @@ def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Proble
         yield first, last, window(problem, first, last)
 
 
-def whole(problem: Problem, batch: int = 1) -> bool:
+def is_one_window(problem: Problem, batch: int = 1) -> bool:
     """Return whether a run is one window."""
     return epochs_of(problem, batch) >= problem.epochs
 
 
 def epochs_of(problem: Problem, batch: int = 1) -> int:
     """Return the number of epochs whose Jacobians fit into the cache."""
-    if problem.epochs == 1 or problem.count == 0 or tied(problem):
+    if problem.epochs == 1 or problem.count == 0 or has_correlated_epochs(problem):
         return problem.epochs
     # And one for the residual.
     columns = problem.layout.n_shared + problem.layout.n_local + 1
@@ -379,7 +385,7 @@ def cut(problem: Problem, first: int, last: int) -> Problem:
     return _begun_anew(problem, part, slice(first, last))
 
 
-def thinned(problem: Problem, epochs: Array) -> Problem:
+def some_epochs(problem: Problem, epochs: Array) -> Problem:
     """Return some epochs (n,) of a run as a run of its own; arguments otherwise as of `cut`."""
     part = _with_rows_of(problem, lambda epoch: np.flatnonzero(np.isin(epoch, epochs)))
     return _begun_anew(problem, part, epochs)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, NoSolution, status_named, too_weak, whole
+from optloc.base.errors import InvalidProblem, NoSolution, status_named, too_weak, whole_redundancy
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
 from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Certificate, Status, statuses_of
@@ -512,7 +512,7 @@ class Fix:
         InvalidProblem
             For an unknown status or a redundancy that is no whole number.
         """
-        wanted = whole(redundancy)
+        wanted = whole_redundancy(redundancy)
         passing = [Status.OK, *(one if isinstance(one, Status) else status_named(one) for one in allow)]
         bad = np.flatnonzero(~np.isin(np.ravel(self.code), passing))
         if len(bad):
@@ -545,7 +545,7 @@ class Fix:
 _TELLER: list[Callable[[], Any]] = []
 
 
-def told_by(teller: Callable[[], Any]) -> None:
+def set_renderer(teller: Callable[[], Any]) -> None:
     """Say which module, loaded when it is needed, tells fixes in words and tables: `optloc.show.fixes`."""
     _TELLER[:] = [teller]
 

@@ -27,7 +27,7 @@ def _in_proportion_to_time(bias: Bias, times: Array, origin: float, epoch: Array
 
 def _in_pieces(bias: Bias, times: Array, origin: float, epoch: Array) -> _Effects:
     assert bias.knots is not None
-    entry, factor = clocks.pieces(bias.knots, times)
+    entry, factor = clocks.spline_weights(bias.knots, times)
     first = bias.member[:, None] * clocks.coefficients(bias.knots)
     return first + entry[epoch], bias.coefficient[:, None] * factor[epoch]
 

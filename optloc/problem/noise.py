@@ -69,7 +69,7 @@ class Whitener:
     def apply(self, values: Array) -> Array:
         """Return whitened values (..., g * r, p) of values (..., m, p) for this block's rows."""
         g, r = self.row.shape
-        matrix, count = arrays.placed(self.matrix, values), values.shape[-2]
+        matrix, count = arrays.as_array_like(self.matrix, values), values.shape[-2]
         whole = self.row.size == count and np.array_equal(self.row.ravel(), np.arange(count))
         white: Array
         # Independent rows and one group of all rows are the usual cases: they need no gathering and no reshape.
@@ -95,7 +95,7 @@ def independent(variance: Array) -> Noise:
     return Noise((Block(rows[:, None], variance[..., None, None]),))
 
 
-def together(key: Array) -> list[Array]:
+def group_members(key: Array) -> list[Array]:
     """Return the members (g, r) of equal keys (m,), one array for each size of group r."""
     # Stable: members keep the order of the rows, on which the covariance is written down.
     order = np.argsort(key, kind="stable")
@@ -174,7 +174,7 @@ def _whitener(block: Block, weight: Array) -> Whitener:
     # All rows as measured: the matrices of the covariance itself, shared by the batch where that is.
     if bool(xp.all(picked == 1.0)):
         # what other libraries trace belongs to one trace
-        own = arrays.foreign(block.covariance)
+        own = arrays.is_other_library(block.covariance)
         return Whitener(block.row, linalg.whitening(block.covariance) if own else block.whitening)
     present = picked > 0.0
     variance = xp.linalg.diagonal(block.covariance)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.arrays import library, placed
+from optloc.base.arrays import as_array_like, library
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
 from optloc.base.types import Array, Band, Bias, CompassRows, Motion, Polygon, Prior, Rows, Stations
@@ -209,7 +209,7 @@ class Problem:
 
     def placed(self, like: Any) -> Problem:
         """Return the problem with its numbers as arrays of another array's library, device and float type."""
-        return map_numbers(self, lambda array, core: placed(array, like))
+        return map_numbers(self, lambda array, core: as_array_like(array, like))
 
     def take(self, index: Array) -> Problem:
         """Return the problems of a flat batch at an index or mask; structure stays."""

@@ -14,7 +14,7 @@ from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, S
 from optloc.base.units import LARGEST
 from optloc.models import MODELS
 from optloc.models.surfaces import SURFACES
-from optloc.problem.epochs import separable, tied, untied
+from optloc.problem.epochs import has_correlated_epochs, separable, without_epoch_correlation
 from optloc.problem.forms import form_of
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem, at_rest, check_medium
@@ -65,8 +65,8 @@ def checked(problem: Problem) -> Problem:
 def _cut_noise(problem: Problem) -> Problem:
     """Return the problem with noise in blocks of one epoch each, as the elimination of local unknowns needs it."""
     # Correlation between epochs that are independent of each other would couple what is eliminated epoch by epoch.
-    if not tied(problem):
-        return untied(problem)
+    if not has_correlated_epochs(problem):
+        return without_epoch_correlation(problem)
     if problem.layout.n_local:
         name = problem.layout.local[0].name
         what = f"rows of different epochs are correlated, but every epoch has its own {name!r}"
@@ -448,11 +448,11 @@ def check_constraints(problem: Problem) -> None:
             check_polygon(constraint.vertices, where)
         else:
             _check_band(problem, constraint, where)
-    for same in like(problem.constraints):
+    for same in bands_by_quantity(problem.constraints):
         _check_agreement(same)
 
 
-def like(constraints: Sequence[Band | Polygon]) -> list[list[Band]]:
+def bands_by_quantity(constraints: Sequence[Band | Polygon]) -> list[list[Band]]:
     """Return the bands on one quantity of one target together, in the order of their first."""
     groups: dict[tuple[str, int, bool, bytes], list[Band]] = {}
     for c in constraints:

@@ -20,7 +20,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined, put, put_rows
-from optloc.proof.nodes.node import Triple, blend, inner, reach, triple, write
+from optloc.proof.nodes.node import Triple, inner_product, reach, sum_of_forms, triple_at, write_triple
 
 
 class AtlasMinima(NamedTuple):
@@ -138,7 +138,7 @@ def first_minima(minima: AtlasMinima, count: int) -> AtlasMinima:
 
 
 @compiled
-def one_more(atlas: Atlas) -> Atlas:
+def with_room_for_minimum(atlas: Atlas) -> Atlas:
     """Return the same pieces with room for one more known minimum, the last."""
     before, count = atlas.minima, atlas.minima.home.shape[0]
     wider = atlas_of(atlas.middle, atlas.radius, atlas.dimension, count + 1)
@@ -201,7 +201,7 @@ def _set_home(atlas: Atlas, home: int) -> None:
 
 
 @compiled
-def home_of(atlas: Atlas, x: Array, u: Array) -> int:
+def piece_of(atlas: Atlas, x: Array, u: Array) -> int:
     """Return the face or inside on which a position x (D,) lies, and write its coordinates there into u (3,)."""
     d, most, home = atlas.dimension, 1.0, 2 * atlas.dimension
     for k in range(d):
@@ -231,7 +231,7 @@ def coordinates_on(atlas: Atlas, home: int, x: Array, u: Array) -> bool:
 
 
 @compiled
-def position(atlas: Atlas, x: Array) -> None:
+def write_position(atlas: Atlas, x: Array) -> None:
     """Write the position x (D,) of the centre that `set_centre` has set; v must not be zero."""
     for k in range(atlas.dimension):
         x[k] = atlas.middle[k] + atlas.radius * atlas.point[k] / atlas.scale[0]
@@ -252,7 +252,7 @@ def widen_around(atlas: Atlas, i: int, half: Array) -> None:
 
 
 @compiled
-def infinity(atlas: Atlas, piece: int) -> float:
+def infinity_coordinate(atlas: Atlas, piece: int) -> float:
     """Return the last coordinate of infinity in a piece, -inf where it is not reached along that alone.
 
     Around a minimum a little beyond, where v rounds to zero.
@@ -267,7 +267,7 @@ def infinity(atlas: Atlas, piece: int) -> float:
 
 
 @compiled
-def within(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
+def is_near_minimum(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
     """Return whether a box around the centre set lies inside the convex box of minimum i, and whether in its core."""
     minima, d = atlas.minima, atlas.dimension
     if minima.home[i] != atlas.place[0]:
@@ -366,13 +366,15 @@ class AtlasFrame(NamedTuple):
 @inlined
 def frame_of(atlas: Atlas) -> AtlasFrame:
     """Return where the centre that `set_centre` has set lies."""
-    slant = (triple(atlas.slant[0], 0), triple(atlas.slant[1], 0), triple(atlas.slant[2], 0))
-    point, rise = triple(atlas.point, 0), triple(atlas.scale, 1)
-    return AtlasFrame(triple(atlas.middle, 0), atlas.radius, atlas.dimension == 3, point, slant, atlas.scale[0], rise)
+    slant = (triple_at(atlas.slant[0], 0), triple_at(atlas.slant[1], 0), triple_at(atlas.slant[2], 0))
+    point, rise = triple_at(atlas.point, 0), triple_at(atlas.scale, 1)
+    return AtlasFrame(
+        triple_at(atlas.middle, 0), atlas.radius, atlas.dimension == 3, point, slant, atlas.scale[0], rise
+    )
 
 
 @compiled
-def clip_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, half: Array, cut: Array) -> None:
+def contract_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, half: Array, cut: Array) -> None:
     """Clip a box around the centre set to what lies between corners in search coordinates around a fix.
 
     With b a row of `back` a position x has the coordinate ``b.(x - origin)``, and v times it is linear in the
@@ -389,23 +391,23 @@ def clip_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, ha
     half, cut : array (3,), (6,)
         Half-widths of the box, and ends of what is left of it, clipped.
     """
-    frame, h = frame_of(atlas), triple(half, 0)
+    frame, h = frame_of(atlas), triple_at(half, 0)
     s0, s1, s2 = frame.slant
     m0, m1, m2 = frame.middle
     apart, most = (m0 - origin[0], m1 - origin[1], m2 - origin[2]), abs(frame.scale) + reach(frame.rise, h)
     for k in range(3):
-        b = triple(back[k], 0)
+        b = triple_at(back[k], 0)
         # v times the coordinate: at the centre, its derivative, and what both round relative to.
-        away = inner(b, apart)
-        middle = frame.radius * inner(b, frame.point) + away * frame.scale
-        slant = blend(1.0, blend(b[0], s0, b[1], s1), b[2], s2)
-        steep, blur = blend(frame.radius, slant, away, frame.rise), 0.0
+        away = inner_product(b, apart)
+        middle = frame.radius * inner_product(b, frame.point) + away * frame.scale
+        slant = sum_of_forms(1.0, sum_of_forms(b[0], s0, b[1], s1), b[2], s2)
+        steep, blur = sum_of_forms(frame.radius, slant, away, frame.rise), 0.0
         for m in range(3):
             size = frame.radius * (abs(frame.point[m]) + reach(frame.slant[m], h))
             blur += abs(b[m]) * (size + (abs(frame.middle[m]) + abs(origin[m])) * most)
         for side in range(2):
             sign, end = (-1.0, corners[0, k]) if side == 0 else (1.0, corners[1, k])
-            slope = blend(sign, steep, -sign * end, frame.rise)
+            slope = sum_of_forms(sign, steep, -sign * end, frame.rise)
             # How far the coordinate is beyond the end, times v, must not be positive: from the lowest corner of the box
             # there is so much room.
             room = reach(slope, h) - sign * (middle - end * frame.scale) + _BEYOND * (blur + abs(end) * most)
@@ -435,18 +437,22 @@ def _station(frame: AtlasFrame, data: Array, first: int) -> Triple:
 def set_line(frame: AtlasFrame, data: Array, first: int, away: Array, sense: Array) -> None:
     """Write the scaled line p - v a to the station at data[first:first + 3], and its derivative."""
     a0, a1, a2 = _station(frame, data, first)
-    write(blend(1.0, frame.point, -frame.scale, (a0, a1, a2)), away)
+    write_triple(sum_of_forms(1.0, frame.point, -frame.scale, (a0, a1, a2)), away)
     s0, s1, s2 = frame.slant
-    sense[0, 0], sense[0, 1], sense[0, 2] = blend(1.0, s0, -a0, frame.rise)
-    sense[1, 0], sense[1, 1], sense[1, 2] = blend(1.0, s1, -a1, frame.rise)
-    sense[2, 0], sense[2, 1], sense[2, 2] = blend(1.0, s2, -a2, frame.rise)
+    sense[0, 0], sense[0, 1], sense[0, 2] = sum_of_forms(1.0, s0, -a0, frame.rise)
+    sense[1, 0], sense[1, 1], sense[1, 2] = sum_of_forms(1.0, s1, -a1, frame.rise)
+    sense[2, 0], sense[2, 1], sense[2, 2] = sum_of_forms(1.0, s2, -a2, frame.rise)
 
 
 @inlined
 def scaled_station(frame: AtlasFrame, data: Array) -> tuple[float, float, Triple]:
     """Return ``|a|`` of a station a, and ``N = -2 a.p + v |a|^2`` with its gradient, a constant."""
     a = _station(frame, data, 0)
-    squared = inner(a, a)
+    squared = inner_product(a, a)
     s0, s1, s2 = frame.slant
-    n = blend(1.0, blend(a[0], s0, a[1], s1), a[2], s2)
-    return sqrt(squared), frame.scale * squared - 2.0 * inner(a, frame.point), blend(-2.0, n, squared, frame.rise)
+    n = sum_of_forms(1.0, sum_of_forms(a[0], s0, a[1], s1), a[2], s2)
+    return (
+        sqrt(squared),
+        frame.scale * squared - 2.0 * inner_product(a, frame.point),
+        sum_of_forms(-2.0, n, squared, frame.rise),
+    )

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array
-from optloc.kernels.jit import FEW, compiled, enabled, plain, ready, usable, worth_loading
-from optloc.proof.box import bound_nodes, cost_at, rounding
-from optloc.proof.everywhere import prove_everywhere
+from optloc.kernels.jit import FEW, compiled, enabled, is_in_use, may_use_code, plain, worth_loading
+from optloc.proof.box import bound_nodes, cost_at, rounding_error
+from optloc.proof.global_search import prove_globally
 from optloc.proof.groups import empty_groups
-from optloc.proof.near import OPEN, prove
+from optloc.proof.local_search import OPEN, prove_locally
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import LINES, Cost, KnownMinima, accuracy_floor, cost_of, empty_box, set_geometry
 
@@ -77,7 +77,7 @@ class ProofResult(NamedTuple):
     Parameters
     ----------
     verdict : int array (n,)
-        As `optloc.proof.near.prove` or `optloc.proof.everywhere.prove_everywhere` returns it.
+        As `optloc.proof.local_search.prove_locally` or `optloc.proof.global_search.prove_globally` returns it.
     boxes : int array (n,)
         Boxes looked at.
     bound : array (n,)
@@ -114,12 +114,12 @@ def prove_all(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     The first few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
     """
     n = len(asked.x)
-    if worth_loading(_loop, n) or (len(costs.kinds) > SMALL and usable(_loop, n)):
+    if worth_loading(_loop, n) or (len(costs.kinds) > SMALL and may_use_code(_loop, n)):
         return _prove(costs, asked)
     parts = []
     for first in range(0, n, FEW):
         # Where machine code is made meanwhile, it goes on with the rest.
-        last = n if first > 0 and usable(_loop, n) else min(first + FEW, n)
+        last = n if first > 0 and may_use_code(_loop, n) else min(first + FEW, n)
         some = slice(first, last)
         parts.append((_prove if last - first > FEW else _prove_few)(costs.take(some), asked.take(some)))
         if last == n:
@@ -137,7 +137,7 @@ def _prove_few(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
     if len(short) and enabled():
         costs, asked = costs.take(short), asked.take(short)
         plenty = max(_AT_LEAST, PLAIN_BOXES // len(short))
-        more = _prove(costs, asked) if usable(_loop, n) else _prove_plainly(costs, asked, plenty)
+        more = _prove(costs, asked) if may_use_code(_loop, n) else _prove_plainly(costs, asked, plenty)
         for array, found in zip(out, more, strict=True):
             array[short] = found
     return out
@@ -150,7 +150,7 @@ def _prove_plainly(costs: PositionCosts, asked: ProofRequest, boxes: int) -> Pro
 
 def lacks_code(count: int) -> bool:
     """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
-    return enabled() and not usable(_loop, count)
+    return enabled() and not may_use_code(_loop, count)
 
 
 def empty_answer(n: int, d: int) -> ProofResult:
@@ -191,7 +191,7 @@ def _prove(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
             _loop(costs.take(part), asked.take(part), out.take(part))
 
     if enabled():
-        mapped(stretch, range(0, n, length))
+        map_on_threads(stretch, range(0, n, length))
         return out
     for first in range(0, n, length):  # plain Python holds the interpreter: threads would wait for each other
         stretch(first)
@@ -206,9 +206,9 @@ def prove_here(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> N
     _loop(costs, asked, out)
 
 
-def loaded() -> bool:
+def is_code_loaded() -> bool:
     """Return whether the machine code of proofs has been used in this process."""
-    return ready(_loop)
+    return is_in_use(_loop)
 
 
 def costs_at(costs: PositionCosts, x: Array) -> tuple[Array, Array]:
@@ -251,7 +251,7 @@ def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
         cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, w[i], A, weight, groups), box
         # Rows that are absent in this problem alone: the tables of the batch are too wide for it.
         if (weight == 0.0).any():
-            cost = present_in(cost)
+            cost = without_unused_nodes(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
         x, gaps, eps, found = fixes[i], steps[i], tolerances[i], points[i]
         beside, low, high = (
@@ -262,7 +262,7 @@ def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
         boxes = 0
         wholes[i] = isnan(low[0])
         if wholes[i]:
-            verdict, boxes, bound, gap, met = prove_everywhere(
+            verdict, boxes, bound, gap, met = prove_globally(
                 cost, own, x, beside, gaps, eps, budgets[i], rivals[i], found
             )
             verdicts[i], counts[i], bounds[i], shown[i], numbers[i] = verdict, boxes, bound, gap, met
@@ -270,12 +270,14 @@ def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
                 continue
             wholes[i] = False
             low, high = fallbacks[i, 0], fallbacks[i, 1]
-        verdict, more, bound = prove(cost, own, x, beside, gaps[0], eps, budgets[i], inf, low, high, False, found)
+        verdict, more, bound = prove_locally(
+            cost, own, x, beside, gaps[0], eps, budgets[i], inf, low, high, False, found
+        )
         verdicts[i], counts[i], bounds[i], shown[i], numbers[i] = verdict, boxes + more, bound, gaps[0], 0
 
 
 @compiled
-def present_in(cost: Cost) -> Cost:
+def without_unused_nodes(cost: Cost) -> Cost:
     """Return a cost without nodes that no row has: time goes with the square of the nodes."""
     K, w = cost.K, cost.w
     nodes, rows = np.empty(K.shape[1], dtype=np.int64), np.empty(K.shape[0], dtype=np.int64)
@@ -316,4 +318,4 @@ def _evaluate(costs: PositionCosts, x: Array, out: Array) -> None:
             bound_nodes(costs.kinds, data, origin, axes, axes, box.half, box.line, box.nodes)
             out[0, i, p] = cost_at(K, w, box.nodes)
             floor = accuracy_floor(costs.kinds, data, weight, w, origin, LINES)
-            out[1, i, p] = rounding(K, weight, floor, box.nodes)
+            out[1, i, p] = rounding_error(K, weight, floor, box.nodes)

@@ -13,16 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array
-from optloc.kernels.jit import FEW, compiled, enabled, inlined, plain, ready, usable, zero
-from optloc.proof.atlas import atlas_of, one_more
-from optloc.proof.batch import FIRST_BOXES, PLAIN_BOXES, SMALL, plainly, present_in
+from optloc.kernels.jit import FEW, compiled, enabled, inlined, is_in_use, may_use_code, plain, zero
+from optloc.proof.atlas import atlas_of, with_room_for_minimum
+from optloc.proof.batch import FIRST_BOXES, PLAIN_BOXES, SMALL, plainly, without_unused_nodes
 from optloc.proof.box import (
     DEPTH,
     PIECE,
+    contract_box,
     cost_at,
-    cube,
     cut_out,
     least_residual,
     linearise_rows,
@@ -30,27 +30,27 @@ from optloc.proof.box import (
     push_around,
     push_halves,
     reaches_infinity,
-    rounding,
-    shrink,
+    reset_cut,
+    rounding_error,
+    station_cube,
     steepest_side,
-    uncut,
 )
 from optloc.proof.convex_boxes import known_minima, set_minimum
-from optloc.proof.curvature import clip_to_minima
+from optloc.proof.curvature import contract_to_minima
 from optloc.proof.descents import descend
-from optloc.proof.everywhere import leaves
-from optloc.proof.near import cut_side, region_of
+from optloc.proof.global_search import excludes_infimum
+from optloc.proof.local_search import cut_side, region_of
 from optloc.proof.pieces import push_faces
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import (
     Box,
     Cost,
     KnownMinima,
+    axes_of_next_piece,
     chart_on,
     cost_of,
     curve_box,
     empty_box,
-    turned,
 )
 from optloc.proof.space import Space, bound_or_halve, floor_of, place_of
 from optloc.proof.surface import SIDES, reach_of_piece
@@ -65,7 +65,7 @@ _STILL = 1e-3
 # Distance, reaches of the stations, beyond which a descent has run away.
 _AWAY = 1e5
 # The test for stationary points is made where the cost at the centre is within so many levels; boxes at infinity are
-# not split below a size. Both as in `optloc.proof.everywhere`, and only a matter of time.
+# not split below a size. Both as in `optloc.proof.global_search`, and only a matter of time.
 _NEAR, _TINY = 100.0, 1e-5
 # How far the cost may fall below that of a minimum in its convex box: what its polish leaves.
 _POLISHED = 1e-6
@@ -170,14 +170,14 @@ def search_minima(
     around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
     level, d, bent = cost_at(cost.K, cost.w, box.nodes) + aim.gap, x.shape[0], aim.surface.shape[0] > 0
     far = not bent and aim.planes.shape[0] == 0 and reaches_infinity(cost.kinds, cost.K)
-    middle, radius = cube(cost.kinds, cost.data, x)
+    middle, radius = station_cube(cost.kinds, cost.data, x)
     atlas, none, nowhere = atlas_of(middle, radius, d, 0), np.empty((0, 3)), np.full(d, nan)
     stack, corners = np.zeros((2 * budget + 4 * (d + 1) + 6 * aim.points.shape[0], DEPTH)), np.empty((2, 3))
     chart, count, boxes = around, zero(), zero()
     for look in range(2 * SIDES if bent else 1):
         most = min(_LOOK, budget - boxes) if bent and look < SIDES else budget - boxes
         if bent:
-            chart = turned(cost, around, look % SIDES)
+            chart = axes_of_next_piece(cost, around, look % SIDES)
             corners[0], corners[1] = -inf, inf
             reach_of_piece(chart.surface, chart.origin, chart.sense, corners[0], corners[1])
         elif not far and not region_of(cost, chart, box, sqrt(level), nowhere, nowhere, corners[0], corners[1]):
@@ -288,9 +288,9 @@ def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here
     touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
     if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
         return -1
-    if level < inf and here < _NEAR * (level + 1.0) and leaves(cost, atlas, box, touching, floor):
+    if level < inf and here < _NEAR * (level + 1.0) and excludes_infimum(cost, atlas, box, touching, floor):
         return -1
-    uncut(box.half, box.cut)
+    reset_cut(box.half, box.cut)
     return int(steepest_side(box.half, box.rows, d))
 
 
@@ -299,14 +299,14 @@ def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
     """Write the ends of the part of a box that may hold a minimum below a level; return the side to halve, or -1."""
     chart = space.chart
     gram = box.gram if chart.surface.shape[0] > 0 else chart.gram
-    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
-    uncut(box.half, box.cut)
+    noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
+    reset_cut(box.half, box.cut)
     if level < inf:
         flat = box.half[2] == 0.0
-        shrink(cost.K, cost.weight, sqrt(level) + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
+        contract_box(cost.K, cost.weight, sqrt(level) + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
     side = cut_side(cost.kinds, cost.K, gram, box.half, box.nodes, box.rows, here < level)
     curve_box(cost, chart, box)
-    minima = clip_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+    minima = contract_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
     return int(side) if minima else -1
 
 
@@ -321,7 +321,7 @@ def _with_known(cost: Cost, space: Space, near: Box, aim: SearchGoal, corners: A
 @compiled
 def _push_minimum(cost: Cost, space: Space, near: Box, x: Array, stack: Array, size: int) -> tuple[Space, int]:
     """Return the atlas with one more minimum x (D,), and push boxes around it; the same if x is no minimum."""
-    known, atlas = space.atlas.minima.home.shape[0], one_more(space.atlas)
+    known, atlas = space.atlas.minima.home.shape[0], with_room_for_minimum(space.atlas)
     if not set_minimum(cost, near, atlas, known, x, -inf, _POLISHED, inf):
         return space, size
     core, sides = atlas.minima.core[known], atlas.minima.sides[known]
@@ -384,15 +384,15 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
             points[i], boxes[i] = _minima_of(costs.take(slice(i, i + 1)), places.take(i), gap, budget, most)
 
     asked = list(range(n))
-    if n <= FEW and len(costs.kinds) <= SMALL and not ready(present_in):
+    if n <= FEW and len(costs.kinds) <= SMALL and not is_in_use(without_unused_nodes):
         # As few proofs are: most need few boxes, and machine code takes longer to load.
         first = min(budget, FIRST_BOXES // n)
         with plain():
             for i in asked:
                 search(i, first)
         asked = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
-    if enabled() and usable(search_minima, n):
-        mapped(lambda i: search(i, budget), asked)
+    if enabled() and may_use_code(search_minima, n):
+        map_on_threads(lambda i: search(i, budget), asked)
         return points, boxes
     # Plain Python holds the interpreter: threads would wait for each other.
     few = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(asked), 1))) if enabled() else budget
@@ -404,8 +404,8 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
 
 def _minima_of(costs: PositionCosts, place: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, int]:
     """Return the minima (most, d) of one cost, and the boxes that it took; places without their first axis."""
-    cost = present_in(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
-    _, radius = cube(cost.kinds, cost.data, place.x)
+    cost = without_unused_nodes(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
+    _, radius = station_cube(cost.kinds, cost.data, place.x)
     found, least = np.zeros((most, len(place.x))), np.full(most, inf)
     aim = SearchGoal(place.planes, place.surface, gap, _AWAY * radius, found, least)
     box, near = empty_box(*cost.K.shape), empty_box(*cost.K.shape)

@@ -155,28 +155,28 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
                 total += K[i, j] * rows[i, DIRECTION]
             if radius < inf:
                 reach -= abs(total) * radius
-            elif not total * _open_side(nodes, j) > digits(K) * weight[j] * sqrt(length):
+            elif not total * _open_side(nodes, j) > relative_rounding(K) * weight[j] * sqrt(length):
                 return -1.0  # along v the node has no bound
-    return float(reach / sqrt(length)) - rounding(K, weight, floor, nodes)
+    return float(reach / sqrt(length)) - rounding_error(K, weight, floor, nodes)
 
 
 @inlined
-def reaches(low: float, level: float) -> bool:
+def exceeds_level(low: float, level: float) -> bool:
     """Return whether a cost is at least a level where the residual is at least `low` long: no cost is negative."""
     return level <= 0.0 or (low > 0.0 and low * low >= level)
 
 
 @inlined
-def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
+def rounding_error(K: Array, weight: Array, floor: float, nodes: Array) -> float:
     """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
     size = floor
     for j in range(K.shape[1]):
         size += weight[j] * (abs(nodes[j, PHI]) + size_within(nodes[j, LOW], nodes[j, HIGH]))
-    return float(digits(K) * size)
+    return float(relative_rounding(K) * size)
 
 
 @inlined
-def digits(K: Array) -> float:
+def relative_rounding(K: Array) -> float:
     """Return the relative rounding error of sums over the nodes and rows of K (q, J)."""
     # One rounding for each term of the sums, and 32 for those within a node and in the slopes.
     return float((32 + K.shape[0] + K.shape[1]) * _ULP)
@@ -201,7 +201,7 @@ def normal_of(rows: Array) -> tuple[float, float, float, float, float, float, fl
 
 
 @compiled
-def within(s: float, half: float) -> float:
+def clamp(s: float, half: float) -> float:
     """Return the number nearest to s between -half and half."""
     if s > half:
         return half
@@ -216,9 +216,9 @@ def _nearest(half: Array, rows: Array) -> None:
     d2 = 1.0 / a22 if a22 > 0.0 else 0.0
     s0, s1, s2 = 0.0, 0.0, 0.0
     for _ in range(_SWEEPS):
-        s0 = within(-(b0 + a01 * s1 + a02 * s2) * d0, half[0])
-        s1 = within(-(b1 + a01 * s0 + a12 * s2) * d1, half[1])
-        s2 = within(-(b2 + a02 * s0 + a12 * s1) * d2, half[2])
+        s0 = clamp(-(b0 + a01 * s1 + a02 * s2) * d0, half[0])
+        s1 = clamp(-(b1 + a01 * s0 + a12 * s2) * d1, half[1])
+        s2 = clamp(-(b2 + a02 * s0 + a12 * s1) * d2, half[2])
     for i in range(rows.shape[0]):
         rows[i, DIRECTION] = rows[i, MIDDLE] + rows[i, J0] * s0 + rows[i, J1] * s1 + rows[i, J2] * s2
 
@@ -236,7 +236,7 @@ def _absorb(K: Array, weight: Array, nodes: Array, rows: Array) -> None:
             for i in range(K.shape[0]):
                 pull += K[i, j] * rows[i, DIRECTION]
             if radius < inf:
-                move = within(-pull / (weight[j] * weight[j]), radius)
+                move = clamp(-pull / (weight[j] * weight[j]), radius)
             else:
                 move = _move_beyond(K, weight[j], rows, pull, _open_side(nodes, j))
             for i in range(K.shape[0]):
@@ -263,7 +263,7 @@ def _move_beyond(K: Array, weight: float, rows: Array, pull: float, side: float)
 
 
 @inlined
-def shrink(
+def contract_box(
     K: Array, weight: Array, rho: float, half: Array, plane: bool, nodes: Array, rows: Array, cut: Array, solve: Array
 ) -> None:
     """Clip a box to where the residual may be shorter than rho.
@@ -313,7 +313,7 @@ def shrink(
             r2 += abs(solve[2, 0] * p0 + solve[2, 1] * p1 + solve[2, 2] * p2) * radius
     l0, l1, l2, h0, h1, h2 = sqrt(a00), sqrt(a11), sqrt(a22), half[0], half[1], half[2]
     # Products of Y with vectors of these lengths are off by so many of their digits, before they cancel.
-    slack = digits(K) * (size + sqrt(longest) + l0 * h0 + l1 * h1 + l2 * h2)
+    slack = relative_rounding(K) * (size + sqrt(longest) + l0 * h0 + l1 * h1 + l2 * h2)
     for k in range(2 if plane else 3):
         y0, y1, y2 = solve[k, 0], solve[k, 1], solve[k, 2]
         e0 = abs(y0 * a00 + y1 * a01 + y2 * a02 - (k == 0))
@@ -323,18 +323,18 @@ def shrink(
         across = solve[k, k] + (e0 * abs(y0) + e1 * abs(y1) + e2 * abs(y2))
         reach = (r0 if k == 0 else (r1 if k == 1 else r2)) + rho * sqrt(max(across, 0.0))
         reach += e0 * h0 + e1 * h1 + e2 * h2 + slack * (abs(y0) * l0 + abs(y1) * l1 + abs(y2) * l2)
-        clip(cut, k, -(y0 * b0 + y1 * b1 + y2 * b2), reach)
+        contract_coordinate(cut, k, -(y0 * b0 + y1 * b1 + y2 * b2), reach)
 
 
 @inlined
-def uncut(half: Array, cut: Array) -> None:
+def reset_cut(half: Array, cut: Array) -> None:
     """Write the ends of a whole box."""
     for k in range(3):
         cut[k], cut[3 + k] = -half[k], half[k]
 
 
 @compiled
-def clip(cut: Array, k: int, centre: float, reach: float) -> None:
+def contract_coordinate(cut: Array, k: int, centre: float, reach: float) -> None:
     """Clip coordinate k of a box to ``|s - centre| <= reach``, with some slack for rounding."""
     reach += 1e-9 * (abs(centre) + reach)
     if not reach < inf:  # NaN as well: where bounds are infinite nothing is known
@@ -537,7 +537,7 @@ def reaches_infinity(kinds: Array, K: Array) -> bool:
 
 
 @compiled
-def cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
+def station_cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
     """Return centre (3,) and half-width of a cube that holds all stations well.
 
     Parameters

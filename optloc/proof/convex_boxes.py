@@ -9,12 +9,12 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined, put
 from optloc.kernels.systems import principal
-from optloc.proof.atlas import Atlas, home_of, infinity, set_centre
-from optloc.proof.box import J0, cost_at, linearise_rows, rounding
-from optloc.proof.curvature import FAINT, G0, G1, G2, NOISE0, bend_axes, convex, least_of, sum_up
+from optloc.proof.atlas import Atlas, infinity_coordinate, piece_of, set_centre
+from optloc.proof.box import J0, cost_at, linearise_rows, rounding_error
+from optloc.proof.curvature import FAINT, G0, G1, G2, NOISE0, bend_axes, is_convex_over_box, least_diagonal, sum_up
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, size_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE
-from optloc.proof.search_space import HIDDEN_REACH, Box, Cost, KnownMinima, LocalAxes, is_convex, widen
+from optloc.proof.search_space import HIDDEN_REACH, Box, Cost, KnownMinima, LocalAxes, is_convex, widen_by_rounding
 
 # Around a fix, in its search coordinates.
 
@@ -108,12 +108,12 @@ def known_minima(
         for k in range(3):
             hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
         if hidden:
-            draw_in(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
+            limit_half_widths(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
         if set_convex(cost, chart, box, hull, margin):
             # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
             shift[:] = 0.0
             if p > 0:
-                widen(chart, box.centre, shift)
+                widen_by_rounding(chart, box.centre, shift)
             for k in range(3):
                 minima[count, k], sides[count, k] = box.at[k], max(box.half[k] - shift[k], 0.0)
             count += 1
@@ -138,7 +138,7 @@ def is_elsewhere(chart: LocalAxes, box: Box, place_of: Array) -> bool:
 
 
 @compiled
-def draw_in(sense: Array, hull: Array) -> None:
+def limit_half_widths(sense: Array, hull: Array) -> None:
     """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
     share = 1.0
     for k in range(3):
@@ -213,7 +213,7 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: flo
         How far, in metres, these may reach along any coordinate.
     """
     minima, d = atlas.minima, atlas.dimension
-    minima.home[i] = home_of(atlas, x, minima.start[i])
+    minima.home[i] = piece_of(atlas, x, minima.start[i])
     if not set_axes(cost, box, atlas, i):
         return False
     _tables(cost, box, atlas, i, np.zeros(3))
@@ -240,7 +240,7 @@ def widen_core(atlas: Atlas, i: int, limit: float) -> None:
     Where infinity is no farther than that, and the axes allow it, the box reaches there.
     """
     d, core, hull = atlas.dimension, atlas.minima.core[i], np.full(3, _VALLEY)
-    end = infinity(atlas, 2 * d + 1 + i)
+    end = infinity_coordinate(atlas, 2 * d + 1 + i)
     if end == -inf:
         set_hull(atlas, i, hull, limit)
     elif limit < inf:
@@ -257,7 +257,7 @@ def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
     """Write half-widths (3,) around minimum i beyond which no convex box is looked for, within a limit in metres."""
     minima, d = atlas.minima, atlas.dimension
     # v falls along the last of the axes alone, or along all of them at once.
-    ways = 1 if infinity(atlas, 2 * d + 1 + i) > -inf else d
+    ways = 1 if infinity_coordinate(atlas, 2 * d + 1 + i) > -inf else d
     for k in range(d):
         steep = abs(minima.axes[i, d - 1, k]) * ways if minima.home[i] < 2 * d else 0.0
         hull[k] = min(_WIDEST, _SHARE * minima.start[i, d - 1] / steep if steep > 0.0 else _WIDEST)
@@ -309,7 +309,7 @@ def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
                 information[k, m] += box.rows[row, J0 + k] * box.rows[row, J0 + m]
     lengths, steep = information.copy(), 0.0
     principal(lengths, vectors)
-    if least_of(lengths, d) <= FAINT * max(lengths[0, 0], lengths[1, 1], lengths[2, 2]):
+    if least_diagonal(lengths, d) <= FAINT * max(lengths[0, 0], lengths[1, 1], lengths[2, 2]):
         bend_axes(box.sums, vectors, lengths, d)
     axes[:], back[:] = 0.0, 0.0
     for k in range(d):
@@ -359,7 +359,7 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
     set_centre(atlas, 2 * atlas.dimension + 1 + i, box.at)
     bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
-    noise = rounding(cost.K, cost.weight, accuracy_floor_far(cost, atlas), box.nodes)
+    noise = rounding_error(cost.K, cost.weight, accuracy_floor_far(cost, atlas), box.nodes)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
 
 
@@ -367,7 +367,7 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
 def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
     _tables(cost, box, atlas, i, half)
     # Ranges are differences here, whose Hessians have no sign: the test must take them for any node.
-    return convex(np.full_like(cost.kinds, ANY), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
+    return is_convex_over_box(np.full_like(cost.kinds, ANY), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
 
 
 @compiled

@@ -9,7 +9,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined
 from optloc.kernels.systems import inverse, positive, positive_along, principal
-from optloc.proof.box import clip, digits, is_empty
+from optloc.proof.box import contract_coordinate, is_empty, relative_rounding
 from optloc.proof.nodes.dispatch import curve_others, shape_of
 from optloc.proof.nodes.node import (
     BLUR,
@@ -124,7 +124,7 @@ def sum_up(K: Array, w: Array, weight: Array, noise: float, nodes: Array, curves
             curves[j, PULL0] += factor * j0
             curves[j, PULL1] += factor * j1
             curves[j, PULL2] += factor * j2
-    longest, share = sqrt(longest), digits(K)
+    longest, share = sqrt(longest), relative_rounding(K)
     sums[LENGTH0], sums[LENGTH1], sums[LENGTH2] = sqrt(sums[H00]), sqrt(sums[H11]), sqrt(sums[H22])
     for j in range(K.shape[1]):
         curves[j, BLUR] = weight[j] * (noise + share * longest) + share * abs(curves[j, FORCE])
@@ -152,7 +152,9 @@ def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> 
 
 
 @compiled
-def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, margin: float) -> bool:
+def is_convex_over_box(
+    kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, margin: float
+) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` times the identity all over the box.
 
     H = Phi'A Phi + sum_j g_j N_j. The first part changes by at least ``-(B'E + E'B)`` with B = A Phi and E the changes
@@ -238,7 +240,9 @@ def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -
 
 
 @compiled
-def clip_to_minima(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, cut: Array, solve: Array) -> bool:
+def contract_to_minima(
+    A: Array, half: Array, nodes: Array, curves: Array, sums: Array, cut: Array, solve: Array
+) -> bool:
     """Clip a box to where the gradient of f may vanish; return whether it may hold a minimum.
 
     Interval Newton: the gradient at c + s is ``g + H s``, H the mean of the Hessian between centre and s. Bounds of its
@@ -258,7 +262,7 @@ def clip_to_minima(A: Array, half: Array, nodes: Array, curves: Array, sums: Arr
 
 
 @inlined
-def clip_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Array) -> None:
+def contract_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Array) -> None:
     """Clip a box to where the gradient of f may vanish; `ball` and sums[C00:] bound the change of the Hessian."""
     if not ball < inf:
         return
@@ -288,7 +292,7 @@ def clip_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Array)
         reach += abs(y0) * sums[NOISE0] + abs(y1) * sums[NOISE1] + abs(y2) * sums[NOISE2]
         g0, g1, g2 = abs(sums[G0]), abs(sums[G1]), abs(sums[G2])
         reach += _ROUNDING * (abs(y0) * g0 + abs(y1) * g1 + abs(y2) * g2)
-        clip(cut, k, -step, reach + 1e-9)
+        contract_coordinate(cut, k, -step, reach + 1e-9)
 
 
 @inlined
@@ -306,12 +310,12 @@ def _clip_along(a: float, d: float, f: float, plane: bool, sums: Array, ball: fl
             # The rounding of the sum counts, whatever is left of it: its own slope may be little.
             middle, wide = sums[G0 + k], ball + sums[NOISE0 + k] + _ROUNDING * abs(sums[G0 + k])
             for m in range(3):
-                at, far = entry(k, m), max(abs(cut[m]), abs(cut[3 + m]))
+                at, far = symmetric_entry(k, m), max(abs(cut[m]), abs(cut[3 + m]))
                 wide += (0.5 * sums[C00 + at] + _ROUNDING * abs(sums[at])) * far
                 if m != k:
                     middle += sums[at] * 0.5 * (cut[m] + cut[3 + m])
                     wide += abs(sums[at]) * 0.5 * (cut[3 + m] - cut[m])
-            clip(cut, k, -middle / own, wide / own + 1e-9)
+            contract_coordinate(cut, k, -middle / own, wide / own + 1e-9)
             if cut[k] > cut[3 + k]:
                 return False
     return True
@@ -344,13 +348,13 @@ def has_no_infimum(
     if not ball < inf:
         return False
     if not touching:
-        clip_newton(half, sums, ball, cut, solve)
-        return is_empty(cut) or bends_down(sums, ball, solve)
+        contract_newton(half, sums, ball, cut, solve)
+        return is_empty(cut) or is_concave_along(sums, ball, solve)
     ball *= sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2])
     for k in range(dimension):
         change = ball
         for m in range(3):
-            at = entry(k, m)
+            at = symmetric_entry(k, m)
             change += (abs(sums[at]) + sums[C00 + at]) * half[m]
         # Slack for the rounding of the sums, relative, and of the gradient itself.
         slope, change = sums[G0 + k], change * (1.0 + 1e-6) + sums[NOISE0 + k]
@@ -369,7 +373,7 @@ def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
     for m in range(dimension):
         change = 0.0
         for k in range(dimension):
-            change += sums[C00 + entry(k, m)] * half[k]
+            change += sums[C00 + symmetric_entry(k, m)] * half[k]
         change *= half[m]
         if most < change < inf:
             most, side = change, m
@@ -377,7 +381,7 @@ def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
 
 
 @compiled
-def bends_down(sums: Array, ball: float, hessian: Array) -> bool:
+def is_concave_along(sums: Array, ball: float, hessian: Array) -> bool:
     """Return whether the cost curves downwards along one direction all over a box, as around a saddle."""
     # No eigenvalue is less than an entry of the diagonal less those beside it (Gershgorin): the common case.
     a, b, c = abs(sums[H01]), abs(sums[H02]), abs(sums[H12])
@@ -387,7 +391,7 @@ def bends_down(sums: Array, ball: float, hessian: Array) -> bool:
     vectors = np.empty((3, 3))
     for k in range(3):
         for m in range(3):
-            hessian[k, m] = sums[entry(k, m)]
+            hessian[k, m] = sums[symmetric_entry(k, m)]
     principal(hessian, vectors)
     column = 0
     for k in range(1, 3):
@@ -396,7 +400,7 @@ def bends_down(sums: Array, ball: float, hessian: Array) -> bool:
     most = ball
     for k in range(3):
         for m in range(3):
-            at = entry(k, m)
+            at = symmetric_entry(k, m)
             z = vectors[k, column] * vectors[m, column]
             most += sums[at] * z + sums[C00 + at] * abs(z)
     size = abs(sums[H00]) + abs(sums[H11]) + abs(sums[H22])
@@ -404,7 +408,7 @@ def bends_down(sums: Array, ball: float, hessian: Array) -> bool:
 
 
 @compiled
-def least_of(information: Array, dimension: int) -> float:
+def least_diagonal(information: Array, dimension: int) -> float:
     """Return the least entry of the diagonal of an information matrix."""
     least = inf
     for k in range(dimension):
@@ -431,12 +435,12 @@ def bend_axes(sums: Array, axes: Array, information: Array, dimension: int) -> N
         bent = 0.0
         for k in range(3):
             for m in range(3):
-                bent += axes[k, column] * axes[m, column] * sums[entry(k, m)]
+                bent += axes[k, column] * axes[m, column] * sums[symmetric_entry(k, m)]
         information[column, column] = max(information[column, column], bent)
 
 
 @compiled
-def entry(k: int, m: int) -> int:
+def symmetric_entry(k: int, m: int) -> int:
     """Return where entry (k, m) of a symmetric matrix stands among (00, 01, 02, 11, 12, 22)."""
     first, second = min(k, m), max(k, m)
     return second if first == 0 else first + second + 1

@@ -8,7 +8,7 @@ from optloc.kernels.jit import compiled, inlined, put
 from optloc.kernels.systems import inverse, positive_along
 from optloc.proof.curvature import G0, G1, G2
 from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22
-from optloc.proof.search_space import Box, Cost, LocalAxes, blur_at, curve_box, value_at
+from optloc.proof.search_space import Box, Cost, LocalAxes, curve_box, rounding_at_centre, value_at
 
 # Steps of a descent: damped Newton needs five to ten from a box near a minimum; beyond forty it creeps along a valley.
 _STEPS = 40
@@ -34,7 +34,7 @@ def descend(cost: Cost, chart: LocalAxes, box: Box) -> float:
     cost_now, damping = value_at(cost, chart, box), _DAMPING
     if not cost_now < inf:
         return inf
-    noise = blur_at(cost, chart, box)
+    noise = rounding_at_centre(cost, chart, box)
     curve_box(cost, chart, box)
     for _ in range(_STEPS):
         length = newton_step(box, damping)
@@ -46,7 +46,7 @@ def descend(cost: Cost, chart: LocalAxes, box: Box) -> float:
         after = value_at(cost, chart, box)
         if after <= cost_now + _SAME_COST * (1.0 + cost_now) + noise * (2.0 * sqrt(cost_now) + noise):
             cost_now = after
-            noise = blur_at(cost, chart, box)
+            noise = rounding_at_centre(cost, chart, box)
             curve_box(cost, chart, box)
             if length < _CLOSE * _CLOSE + noise * noise and damping <= _FREE:
                 sums = box.sums

@@ -9,7 +9,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined, zero
 from optloc.kernels.systems import inverse, invert
-from optloc.proof.box import rounding
+from optloc.proof.box import rounding_error
 from optloc.proof.groups import LOOSE
 from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
 from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
@@ -454,7 +454,7 @@ def enclose(cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, up
     kinds, data, A, groups, nodes, curves = cost.kinds, cost.data, cost.A, cost.groups, box.nodes, box.curves
     x, sense, back = chart.origin, chart.sense, chart.back
     # Longer by what rounding may have taken off the residuals.
-    rho, first, rays = rho * (1.0 + SLACK) + SLACK + rounding(cost.K, cost.weight, chart.floor, nodes), 0, 0
+    rho, first, rays = rho * (1.0 + SLACK) + SLACK + rounding_error(cost.K, cost.weight, chart.floor, nodes), 0, 0
     order, R, ties = groups.order, groups.R, np.empty((kinds.shape[0], TIE_WIDTH))
     for k in range(3):
         plane = sense[0, k] == 0.0 and sense[1, k] == 0.0 and sense[2, k] == 0.0

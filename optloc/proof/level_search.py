@@ -16,11 +16,11 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, zero
-from optloc.proof.atlas import Atlas, infinity, one_more, set_centre
-from optloc.proof.box import DEPTH, LEAST, PIECE, least_left, reaches
+from optloc.proof.atlas import Atlas, infinity_coordinate, set_centre, with_room_for_minimum
+from optloc.proof.box import DEPTH, LEAST, PIECE, exceeds_level, least_left
 from optloc.proof.convex_boxes import is_known, widen_core
-from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
-from optloc.proof.pieces import CAPACITY, SPARE, is_listed, is_tiny, keep_rest, push_core, touches_infinity
+from optloc.proof.local_search import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT
+from optloc.proof.pieces import CAPACITY, SPARE, is_listed, is_tiny, push_core, push_or_defer, touches_infinity
 from optloc.proof.search_space import LocalAxes
 from optloc.proof.space import Space, in_atlas, place_of, set_place
 
@@ -30,7 +30,7 @@ from optloc.proof.space import Space, in_atlas, place_of, set_place
 # levels took the same time.
 _NEAR = 10.0
 
-# What differs between costs: kernels of these names take the places of these (`optloc.kernels.jit.with_constants`).
+# What differs between costs: kernels of these names take the places of these (`optloc.kernels.jit.specialise`).
 
 
 @compiled
@@ -145,9 +145,9 @@ def search_levels(
         if here < value:
             place_of(space, box, found)
             return CHEAPER, boxes, 0.0, shown, met
-        touching = touches_infinity(box, d - 1, infinity(space.atlas, piece) if space.far else -inf)
+        touching = touches_infinity(box, d - 1, infinity_coordinate(space.atlas, piece) if space.far else -inf)
         # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
-        sound = (whole or reaches(low, value)) and here < _NEAR * (level + 1.0)
+        sound = (whole or exceeds_level(low, value)) and here < _NEAR * (level + 1.0)
         side = side_of_rest(work, space, touching, sqrt(max(level, 0.0)), sound)
         if side < 0:
             continue
@@ -165,7 +165,7 @@ def search_levels(
             first = _first_below(levels, first, _at_infinity(work, space.atlas, piece))
             if first > now:
                 return CLEAR if shown < levels.shape[0] else INFINITE, boxes, value, shown, met
-        size, waiting = keep_rest(stack, size, aside, waiting, box, side, low, piece, levels[now])
+        size, waiting = push_or_defer(stack, size, aside, waiting, box, side, low, piece, levels[now])
 
 
 @compiled
@@ -200,7 +200,7 @@ def _meet(
         found[m] = near.centre[m]
     if not space.far or met == rivals.shape[0]:
         return -1, size, space
-    known, wider, value = atlas.minima.home.shape[0], one_more(atlas), levels[-1]
+    known, wider, value = atlas.minima.home.shape[0], with_room_for_minimum(atlas), levels[-1]
     # As of those that are known all its convex box must cost at least what nothing may fall short of.
     slack, rho = max(0.5 * (least - value), 0.5 * eps), sqrt(max(levels[0], 0.0))
     if not set_rival(work, wider, chart, known, found, value + 0.5 * slack, 0.5 * slack, rho):
@@ -215,7 +215,7 @@ def _meet(
 def _at_infinity(work: Any, atlas: Atlas, piece: int) -> float:
     """Return the cost at infinity next to the centre of a box that reaches there; its tables are lost."""
     at = work.box.at.copy()
-    at[atlas.dimension - 1] = infinity(atlas, piece)
+    at[atlas.dimension - 1] = infinity_coordinate(atlas, piece)
     set_centre(atlas, piece, at)
     atlas.scale[0] = 0.0
     return cost_set(work, atlas)

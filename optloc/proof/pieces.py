@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined
-from optloc.proof.atlas import Atlas, coordinates_on, infinity, within
+from optloc.proof.atlas import Atlas, coordinates_on, infinity_coordinate, is_near_minimum
 from optloc.proof.box import CENTRE, HALF, PIECE, cut_out, push, push_around, push_halves
 from optloc.proof.search_space import Box
 
@@ -26,7 +26,7 @@ _SAME = 1e-3
 # Share of a box below which what is left is looked at again before it is cut. Over 16 fixes by range differences a half
 # took 2 % fewer boxes than a quarter or four fifths, and 5 % fewer than no second look.
 SHRUNK = 0.5
-_WITHIN = 1e-9  # as of `optloc.proof.atlas.within`
+_WITHIN = 1e-9  # as of `optloc.proof.atlas.is_near_minimum`
 _BEYOND = 1e-12  # what a sum of two rounds, and a thousand times that
 
 
@@ -37,7 +37,7 @@ def is_tiny(box: Box, piece: int, d: int) -> bool:
 
 
 @inlined
-def keep_rest(
+def push_or_defer(
     stack: Array, size: int, aside: Array, waiting: int, box: Box, side: int, low: float, piece: int, level: float
 ) -> tuple[int, int]:
     """Push what its cut leaves of a box, or let it wait where it costs more than a level; return both sizes."""
@@ -53,7 +53,7 @@ def touches_infinity(box: Box, last: int, end: float) -> bool:
 
 
 @compiled
-def end_at_infinity(box: Box, last: int, end: float) -> None:
+def contract_at_infinity(box: Box, last: int, end: float) -> None:
     """Take off a box what rounding has put beyond infinity, where the inverse range would be negative."""
     if end > -inf and box.at[last] - end < box.half[last]:
         box.half[last] = 0.5 * (box.at[last] - end + box.half[last]) * (1.0 + _BEYOND)
@@ -82,7 +82,7 @@ def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
             if inside:
                 return True
         else:
-            convex, searched = within(atlas, box.half, i)
+            convex, searched = is_near_minimum(atlas, box.half, i)
             if convex or (searched and (piece <= 2 * d or piece > 2 * d + 1 + i)):
                 return True
     return False
@@ -131,5 +131,5 @@ def push_core(stack: Array, size: int, atlas: Atlas, i: int) -> int:
     """Push what is searched along the axes of minimum i; return the size of the stack."""
     low, last, piece = atlas.minima.core[i, 0].copy(), atlas.dimension - 1, 2 * atlas.dimension + 1 + i
     if low[last] == -inf:
-        low[last] = infinity(atlas, piece)
+        low[last] = infinity_coordinate(atlas, piece)
     return push_around(stack, size, low, atlas.minima.core[i, 1], atlas.minima.sides[i], piece)

@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.linalg import project_out
 from optloc.base.types import Array
 from optloc.linear.evaluate import block_links, columns
-from optloc.linear.normal import prior_parts, weighed
+from optloc.linear.normal import prior_parts, with_station_noise
 from optloc.models import MODELS, Model
 from optloc.problem.forms import form_of
 from optloc.problem.noise import variances, whiten, whiten_rows
@@ -333,7 +333,7 @@ def position_costs(problem: Problem) -> PositionCosts:
     Parameters
     ----------
     problem : Problem
-        N problems within the scope of the proof, see `optloc.proof.scope.unsupported`.
+        N problems within the scope of the proof, see `optloc.proof.scope.why_unsupported`.
     """
     kinds, numbers, K, w, level, _ = _rows_of(problem, np.zeros(problem.count, dtype=int))
     K, w = compress(K, w)
@@ -378,7 +378,7 @@ def _rows_of(problem: Problem, group: Array | None) -> tuple[Array, Array, Array
 
     Groups of rows (m,); None: the components of the target's velocity.
     """
-    problem = weighed(problem)
+    problem = with_station_noise(problem)
     others = OtherRows.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
     # Absent rows have weight zero, and any finite value will do.

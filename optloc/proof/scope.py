@@ -26,7 +26,7 @@ SHORT, MOST_DENSE = 24, 128
 MOST_FACTORS = 3
 
 
-def unsupported(problem: Problem) -> str:
+def why_unsupported(problem: Problem) -> str:
     """Return why a problem is beyond the proof, in a sentence that names what, or nothing where it is within.
 
     Parameters
@@ -48,7 +48,7 @@ def _reasons(problem: Problem) -> Iterator[str]:
         yield from _beyond_courses(problem)
     yield from _beyond_rows(problem)
     yield from _beyond_biases(problem)
-    if is_scaled(problem) and not is_moment(problem):
+    if is_scaled(problem) and not has_one_epoch_velocity(problem):
         yield from _beyond_scale(problem)
     yield from _beyond_stations(problem)
     yield from _beyond_constraints(problem)
@@ -65,7 +65,7 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
     motion = problem.motions[0]
     if motion.order > 1:
         yield "the target accelerates, and the proof is for one that stays or moves uniformly"
-    if is_moment(problem):
+    if has_one_epoch_velocity(problem):
         yield from _beyond_moments(problem)
         return
     if problem.epochs < 2:
@@ -79,7 +79,7 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
             yield f"the target moves, and {rows.kind} rows depend on how fast"
 
 
-def is_moment(problem: Problem) -> bool:
+def has_one_epoch_velocity(problem: Problem) -> bool:
     """Return whether the rows are of one epoch, and show by rates how fast the target moves."""
     motion = problem.motions[0]
     if motion.order != 1 or motion.known is not None or problem.epochs > 1:
@@ -137,11 +137,11 @@ def is_run(problem: Problem) -> bool:
     return 2 * problem.count > most and _nodes(problem) > most
 
 
-def crowded(problem: Problem) -> str:
+def why_too_large(problem: Problem) -> str:
     """Return why a problem is beyond what works with dense rows, in a sentence, or nothing where it is within."""
     number = _nodes(problem)
     if is_scaled(problem):
-        return "the velocity is unknown" if is_moment(problem) else "a factor of the rows is unknown"
+        return "the velocity is unknown" if has_one_epoch_velocity(problem) else "a factor of the rows is unknown"
     return "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, over {MOST_DENSE}"
 
 
@@ -171,7 +171,7 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
 
 def is_scaled(problem: Problem) -> bool:
     """Return whether unknown factors multiply rows, or a velocity does; `optloc.proof.scaled` proves such fixes."""
-    return any(form_of(bias).enters == "scales" for bias in problem.biases) or is_moment(problem)
+    return any(form_of(bias).enters == "scales" for bias in problem.biases) or has_one_epoch_velocity(problem)
 
 
 def _beyond_scale(problem: Problem) -> Iterator[str]:

@@ -12,8 +12,28 @@ from optloc.kernels.jit import compiled, inlined, put_rows
 from optloc.kernels.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
 from optloc.proof.atlas import Atlas, AtlasMinima
-from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, cube, digits, reaches_infinity, rounding
-from optloc.proof.curvature import DETERMINED, FAINT, G0, G1, G2, SUMS, bend_axes, convex, curve_nodes, least_of, sum_up
+from optloc.proof.box import (
+    ROW_WIDTH,
+    bound_nodes,
+    cost_at,
+    reaches_infinity,
+    relative_rounding,
+    rounding_error,
+    station_cube,
+)
+from optloc.proof.curvature import (
+    DETERMINED,
+    FAINT,
+    G0,
+    G1,
+    G2,
+    SUMS,
+    bend_axes,
+    curve_nodes,
+    is_convex_over_box,
+    least_diagonal,
+    sum_up,
+)
 from optloc.proof.groups import Groups, empty_groups, set_groups
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, size_of
 from optloc.proof.nodes.level import LEAST_RADIUS
@@ -29,7 +49,7 @@ from optloc.proof.surface import (
     UP,
     fold_bounds,
     fold_curves,
-    lay,
+    lay_box,
     principal_along,
     set_tangents,
     unfold_slopes,
@@ -38,8 +58,8 @@ from optloc.proof.surface import (
 # Roundings of a coordinate on its way from search coordinates to metres: three products, three sums, and the sizes of
 # what they are rounded beside.
 _PLACED = 8.0 * 2.0**-52
-# A residual counts 34 roundings or more for each size (`optloc.proof.box.digits`), of coordinates a share. Lines from a
-# position to stations are as exact as their own lengths, for a difference of two doubles is rounded once: what is left
+# A residual counts 34 roundings or more for each size (`optloc.proof.box.relative_rounding`), of coordinates a share.
+# Lines from a position to stations are as exact as their own lengths, for a difference of two doubles is rounded once: what is left
 # are the 8 roundings of a position as it is placed.
 LINES = 0.25
 # Rounding of a residual up to which ranges are counted from a place: costs are then right to a hundredth.
@@ -254,7 +274,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         count = set_tangents(D, planes, surface, gram)
         principal_along(information, gram, count)
     most = max(information[0, 0], information[1, 1], information[2, 2])
-    if count == D and least_of(information, D) <= FAINT * most:
+    if count == D and least_diagonal(information, D) <= FAINT * most:
         lengths = information.copy()  # what follows overwrites it
         unit = np.eye(3)
         curve_nodes(cost.kinds, cost.data, origin, unit, unit, box.half, box.line, information, nodes, curves)
@@ -284,10 +304,10 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin, LINES)
     chart = LocalAxes(origin, sense, back, gram, slip, floor, own, False, origin)
     if own.shape[0] > 0 and reaches_infinity(cost.kinds, cost.K):
-        middle, _ = cube(cost.kinds, cost.data, x)
+        middle, _ = station_cube(cost.kinds, cost.data, x)
         floor += _length_of_lines(cost, own, middle)
         # Lines from anywhere have fewer digits than those from the fix, which very sharp rows need.
-        if digits(cost.K) * floor < _SHARP:
+        if relative_rounding(cost.K) * floor < _SHARP:
             chart = LocalAxes(origin, sense, back, gram, slip, floor, own, True, middle)
     return chart, good
 
@@ -338,7 +358,7 @@ def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: A
 
 
 @inlined
-def place(origin: Array, sense: Array, at: Array, centre: Array) -> None:
+def write_centre(origin: Array, sense: Array, at: Array, centre: Array) -> None:
     """Write the centre of a box at search coordinates `at` in metres."""
     s0, s1, s2 = at[0], at[1], at[2]
     for k in range(3):
@@ -346,7 +366,7 @@ def place(origin: Array, sense: Array, at: Array, centre: Array) -> None:
 
 
 @inlined
-def widen(chart: LocalAxes, centre: Array, half: Array) -> None:
+def widen_by_rounding(chart: LocalAxes, centre: Array, half: Array) -> None:
     """Widen a box by how far rounding may have moved its centre, metres: all that is said of it holds where it is."""
     size = abs(centre[0]) + abs(centre[1]) + abs(centre[2])
     # What is added to the origin may be larger than the sum.
@@ -358,18 +378,18 @@ def widen(chart: LocalAxes, centre: Array, half: Array) -> None:
 @inlined
 def is_bounded(cost: Cost, chart: LocalAxes, box: Box) -> bool:
     """Bound the nodes over a box; return False where it is so large that a surface is no graph over it."""
-    place(chart.origin, chart.sense, box.at, box.centre)
+    write_centre(chart.origin, chart.sense, box.at, box.centre)
     if chart.surface.shape[0] == 0:
         bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
         return True
-    return lay_down(cost, chart, box)
+    return lay_on_surface(cost, chart, box)
 
 
 @compiled
-def lay_down(cost: Cost, chart: LocalAxes, box: Box) -> bool:
+def lay_on_surface(cost: Cost, chart: LocalAxes, box: Box) -> bool:
     """Bound the nodes over a box whose centre is in the plane of its chart along a surface, onto which it is moved."""
     put_rows(chart.sense, box.sense)
-    if not lay(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
+    if not lay_box(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
         box.half[2] = 0.0
         return False
     if chart.differs:
@@ -450,7 +470,7 @@ def curve_at(cost: Cost, chart: LocalAxes, box: Box) -> None:
 def curve_box(cost: Cost, chart: LocalAxes, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
     curve_at(cost, chart, box)
-    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+    noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
 
 
@@ -461,12 +481,12 @@ def value_at(cost: Cost, chart: LocalAxes, box: Box) -> float:
 
 
 @inlined
-def blur_at(cost: Cost, chart: LocalAxes, box: Box) -> float:
+def rounding_at_centre(cost: Cost, chart: LocalAxes, box: Box) -> float:
     """Return a bound of the rounding errors of a residual (its length) at the centre of a box whose nodes are bounded.
 
     On a surface the height, which is worked out from the Earth's centre, is rounded as well.
     """
-    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+    noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     if chart.surface.shape[0] > 0:
         total = 0.0
         for i in range(cost.K.shape[0]):
@@ -504,11 +524,11 @@ def is_convex(cost: Cost, chart: LocalAxes, box: Box, margin: float) -> bool:
     if not is_bounded(cost, chart, box):
         return False
     curve_box(cost, chart, box)
-    return convex(shapes_of(cost, chart), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
+    return is_convex_over_box(shapes_of(cost, chart), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
 
 
 @compiled
-def turned(cost: Cost, chart: LocalAxes, side: int) -> LocalAxes:
+def axes_of_next_piece(cost: Cost, chart: LocalAxes, side: int) -> LocalAxes:
     """Return the search coordinates of another piece of a surface, one unit the Earth's least distance.
 
     Parameters

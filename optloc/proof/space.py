@@ -8,10 +8,10 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined
-from optloc.proof.atlas import Atlas, position, set_centre, widen_around
+from optloc.proof.atlas import Atlas, set_centre, widen_around, write_position
 from optloc.proof.box import bound_nodes
 from optloc.proof.convex_boxes import accuracy_floor_far, is_known
-from optloc.proof.near import lay_or_halve
+from optloc.proof.local_search import lay_or_halve
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.pieces import is_left
 from optloc.proof.search_space import (
@@ -22,8 +22,8 @@ from optloc.proof.search_space import (
     accuracy_floor,
     curve_at,
     is_bounded,
-    place,
-    widen,
+    widen_by_rounding,
+    write_centre,
 )
 
 
@@ -72,7 +72,7 @@ def set_place(space: Space, box: Box, piece: int) -> None:
     if space.far:
         set_centre(space.atlas, piece, box.at)
     else:
-        place(space.chart.origin, space.chart.sense, box.at, box.centre)
+        write_centre(space.chart.origin, space.chart.sense, box.at, box.centre)
 
 
 @inlined
@@ -80,7 +80,7 @@ def set_box(space: Space, box: Box, piece: int) -> None:
     """Set the centre of a box, and widen the box by the rounding of its centre."""
     set_place(space, box, piece)
     if not space.far:
-        widen(space.chart, box.centre, box.half)
+        widen_by_rounding(space.chart, box.centre, box.half)
     elif piece > 2 * space.atlas.dimension:
         widen_around(space.atlas, piece - 2 * space.atlas.dimension - 1, box.half)
 
@@ -129,7 +129,7 @@ def set_curves(space: Space, cost: Cost, box: Box) -> None:
 def place_of(space: Space, box: Box, x: Array) -> None:
     """Write the position x (D,) of the centre of a box that is set."""
     if space.far:
-        position(space.atlas, x)
+        write_position(space.atlas, x)
     else:
         for k in range(x.shape[0]):
             x[k] = box.centre[k]

@@ -25,14 +25,14 @@ from optloc.proof.box import (
     J0,
     MIDDLE,
     ROW_WIDTH,
-    digits,
+    contract_box,
     is_empty,
     least_residual,
-    shrink,
-    uncut,
+    relative_rounding,
+    reset_cut,
 )
 from optloc.proof.enclosure import SLACK
-from optloc.proof.nodes.node import FORCE, HIGH, LOW, NODE_WIDTH, PHI, RANGE, range_form, triple
+from optloc.proof.nodes.node import FORCE, HIGH, LOW, NODE_WIDTH, PHI, RANGE, range_form, triple_at
 from optloc.proof.search_space import Box, Cost
 
 # Columns of a table of lines over a box (J, LINE_WIDTH): value, slope, least, greatest and remainder of the scaled
@@ -164,9 +164,9 @@ def _set_spread(own: Array, R: Array, spread: Array) -> None:
 
 
 @compiled
-def bend_of(atlas: Atlas, squares: Squares, half: Array) -> float:
+def change_of_residual(atlas: Atlas, squares: Squares, half: Array) -> float:
     """Return how much a residual may change by what the distance to the centre of the cube bends over a box."""
-    return float(range_form(atlas.point, atlas.slant, triple(half, 0))[3] * squares.steep)
+    return float(range_form(atlas.point, atlas.slant, triple_at(half, 0))[3] * squares.steep)
 
 
 @compiled
@@ -181,18 +181,20 @@ def clip_to_squares(cost: Cost, atlas: Atlas, squares: Squares, rho: float, box:
     longest *= 1.0 + wider
     _deflate(squares, longest)
     low = least_residual(squares.K, squares.weight, size, box.half, squares.nodes, squares.rows)
-    uncut(box.half, box.cut)
+    reset_cut(box.half, box.cut)
     if low > longest:
         return False
-    noise, flat = digits(squares.K) * size, box.half[2] == 0.0
-    shrink(squares.K, squares.weight, longest + noise, box.half, flat, squares.nodes, squares.rows, box.cut, box.solve)
+    noise, flat = relative_rounding(squares.K) * size, box.half[2] == 0.0
+    contract_box(
+        squares.K, squares.weight, longest + noise, box.half, flat, squares.nodes, squares.rows, box.cut, box.solve
+    )
     return not is_empty(box.cut)
 
 
 @compiled
 def _fill_lines(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> None:
     """Fill the table of lines over a box."""
-    frame, h, lines = frame_of(atlas), triple(half, 0), squares.lines
+    frame, h, lines = frame_of(atlas), triple_at(half, 0), squares.lines
     for j in range(lines.shape[0]):
         if squares.group[j] < 0:
             continue
@@ -254,7 +256,7 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
                 squares.K[i, g] += weight * 2.0 * late
         squares.nodes[g, LOW], squares.nodes[g, HIGH] = -bend, bend
     # Sums over all nodes of a group are rounded as often as there are of them.
-    return wider, size * digits(cost.K) / digits(squares.K)
+    return wider, size * relative_rounding(cost.K) / relative_rounding(squares.K)
 
 
 @compiled

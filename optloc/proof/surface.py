@@ -33,8 +33,8 @@ from optloc.proof.nodes.node import (
     TURN0,
     TURN1,
     TURN2,
-    inner,
-    triple,
+    inner_product,
+    triple_at,
 )
 
 # Numbers of a surface: its height, those of the node, the Earth's centre, and three orthonormal axes of a piece, the
@@ -79,7 +79,7 @@ def is_beyond(surface: Array, centre: Array, sense: Array, half: Array) -> bool:
 
 
 @compiled
-def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, graph: Array, second: Array) -> bool:
+def lay_box(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, graph: Array, second: Array) -> bool:
     """Move the centre of a box onto a surface, and the box into the tangent plane; False where it is too large.
 
     Parameters
@@ -95,12 +95,12 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
     second : array (3, 3)
         Working memory.
     """
-    data, up, off, rise = surface[DATA:MIDDLE], triple(surface, UP), 0.0, 0.0
+    data, up, off, rise = surface[DATA:MIDDLE], triple_at(surface, UP), 0.0, 0.0
     exact = EXACT * max(1.0, surface[LEVEL] / LEAST_RADIUS)
     _, normal, _, _, _ = normal_at(data, centre)
     for _ in range(_STEPS):
         height, normal, _, _, _ = normal_at(data, centre)
-        rise, off = inner(normal, up), height - surface[LEVEL]
+        rise, off = inner_product(normal, up), height - surface[LEVEL]
         if not rise > _STEEP:
             return False
         if abs(off) <= exact:
@@ -111,7 +111,7 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
         return False
     farthest = size = 0.0
     for k in range(2):
-        lean = -inner(normal, (sense[0, k], sense[1, k], sense[2, k])) / rise
+        lean = -inner_product(normal, (sense[0, k], sense[1, k], sense[2, k])) / rise
         square = 0.0
         for m in range(3):
             sense[m, k] += up[m] * lean
@@ -218,8 +218,8 @@ def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high
     # A point that is farthest out along the third axis is at most so far aside: its squares sum to the distance's.
     most = sqrt(0.5) * (WGS84_A + abs(surface[LEVEL])) * (1.0 + 1e-9)
     for k in range(2):
-        unit, away = triple(surface, FIRST if k == 0 else SECOND), 0.0
-        size = inner(unit, (sense[0, k], sense[1, k], sense[2, k]))
+        unit, away = triple_at(surface, FIRST if k == 0 else SECOND), 0.0
+        size = inner_product(unit, (sense[0, k], sense[1, k], sense[2, k]))
         for m in range(3):
             away += unit[m] * (origin[m] - surface[MIDDLE + m])
         low[k], high[k] = max(low[k], (-most - away) / size), min(high[k], (most - away) / size)
@@ -267,9 +267,9 @@ def set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
         if number < 3 - D:
             first = (0.0, 0.0, 1.0)
         elif number < 3 - D + bent:
-            first = triple(surface, UP)
+            first = triple_at(surface, UP)
         elif number < across:
-            first = triple(planes[number - bent - 3 + D], 0)
+            first = triple_at(planes[number - bent - 3 + D], 0)
         else:
             first = (0.0, 0.0, 0.0)
         if number < across:

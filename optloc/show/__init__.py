@@ -54,10 +54,10 @@ if TYPE_CHECKING:
         GREY as GREY,
         ORANGE as ORANGE,
         PURPLE as PURPLE,
-        apart as apart,
         figure_class as figure_class,
         literal as literal,
         save as save,
+        separate_notes as separate_notes,
     )
     from optloc.show.pictures.track import plot_tracks as plot_tracks
     from optloc.show.sheet import ABSENT as ABSENT, Sheet as Sheet, TextTable as TextTable

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from optloc.solvers.policy import (
         AMBIGUOUS_GAP as AMBIGUOUS_GAP,
         LISTED_GAP as LISTED_GAP,
-        REFUTED as REFUTED,
+        P_MISFIT as P_MISFIT,
         equal_cost as equal_cost,
     )
     from optloc.solvers.pool import Pool as Pool, begin as begin, offer as offer

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.kernels.kept import folder
+from optloc.kernels.code_cache import folder
 
 # Seconds in which a solver ends on programs of two unknowns, which take milliseconds; and to begin a process.
 _PATIENCE, _START = 5.0, 60.0
@@ -140,7 +140,7 @@ def _faults(kinds: tuple[tuple[str, str], ...]) -> dict[str, str]:
             kept = json.loads(file.read_text(encoding="utf-8"))
             if isinstance(kept, dict) and set(kept) == {name for name, _ in kinds}:
                 return {str(name): str(fault) for name, fault in kept.items()}
-    found = try_apart(dict(kinds))
+    found = try_in_process(dict(kinds))
     if file is not None:
         with suppress(OSError):
             own = file.with_suffix(f".{os.getpid()}")
@@ -164,7 +164,7 @@ def _key(kinds: tuple[tuple[str, str], ...]) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def try_apart(kinds: dict[str, str]) -> dict[str, str]:
+def try_in_process(kinds: dict[str, str]) -> dict[str, str]:
     """Return what is wrong with back ends, given by name and kind, after a trial in a process apart.
 
     A new process begins behind a solver that ends one.

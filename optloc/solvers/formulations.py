@@ -15,10 +15,10 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import Reference, reference_bound
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
-from optloc.solvers.starts.doppler import doppler_starts, dopplered
-from optloc.solvers.starts.position import height_starts, over_ground, registrable, squared_range_starts
+from optloc.solvers.starts.doppler import doppler_starts, has_doppler_of_rest
+from optloc.solvers.starts.position import height_starts, is_registration_run, over_ground, squared_range_starts
 from optloc.solvers.starts.registration import closed_form, relax_run, run_starts
-from optloc.solvers.starts.squared_range import every, hull, minimum, shor
+from optloc.solvers.starts.squared_range import hull, minimum, shor, stationary_points
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "More 1993; Beck, Stoica, Li 2008",
         starts={
             "gtrs": partial(squared_range_starts, pick=minimum),
-            "roots": partial(squared_range_starts, pick=every),
+            "roots": partial(squared_range_starts, pick=stationary_points),
         },
     ),
     "squared_range_conic: shor": Formulation(
@@ -225,7 +225,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "exact without noise; with noise a start near the bound",
         "0.3 ms",
         "Chan, Ho 1994; Beck, Stoica, Li 2008",
-        serves=registrable,
+        serves=is_registration_run,
         starts={"gtrs": _start_run, "roots": _start_run, "socp": _start_run},
     ),
     "registration_sdp": Formulation(
@@ -234,7 +234,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "never tight: a start",
         "0.5 s",
         "Shor 1987",
-        serves=registrable,
+        serves=is_registration_run,
         starts={"sdp": _start_relaxed_run},
     ),
     "doppler_sdp": Formulation(
@@ -243,7 +243,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "never tight: a start, seldom the only minimum; many rows are joined to normal points",
         "10 ms four stations, 0.1 s a pass of a satellite",
         "Song et al. 2025; Wang, Li, Ansari 2013",
-        serves=dopplered,
+        serves=has_doppler_of_rest,
         starts={"sdp": doppler_starts},
     ),
     "lifted": Formulation(

@@ -21,7 +21,7 @@ from optloc.problem.chart import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
-from optloc.solvers.policy import REFUTED
+from optloc.solvers.policy import P_MISFIT
 from optloc.solvers.pool import Pool
 
 
@@ -284,7 +284,7 @@ def _fits(pool: Pool, cost: Array) -> Array:
     """Return which costs (N, q) noise explains; all of a pool with a loss, whose costs have no such test."""
     if pool.loss:
         return np.ones(cost.shape, dtype=bool)
-    return ~(tail_probability(cost, pool.dof[:, None]) < REFUTED)
+    return ~(tail_probability(cost, pool.dof[:, None]) < P_MISFIT)
 
 
 def without_broken(problem: Problem, pool: Pool) -> Pool:

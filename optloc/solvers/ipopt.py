@@ -16,10 +16,10 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
-from optloc.linear.normal import decrement, prior_parts, step, weighed
+from optloc.linear.normal import decrement, prior_parts, step, with_station_noise
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
 from optloc.linear.vectors import complete
-from optloc.linear.walks import chain_at, places, walks
+from optloc.linear.walks import chain_at, state_columns, walks
 from optloc.problem.fix import Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
@@ -27,9 +27,9 @@ from optloc.solvers.inequalities import without_broken
 from optloc.solvers.pool import Pool, begin, offer
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.block_averages import average_blocks
-from optloc.solvers.starts.position import registrable, spread_of
+from optloc.solvers.starts.position import is_registration_run, spread_of
 from optloc.solvers.starts.registration import BLOCKS, group_alike
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, surviving_candidates
 from optloc.solvers.verdict.minima import settle
 
 # "1" has programs compiled by the system's C compiler: worth its seconds for many fixes of one large structure
@@ -55,10 +55,10 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
         raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
     # a program of thousands of rows is slow to build and to solve; least squares behind it has all epochs
-    if registrable(problem) and problem.epochs >= 2 * BLOCKS:
+    if is_registration_run(problem) and problem.epochs >= 2 * BLOCKS:
         return lsr(problem, offer(problem, _of_blocks(problem, pool.x), pool, "nlp", began))
     # IPOPT sees one covariance: station errors of an epoch are noise to it
-    problem = weighed(problem)
+    problem = with_station_noise(problem)
     x, shape = pool.x.copy(), pool.x.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.NUMERICAL), dtype=np.int8)
     item, slot = pool.occupied
@@ -86,7 +86,7 @@ def _of_blocks(problem: Problem, x: Array) -> Array:
     for items in group_alike(problem):
         blocks = average_blocks(problem.take(items), BLOCKS)
         pool = nlp(blocks, begin(blocks, complete(blocks, x[items, :, :n])))
-        found = standing(pool, judge(blocks, pool))
+        found = surviving_candidates(pool, judge(blocks, pool))
         width = min(found.shape[1], x.shape[1])
         out[items, :width] = complete(problem.take(items), found[:, :width, :n])
     return out
@@ -231,7 +231,7 @@ def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
     for bias in walks(problem):
         # a walk from its prior mean that takes no steps costs nothing
         if bias.sigma is not None:
-            place = starts[:, None] + places(layout, bias)[:, 0]
+            place = starts[:, None] + state_columns(layout, bias)[:, 0]
             mean[place] = np.ravel(bias.mean)
 
 

@@ -18,20 +18,20 @@ from optloc.problem.claims import GLOBAL, REGION, Claims, claim
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
-from optloc.proof.scope import is_run, is_scaled, unsupported
+from optloc.proof.scope import is_run, is_scaled, why_unsupported
 from optloc.solvers import stages
 from optloc.solvers.certificates.admitted import certified, value_certified
 from optloc.solvers.certificates.branch_and_bound import claims_before, tried_before
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
-from optloc.solvers.planned import Quick
+from optloc.solvers.planned import PlannedStages
 from optloc.solvers.policy import LISTED_GAP
-from optloc.solvers.pool import Pool, offer, pack, where
+from optloc.solvers.pool import Pool, noting_place, offer, pack
 from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
 from optloc.solvers.suspect_rows.stage import suspect
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, surviving_candidates
 
 # The back end that holds for a stretch of code (`formulations.backend`), for layers that know formulations from here.
 __all__ = [
@@ -140,7 +140,7 @@ _STAGES: dict[str, SolverEntry] = {
     "minimax": _start(
         stages.start_with("minimax"), "least worst angle by second-order cones (Clarabel); bounded errors"
     ),
-    "widen": _refinement(stages.widen, "more candidates beside a fix: mirror image, sub-arrays", batched=True),
+    "widen": _refinement(stages.add_candidates, "more candidates beside a fix: mirror image, sub-arrays", batched=True),
     "search": _refinement(
         stages.search,
         "a search for problems still without an answer: by boxes where a proof bounds them, or from many places",
@@ -184,7 +184,7 @@ SOLVERS: Registry[SolverEntry] = Registry(
 )
 
 # Beginnings of methods for which there is a stage that does the same in one.
-SHORTCUTS: Mapping[tuple[str, ...], Quick] = {("gtrs", "lsr"): Quick()}
+SHORTCUTS: Mapping[tuple[str, ...], PlannedStages] = {("gtrs", "lsr"): PlannedStages()}
 
 # What stands behind "|" is for the problems of which not everything is proven by then.
 METHODS = {
@@ -257,7 +257,7 @@ class Method:
         """
         branches = list(self.branches)
         # its first branch would end without a proof, or with one that is made again, and be done for nothing
-        if len(branches) > 1 and (unsupported(problem) or is_run(problem) or is_scaled(problem)):
+        if len(branches) > 1 and (why_unsupported(problem) or is_run(problem) or is_scaled(problem)):
             branches = branches[-1:]
         pool = _run_through(branches[0], problem, pool)
         for branch in branches[1:]:
@@ -273,7 +273,7 @@ def _named(name: str, solver: Solver) -> Solver:
     """Return a stage whose numerical failures say where they happened."""
 
     def stage(problem: Problem, pool: Pool | None) -> Pool:
-        with where(name), recording() as endings:
+        with noting_place(name), recording() as endings:
             found = solver(problem, pool)
         failed = [ending for ending in endings if not ending.found]
         return _note_failures(found, name, failed, len(endings)) if failed else found
@@ -313,7 +313,10 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     part, (first, *others) = problem.take(items), method.runs(len(items))
     start = first(part, None)
     # what was found competes: a branch never answers worse than the one before
-    new, before = _beside(part, start, standing(take(pool, items), fix[items])), tried_before(pool, fix, items)
+    new, before = (
+        _beside(part, start, surviving_candidates(take(pool, items), fix[items])),
+        tried_before(pool, fix, items),
+    )
     for stage in others:
         # a proof takes most of the time, and is not made again where all else found nothing new
         new = stage(part, replace(new, tried_before=before))

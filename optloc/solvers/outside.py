@@ -10,13 +10,13 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.types import Array, Status
-from optloc.problem.claims import Claims, choose, untried
+from optloc.problem.claims import Claims, empty_claims, merged_claims
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Curvature, NoStart, Pool, begin
 from optloc.solvers.stages import Solver
 from optloc.solvers.verdict.findings import NO_ANSWER, NO_PROOF
-from optloc.solvers.verdict.judge import fill, judge, verdict
+from optloc.solvers.verdict.judge import filled_objects, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
 FixSolver = Callable[[Problem, Fix | None], Fix]
@@ -124,11 +124,11 @@ def _lengths(explanations: Array) -> Array:
 def _claims(claims: Claims) -> Claims:
     """Return claims of which those that say nothing are as if nobody had tried."""
     nothing = (claims.reason == NO_PROOF.reason) | (claims.reason == NO_ANSWER.reason)
-    return choose(nothing, untried(len(nothing)), claims)
+    return merged_claims(nothing, empty_claims(len(nothing)), claims)
 
 
 def _verbatim(fix: Fix, items: Array) -> Array:
-    out = fill(len(fix), None)
+    out = filled_objects(len(fix), None)
     for i in np.flatnonzero(items):
         out[i] = fix[int(i)]
     return out

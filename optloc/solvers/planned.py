@@ -19,7 +19,7 @@ from optloc.kernels.jit import enabled
 from optloc.kernels.pack import PackedRuns, fold, folding, pack_runs
 from optloc.kernels.sums import equations_at, serves
 from optloc.linear.evaluate import block_links
-from optloc.linear.normal import depends_on_place, weighed
+from optloc.linear.normal import depends_on_place, with_station_noise
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.vectors import vectors, without_biases
 from optloc.model_checks.shape import BENT
@@ -34,7 +34,7 @@ from optloc.solvers.verdict.minima import likelihood_of, measure_curvature
 
 
 @dataclass(frozen=True, slots=True)
-class Quick:
+class PlannedStages:
     """The stages "gtrs" and "lsr" as one, by a plan where there is one.
 
     Parameters
@@ -62,10 +62,10 @@ class Quick:
             return in_parts(problem, work, PART if run is None else max(1, PART // problem.epochs))
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         z = z if z.ndim == 2 and len(z) == count else np.broadcast_to(z, (count, problem.count))
-        return settle_directly(plan, plan.load(problem), z, problem.take, refinement)
+        return settle_by_plan(plan, plan.load(problem), z, problem.take, refinement)
 
 
-def settle_directly(
+def settle_by_plan(
     plan: Plan,
     load: Load,
     z: Array,
@@ -150,7 +150,7 @@ def _pool(plan: Plan, answer: Answer, steps: int, began: float) -> Pool:
         np.broadcast_to(0, cost.shape),
         np.broadcast_to(plan.weight, (count, len(plan.weight))),
         np.broadcast_to(np.int32(plan.dof), count),
-        direct_stages(count, steps, seconds),
+        planned_stages(count, steps, seconds),
         refined=True,
         curvature=Curvature(answer.covariance, kappa=answer.kappa, active=active_of(plan, answer.multiplier)),
         plain=answer.settled & ~rivalled,
@@ -186,7 +186,7 @@ def active_of(plan: Plan, multiplier: Array) -> Array | None:
 _STARTED = Stage("gtrs", "1 candidates at most", 0.0)
 
 
-def direct_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
+def planned_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
     """Return the stages that so many fixes went through at once, and the most steps that one took."""
     return _STARTED, Stage("lsr", f"{count} candidates, {steps} steps at most", seconds)
 
@@ -257,7 +257,7 @@ class RunPlan:
             np.broadcast_to(0, (count, 1)),
             np.broadcast_to(problem.weight, (count, problem.count)),
             np.broadcast_to(np.int32(self.dof), count),
-            direct_stages(count, int(done.iterations.max(initial=0)), seconds),
+            planned_stages(count, int(done.iterations.max(initial=0)), seconds),
             refined=True,
             curvature=curvature,
             plain=plain,
@@ -294,7 +294,7 @@ def _plan_run(problem: Problem) -> RunPlan | None:
     dof = int(degrees_of_freedom(one)[0])
     if plan is None or dof < 0 or epoch.weight.ndim > 1 or depends_on_place(one):
         return None
-    runs = pack_runs(one, whiten(weighed(one).noise, one.weight))
+    runs = pack_runs(one, whiten(with_station_noise(one).noise, one.weight))
     if runs is None or len(runs.packed.numbers.source) > 1:
         return None
     base, links = vectors(epoch, None)[0], block_links(epoch)

@@ -10,17 +10,17 @@ AMBIGUOUS_GAP = 9.0
 LISTED_GAP = 25.0
 """Cost up to which other minima are listed: with five stations a gap of less still misleads one fix in a thousand."""
 
-DOUBT = 1e-3
+P_SUSPECT = 1e-3
 """Probability of the chi-square test below which more is looked into: a better minimum, a constraint that is wrong."""
 
-REFUTED = 1e-4
+P_MISFIT = 1e-4
 """Probability of the chi-square test below which the noise does not allow the residuals: so rarely good data fail."""
 
-NOTICED = 0.01
+P_OUTLIER = 0.01
 """Probability at which a search for suspects takes notice: of all groups of a long list together, and with redundancy
 one, where an error shows but nobody can be named."""
 
-COVERED = 0.95
+REGION_LEVEL = 0.95
 """Level of the likelihood region that must not reach to infinity, with d degrees of freedom: what users ask for."""
 
 FAR, FLAT = 1e4, 1e6

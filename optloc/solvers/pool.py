@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.errors import NUMERICAL
 from optloc.base.records import Axes, join, overwrite
-from optloc.base.threads import flow
+from optloc.base.threads import map_in_order
 from optloc.base.types import Array, Status
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models.layers import Layers
@@ -291,7 +291,7 @@ def pack(points: Array) -> Array:
     return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
 
 
-def crowd_of(problem: Problem) -> int:
+def chunk_size(problem: Problem) -> int:
     """Return the number of problems that are worked on at a time, where each has dozens of candidates."""
     return max(1, _ROWS // max(problem.count, 1))
 
@@ -332,7 +332,7 @@ def in_parts(
     # An even number of parts of one size: as many threads are done at a time.
     size = -(-count // (2 * -(-count // (2 * most))))
     parts = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-    return _joined(chain.from_iterable(flow(answer, parts)), count)
+    return _joined(chain.from_iterable(map_in_order(answer, parts)), count)
 
 
 def _contained(
@@ -360,7 +360,7 @@ def _contained(
 
 
 @contextmanager
-def where(place: str) -> Iterator[None]:
+def noting_place(place: str) -> Iterator[None]:
     """Note the place on a numerical failure that passes, unless an inner one has: its cause is told with it."""
     try:
         yield

@@ -17,8 +17,8 @@ from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import Method, shortcut
-from optloc.solvers.planned import settle_directly
-from optloc.solvers.single import Single, is_few, single
+from optloc.solvers.planned import settle_by_plan
+from optloc.solvers.single import PreparedFix, is_few, prepare_fix
 from optloc.solvers.solution import solve, solve_in_stages
 from optloc.solvers.verdict.judge import verdict
 
@@ -48,7 +48,7 @@ class Prepared:
     plan: Plan | None
     shape: tuple[int, ...]
     count: int
-    short: Single | None
+    short: PreparedFix | None
 
     def __call__(self, z: ArrayLike) -> Fix:
         """Return the fix of measurements, as `solve` does."""
@@ -90,7 +90,7 @@ class Prepared:
             return solve_in_stages(self.problem.with_rows(z=wide), Method.parse(self.method))
         flat = self._flat(values, shape)
         try:
-            pool = settle_directly(self.plan, self.plan.load(flat), flat.z, flat.take)
+            pool = settle_by_plan(self.plan, self.plan.load(flat), flat.z, flat.take)
             fix = verdict(flat, pool)
         except NUMERICAL:
             # one of them fails: which one is told where all take the stages
@@ -154,5 +154,5 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
     plan = short = None
     with suppress(*NUMERICAL):  # the stages tell which of its fixes fails
         plan = plan_of(bare) if shortcut(parsed) and not separable(bare) else None
-        short = single(bare, parsed)
+        short = prepare_fix(bare, parsed)
     return Prepared(bare, method, plan, bare.batch_shape, bare.count, short)

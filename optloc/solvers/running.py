@@ -15,7 +15,7 @@ from optloc.kernels.sums import summed
 from optloc.linear.normal import Normal, covariance, eliminated, with_priors
 from optloc.linear.vectors import complete
 from optloc.linear.walks import walks
-from optloc.problem.epochs import cut, joined, tied, window
+from optloc.problem.epochs import cut, has_correlated_epochs, joined, window
 from optloc.problem.fix import Fix
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
@@ -201,7 +201,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
         Where the epochs share nothing or noise ties them together, a count is out of range, or the fix has no answer.
     """
     k, n = problem.epochs, problem.layout.n_shared
-    if k == 1 or not n or problem.batch_shape or tied(problem):
+    if k == 1 or not n or problem.batch_shape or has_correlated_epochs(problem):
         advice = "give a single run of epochs that have biases or a motion in common"
         raise InvalidProblem("the estimate does not grow with the epochs", "problem", advice)
     if fix.shape or not np.isfinite(fix.x).all():

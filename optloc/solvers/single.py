@@ -25,20 +25,20 @@ from optloc.engine.admission import levels_of
 from optloc.engine.memory import Answer, EngineResult
 from optloc.engine.plan import LIMIT, MOST, TOLERANCE, Load, Plan, blank_answer, is_planned, key_of, plan_of
 from optloc.engine.shape import STRAIGHT
-from optloc.kernels.jit import usable
+from optloc.kernels.jit import may_use_code
 from optloc.linear.constraints import is_exact, violation_names
 from optloc.linear.redundancy import largest
 from optloc.model_checks.coplanar import normal_of
 from optloc.model_checks.truncation import are_near, has_law
 from optloc.problem.chart import CARTESIAN, CURVED, Chart, quantile
-from optloc.problem.claims import Claims, alike, claim
+from optloc.problem.claims import Claims, claim, repeated_claims
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Alternatives, Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import ProofRequest, ProofResult, empty_answer, lacks_code, prove_here
-from optloc.proof.near import OTHER, UNIQUE
+from optloc.proof.local_search import OTHER, UNIQUE
 from optloc.proof.position_costs import Affine, PositionCosts, affine_costs
-from optloc.proof.scope import is_run, is_scaled, unsupported
+from optloc.proof.scope import is_run, is_scaled, why_unsupported
 from optloc.proof.search_space import HIDDEN_REACH
 from optloc.proof.surface import UP
 from optloc.solvers.certificates.branch_and_bound import (
@@ -47,16 +47,16 @@ from optloc.solvers.certificates.branch_and_bound import (
     METHOD,
     budgets,
     certify_stage,
+    claim_sentence,
     gaps_below,
-    sentence,
 )
-from optloc.solvers.certificates.out_of_reach import Edges, ReachWorkspace, are_out_of_reach, edges_of, scratch
-from optloc.solvers.certificates.position_cost import agrees, surfaces_of
+from optloc.solvers.certificates.out_of_reach import Edges, ReachWorkspace, are_out_of_reach, edges_of, new_workspace
+from optloc.solvers.certificates.position_cost import matches_problem_cost, surfaces_of
 from optloc.solvers.coplanar import APART
 from optloc.solvers.inequalities import Sight, sights
 from optloc.solvers.methods import Method
-from optloc.solvers.planned import active_of, direct_stages
-from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
+from optloc.solvers.planned import active_of, planned_stages
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, P_SUSPECT, REGION_LEVEL, equal_cost
 from optloc.solvers.verdict.findings import (
     BENT_SENTENCE,
     NO_PROOF,
@@ -77,10 +77,10 @@ _WORDS = {("gtrs", "lsr"): False, ("gtrs", "lsr", "certify"): True}
 _SENTENCES: dict[tuple[Status, int | None], str] = {
     (Status.OK, None): "",
     (Status.UNPROVEN, None): NOT_TRIED,
-    **{(Status.CURVED, kind): sentence for kind, sentence in BENT_SENTENCE.items()},
+    **{(Status.CURVED, kind): claim_sentence for kind, claim_sentence in BENT_SENTENCE.items()},
 }
 # What a proof of all that an `ok` asks for claims, but for its bound.
-_PROVEN = claim(Certificate("global", sentence(LISTED_GAP, 0, None), METHOD, unique=True, margin=LISTED_GAP))
+_PROVEN = claim(Certificate("global", claim_sentence(LISTED_GAP, 0, None), METHOD, unique=True, margin=LISTED_GAP))
 _NOTHING = np.empty((), dtype=object)
 _NOTHING[()] = ()
 # By how much of what counts as equal (`equal_cost`) the bound of a proof may be off the cost: it is one below.
@@ -138,7 +138,7 @@ class _SingleWorkspace:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Single:
+class PreparedFix:
     """A problem without batch axes that waits for measurements; see `single`.
 
     Parameters
@@ -206,7 +206,7 @@ class Single:
         began, shape, plan = perf_counter(), z.shape[:-1], self.plan
         n = prod(shape)
         kernel = plan.kernel(n, often=self.often)
-        if not usable(kernel, n) or (self.map is not None and lacks_code(n)):
+        if not may_use_code(kernel, n) or (self.map is not None and lacks_code(n)):
             return None
         room, size, shared = self._room(shape), plan.size, plan.shared
         room.z[:] = z
@@ -225,7 +225,7 @@ class Single:
         if self.normal is not None and self._is_near_plane(self.normal, answer):
             return None
         fixed = perf_counter()
-        stages = direct_stages(n, steps, fixed - began)
+        stages = planned_stages(n, steps, fixed - began)
         if self.map is not None:
             if not self._proves(self.map, answer, found, room):
                 return None
@@ -311,7 +311,7 @@ class Single:
     def _agrees(self, fix: Fix, room: _SingleWorkspace) -> bool:
         """Return whether the position costs are the problem's own, at the first fixes of a thread and beside them."""
         many = self.problem.with_rows(z=room.z.copy())
-        return self.map is None or bool(agrees(many, fix.flat(), room.costs).all())
+        return self.map is None or bool(matches_problem_cost(many, fix.flat(), room.costs).all())
 
     def _judge(
         self,
@@ -413,18 +413,18 @@ class Single:
             "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
             "reach": np.broadcast_to(centre_and_spread(self.problem.stations.places)[1].reshape(()), shape),
         }
-        claims = alike(NO_PROOF if affine is None else _PROVEN, shape)
+        claims = repeated_claims(NO_PROOF if affine is None else _PROVEN, shape)
         alone = Alternatives(np.empty((*shape, 0, size)), np.empty((*shape, 0)))
         nothing = np.broadcast_to(_NOTHING, shape)
         z, answered = np.empty((n, m)), empty_answer(n, d)
-        beside = None if affine is None or self.edges is None else scratch(affine, self.edges, n, d)
+        beside = None if affine is None or self.edges is None else new_workspace(affine, self.edges, n, d)
         return _SingleWorkspace(z, found, costs, asked, answered, centre, claims, nothing, alone, beside, kept)
 
 
 def _reasons(listed: Array, shape: tuple[int, ...]) -> Array:
     """Return what is claimed of proven fixes, of which some (n,) have another minimum that is listed."""
     out = np.empty(len(listed), dtype=object)
-    out[:] = [sentence(LISTED_GAP, int(one), None) for one in listed]
+    out[:] = [claim_sentence(LISTED_GAP, int(one), None) for one in listed]
     return out.reshape(shape)
 
 
@@ -464,7 +464,7 @@ def _told(
     return out
 
 
-def single(problem: Problem, method: Method, *, often: bool = True) -> Single | None:
+def prepare_fix(problem: Problem, method: Method, *, often: bool = True) -> PreparedFix | None:
     """Return what fixes measurements of one problem the short way, or None where there is none.
 
     There is one where problems differ in measurements alone and have a direct way, for methods that begin with it, and
@@ -484,7 +484,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         return None
     bare = _alone(problem)
     plan = None if bare.batch_shape else plan_of(bare)
-    if plan is None or (proves and (unsupported(bare) or is_run(bare) or is_scaled(bare))):
+    if plan is None or (proves and (why_unsupported(bare) or is_run(bare) or is_scaled(bare))):
         return None
     limited = proves and any(not is_exact(constraint) for constraint in bare.constraints)
     edges = edges_of(bare) if limited else None
@@ -497,7 +497,7 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
     planes, surface = surfaces_of(bare.flat(), load.place[:1, 0])
     held = [constraint for constraint in bare.constraints if is_exact(constraint)]
     upward = [i for i, band in enumerate(held) if isinstance(band, Band) and band.kind == "height"]
-    return Single(
+    return PreparedFix(
         bare,
         plan,
         load._replace(place=np.require(load.place, dtype=float, requirements=["C", "W"])),
@@ -510,9 +510,9 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
         normal_of(bare.flat()),
         weight == 0.0 if (weight == 0.0).any() else None,
         centre_of(bare).reshape(d),
-        largest(plan.dof, DOUBT),
-        largest(plan.dof, REFUTED),
-        quantile(COVERED, d),
+        largest(plan.dof, P_SUSPECT),
+        largest(plan.dof, P_MISFIT),
+        quantile(REGION_LEVEL, d),
         often,
         is_repeatable(bare.flat()),
         levels_of(bare)[0][len(held) :] if has_law(bare) else None,
@@ -531,7 +531,7 @@ def _alone(problem: Problem) -> Problem:
 
 
 # What fixes one problem is made in two milliseconds and takes some 50 kB.
-_KEPT = Cache["Single | None"](64)
+_KEPT = Cache["PreparedFix | None"](64)
 
 
 def at_once(problem: Problem, method: Method) -> Fix | None:
@@ -545,7 +545,7 @@ def at_once(problem: Problem, method: Method) -> Fix | None:
     if not few or (shape and not is_planned(problem)):
         return None
     with suppress(*NUMERICAL):  # the stages tell which of them fails
-        ready = _KEPT.find((method, *_own_numbers(problem), *key_of(problem)), lambda: single(problem, method))
+        ready = _KEPT.find((method, *_own_numbers(problem), *key_of(problem)), lambda: prepare_fix(problem, method))
         if ready is not None:
             z = problem.z
             return ready(z if z.shape[:-1] == shape else np.broadcast_to(z, (*shape, z.shape[-1])))

@@ -15,9 +15,9 @@ from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import Method, shortcut
-from optloc.solvers.pool import PART, begin, in_parts, where
+from optloc.solvers.pool import PART, begin, in_parts, noting_place
 from optloc.solvers.single import at_once
-from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
+from optloc.solvers.verdict.judge import failed_fixes, hide_open_epochs, verdict
 
 
 def solve(problem: Problem, method: str = "auto", *, start: ArrayLike | None = None, refine: bool = True) -> Fix:
@@ -67,13 +67,13 @@ def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine:
         pool = run(some, None if vector is None else begin(some, vector[part]))
         if refine and pool.curvature is None:
             pool = _FINISH(some, pool)
-        with where("the verdict"):
+        with noting_place("the verdict"):
             return hide_open_epochs(verdict(some, pool))
 
     # the shortcut divides its work itself, and shares it among threads
     most = flat.batch_shape[0] if shortcut(run) and vector is None else PART
     with np.errstate(all="ignore"):  # what overflows is judged: a status says so, once
-        fix = in_parts(flat, work, most, failed)
+        fix = in_parts(flat, work, most, failed_fixes)
     return fix.reshape(shape) if shape != (len(fix),) else fix
 
 

@@ -11,12 +11,12 @@ from scipy.special import ndtri
 
 from formulations.sparse_errors import range_cone, square_cone
 from optloc.base import linalg
-from optloc.base.threads import WORTH, mapped
+from optloc.base.threads import WORTH, map_on_threads
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
 from optloc.linear.mirror import one_position
 from optloc.linear.redundancy import present_unknowns
-from optloc.linear.vectors import hold_still, vectors
+from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.models import MODELS
 from optloc.problem.arrival_times import as_arrivals
 from optloc.problem.noise import variances
@@ -247,7 +247,7 @@ def _starts(problem: Problem, pool: Pool | None) -> Pool:
     if not one_position(problem):
         x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: _starts(one, None)))
         return offer(problem, x, pool, "sparse", began)
-    alone = hold_still(problem)
+    alone = problem_at_rest(problem)
     arrived = as_arrivals(alone)
     found = sparse_errors(alone if arrived is None else arrived.problem)
     # a wrong arrival is in all differences that were made from it
@@ -341,7 +341,7 @@ def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) 
         y[i], errors[i] = 0.0, found.errors
         y[i, used] = found.y
 
-    mapped(fit, range(len(rows)), least=WORTH)
+    map_on_threads(fit, range(len(rows)), least=WORTH)
     return y, errors, failed
 
 

@@ -19,24 +19,24 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.mirror import mirror, one_position
 from optloc.linear.normal import decrement, step
-from optloc.linear.vectors import hold_still, vectors
+from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.models.layers import Layers
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.scope import is_scaled, unsupported
+from optloc.proof.scope import is_scaled, why_unsupported
 from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
 from optloc.solvers.layered import equations_in_layers, in_every_layer, refine_in_layers, strata_of
-from optloc.solvers.policy import DOUBT
-from optloc.solvers.pool import Pool, crowd_of, in_parts, offer, pack
+from optloc.solvers.policy import P_SUSPECT
+from optloc.solvers.pool import Pool, chunk_size, in_parts, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.orientation import headings, oriented_starts, unwind
-from optloc.solvers.starts.position import along_the_valley, registrable, spread_of, subarray_starts
+from optloc.solvers.starts.position import along_the_valley, is_registration_run, spread_of, subarray_starts
 from optloc.solvers.starts.registration import step_beside
 from optloc.solvers.starts.several_positions import from_pieces
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, surviving_candidates
 from optloc.solvers.verdict.minima import is_measured, settle
 
 Solver = Callable[[Problem, Pool | None], Pool]
@@ -66,7 +66,7 @@ def start_with(word: str) -> Solver:
         # what serves fewer problems knows more of this one: where nothing refines the starts, its answer is the fix
         serving.sort(key=lambda form: form.serves is one_position)
         if one_position(problem):
-            alone = hold_still(problem)
+            alone = problem_at_rest(problem)
             # an empty slot, so that rows which no formulation starts give a pool without candidates
             nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
             position = np.concatenate([*(form.starts[word](alone) for form in serving), nowhere], axis=1)
@@ -165,26 +165,26 @@ def fix_by(problem: Problem, start: Callable[[Problem], Pool]) -> Fix:
     return judge(problem, lsr(problem, start(problem)))
 
 
-def widen(problem: Problem, pool: Pool | None) -> Pool:
+def add_candidates(problem: Problem, pool: Pool | None) -> Pool:
     """Return a refined pool with mirror images beside it, and where the verdict is not clean starts of sub-arrays."""
     if pool is None:
         raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
-    if registrable(problem):
+    if is_registration_run(problem):
         began, fix = perf_counter(), judge(problem, pool)
         around = step_beside(problem, fix.x, fix.covariance())
         return _beside(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
     if not one_position(problem):
         return pool
-    return in_parts(problem, lambda part, own: _widen(part, take(pool, own)), crowd_of(problem))
+    return in_parts(problem, lambda part, own: _widen(part, take(pool, own)), chunk_size(problem))
 
 
 def _widen(problem: Problem, pool: Pool) -> Pool:
     """Return the candidates of a refined pool of problems of one position, and more."""
-    began, fix, alone = perf_counter(), judge(problem, pool), hold_still(problem.straightened())
-    seen = problem.layout.take(standing(pool, fix), "position")
+    began, fix, alone = perf_counter(), judge(problem, pool), problem_at_rest(problem.straightened())
+    seen = problem.layout.take(surviving_candidates(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
     # the mirror image is one start and always tried; the others are many: where the verdict is not clean
-    unsettled = ~fix.answered | fix.has(*_UNSETTLED) | (fix.p_value < DOUBT)
+    unsettled = ~fix.answered | fix.has(*_UNSETTLED) | (fix.p_value < P_SUSPECT)
     valley = np.flatnonzero(unsettled | _weak(problem, fix))
     for items, more in (
         (np.flatnonzero(unsettled), _subarrays),
@@ -200,7 +200,7 @@ def _widen(problem: Problem, pool: Pool) -> Pool:
 
 
 def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
-    return offer(problem, pack(np.concatenate([standing(pool, fix), x], axis=1)), pool, "widen", began)
+    return offer(problem, pack(np.concatenate([surviving_candidates(pool, fix), x], axis=1)), pool, "widen", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
@@ -250,7 +250,7 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
     """
     if pool is None or pool.curvature is None:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
-    if not (unsupported(problem) or is_scaled(problem)):
+    if not (why_unsupported(problem) or is_scaled(problem)):
         pool = _answer(problem, pool, lambda part: _with_offsets(part, best_first_starts(part)), lambda why: {})
     elif moves_at_once(problem):
         pool = _answer(problem, pool, lambda part: _with_offsets(part, moving_starts(part)), lambda why: {})
@@ -351,7 +351,7 @@ def _searched_sentence(why: str) -> str:
 
 def search_widely(problem: Problem) -> Pool:
     """Return what the method "searched" returns: every start that is known, and a search where there is none."""
-    return search(problem, lsr(problem, widen(problem, lsr(problem, roots(problem, None)))))
+    return search(problem, lsr(problem, add_candidates(problem, lsr(problem, roots(problem, None)))))
 
 
 def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int = 100) -> Pool:

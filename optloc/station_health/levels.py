@@ -22,9 +22,9 @@ from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_lev
 from optloc.model_checks.overbound import tail_factors
 from optloc.model_checks.variance_components import Tested, VarianceFit, fit, tested, total, visible, without
 from optloc.problem.arrival_times import as_arrivals
-from optloc.problem.epochs import tied
+from optloc.problem.epochs import has_correlated_epochs
 from optloc.problem.fix import Fix
-from optloc.problem.noise import Block, Noise, gathered, group, together
+from optloc.problem.noise import Block, Noise, gathered, group, group_members
 from optloc.problem.problem import Problem
 
 # Groups that a sentence names; the others are counted.
@@ -206,12 +206,12 @@ def _scale(problem: Problem, block: Block, by: By, factor: dict[str, float], pre
 
 def _with_common(problem: Problem, noise: Noise, by: By, sigma: dict[str, float]) -> Noise:
     """Return noise with an error of each of some groups that lasts an epoch, of these standard deviations."""
-    if tied(problem):
+    if has_correlated_epochs(problem):
         what = "errors of rows of several epochs are correlated"
         raise InvalidProblem(what, "noise", "leave out what rows of an epoch have in common")
     effect, _, _ = common_effects(problem, by, sigma)
     blocks = []
-    for members in together(problem.epoch):
+    for members in group_members(problem.epoch):
         own = effect[members]
         blocks.append(Block(members, gathered(noise, members) + own @ np.swapaxes(own, -1, -2)))
     return group(blocks)

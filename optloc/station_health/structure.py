@@ -13,7 +13,7 @@ from optloc.linear.constraints import is_exact
 from optloc.model_checks.elements import By, Elements, batch_of, common_name, elements, ends_of, kinds_of
 from optloc.model_checks.score import descend
 from optloc.model_checks.variance_components import Tested, VarianceFit, cleaned, deviance, tested
-from optloc.problem.epochs import separable, tied
+from optloc.problem.epochs import has_correlated_epochs, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.station_health.levels import (
@@ -150,7 +150,7 @@ def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> N
     with threadpool_limits(1):
         # Noise that several epochs share has no place for an error of each epoch.
         plain = _try(batch, x, "kind", None)
-        common = plain if tied(batch) else _try(batch, x, "kind", "kind")
+        common = plain if has_correlated_epochs(batch) else _try(batch, x, "kind", "kind")
         best = common if common.seen and common.tried.total < plain.tried.total else plain
         lasting = _lasting(batch, x, number, best)
         found = [plain, common] if common.seen else [plain]

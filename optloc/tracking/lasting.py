@@ -29,7 +29,7 @@ import numpy as np
 from optloc.base.errors import NUMERICAL
 from optloc.base.types import Array
 from optloc.kernels.filter import COLUMNS, ScanRows
-from optloc.linear.normal import linearise, weighed
+from optloc.linear.normal import linearise, with_station_noise
 from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
 from optloc.tracking.dynamics import Dynamics
@@ -82,7 +82,7 @@ class _LastingRows:
     def of(cls, part: Problem, at: Array, cov: Array | None) -> _LastingRows:
         """Return the rows of scans at a state that pass the gate; without a covariance, of residuals after a fit."""
         linear = linearise(part, at, ())
-        R = noises.dense(weighed(part, at).noise, np.arange(part.count))
+        R = noises.dense(with_station_noise(part, at).noise, np.arange(part.count))
         spread = np.diagonal(R) + (0.0 if cov is None else ((linear.shared @ cov) * linear.shared).sum(-1))
         used = (part.weight > 0.0) & (np.diagonal(R) > 0.0) & (np.abs(linear.residual) <= _GATE * np.sqrt(spread))
         D = _errors(R, *touched(part), part.stations.places.shape[-2])[:, used]

@@ -13,11 +13,11 @@ from optloc.base import linalg
 from optloc.base.cache import Cache
 from optloc.base.types import Array, Motion
 from optloc.kernels.filter import COLUMNS, VALUES, Filtered, Filtering, Move, ScanRows, filter_scan
-from optloc.kernels.jit import at_hand
+from optloc.kernels.jit import is_available
 from optloc.kernels.pack import sources
 from optloc.kernels.tables import tables
-from optloc.linear.normal import depends_on_place, weighed
-from optloc.problem.epochs import cut, tied
+from optloc.linear.normal import depends_on_place, with_station_noise
+from optloc.problem.epochs import cut, has_correlated_epochs
 from optloc.problem.noise import gathered, variances
 from optloc.problem.problem import Problem
 
@@ -58,7 +58,7 @@ class Scans:
         """Return the scans of a run."""
         rows: list[ScanRows | None] = [None] * problem.epochs
         item = [0] * problem.epochs
-        if problem.count and at_hand(filter_scan):
+        if problem.count and is_available(filter_scan):
             observed, weight = problem.observed, problem.weight
             for epochs, index, kept in _structures(problem, order):
                 made = kept
@@ -187,7 +187,7 @@ def _is_plain(problem: Problem) -> bool:
         and all(array is None or (type(array) is np.ndarray and array.ndim == core) for array, core in shared)
         and not (problem.biases or problem.emitting or stations.unknown_for)
         and not depends_on_place(problem)
-        and not tied(problem)
+        and not has_correlated_epochs(problem)
     )
 
 
@@ -243,7 +243,7 @@ def _by_scan(values: Array, index: Array) -> Array:
 
 def _made(problem: Problem, order: int, epochs: Array, index: Array) -> ScanRows | None:
     """Return scans without measurements and weights, or None where one of their kinds has no tape."""
-    problem, m = weighed(problem), index.shape[1]
+    problem, m = with_station_noise(problem), index.shape[1]
     scan = _first_of(problem, order, epochs)
     found = tables(scan, (np.arange(m)[None],))
     if found is None or found.tables.local:

@@ -203,7 +203,8 @@ def _row(block: Rows, kept: Array) -> Rows:
 def _with_noise(problem: Problem, made: Problem, first: Array) -> Problem:
     """Return the channels with the covariance of their first rows, epoch by epoch."""
     blocks = [
-        noises.Block(members, noises.gathered(problem.noise, first[members])) for members in noises.together(made.epoch)
+        noises.Block(members, noises.gathered(problem.noise, first[members]))
+        for members in noises.group_members(made.epoch)
     ]
     return replace(made, noise=noises.Noise(tuple(blocks)))
 

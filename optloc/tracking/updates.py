@@ -29,7 +29,7 @@ from optloc.kernels.filter import (
     Filtering,
 )
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import linearise, weighed
+from optloc.linear.normal import linearise, with_station_noise
 from optloc.problem import noise as noises
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Whitener
@@ -387,7 +387,7 @@ def innovation(scan: Problem, mean: Array, cov: Array) -> Innovation:
     linear = linearise(scan, mean, ())  # nothing is whitened here
     H = linear.shared
     # Station errors are part of the noise, and grow with the place of the target.
-    R = noises.dense(weighed(scan, mean).noise, np.arange(scan.count))
+    R = noises.dense(with_station_noise(scan, mean).noise, np.arange(scan.count))
     return Innovation(linear.residual, H @ cov @ np.swapaxes(H, -1, -2) + R)
 
 

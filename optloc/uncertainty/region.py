@@ -18,10 +18,10 @@ from optloc.model_checks.shape import BENT, cost_at_infinity, departure, profile
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.proof.cover import cover
 from optloc.proof.position_costs import position_costs
-from optloc.proof.scope import crowded, unsupported
+from optloc.proof.scope import why_too_large, why_unsupported
 from optloc.proof.search_space import Cost, cost_of, empty_box
+from optloc.proof.subpaving import cover_region
 
 # Boxes of a cover at most, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, that of an
 # ellipsoid 10 %, after some 20 and 100 ms. Plain Python takes a thousand times longer for each.
@@ -205,7 +205,7 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
 
 def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
     """Return cells that hold the region, whether they found it open, or why there are none."""
-    why = unsupported(surface.problem) or crowded(surface.problem)
+    why = why_unsupported(surface.problem) or why_too_large(surface.problem)
     if why:
         return None, False, why
     costs = position_costs(surface.problem)
@@ -214,7 +214,7 @@ def _cover(surface: RegionSurface, threshold: float, boxes: int | None) -> tuple
     most = boxes or (_MOST[d] if enabled() else _MOST_PLAIN)
     base, edges, ends = np.zeros(3), np.zeros((2 * most, 1 + d, 1 + d)), np.zeros(2 * most)
     above, bent = threshold - surface.least, surface.kind != CARTESIAN
-    count, inside, highest = cover(cost, box, x, above, most, bent, base, edges, ends)
+    count, inside, highest = cover_region(cost, box, x, above, most, bent, base, edges, ends)
     if costs.level[0] < highest:
         return None, False, TURNS
     if count < 0:

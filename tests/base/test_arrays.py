@@ -27,7 +27,7 @@ from cases import CASES
 
 from optloc import Stations, assemble, measured, simulate
 from optloc.files import read
-from optloc.lab.study.draws import draw
+from optloc.lab.study.simulation import draw
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.design import design_of, design_of_text, shipped
 

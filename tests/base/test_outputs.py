@@ -211,7 +211,7 @@ def test_an_error_leaves_what_was_there(tmp_path):
 
 def test_files_that_belong_together_get_their_names_together(tmp_path):
     def both():
-        with outputs.together():
+        with outputs.replace_together():
             with outputs.written(tmp_path / "a.txt") as file:
                 file.write_text("new")
             assert not (tmp_path / "a.txt").exists()

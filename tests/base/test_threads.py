@@ -14,7 +14,7 @@ from formulations.conic import Relaxation
 from formulations.moment_sdp import moment_problem
 from formulations.nls import Program
 from optloc import Fix, InvalidProblem, Problem, assemble, measured, simulate, solve
-from optloc.base.threads import flow, mapped, thread_count
+from optloc.base.threads import map_in_order, map_on_threads, thread_count
 from optloc.engine import plan
 from optloc.kernels import tables, trace
 from optloc.linear import evaluate
@@ -27,13 +27,13 @@ def test_results_come_in_the_order_of_the_items(threads):
         time.sleep(0.002 * (i % 3))
         return i * i
 
-    assert mapped(slow, range(20), threads) == [i * i for i in range(20)]
-    assert mapped(slow, [], threads) == []
+    assert map_on_threads(slow, range(20), threads) == [i * i for i in range(20)]
+    assert map_on_threads(slow, [], threads) == []
 
 
 def test_as_many_run_at_a_time_as_asked_for():
     gate = threading.Barrier(3, timeout=20.0)
-    assert sorted(mapped(lambda i: gate.wait() * 0 + i, range(3), 3)) == [0, 1, 2]
+    assert sorted(map_on_threads(lambda i: gate.wait() * 0 + i, range(3), 3)) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("threads", [1, 4])
@@ -45,14 +45,14 @@ def test_the_error_of_the_earliest_item_is_raised(threads):
         return i
 
     with pytest.raises(ValueError, match=r"^3$"):
-        mapped(bad, range(8), threads)
+        map_on_threads(bad, range(8), threads)
 
 
 def test_what_holds_for_the_caller_holds_for_its_threads():
     choice: ContextVar[str] = ContextVar("choice", default="none")
     token = choice.set("mine")
     try:
-        assert mapped(lambda _: choice.get(), range(4), 2) == ["mine"] * 4
+        assert map_on_threads(lambda _: choice.get(), range(4), 2) == ["mine"] * 4
     finally:
         choice.reset(token)
 
@@ -66,15 +66,15 @@ def test_parts_flow_in_their_order_and_share_the_threads(threads, monkeypatch):
         return i, thread_count()
 
     share = max(1, int(threads) // min(int(threads), 5))
-    assert list(flow(slow, range(5))) == [(i, share) for i in range(5)]
-    assert list(flow(slow, [])) == []
+    assert list(map_in_order(slow, range(5))) == [(i, share) for i in range(5)]
+    assert list(map_in_order(slow, [])) == []
     assert thread_count() == int(threads)
 
 
 def test_no_more_parts_are_held_than_there_are_threads(monkeypatch):
     monkeypatch.setenv("OPTLOC_THREADS", "2")
     begun: list[int] = []
-    parts = flow(begun.append, range(20))
+    parts = map_in_order(begun.append, range(20))
     next(parts)
     time.sleep(0.05)
     assert len(begun) <= 4
@@ -91,7 +91,7 @@ def test_the_error_of_a_part_comes_where_the_part_would(threads, monkeypatch):
             raise ValueError(str(i))
         return i
 
-    parts, found = flow(bad, range(8)), []
+    parts, found = map_in_order(bad, range(8)), []
     with pytest.raises(ValueError, match=r"^3$"):
         found.extend(parts)
     assert found == [0, 1, 2]
@@ -140,7 +140,7 @@ def test_items_that_take_less_than_threads_are_worth_stay_where_they_are(seconds
         return i
 
     who: set[int] = set()
-    assert mapped(slept, range(8), 2, least=5e-3) == list(range(8))
+    assert map_on_threads(slept, range(8), 2, least=5e-3) == list(range(8))
     assert len(who) == (1 if seconds == 0.0 else 2)  # the caller and one more
 
 

@@ -20,7 +20,7 @@ from sites.calibration.scenes import distances, hall
 import optloc
 from optloc import Motion, Problem, assemble, measured, with_bias
 from optloc.cli.fix import run_fix
-from optloc.files.readings import ColumnHints
+from optloc.files.table_import import ColumnHints
 from optloc.sites.calibration import calibrate, network_of
 from optloc.tracking import State, polynomial
 from optloc.tracking.scan_rows import Scans

@@ -25,7 +25,7 @@ def run(**change):
     problem = with_bias(plain, "clock", members=["S1", "S2", "S3", "S4"], **change)
     truth = np.zeros(problem.layout.size)
     truth[:3] = [4e3, 3e3, 1e3]
-    return optloc.simulate(problem, optloc.engine.wander(problem, truth, 5), 6)
+    return optloc.simulate(problem, optloc.engine.simulate_walks(problem, truth, 5), 6)
 
 
 def seconds(problem):

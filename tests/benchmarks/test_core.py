@@ -14,8 +14,8 @@ from optloc.kernels.damping import StopRules
 from optloc.kernels.jit import enabled
 from optloc.kernels.least_squares import refine
 from optloc.kernels.pack import pack
-from optloc.kernels.refine import answers, refine_block
-from optloc.linear.normal import weighed
+from optloc.kernels.refine import new_answers, refine_block
+from optloc.linear.normal import with_station_noise
 from optloc.problem.noise import whiten
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="kernels are not compiled")
@@ -40,7 +40,7 @@ def product():
 
 
 def ready(problem):
-    return pack(problem, whiten(weighed(problem).noise, problem.weight))
+    return pack(problem, whiten(with_station_noise(problem).noise, problem.weight))
 
 
 def array(scene):
@@ -53,9 +53,9 @@ def iteration(scene):
     """Microseconds of an iteration of a fix of six stations, and of a fix."""
     problem, start = array(scene)
     ours, item = ready(problem), np.arange(len(start))
-    out = answers(start)
+    out = new_answers(start)
     refine_block(ours, item, 0, len(start), StopRules(), out)
-    seconds = quickest(lambda: refine_block(ours, item, 0, len(start), StopRules(), answers(start)))
+    seconds = quickest(lambda: refine_block(ours, item, 0, len(start), StopRules(), new_answers(start)))
     count = int(out.iterations.sum()) + len(start)
     return 1e6 * seconds / count, 1e6 * seconds / len(start)
 
@@ -72,7 +72,7 @@ def single(scene):
     """Microseconds of one small fix, the call from Python included."""
     problem, start = array(scene)
     ours, item = ready(problem), np.arange(1)
-    return 1e6 * quickest(lambda: refine_block(ours, item, 0, 1, StopRules(), answers(start[:1])), 200)
+    return 1e6 * quickest(lambda: refine_block(ours, item, 0, 1, StopRules(), new_answers(start[:1])), 200)
 
 
 def registration(eliminated):
@@ -82,9 +82,9 @@ def registration(eliminated):
     start = np.tile(truth(problem), (RUNS, 1)) + 20.0
     ours, item = ready(problem), np.arange(RUNS)
     kept = 0 if eliminated else None
-    out = answers(start, kept)
+    out = new_answers(start, kept)
     refine_block(ours, item, 0, RUNS, StopRules(), out)
-    seconds = quickest(lambda: refine_block(ours, item, 0, RUNS, StopRules(), answers(start, kept)), 3)
+    seconds = quickest(lambda: refine_block(ours, item, 0, RUNS, StopRules(), new_answers(start, kept)), 3)
     each = 1e6 * seconds / (int(out.iterations.sum()) + RUNS)
     return each, each / problem.count
 

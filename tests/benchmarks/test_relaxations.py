@@ -17,7 +17,7 @@ from formulations.range_enclosure import Ranged, enclosure
 from formulations.squared_range import cone
 from formulations.squared_range_conic import hull, shor
 from optloc import solve
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.solvers.certificates.relaxations import reference_bound
 
 ROUNDS = 7
@@ -27,13 +27,15 @@ Work = Callable[[int], object]
 def matrix_products(threads: int) -> object:
     """Matrix products of a millisecond: they hold no lock and share no cache, so they show what the machine gives."""
     matrices = [np.random.default_rng(i).normal(size=(160, 160)) for i in range(threads)]
-    return mapped(lambda i: [matrices[i % threads] @ matrices[i % threads] for _ in range(20)], range(40), threads)
+    return map_on_threads(
+        lambda i: [matrices[i % threads] @ matrices[i % threads] for _ in range(20)], range(40), threads
+    )
 
 
 def squared(relax: Callable[..., object]) -> Work:
     rng = np.random.default_rng(0)
     items = [(rng.normal(size=(6, 4)), 2.0 * rng.normal(size=6)) for _ in range(600)]
-    return lambda threads: mapped(lambda item: relax(*item, cone(3), bound=False), items, threads)
+    return lambda threads: map_on_threads(lambda item: relax(*item, cone(3), bound=False), items, threads)
 
 
 def by_directions() -> Work:
@@ -44,7 +46,7 @@ def by_directions() -> Work:
         apart = target - station
         angle = np.stack([np.arctan2(apart[:, 1], apart[:, 0]), np.arctan2(apart[:, 2], np.hypot(*apart[:, :2].T))], 1)
         items.append((angle + 5e-3 * rng.normal(size=(4, 2)), np.full((4, 2), 5e-3), station))
-    return lambda threads: mapped(lambda item: directions(*item), items, threads)
+    return lambda threads: map_on_threads(lambda item: directions(*item), items, threads)
 
 
 def by_moments() -> Work:
@@ -59,7 +61,7 @@ def by_moments() -> Work:
         box = enclosure(ranged, target, 2.0)
         if box is not None:
             items.append((ranged, box, 2.0))
-    return lambda threads: mapped(lambda item: moment_bound(*item), items, threads)
+    return lambda threads: map_on_threads(lambda item: moment_bound(*item), items, threads)
 
 
 def stage(case: str, run: Callable[..., object]) -> Work:

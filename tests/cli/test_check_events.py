@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 from optloc import solve
 from optloc.cli import app
 from optloc.cli.check import _check_health
-from optloc.files.convert import understood
-from optloc.files.readings import ColumnHints
+from optloc.files.convert import interpret_table
+from optloc.files.table_import import ColumnHints
 from optloc.station_health import health
 
 RUN = CliRunner()
@@ -43,7 +43,7 @@ def tables(folder, counts, *, gap=(), wrong=(), bearing=False):
 
 def read(folder, told, head, lines, name="all.csv"):
     (folder / name).write_text("\n".join([head, *lines]) + "\n")
-    return understood(folder / name, told).read()
+    return interpret_table(folder / name, told).read()
 
 
 CASES = {

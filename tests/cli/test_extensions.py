@@ -25,5 +25,5 @@ def test_neighbours_do_not_replace_each_other():
 
 def test_a_part_misses_the_kernels_that_are_not_on_disk(monkeypatch):
     monkeypatch.setattr("optloc.kernels.jit.named", lambda name: name)
-    monkeypatch.setattr("optloc.kernels.kept.is_kept", lambda kernel: kernel == "here")
+    monkeypatch.setattr("optloc.kernels.code_cache.is_cached", lambda kernel: kernel == "here")
     assert KernelPart("a part", "optloc", (), ("here", "gone")).missing() == ["gone"]

@@ -7,7 +7,7 @@ from engine.blocks import block_of
 
 from optloc.engine import ranges, tapes
 from optloc.engine.memory import BLUR, CENTRE, GOOD, ORIGIN, SCALE, SPREAD, X
-from optloc.engine.start import begin, square
+from optloc.engine.start import begin, square_ranges
 
 pytestmark = pytest.mark.usefixtures("in_python")
 
@@ -49,7 +49,7 @@ def test_squared_rows_vanish_at_the_truth():
         station, reference = block.model.station, block.model.reference
         scalar, spare = room.scalar, room.scalar[0]
         sizes = room.place, scalar[SPREAD], scalar[SCALE]
-        block.run(square, room.value[:s], station, reference, *sizes, room.squared, spare)
+        block.run(square_ranges, room.value[:s], station, reference, *sizes, room.squared, spare)
         x = (TARGET[2] - room.vector[ORIGIN, :, 0]) / scalar[SCALE, 0]
         last = np.linalg.norm(x) if reference >= 0 else x @ x
         rows = room.squared[:, :, 0]

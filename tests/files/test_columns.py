@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from optloc import InvalidProblem, solve
 from optloc.cli import app
 from optloc.files.columns import any_unit, role_of, roles, sigma_kind, stem
-from optloc.files.convert import understood
-from optloc.files.readings import ColumnHints
+from optloc.files.convert import interpret_table
+from optloc.files.table_import import ColumnHints
 from optloc.models import MODELS
 
 RUN = CliRunner()
@@ -45,7 +45,7 @@ def read(folder, text, name="t.csv", **told):
     told.setdefault("stations", folder / "sites.csv")
     if not told["stations"].exists():
         sites(folder)
-    return understood(path, ColumnHints(**{"sigma": "10 cm", **told}))
+    return interpret_table(path, ColumnHints(**{"sigma": "10 cm", **told}))
 
 
 def fixed(made):

@@ -11,12 +11,12 @@ from optloc import InvalidProblem, solve
 from optloc.base.frames import ECEF
 from optloc.cli import app
 from optloc.files import load
-from optloc.files.cells import Decimals
-from optloc.files.convert import convert, understood
+from optloc.files.cell_text import Decimals
+from optloc.files.convert import convert, interpret_table
 from optloc.files.headings import from_bow, heading_of, stations_turned
-from optloc.files.readings import BOW, COMPASS, ColumnHints, Readings, sort_named
 from optloc.files.roles import ColumnPlaces, Roles
 from optloc.files.table import of_rows
+from optloc.files.table_import import BOW, COMPASS, ColumnHints, Readings, sort_named
 
 RUN = CliRunner()
 TARGET = (59.912, 10.735)
@@ -44,7 +44,7 @@ def drive(
 
 
 def fixed(path, **options):
-    return solve(understood(path, ColumnHints(**{"sigma": "1 deg", "still": True} | options)).read().problem)
+    return solve(interpret_table(path, ColumnHints(**{"sigma": "1 deg", "still": True} | options)).read().problem)
 
 
 def off(fix):
@@ -70,7 +70,7 @@ def test_headings_are_added_whatever_they_are_called(heading, unit, tmp_path):
 def test_a_stated_convention_leaves_the_heading_out(tmp_path):
     path = drive(tmp_path, relative=False)
     assert off(fixed(path, azimuth="north-clockwise")) < 0.1
-    added = [float(z) for z in understood(path, ColumnHints(sigma="1 deg", still=True)).sections[0].columns["z"]]
+    added = [float(z) for z in interpret_table(path, ColumnHints(sigma="1 deg", still=True)).sections[0].columns["z"]]
     apart = [z - true_bearing(lat, lon) - course for z, (lat, lon, course) in zip(added, COURSE, strict=True)]
     assert np.cos(np.radians(apart)) == pytest.approx([1.0] * len(COURSE))
     told = RUN.invoke(app, ["convert", str(path), "--sigma", "1 deg", "--azimuth", "north-clockwise", "--still"])
@@ -84,7 +84,7 @@ def test_a_stated_convention_leaves_the_heading_out(tmp_path):
 def test_other_angles_of_a_vehicle_are_no_headings_unless_named(column, tmp_path):
     path = drive(tmp_path, column)
     with pytest.raises(InvalidProblem, match="no column looks like the heading"):
-        understood(path, ColumnHints(sigma="1 deg", still=True, azimuth="bow-clockwise"))
+        interpret_table(path, ColumnHints(sigma="1 deg", still=True, azimuth="bow-clockwise"))
     assert off(fixed(path, columns={"heading": column})) < 0.1
     assert off(fixed(path, columns={"heading": column}, azimuth="bow-clockwise")) < 0.1
 
@@ -102,7 +102,7 @@ def test_a_declination_is_added_to_magnetic_headings(tmp_path):
     convert(path, out, sigma="1 deg", still=True, declination="5.5 deg")
     assert 'declination = "5.5 deg"' in out.read_text()
     assert off(solve(load(out))) < 0.1
-    by_date = understood(path, ColumnHints(sigma="1 deg", still=True, declination="2026-06-01")).read()
+    by_date = interpret_table(path, ColumnHints(sigma="1 deg", still=True, declination="2026-06-01")).read()
     assert "magnetic declination +5." in by_date.azimuths or "magnetic declination +4." in by_date.azimuths
     assert off(solve(by_date.problem)) < 60.0
 
@@ -137,7 +137,7 @@ def test_small_headings_without_a_unit_are_asked_for(tmp_path):
     path.write_text("lat,lon,heading,bearing_deg\n59.9,10.7,1.0,30\n59.8,10.75,2.0,20\n")
     with pytest.raises(InvalidProblem, match=r"the unit of the column 'heading' is not known; call it heading_deg"):
         fixed(path)
-    found = understood(path, ColumnHints(sigma="1 deg", still=True, unit="deg")).sections[0]
+    found = interpret_table(path, ColumnHints(sigma="1 deg", still=True, unit="deg")).sections[0]
     assert found.columns["z"].texts() == ["31.0", "22.0"]
 
 
@@ -158,14 +158,14 @@ def test_stations_of_a_table_may_have_headings(tmp_path):
         rows.append(f"S{k},{lat},{lon},{course}")
     path.write_text("\n".join(lines) + "\n")
     sites.write_text("\n".join(rows) + "\n")
-    made = understood(path, ColumnHints(sigma="1 deg", stations=sites))
+    made = interpret_table(path, ColumnHints(sigma="1 deg", stations=sites))
     assert off(solve(made.read().problem)) < 0.1
     assert "bearings are taken from the headings of the stations" in made.notes[0]
     sites.write_text("\n".join(rows).replace(",65.0", ",") + "\n")
     with pytest.raises(InvalidProblem, match="station 'S2' has no heading"):
-        understood(path, ColumnHints(sigma="1 deg", stations=sites))
+        interpret_table(path, ColumnHints(sigma="1 deg", stations=sites))
     path.write_text(path.read_text().replace("bearing_deg", "range_m"))
-    assert "heading_deg" not in understood(path, ColumnHints(sigma="1 m", stations=sites)).places.columns
+    assert "heading_deg" not in interpret_table(path, ColumnHints(sigma="1 m", stations=sites)).places.columns
 
 
 def test_json_and_range_beside_the_bearing(tmp_path):

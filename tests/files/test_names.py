@@ -12,8 +12,8 @@ from optloc.base.errors import nearest
 from optloc.base.types import Stations, Status
 from optloc.cli import app
 from optloc.files import read
-from optloc.files.convert import understood
-from optloc.files.readings import ColumnHints
+from optloc.files.convert import interpret_table
+from optloc.files.table_import import ColumnHints
 
 ANCHORS = {"A1": (0.0, 0.0), "A2": (10.0, 0.0), "A3": (10.0, 8.0), "A4": (0.0, 8.0), "A5": (5.0, -2.0)}
 # The last one is 2 m short: it contradicts the others.
@@ -130,7 +130,7 @@ def wide(folder, columns, values=None, **told):
     values = values or [*CENTIMETRES, *[310] * (len(columns) - 4)]
     lines = [",".join(["t_s", *columns]), *(",".join([str(row), *map(str, values)]) for row in range(3))]
     (folder / "table.csv").write_text("\n".join(lines) + "\n")
-    return understood(
+    return interpret_table(
         folder / "table.csv", ColumnHints(**({"stations": stations, "sigma": "5 cm", "what": "range"} | told))
     )
 
@@ -207,7 +207,7 @@ def test_rows_of_files_have_the_rule(name, tmp_path):
     (tmp_path / "rows.csv").write_text(f"station,range_cm\nA1,502\nA2,668\nA3,783\n{name},638\n")
     told = ColumnHints(stations=tmp_path / "anchors.csv", sigma="5 cm")
     with pytest.raises(InvalidProblem, match=rf"row 4, column 'station': there is no station '{name}'"):
-        understood(tmp_path / "rows.csv", told)
+        interpret_table(tmp_path / "rows.csv", told)
     rows = "\n".join(f'  {{ a = "{each}", z = 5.0 }},' for each in ("A1", "A2", name))
     stations = '[stations]\nrows = [{name="A1",x=0,y=0},{name="A2",x=9,y=0},{name="A3",x=9,y=9}]\n'
     text = f'format = 2\n{stations}[[measurements]]\nkind = "range"\nsigma = "1 m"\nrows = [\n{rows}\n]\n'

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem
-from optloc.files.cells import Decimals
-from optloc.files.reading_report import check_receivers, farther, left_over
-from optloc.files.readings import Readings, named_columns, sort_named
+from optloc.files.cell_text import Decimals
+from optloc.files.reading_report import check_receivers, farther_station, unused_columns
 from optloc.files.roles import Roles
 from optloc.files.table import of_rows
+from optloc.files.table_import import Readings, named_columns, sort_named
 
 
 def test_unused_columns_are_listed_unless_they_may_be_measured():
     table = of_rows([{"station": "A", "range_m": 5.0, "note": "x", "azimuth_deg": 3.0}], "t.csv", {})
     roles = Roles.of(table, {})
     with pytest.raises(InvalidProblem, match="azimuth_deg"):
-        left_over(roles, {"station": "station", "range_m": "range"})
-    assert left_over(roles, {"station": "station", "range_m": "range", "azimuth_deg": "azimuth"}) == ["note"]
+        unused_columns(roles, {"station": "station", "range_m": "range"})
+    assert unused_columns(roles, {"station": "station", "range_m": "range", "azimuth_deg": "azimuth"}) == ["note"]
 
 
 def test_a_column_named_like_those_of_receivers_must_name_a_station():
@@ -36,4 +36,4 @@ def test_a_column_named_like_those_of_receivers_must_name_a_station():
 def test_the_farther_station_follows_from_the_sign_and_the_quantity(kind, positive, which):
     none = np.zeros(0, dtype=int)
     found = Readings(sort_named(kind), "m", Decimals.of([]), none, (), none, none, none, positive)
-    assert farther(found) == which
+    assert farther_station(found) == which

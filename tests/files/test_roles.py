@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem
-from optloc.files.roles import Roles, in_space, placed, places_of, scaled, worded
+from optloc.files.roles import Roles, in_space, placed, places_of, scaled, with_standard_columns
 from optloc.files.table import of_rows
 
 
@@ -57,6 +57,6 @@ def test_points_of_geojson_are_longitude_latitude_height(tmp_path):
 
 
 def test_other_words_of_station_tables_become_our_names():
-    found = worded(table(receiver="A", latitude=1.0, longitude=2.0, altitude_km=0.5), "m")
+    found = with_standard_columns(table(receiver="A", latitude=1.0, longitude=2.0, altitude_km=0.5), "m")
     assert found.raw("name").tolist() == ["A"]
     assert [found.numbers(key).tolist() for key in ("lat_deg", "lon_deg", "height")] == [[1.0], [2.0], [500.0]]

@@ -9,11 +9,11 @@ from optloc.base.frames import ECEF
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.cli import app
 from optloc.files import load
-from optloc.files.convert import convert, understood
-from optloc.files.readings import ColumnHints
+from optloc.files.convert import convert, interpret_table
 from optloc.files.roles import Roles
 from optloc.files.satellite_tables import pseudoranges, write_satellites
 from optloc.files.table import of_rows
+from optloc.files.table_import import ColumnHints
 from optloc.problem import by_epoch
 
 RUN = CliRunner()
@@ -77,13 +77,13 @@ def test_places_at_transmission_are_turned(lat, lon, clocks, unit, far, tmp_path
     sent = table(tmp_path, at, clocks=clocks, unit=unit, far=far)
     there = table(tmp_path, at, clocks=clocks, unit=unit, far=far, sent=False, name="there.csv")
     found, right = (
-        understood(path, ColumnHints(sigma="1 m", turned=path == there)).read().problem for path in (sent, there)
+        interpret_table(path, ColumnHints(sigma="1 m", turned=path == there)).read().problem for path in (sent, there)
     )
     # The turned places are those at reception to less than a millimetre.
     assert np.abs(found.stations.position - right.stations.position).max() < 1e-4
     assert miss(found, at) < 1e-3
     if far > 2e7 and lat < 60.0:
-        unturned = understood(sent, ColumnHints(sigma="1 m", turned=True)).read().problem
+        unturned = interpret_table(sent, ColumnHints(sigma="1 m", turned=True)).read().problem
         assert miss(unturned, at) > 10.0
 
 
@@ -113,7 +113,7 @@ def test_epochs_in_any_order_and_with_few_satellites(tmp_path):
     few = [line for line in lines if not line.startswith("2,") or line.split(",")[1] in ("G00", "G01", "G02")]
     shuffled = [few[i] for i in np.random.default_rng(5).permutation(len(few))]
     path.write_text("\n".join([head, *shuffled]) + "\n")
-    loaded = understood(path, ColumnHints(sigma="1 m")).read()
+    loaded = interpret_table(path, ColumnHints(sigma="1 m")).read()
     fix = solve(by_epoch(loaded.problem))
     good = [k for k, label in enumerate(loaded.epochs) if label != "2"]
     assert np.linalg.norm(fix.position - at, axis=-1)[good].max() < 1e-3
@@ -132,15 +132,15 @@ def test_too_few_satellites_are_not_turned(tmp_path):
     at = receiver(48.2, 16.4)
     path = table(tmp_path, at, count=2)
     with pytest.raises(InvalidProblem, match=r"gnss.csv: no epoch has 3 satellites.*cannot be turned.*say --turned"):
-        understood(path, ColumnHints(sigma="1 m"))
-    assert understood(path, ColumnHints(sigma="1 m", turned=True)).read().problem.count == 2
+        interpret_table(path, ColumnHints(sigma="1 m"))
+    assert interpret_table(path, ColumnHints(sigma="1 m", turned=True)).read().problem.count == 2
 
 
 def test_turned_is_refused_where_there_are_no_satellites(tmp_path):
     path = tmp_path / "ranges.csv"
     path.write_text("lat,lon,range_m\n59.9,10.7,100\n59.91,10.7,900\n59.9,10.71,700\n")
     with pytest.raises(InvalidProblem, match="--turned: the table has no satellites"):
-        understood(path, ColumnHints(sigma="1 m", turned=True))
+        interpret_table(path, ColumnHints(sigma="1 m", turned=True))
 
 
 def sent(**change):

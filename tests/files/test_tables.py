@@ -10,8 +10,8 @@ from optloc import InvalidProblem, locate, solve
 from optloc.base.frames import ECEF
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.cli import app
-from optloc.files.convert import understood
-from optloc.files.readings import ColumnHints, named_columns
+from optloc.files.convert import interpret_table
+from optloc.files.table_import import ColumnHints, named_columns
 
 RUN = CliRunner()
 SITES = {"Lake": (47.812, 11.183, 612.0), "Chapel": (47.861, 11.246, 701.0), "Quarry": (47.843, 11.121, 655.0)}
@@ -51,7 +51,9 @@ def table(folder, text, name="t.csv"):
 
 
 def table_problem(folder, text, name="t.csv", **told):
-    return understood(table(folder, text, name), ColumnHints(**{"sigma": "10 cm", "stations": anchors(folder), **told}))
+    return interpret_table(
+        table(folder, text, name), ColumnHints(**{"sigma": "10 cm", "stations": anchors(folder), **told})
+    )
 
 
 def ranges():
@@ -390,7 +392,7 @@ def test_an_mlat_server_dump_brings_its_receivers(tmp_path):
 def test_a_kraken_log_has_the_heading_added(tmp_path):
     line = "1700000000000, {}, 5.2, -42.0, 148524000, UCA, 436, {}, {}, {}, {}, 0, GPS, R, R, R, R" + ", 1.2" * 360
     rows = [line.format(150, "north", 47.9, 11.2, 30), line.format(90, "west", 47.8, 11.0, 350)]
-    found = understood(table(tmp_path, " \n".join(rows), "k.csv"), ColumnHints(sigma="1 deg", still=True))
+    found = interpret_table(table(tmp_path, " \n".join(rows), "k.csv"), ColumnHints(sigma="1 deg", still=True))
     assert [float(z) for z in found.sections[0].columns["z"]] == [180.0, 80.0]
     assert found.sections[0].lines == ('azimuth = "north-clockwise"',)
     assert "its heading was added" in found.notes[0]
@@ -410,7 +412,7 @@ def test_a_kraken_log_has_the_heading_added(tmp_path):
 )
 def test_what_holds_no_measurements_is_said(name, text, words, tmp_path):
     with pytest.raises(InvalidProblem, match=words):
-        understood(table(tmp_path, text, name), ColumnHints(sigma="1 m"))
+        interpret_table(table(tmp_path, text, name), ColumnHints(sigma="1 m"))
 
 
 # Broken tables: one sentence, exit code 2, nothing written.
@@ -491,7 +493,7 @@ def test_digits_that_are_lost_are_told(tmp_path):
     import pandas as pd
 
     pd.DataFrame({"rx": ["Lake", "Mill"], "toa_s": [1790000000.25, 1790000000.5]}).to_parquet(tmp_path / "t.parquet")
-    assert "rounded to 71.5 m" in understood(tmp_path / "t.parquet", ColumnHints(**told)).notes[0]
+    assert "rounded to 71.5 m" in interpret_table(tmp_path / "t.parquet", ColumnHints(**told)).notes[0]
 
 
 def test_a_column_like_those_of_receivers_that_names_none_is_refused(tmp_path):

@@ -18,8 +18,8 @@ import pytest
 
 import optloc
 from optloc.cli.compile import parts
-from optloc.kernels import digests, kept
-from optloc.kernels.jit import _KERNELS, compiled, enabled, inlined, named, replace, with_constants
+from optloc.kernels import code_cache, digests
+from optloc.kernels.jit import _KERNELS, compiled, enabled, inlined, named, replace, specialise
 from optloc.proof.nodes.dispatch import NODES, text_of
 
 # Of the lines of all kernels, what an edit of one module may renew on average.
@@ -241,8 +241,8 @@ def test_named_tuples_with_other_fields_have_other_keys():
     from numba import typeof
 
     one, other = (typeof((Outer(kind(1.0, 2.0), 3.0), 4)) for kind in (Inner, turned()))
-    assert kept._fields(one) != kept._fields(other)
-    assert kept._fields(typeof(1.0)) == ()
+    assert code_cache._fields(one) != code_cache._fields(other)
+    assert code_cache._fields(typeof(1.0)) == ()
 
 
 def test_a_callee_that_is_taken_in_makes_other_code():
@@ -287,7 +287,7 @@ def test_replaced_functions_answer_through_their_callers(level):
 
 
 def test_other_constants_are_other_code():
-    own = with_constants(_answer, "three", STEP=3.0)
+    own = specialise(_answer, "three", STEP=3.0)
     assert digests.digest_of(own) != digests.digest_of(_answer)
     assert [kernel for kernel in _KERNELS if kernel.name.endswith("_level_STEP_3_0")]
 

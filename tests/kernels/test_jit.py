@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from optloc.kernels import jit
-from optloc.kernels.jit import Constant, compiled, enabled, with_constants
+from optloc.kernels.jit import Constant, compiled, enabled, specialise
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba nothing is compiled")
 WIDTH, UNIT = 3, 1.0
@@ -57,7 +57,7 @@ def test_constants_for_which_an_argument_asks_have_a_form_of_their_own():
 
 
 def test_kernels_with_other_constants_ask_for_the_same():
-    wide = with_constants(_repeatedly, "wide", WIDTH=5, UNIT=2.0)
+    wide = specialise(_repeatedly, "wide", WIDTH=5, UNIT=2.0)
     assert wide(1.5, 4) == 18 * 1.5
     (copy,) = (kernel for kernel in jit._KERNELS if kernel.name.endswith("._repeated_UNIT_2_0"))
     assert {str(kinds[1]) for kinds in forms(copy)} == {"int64", "Literal[int](5)"}
@@ -65,6 +65,6 @@ def test_kernels_with_other_constants_ask_for_the_same():
 
 def test_what_differs_by_constants_alone_is_one_kernel_for_all_that_call_it():
     count = len(jit._KERNELS)
-    one, other = (with_constants(_repeatedly, mark, WIDTH=7) for mark in ("one", "other"))
+    one, other = (specialise(_repeatedly, mark, WIDTH=7) for mark in ("one", "other"))
     assert one is other
     assert len(jit._KERNELS) == count + 1

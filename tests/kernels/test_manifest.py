@@ -17,8 +17,8 @@ import optloc
 from optloc.cli import wheel
 from optloc.cli.compile import make
 from optloc.kernels import manifest
+from optloc.kernels.code_cache import folder
 from optloc.kernels.jit import enabled
-from optloc.kernels.kept import folder
 from optloc.tracking.updates import ekf
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
@@ -68,7 +68,7 @@ def site(tmp_path):
     few = tmp_path / "few"
     few.mkdir()
     for file in folder().glob("optloc.kernels.*.nb[ic]"):
-        if file.name.startswith(("optloc.kernels.filter.", "optloc.kernels.lanes.", "optloc.kernels.systems.")):
+        if file.name.startswith(("optloc.kernels.filter.", "optloc.kernels.batched_rows.", "optloc.kernels.systems.")):
             (few / file.name).write_bytes(file.read_bytes())
             (few / re.sub(r"-[0-9a-f]{16}\.", f"-{BEFORE}.", file.name)).write_bytes(b"of a version before")
     packed = wheel.pack(few, tmp_path / "dist")

@@ -11,7 +11,7 @@ import pytest
 import optloc
 from optloc import InvalidProblem
 from optloc.cli.compile import parts
-from optloc.kernels.jit import enabled, names_in, usable
+from optloc.kernels.jit import enabled, may_use_code, names_in
 from optloc.proof.batch import _loop
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
@@ -69,22 +69,22 @@ def test_a_batch_goes_on_in_plain_python_while_a_child_compiles(tmp_path):
 )
 def test_who_waits(monkeypatch, way, few, many):
     begun = []
-    monkeypatch.setattr("optloc.kernels.jit.is_kept", lambda name: False)
-    monkeypatch.setattr("optloc.kernels.jit.begin_child", lambda: begun.append(1))
+    monkeypatch.setattr("optloc.kernels.jit.is_cached", lambda name: False)
+    monkeypatch.setattr("optloc.kernels.jit.start_background_compiler", lambda: begun.append(1))
     monkeypatch.setattr(_loop, "ready", False)
     monkeypatch.setattr(_loop, "seen", False)
     monkeypatch.setenv("OPTLOC_COMPILE", way)
-    assert (usable(_loop, 16), usable(_loop, 17)) == (few, many)
+    assert (may_use_code(_loop, 16), may_use_code(_loop, 17)) == (few, many)
     assert len(begun) == (way == "child")
 
 
 def test_another_way_is_named(monkeypatch):
-    monkeypatch.setattr("optloc.kernels.jit.is_kept", lambda name: False)
+    monkeypatch.setattr("optloc.kernels.jit.is_cached", lambda name: False)
     monkeypatch.setattr(_loop, "ready", False)
     monkeypatch.setattr(_loop, "seen", False)
     monkeypatch.setenv("OPTLOC_COMPILE", "later")
     with pytest.raises(InvalidProblem, match=r"'later'.*wait, child, never"):
-        usable(_loop, 1)
+        may_use_code(_loop, 1)
 
 
 def test_entries_are_kernels_that_there_are():

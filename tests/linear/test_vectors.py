@@ -6,7 +6,7 @@ from cases import CASES, STATIONS, TARGET
 
 from optloc import Motion, assemble, measured, with_bias
 from optloc.engine import predict
-from optloc.linear.vectors import complete, emission_columns, hold_still, vectors, without_biases
+from optloc.linear.vectors import complete, emission_columns, problem_at_rest, vectors, without_biases
 from optloc.problem import Prior
 
 Z = np.linspace(3e3, 8e3, 6)
@@ -60,4 +60,4 @@ def test_known_biases_leave_the_rows_and_free_ones_count_as_zero():
 
 
 def test_a_target_that_is_held_still_has_no_velocity():
-    assert [slot.name for slot in hold_still(ranges(motions=(Motion(1),))).layout.shared] == ["position"]
+    assert [slot.name for slot in problem_at_rest(ranges(motions=(Motion(1),))).layout.shared] == ["position"]

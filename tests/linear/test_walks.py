@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optloc import assemble, measured, with_bias
-from optloc.linear.walks import chain_at, free_of, places, walk_names, walks, wander
+from optloc.linear.walks import chain_at, count_free_unknowns, simulate_walks, state_columns, walk_names, walks
 
 TIMES = np.array([0.0, 10.0, 30.0, 35.0])
 DENSITY, MEAN, SIGMA = 0.04, 3.0, 2.0
@@ -50,14 +50,14 @@ def test_information_and_vector_of_a_walk_are_derivatives_of_its_cost(problem):
 def test_walks_are_named_and_placed_among_the_unknowns_of_an_epoch(problem):
     (walk,) = walks(problem)
     assert walk_names(problem) == ("clock",)
-    assert places(problem.layout, walk).tolist() == [[0], [1]]
-    assert free_of(problem) == 0
-    assert free_of(with_bias(problem, "other", form="walk", density=1.0, rate_density=0.1)) == 8
+    assert state_columns(problem.layout, walk).tolist() == [[0], [1]]
+    assert count_free_unknowns(problem) == 0
+    assert count_free_unknowns(with_bias(problem, "other", form="walk", density=1.0, rate_density=0.1)) == 8
 
 
 def test_drawn_walks_begin_at_the_given_values_and_spread_with_the_root_of_time(problem):
     truth = np.zeros(problem.layout.size)
     truth[problem.layout.n_shared :][:2] = [20.0, -30.0]
-    value = problem.layout.take(wander(problem, truth, 5, 4000), "clock")
+    value = problem.layout.take(simulate_walks(problem, truth, 5, 4000), "clock")
     assert (value[:, 0] == [20.0, -30.0]).all()
     np.testing.assert_allclose(value[:, 1:].std(0), np.sqrt(DENSITY * TIMES[1:])[:, None] * [1, 1], rtol=0.06)

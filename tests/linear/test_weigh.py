@@ -9,7 +9,7 @@ from runs import drawn, estimated, run, truth
 import optloc
 from optloc.kernels.least_squares import refine
 from optloc.kernels.sums import equations_at
-from optloc.linear.normal import linearise, marginal, weighed
+from optloc.linear.normal import linearise, marginal, with_station_noise
 from optloc.problem.noise import dense
 
 
@@ -81,9 +81,9 @@ def test_the_bound_is_that_of_the_full_fisher_matrix():
 
 def test_isotropic_errors_are_arrival_errors():
     problem = run(3, sigma=3.0, station=4.0)
-    covariance = dense(weighed(problem).noise, np.arange(4))
+    covariance = dense(with_station_noise(problem).noise, np.arange(4))
     np.testing.assert_allclose(covariance, 25.0 * (np.eye(4) + 1.0), rtol=1e-12)
-    assert weighed(problem).stations.covariance is None
+    assert with_station_noise(problem).stations.covariance is None
 
 
 def test_stations_say_whether_errors_are_noise_or_unknowns():
@@ -116,7 +116,7 @@ def test_errors_of_a_run_of_one_epoch_have_the_covariance_of_their_information()
 
 def test_what_has_no_such_errors_stays():
     problem = run(3, station=0)
-    assert weighed(problem) is problem
+    assert with_station_noise(problem) is problem
 
 
 def test_simulated_station_errors_have_the_weighed_covariance():
@@ -124,6 +124,6 @@ def test_simulated_station_errors_have_the_weighed_covariance():
     x = truth(problem)
     drawn_ = optloc.simulate(problem, x, 5, trials=20_000)
     sample = np.cov(drawn_.z.T)
-    expected = dense(weighed(problem, x).noise, np.arange(problem.count))
+    expected = dense(with_station_noise(problem, x).noise, np.arange(problem.count))
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(sample / scale / scale[:, None], expected / scale / scale[:, None], atol=0.04)

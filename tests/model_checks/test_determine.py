@@ -82,9 +82,9 @@ def test_far_sources_are_in_the_cones_and_beyond_the_least_range():
 
 def blank(problem):
     """Return the fix of a problem without a position, as a refinement that failed leaves it."""
-    from optloc.solvers.verdict.judge import failed
+    from optloc.solvers.verdict.judge import failed_fixes
 
-    return failed(problem.flat(), "")[0]
+    return failed_fixes(problem.flat(), "")[0]
 
 
 @pytest.mark.parametrize(("places", "seed"), [(SIX, 1), (SIX, 4), (SQUARE, 2)])

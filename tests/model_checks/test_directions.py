@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 
-from optloc.model_checks.directions import View, _false_position, minima_of
+from optloc.model_checks.directions import DirectionCost, _false_position, minima_of
 
 
 def cost(place):
@@ -13,7 +13,7 @@ def cost(place):
 
 
 def test_a_look_in_a_direction_is_the_cost_at_its_place_and_its_slope():
-    view = View.of(ranges_to(PLACE, 5.0))
+    view = DirectionCost.of(ranges_to(PLACE, 5.0))
     turn, v = np.array([0.3, 2.0, 4.5]), np.array([0.2, 0.7, 2.0])
 
     def at(turn, v):
@@ -28,7 +28,7 @@ def test_a_look_in_a_direction_is_the_cost_at_its_place_and_its_slope():
 
 
 def test_the_least_minimum_of_exact_ranges_is_the_target():
-    view = View.of(ranges_to(PLACE, 5.0))
+    view = DirectionCost.of(ranges_to(PLACE, 5.0))
     found = minima_of(view, 1.0)
     assert found.cost[0] == pytest.approx(0.0, abs=1e-6)
     np.testing.assert_allclose(view.positions(found.u[:1], found.v[:1])[0], PLACE, atol=1e-2)

@@ -14,7 +14,7 @@ from optloc.cli import app
 from optloc.files import load
 from optloc.model_checks.advice import advise_at, explained, misfit_of
 from optloc.model_checks.score import FALSE_ALARM, Candidate, explain_misfit
-from optloc.problem.epochs import cut, thinned
+from optloc.problem.epochs import cut, some_epochs
 from tests.monte_carlo.tables import write
 
 SHIPPED = Path(optloc.__file__).parent / "scenarios" / "registration.toml"
@@ -118,10 +118,10 @@ def test_a_long_run_is_looked_at_all_over(shipped):
 def test_epochs_here_and_there_are_a_run_of_their_own(shipped):
     drawn = optloc.simulate(shipped, TRUTH, 2)
     ahead = cut(drawn, 3, 9)
-    same = thinned(drawn, np.arange(3, 9))
+    same = some_epochs(drawn, np.arange(3, 9))
     np.testing.assert_array_equal(optloc.engine.predict(same, TRUTH), optloc.engine.predict(ahead, TRUTH))
     np.testing.assert_array_equal(same.z, ahead.z)
-    every = thinned(drawn, np.arange(0, 200, 10))
+    every = some_epochs(drawn, np.arange(0, 200, 10))
     np.testing.assert_array_equal(every.times, drawn.times[::10])
     x = optloc.solve(drawn, "searched").x
     whole = optloc.engine.predict(drawn, x).reshape(200, -1)

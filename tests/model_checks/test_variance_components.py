@@ -5,7 +5,7 @@ import pytest
 from model_checks.small import means
 
 from optloc.base.errors import InvalidProblem
-from optloc.model_checks.variance_components import fit, shown, snooped, tested as told, total
+from optloc.model_checks.variance_components import error_sizes, fit, snooped, tested as told, total
 
 
 def test_tests_are_those_of_the_dense_projection():
@@ -23,7 +23,7 @@ def test_tests_are_those_of_the_dense_projection():
 def test_the_size_of_an_error_is_its_distance_from_the_mean_of_the_others():
     rows = np.array([[1.0, 2.0, 3.0, 40.0]])
     tests = told(means(rows), np.ones(()))
-    shift, sigma = shown(tests, slice(0, 4))
+    shift, sigma = error_sizes(tests, slice(0, 4))
     assert shift[0, 3] == pytest.approx(40.0 - 2.0)
     assert sigma[0, 3] == pytest.approx(np.sqrt(1.0 + 1.0 / 3.0))
     found = snooped(tests, slice(0, 4), 3.5)

@@ -18,7 +18,7 @@ from optloc.sites.calibration.calibrated import refuted_blocks, spans
 from optloc.sites.calibration.gauge import determined
 from optloc.sites.calibration.likelihood import likelihood
 from optloc.sites.calibration.outliers import truncated
-from optloc.sites.calibration.rounds import starts_of
+from optloc.sites.calibration.restarts import starts_of
 
 KEPT = FOLDER.parents[1] / "build" / "full"  # ignored by git
 # A part of the counts may be asked for.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import optloc
-from optloc.multi_target.assignment_findings import Assigned, spell, verdict
+from optloc.multi_target.assignment_findings import Assigned, count_in_words, verdict
 
 RING = 1e3 * np.array([[0.0, 0], [10, 0], [0, 10], [9, 9]])
 
@@ -48,4 +48,4 @@ def test_a_doubtful_emitter_counts_against_all():
 
 
 def test_numbers_of_emitters_in_words():
-    assert [spell(n) for n in range(3)] == ["no emitter", "one emitter", "2 emitters"]
+    assert [count_in_words(n) for n in range(3)] == ["no emitter", "one emitter", "2 emitters"]

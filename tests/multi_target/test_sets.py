@@ -7,7 +7,7 @@ from multi_target.scenes import RING, STAR, drawn, model
 
 import optloc
 from optloc.multi_target import Clutter
-from optloc.multi_target.sets import around, changes, refine_sets as refined, scenes
+from optloc.multi_target.sets import refine_sets as refined, scenes, value_changes, values_in_balls
 
 
 def mixed(d):
@@ -31,13 +31,13 @@ def test_no_row_leaves_its_enclosure(d):
     rng = np.random.default_rng(1)
     centre = np.concatenate([rng.normal(0.0, 8e3, (300, d)), stations + rng.normal(0.0, 50.0, (4, d)), stations])
     half = 10.0 ** rng.uniform(0.0, 4.0, (len(centre), d))
-    value, slope, remainder = around(problem, centre, np.linalg.norm(half, axis=-1))
-    change = changes(problem, slope, remainder, half)
+    value, slope, remainder = values_in_balls(problem, centre, np.linalg.norm(half, axis=-1))
+    change = value_changes(problem, slope, remainder, half)
     turn = np.concatenate([np.full(b.count, b.kind in ("azimuth", "elevation")) for b in problem.rows])
     touched = 0.0
     for _ in range(200):
         away = half * rng.choice([rng.uniform(-1.0, 1.0), 1.0, -1.0], half.shape) * rng.choice([0.1, 1.0])
-        there = around(problem, centre + away, np.zeros(len(centre)))[0]
+        there = values_in_balls(problem, centre + away, np.zeros(len(centre)))[0]
         moved = there - value
         moved[:, turn] = (moved[:, turn] + np.pi) % (2.0 * np.pi) - np.pi
         sure = np.isfinite(moved)

@@ -9,7 +9,7 @@ from cases import CASES
 from optloc import simulate, solve
 from optloc.base.records import join, overwrite, take
 from optloc.problem import Certificate
-from optloc.problem.claims import alike, choose, claim, untried
+from optloc.problem.claims import claim, empty_claims, merged_claims, repeated_claims
 
 GIVEN = [
     Certificate("global", "proven best", "branch and bound", 1.0, 1e-9, True, 9.0, 57),
@@ -21,7 +21,7 @@ GIVEN = [
 
 def written():
     """Return claims (5,): those given, and one that nobody has tried to prove."""
-    out = untried(5)
+    out = empty_claims(5)
     for i, certificate in enumerate(GIVEN):
         out.write(i, claim(certificate))
     return out
@@ -50,13 +50,13 @@ def test_it_is_taken_joined_and_overwritten_like_every_record():
 
 
 def test_many_are_one_and_one_is_chosen_for_many():
-    assert same(alike(claim(GIVEN[1]), 3).tell(), [GIVEN[1]] * 3)
-    chosen = choose(np.array([True, False, False, False, True]), claim(GIVEN[0]), written())
+    assert same(repeated_claims(claim(GIVEN[1]), 3).tell(), [GIVEN[1]] * 3)
+    chosen = merged_claims(np.array([True, False, False, False, True]), claim(GIVEN[0]), written())
     assert same(chosen.tell(), [GIVEN[0], *GIVEN[1:], GIVEN[0]])
 
 
 def test_rows_of_one_certificate_stay_one_row():
-    one = alike(claim(GIVEN[2]), 4)
+    one = repeated_claims(claim(GIVEN[2]), 4)
     assert join([one, one], 8).bound.strides == (0,)
 
 

@@ -9,9 +9,9 @@ from often import few
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.files import load
-from optloc.linear.walks import places, walks
+from optloc.linear.walks import state_columns, walks
 from optloc.problem.bias import with_bias, with_known_bias
-from optloc.problem.clocks import clock_densities, greville, pieces, process
+from optloc.problem.clocks import clock_densities, greville, process, spline_weights
 from tests.monte_carlo.tables import write
 
 RNG = np.random.default_rng(20261123)
@@ -41,8 +41,8 @@ def drawn(problem, seed, trials=None, begin=(40.0, -80.0, 120.0, 10.0)):
     truth[:3] = TARGET
     base = problem.layout.n_shared
     for bias in walks(problem):
-        truth[base + places(problem.layout, bias)[:, 0]] = begin
-    truth = optloc.engine.wander(problem, truth, seed, trials)
+        truth[base + state_columns(problem.layout, bias)[:, 0]] = begin
+    truth = optloc.engine.simulate_walks(problem, truth, seed, trials)
     return optloc.simulate(problem, truth, seed + 1), truth
 
 
@@ -148,7 +148,7 @@ def test_clocks_and_positions_are_as_certain_as_is_said_over_500_runs():
 
 def test_steps_have_the_variance_of_their_definition():
     problem = walking(400, density=0.04, rate_density=1e-4)
-    x = optloc.engine.wander(problem, np.zeros(problem.layout.size), 4)
+    x = optloc.engine.simulate_walks(problem, np.zeros(problem.layout.size), 4)
     value, rate = (problem.layout.take(x, name) for name in ("clock", "clock rate"))
     F, Q = process(problem.biases[0], problem.times)
     state = np.stack([value, rate], axis=-1)
@@ -169,7 +169,7 @@ def test_allan_deviations_become_densities_and_walks_have_these_deviations():
     # second differences of the error over tau: Allan's definition
     plain = run(4000, seconds=1.0)
     problem = with_bias(plain, "clock", members=["S2", "S3"], form="walk", density=density, rate_density=rate_density)
-    x = problem.layout.take(optloc.engine.wander(problem, np.zeros(problem.layout.size), 8), "clock")
+    x = problem.layout.take(optloc.engine.simulate_walks(problem, np.zeros(problem.layout.size), 8), "clock")
     for n, expected in zip((1, 4, 16), allan, strict=False):
         second = x[2 * n :] - 2.0 * x[n:-n] + x[: -2 * n]
         assert np.sqrt(np.mean(second**2) / 2.0) / n / speed == pytest.approx(expected, rel=0.1)
@@ -187,7 +187,7 @@ def test_a_walk_and_a_spline_begin_together_on_both_sides_of_a_line_of_stations(
     problem = with_bias(problem, "spline", members=["S3"], form="spline", knots=3)
     truth = np.zeros(problem.layout.size)
     truth[:4] = 300.0, 400.0, 1.0, -2.0
-    fix = optloc.solve(optloc.simulate(problem, optloc.engine.wander(problem, truth, 1), 2))
+    fix = optloc.solve(optloc.simulate(problem, optloc.engine.simulate_walks(problem, truth, 1), 2))
     assert fix.status == optloc.Status.AMBIGUOUS
     np.testing.assert_allclose(fix.x[:4] * [1.0, -1.0, 1.0, -1.0], fix.alternatives.x[0, :4], rtol=1e-5)
 
@@ -195,7 +195,7 @@ def test_a_walk_and_a_spline_begin_together_on_both_sides_of_a_line_of_stations(
 def test_a_spline_is_one_and_a_straight_line_where_its_coefficients_are():
     problem = with_bias(run(30), "clock", members=["S2"], form="spline", knots=[-5.0, 20.0, 100.0, 200.0, 300.0])
     bias = problem.biases[0]
-    entry, factor = pieces(bias.knots, problem.times)
+    entry, factor = spline_weights(bias.knots, problem.times)
     np.testing.assert_allclose(factor.sum(1), 1.0)
     np.testing.assert_allclose((factor * greville(bias)[entry]).sum(1), problem.times, atol=1e-9)
     assert problem.layout.find("clock")[0].entries[0] == "S2 at -5 s"
@@ -226,7 +226,7 @@ def test_a_spline_follows_a_clock_that_bends():
     assert fix.p_value > 1e-3
     error = fix.take("position[0]") - TARGET
     assert error @ np.linalg.inv(fix.covariance("position[0]")) @ error < 20.0
-    entry, factor = pieces(problem.biases[0].knots, problem.times)
+    entry, factor = spline_weights(problem.biases[0].knots, problem.times)
     shape = fix.take("clock").reshape(4, -1)
     assert np.abs((factor * shape[0][entry]).sum(1) - wave).max() < 5.0
 
@@ -352,7 +352,9 @@ def test_an_aircraft_that_reports_lets_unsynchronised_receivers_fix_others():
     begin = np.zeros((30, 5))
     begin[0] = [350.0, -820.0, 130.0, 610.0, -240.0]
     silent = np.array([18e3, 24e3, 7.6e3, -150.0, -110.0, 0.0])
-    data = optloc.simulate(model, optloc.engine.wander(model, np.concatenate([silent, begin.ravel()]), 3, trials), 4)
+    data = optloc.simulate(
+        model, optloc.engine.simulate_walks(model, np.concatenate([silent, begin.ravel()]), 3, trials), 4
+    )
     fix = optloc.solve(data)
     assert (fix.code == optloc.Status.UNPROVEN).sum() >= trials - 1  # one in a thousand may be told a misfit
     error = fix.x[:, :6] - silent

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optloc.problem.determined import Determined, Direction, Quantity, bearing_of, flattened, holds
+from optloc.problem.determined import Determined, Direction, Quantity, angles_off_axis, bearing_of, is_in_cone
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -27,13 +27,13 @@ def level(azimuth, low, high, near=0.0, far=np.inf):
 def test_angles_off_an_axis_are_the_angles_between_vectors():
     rng = np.random.default_rng(1)
     vectors = rng.standard_normal((50, 3))
-    size = np.linalg.norm(flattened(UP, vectors), axis=1)
+    size = np.linalg.norm(angles_off_axis(UP, vectors), axis=1)
     np.testing.assert_allclose(size, np.arccos(vectors[:, 2] / np.linalg.norm(vectors, axis=1)), atol=1e-12)
-    assert flattened(UP, 5.0 * UP).tolist() == [0.0, 0.0]
+    assert angles_off_axis(UP, 5.0 * UP).tolist() == [0.0, 0.0]
 
 
 def test_a_cone_holds_the_vectors_within_its_half_angle():
-    found = holds(UP, cone(0.3), np.concatenate([cone(0.29), cone(0.31), cone(2.0)]))
+    found = is_in_cone(UP, cone(0.3), np.concatenate([cone(0.29), cone(0.31), cone(2.0)]))
     assert found.tolist() == [True] * 60 + [False] * 120
     edge = level(0.5, 0.4, 0.7)
     assert edge.covers([[np.cos(a), np.sin(a)] for a in (0.39, 0.41, 0.69, 0.71)]).tolist() == [

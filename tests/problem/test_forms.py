@@ -15,7 +15,7 @@ from optloc.base.types import FormName, Stations
 from optloc.engine import predict
 from optloc.problem.bias import with_known_bias
 from optloc.problem.forms import FORMS, BiasForm
-from optloc.proof.scope import unsupported
+from optloc.proof.scope import why_unsupported
 from optloc.tracking.constants import begun_with_constants
 from optloc.tracking.dynamics import polynomial
 
@@ -117,7 +117,7 @@ def test_one_entry_adds_a_form(monkeypatch):
     assert off @ np.linalg.solve(fix.cov[:4, :4], off) < 18.5  # chi-square of 4 numbers at 0.1 %
     known = with_known_bias(data, "clock", truth[2:])
     np.testing.assert_allclose(known.observed - predict(run_of(), truth[:2]), data.z - predict(data, truth), atol=1e-9)
-    assert unsupported(data.flat()) == f"the bend 'clock' {reason}"
+    assert why_unsupported(data.flat()) == f"the bend 'clock' {reason}"
     assert not fix.status & Status.OK or fix.certificate.proof != "global"
     moving = with_bias(run_of(Motion(1)), "clock", form="bend", members=["B"])
     with pytest.raises(InvalidProblem, match="the bend 'clock' changes in time"):

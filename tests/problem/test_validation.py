@@ -10,7 +10,7 @@ from optloc.base.types import Band, Polygon, Stations
 from optloc.linear.constraints import box, speed
 from optloc.problem import Prior
 from optloc.problem.noise import Block, Noise
-from optloc.problem.validation import check_polygon, check_unknowns, check_values, checked, like
+from optloc.problem.validation import bands_by_quantity, check_polygon, check_unknowns, check_values, checked
 
 PLACES = np.array([[0.0, 0.0], [9.0, 1.0], [10.0, 9.0], [1.0, 10.0]])
 ROWS = measured("range", np.full(4, 5.0), a=np.arange(4), sigma=1.0)
@@ -86,5 +86,5 @@ def test_bands_on_one_quantity_are_together():
     first, second = box([0.0, 1.0], [2.0, 3.0]), box([-1.0, -np.inf], [9.0, np.inf])
     other = Band("plane", np.array(0.0), np.array(1.0), np.array([1.0, 0.0]), "x", target=1)
     region = Polygon(np.array([[0, 0], [1, 0], [0, 1.0]]))
-    groups = like([*first, region, *second, other])
+    groups = bands_by_quantity([*first, region, *second, other])
     assert [[band.lower.item() for band in group] for group in groups] == [[0.0, -1.0], [1.0, -np.inf], [0.0]]

@@ -8,23 +8,27 @@ from math import sqrt
 
 from optloc.kernels.jit import compiled
 from optloc.models import Model
-from optloc.proof.nodes.node import CONVEX, GROWS, Node, inner, pull, reach, triple, write
+from optloc.proof.nodes.node import CONVEX, GROWS, Node, inner_product, reach, triple_at, turned_form, write_triple
 
 
 @compiled
 def bound(data, line, sense, half, slope):
     """Value and slope at the centre of a box; the remainder |sense s|^2 is between 0 and the reaches of its parts."""
-    v, h = triple(line, 0), triple(half, 0)
-    gradient = pull(v, sense)
-    write((2.0 * gradient[0], 2.0 * gradient[1], 2.0 * gradient[2]), slope)
-    most = reach(triple(sense[0], 0), h) ** 2 + reach(triple(sense[1], 0), h) ** 2 + reach(triple(sense[2], 0), h) ** 2
-    return inner(v, v), 0.0, most
+    v, h = triple_at(line, 0), triple_at(half, 0)
+    gradient = turned_form(v, sense)
+    write_triple((2.0 * gradient[0], 2.0 * gradient[1], 2.0 * gradient[2]), slope)
+    most = (
+        reach(triple_at(sense[0], 0), h) ** 2
+        + reach(triple_at(sense[1], 0), h) ** 2
+        + reach(triple_at(sense[2], 0), h) ** 2
+    )
+    return inner_product(v, v), 0.0, most
 
 
 @compiled
 def curve(data, line, sense, half, curvature, turn):
     """The Hessian 2 sense'sense is the same everywhere, so it changes by nothing, and the gradient by its reaches."""
-    h = triple(half, 0)
+    h = triple_at(half, 0)
     for k in range(3):
         for m in range(3):
             entry = 0.0

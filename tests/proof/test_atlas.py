@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from proof.sampling import numbers, value
 
-from optloc.proof.atlas import atlas_of, clip_to_corners, home_of, position, set_centre, within
-from optloc.proof.box import cube
+from optloc.proof.atlas import atlas_of, contract_to_corners, is_near_minimum, piece_of, set_centre, write_position
+from optloc.proof.box import station_cube
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, CURVE_WIDTH, ELEVATION, NODE_WIDTH, RANGE, RATIO
 
@@ -19,11 +19,11 @@ def scene(d, rng):
     """Return nodes of all kinds and an atlas with one known minimum of some cost outside the cube."""
     kinds = np.array([CODES[name] for name in NAMES[d]])
     data = np.stack([numbers("groa" if name == "range" else name, d, rng) for name in NAMES[d]])
-    middle, radius = cube(kinds, data, np.zeros(d))
+    middle, radius = station_cube(kinds, data, np.zeros(d))
     atlas = atlas_of(middle, radius, d, 1)
     minima = atlas.minima
     x = middle[:d] + radius * rng.normal(size=d) * 2.0
-    minima.home[0] = home_of(atlas, x, minima.start[0])
+    minima.home[0] = piece_of(atlas, x, minima.start[0])
     axes = np.zeros((3, 3))
     axes[:d, :d] = np.linalg.qr(rng.normal(size=(d, d)))[0] * 0.02 * minima.start[0, d - 1]
     minima.axes[0], minima.back[0, :d, :d] = axes, np.linalg.inv(axes[:d, :d])
@@ -128,12 +128,12 @@ def test_every_position_has_a_home(d):
     seen = set()
     for _ in range(300):
         x, u, back = rng.normal(size=d) * atlas.radius * 10 ** rng.uniform(-1.0, 4.0), np.zeros(3), np.zeros(d)
-        home = home_of(atlas, x, u)
+        home = piece_of(atlas, x, u)
         seen.add(home)
         assert np.abs(u[:d]).max() <= 1.0 + 1e-12
         assert home == 2 * d or u[d - 1] > 0.0
         set_centre(atlas, home, u)
-        position(atlas, back)
+        write_position(atlas, back)
         assert back == pytest.approx(x, rel=1e-9, abs=1e-9 * atlas.radius)
     assert seen == set(range(2 * d + 1))
 
@@ -153,7 +153,7 @@ def test_a_box_within_another_has_all_its_points_there(d):
         s = (u - minima.start[0]) @ minima.back[0].T
         minima.sides[0], minima.core[0, 0], minima.core[0, 1] = sides, -2.0 * sides, np.inf
         minima.core[0, 0, d - 1] = -np.inf
-        convex, core = within(atlas, half, 0)
+        convex, core = is_near_minimum(atlas, half, 0)
         inside, beside = inside + convex, beside + (core and not convex)
         assert not convex or (np.abs(s) <= sides).all()
         assert not core or (s[:, : d - 1] >= -2.0 * sides[: d - 1]).all()
@@ -177,13 +177,13 @@ def test_no_position_between_the_corners_is_cut_off(d):
         corners[:, :d] = np.sort(rng.standard_normal((2, d)) * 10.0 ** rng.uniform(-1.0, 2.0), axis=0)
         cut = np.concatenate([-half, half])
         set_centre(atlas, piece, at)
-        clip_to_corners(atlas, origin, back, corners, half, cut)
+        contract_to_corners(atlas, origin, back, corners, half, cut)
         parts += int((cut[:3] > -half).any() or (cut[3:] < half).any())
         for u in rng.uniform(-1.0, 1.0, (100, 3)) * half:
             x = np.zeros(d)
             set_centre(atlas, piece, at + u)
             if atlas.scale[0] > 0.0:
-                position(atlas, x)
+                write_position(atlas, x)
                 s = back[:, :d] @ (x - origin[:d])
                 inside = (corners[0] <= s).all() and (s <= corners[1]).all()
                 lost += int(inside and ((u < cut[:3]).any() or (u > cut[3:]).any()))

@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from proof.costs import differences, down_from
 
-from optloc.proof.batch import ProofRequest, ProofResult, costs_at, empty_answer, plainly, present_in, prove_all
-from optloc.proof.near import BETTER, STATIONARY, UNIQUE
+from optloc.proof.batch import (
+    ProofRequest,
+    ProofResult,
+    costs_at,
+    empty_answer,
+    plainly,
+    prove_all,
+    without_unused_nodes,
+)
+from optloc.proof.local_search import BETTER, STATIONARY, UNIQUE
 
 pytestmark = pytest.mark.usefixtures("plainly")
 
@@ -62,7 +70,7 @@ def test_nodes_that_no_row_has_change_no_cost(case):
         K=K,
         w=np.insert(case.w, 1, 0.0),
     )
-    own = present_in(wider)
+    own = without_unused_nodes(wider)
     np.testing.assert_array_equal(own.K, case.K)
     np.testing.assert_array_equal(own.w, case.w)
     np.testing.assert_array_equal(own.data, cost.data)

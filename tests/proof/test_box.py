@@ -12,12 +12,20 @@ from optloc import assemble, measured
 from optloc.kernels.jit import enabled
 from optloc.kernels.systems import inverse
 from optloc.proof.atlas import atlas_of, set_centre
-from optloc.proof.box import cube, is_empty, least_residual, linearise_rows, rounding, shrink, uncut
+from optloc.proof.box import (
+    contract_box,
+    is_empty,
+    least_residual,
+    linearise_rows,
+    reset_cut,
+    rounding_error,
+    station_cube,
+)
 from optloc.proof.convex_boxes import accuracy_floor_far
-from optloc.proof.curvature import clip_to_minima, sum_up
+from optloc.proof.curvature import contract_to_minima, sum_up
 from optloc.proof.enclosure import enclose
-from optloc.proof.everywhere import leaves, prove_everywhere
-from optloc.proof.near import UNIQUE, VALUE
+from optloc.proof.global_search import excludes_infimum, prove_globally
+from optloc.proof.local_search import UNIQUE, VALUE
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, SLOPE0
 from optloc.proof.search_space import LocalAxes, chart_at, cost_of, curve_box, empty_box, value_at
@@ -169,10 +177,10 @@ def check_bounds(rng, d):
     rho = measured_at(rng, made, chart.origin + chart.sense @ s)
     cost = made.cost
     filled(cost, chart, box)
-    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+    noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     assert not least_residual(cost.K, cost.weight, chart.floor, box.half, box.nodes, box.rows) > rho + noise
-    uncut(box.half, box.cut)
-    shrink(cost.K, cost.weight, rho + noise, box.half, d == 2, box.nodes, box.rows, box.cut, box.solve)
+    reset_cut(box.half, box.cut)
+    contract_box(cost.K, cost.weight, rho + noise, box.half, d == 2, box.nodes, box.rows, box.cut, box.solve)
     assert outside(box.cut, s) < 1e-9, made.names
     return bool(((box.cut[:3] > -box.half) | (box.cut[3:] < box.half)).any())
 
@@ -189,8 +197,8 @@ def check_stationary(rng, d):
     measured_at(rng, made, x, made.K @ slopes)
     cost = made.cost
     filled(cost, chart, box)
-    uncut(box.half, box.cut)
-    clip_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+    reset_cut(box.half, box.cut)
+    contract_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
     assert outside(box.cut, s) < 1e-9, made.names
     assert not is_empty(box.cut) or outside(box.cut, s) > -1e-9
     return bool(((box.cut[:3] > -box.half) | (box.cut[3:] < box.half)).any())
@@ -218,7 +226,7 @@ def check_leaves(rng, d):
     Returns whether a box beside it does, so that the test is seen to say something.
     """
     made = scene(rng, d, FAR, balanced=True)
-    middle, radius = cube(made.kinds, made.data, np.ones(d))
+    middle, radius = station_cube(made.kinds, made.data, np.ones(d))
     atlas, box = atlas_of(middle, radius, d, 0), empty_box(len(made.K), len(made.names))
     piece, level = int(rng.integers(0, 2 * d + 1)), rng.integers(0, 14, size=d)
     far = piece < 2 * d
@@ -258,11 +266,11 @@ def check_leaves(rng, d):
     box.at[:], box.half[:] = at, half
     set_centre(atlas, piece, box.at)
     bound_pieces(atlas, made.kinds, made.data, box.half, box.nodes)
-    assert not leaves(cost, atlas, box, touching, floor), (made.names, ends)
+    assert not excludes_infimum(cost, atlas, box, touching, floor), (made.names, ends)
     box.half[:] *= 0.25
     set_centre(atlas, piece, box.at)
     bound_pieces(atlas, made.kinds, made.data, box.half, box.nodes)
-    return bool((np.abs(u - at) > box.half).any() and leaves(cost, atlas, box, False, floor))
+    return bool((np.abs(u - at) > box.half).any() and excludes_infimum(cost, atlas, box, False, floor))
 
 
 @PIECES
@@ -349,7 +357,7 @@ def test_no_bound_is_above_what_another_place_costs(budget):
     cost, box = cost_of(np.full(5, RATIO), data, K, 500.0 * z), empty_box(5, 5)
     eps = 1e-6 * (1.0 + 1553.19)
     args = beside([]), down_from(0.0), eps, budget, no_rivals(), found
-    verdict, _, bound, *_ = prove_everywhere(cost, box, x, *args)
+    verdict, _, bound, *_ = prove_globally(cost, box, x, *args)
     assert verdict not in (UNIQUE, VALUE)
     r = np.linalg.norm(np.array(BETTER_PLACE) - S, axis=1)
     assert bound <= (((r[1:] / r[0] - z) * 500.0) ** 2).sum() + 1e-6

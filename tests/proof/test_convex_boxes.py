@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from proof.costs import beside, random_case
 
-from optloc.proof.atlas import atlas_of, position, set_centre
-from optloc.proof.box import cube
-from optloc.proof.convex_boxes import accuracy_floor_far, draw_in, is_known, known_minima, set_convex, set_minimum
+from optloc.proof.atlas import atlas_of, set_centre, write_position
+from optloc.proof.box import station_cube
+from optloc.proof.convex_boxes import (
+    accuracy_floor_far,
+    is_known,
+    known_minima,
+    limit_half_widths,
+    set_convex,
+    set_minimum,
+)
 from optloc.proof.search_space import HIDDEN_REACH, chart_at
 
 pytestmark = pytest.mark.usefixtures("plainly")
@@ -38,13 +45,13 @@ def test_the_hessian_is_positive_all_over_a_convex_box(fixed):
 
 def test_the_box_of_a_minimum_in_the_atlas_is_convex_too(fixed):
     rng, case, cost, box, x, _ = fixed
-    d, atlas = case.d, atlas_of(*cube(cost.kinds, cost.data, x), case.d, 1)
+    d, atlas = case.d, atlas_of(*station_cube(cost.kinds, cost.data, x), case.d, 1)
     assert set_minimum(cost, box, atlas, 0, x, 0.0, 1e-6, np.inf)
     assert not set_minimum(cost, box, atlas, 0, x, case.cost(x) + 1.0, 1e-6, np.inf)
     s, places = rng.uniform(-1.0, 1.0, (100, 3)) * atlas.minima.sides[0], np.empty((100, d))
     for one, place in zip(s, places, strict=True):
         set_centre(atlas, 2 * d + 1, one)
-        position(atlas, place)
+        write_position(atlas, place)
     assert least_curvature(case, places) > 0.0
     assert accuracy_floor_far(cost, atlas) > np.linalg.norm(case.w)
 
@@ -69,8 +76,8 @@ def test_a_box_is_known_only_if_all_of_it_is_inside():
 
 def test_a_hidden_minimum_reaches_no_farther_than_allowed():
     sense, hull = np.diag([1e3, 10.0, 1.0]), np.array([1e4, 1e4, 1e4])
-    draw_in(sense, hull)
+    limit_half_widths(sense, hull)
     assert np.abs(sense @ hull).max() == pytest.approx(HIDDEN_REACH)
     small = np.array([1.0, 1.0, 1.0])
-    draw_in(sense, small)
+    limit_half_widths(sense, small)
     assert small.tolist() == [1.0, 1.0, 1.0]

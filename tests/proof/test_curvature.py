@@ -6,9 +6,9 @@ from proof.costs import random_case
 from proof.nodes.test_range import bound_box, bounded, charted, drawn_box, ways
 from proof.sampling import many
 
-from optloc.proof.box import is_empty, uncut
+from optloc.proof.box import is_empty, reset_cut
 from optloc.proof.convex_boxes import set_convex
-from optloc.proof.curvature import C00, SUMS, clip_to_minima, convex, spread_of
+from optloc.proof.curvature import C00, SUMS, contract_to_minima, is_convex_over_box, spread_of
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges
 from optloc.proof.search_space import curve_box, is_convex
@@ -136,8 +136,8 @@ def test_no_box_around_a_stationary_point_is_excluded(d):
                 box.at[:d] = at + box.half[:d] * (rng.uniform(-1.0, 1.0, d) if inside else 5.0)
                 bound_box(cost, chart, box)
                 curve_box(cost, chart, box)
-                uncut(box.half, box.cut)
-                clip_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+                reset_cut(box.half, box.cut)
+                contract_to_minima(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
                 none = is_empty(box.cut)
                 assert not (inside and none)
                 around += inside
@@ -177,5 +177,5 @@ def test_a_saddle_is_not_called_convex():
             saddles += 1
             box.at[:], box.half[:] = chart.back @ (point - truth), 0.0
             assert not is_convex(cost, chart, box, 0.0)
-            assert not convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, 0.0)
+            assert not is_convex_over_box(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, 0.0)
     assert saddles > 3

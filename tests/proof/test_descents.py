@@ -5,7 +5,7 @@ import pytest
 from proof.costs import random_case
 
 from optloc.proof.descents import descend, newton_step
-from optloc.proof.search_space import chart_at, curve_box, place, value_at
+from optloc.proof.search_space import chart_at, curve_box, value_at, write_centre
 
 pytestmark = pytest.mark.usefixtures("plainly")
 
@@ -28,7 +28,7 @@ def test_an_undamped_step_is_that_of_newton():
     x = case.minimum(truth) + np.array([3.0, -2.0, 1.0])
     chart, _ = chart_at(cost, x, box)
     box.at[:], box.half[:] = 0.0, 0.0
-    place(chart.origin, chart.sense, box.at, box.centre)
+    write_centre(chart.origin, chart.sense, box.at, box.centre)
     value_at(cost, chart, box)
     curve_box(cost, chart, box)
     length = newton_step(box, 0.0)

@@ -17,7 +17,7 @@ from optloc.proof import batch, best_first
 from optloc.proof.batch import FIRST_BOXES
 
 needs_code = pytest.mark.skipif(not enabled(), reason="without machine code every call is like the first")
-KERNELS = (batch._loop, batch._evaluate, best_first.present_in)
+KERNELS = (batch._loop, batch._evaluate, best_first.without_unused_nodes)
 
 
 def drawn(kind: str, d: int, count: int, size: int, seed: int):

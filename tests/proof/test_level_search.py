@@ -7,7 +7,7 @@ import pytest
 
 from optloc.proof.box import DEPTH, LEAST
 from optloc.proof.level_search import _first_below, _last_above_zero, _take_back, bound_row, search_levels
-from optloc.proof.near import CLEAR
+from optloc.proof.local_search import CLEAR
 
 pytestmark = pytest.mark.usefixtures("plainly")
 

@@ -18,8 +18,8 @@ from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scale
 from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_rows
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, largest_rate, velocity_costs
 from optloc.proof.scaled.scaled_search import rest_of
-from optloc.proof.scope import unsupported
-from optloc.solvers.certificates.position_cost import agrees
+from optloc.proof.scope import why_unsupported
+from optloc.solvers.certificates.position_cost import matches_problem_cost
 
 PAIRS, ARRIVALS, RANGES = (("tdoa", "fdoa"), ("toa", "range_rate"), ("range", "range_rate"))
 # Dimension, stations, kinds of rows, standard deviation of a prior on the velocity.
@@ -203,7 +203,7 @@ def test_position_costs_are_the_costs_of_the_problem(d, n, kinds, prior, seed):
         np.testing.assert_allclose(costs_at_scaled(costs, x)[0][0], flight.profiled(x[0])[0], rtol=1e-7)
         fix = solve(flight.problem)
         if fix.answered:
-            assert agrees(flight.problem.flat(), fix[None], costs).all()
+            assert matches_problem_cost(flight.problem.flat(), fix[None], costs).all()
 
 
 def places_of(fix, d):
@@ -254,12 +254,12 @@ def test_rates_decide_between_places_that_ranges_leave_open(seed):
 def test_problems_beyond_the_proof_are_named():
     rng = np.random.default_rng(3)
     problem = Flight.drawn(rng, 2, 5, PAIRS, None).problem
-    assert unsupported(problem.flat()) == ""
+    assert why_unsupported(problem.flat()) == ""
     scaled = with_bias(problem, "gain", form="scale", per="kind", kind="tdoa", sigma=0.1)
-    assert "unknown scales" in unsupported(scaled.flat())
-    assert "constraints" in unsupported(replace(problem, constraints=speed(900.0)).flat())
+    assert "unknown scales" in why_unsupported(scaled.flat())
+    assert "constraints" in why_unsupported(replace(problem, constraints=speed(900.0)).flat())
     late = replace(problem, motions=(Motion(order=1, reference=-5.0),))
-    assert "another time" in unsupported(late.flat())
+    assert "another time" in why_unsupported(late.flat())
 
 
 def test_rates_alone_bound_no_position():

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from optloc.proof.atlas import atlas_of, position, set_centre
+from optloc.proof.atlas import atlas_of, set_centre, write_position
 from optloc.proof.box import CENTRE, DEPTH, HALF, LEAST, PIECE
 from optloc.proof.pieces import (
-    end_at_infinity,
+    contract_at_infinity,
     is_listed,
     is_tiny,
-    keep_rest,
     push_faces,
+    push_or_defer,
     push_pieces,
     push_rest,
     touches_infinity,
@@ -37,7 +37,7 @@ def test_faces_and_inside_reach_every_direction_and_infinity(d):
     x, ways = np.empty(d), set()
     for row in stack[: 2 * d]:
         set_centre(atlas, int(row[PIECE]), row[CENTRE : CENTRE + 3])
-        position(atlas, x)
+        write_position(atlas, x)
         ways.add((int(np.argmax(np.abs(x))), bool(x[np.argmax(np.abs(x))] > 0.0)))
     assert len(ways) == 2 * d
 
@@ -45,7 +45,7 @@ def test_faces_and_inside_reach_every_direction_and_infinity(d):
 def test_a_box_beyond_infinity_is_cut_off_there():
     box = box_at([0.0, 0.3, 0.0], [0.1, 0.4, 0.0])
     assert touches_infinity(box, 1, 0.0)
-    end_at_infinity(box, 1, 0.0)
+    contract_at_infinity(box, 1, 0.0)
     assert box.at[1] - box.half[1] == pytest.approx(0.0, abs=1e-11)
     assert box.at[1] + box.half[1] == pytest.approx(0.7)
     assert not touches_infinity(box_at([0.0, 0.3, 0.0], [0.1, 0.2, 0.0]), 1, 0.0)
@@ -65,10 +65,10 @@ def test_what_is_left_is_halved_if_it_is_large_and_kept_whole_if_it_is_small():
 def test_a_box_that_costs_more_than_a_level_waits():
     stack, aside = np.zeros((8, DEPTH)), np.zeros((8, DEPTH))
     box = box_at(np.zeros(3), [1.0, 1.0, 0.0])
-    assert keep_rest(stack, 0, aside, 0, box, 0, 3.0, 4, 4.0) == (0, 2)
+    assert push_or_defer(stack, 0, aside, 0, box, 0, 3.0, 4, 4.0) == (0, 2)
     assert aside[0, LEAST] == 3.0
     box = box_at(np.zeros(3), [1.0, 1.0, 0.0])
-    assert keep_rest(stack, 0, aside, 0, box, 0, 1.0, 4, 4.0) == (2, 0)
+    assert push_or_defer(stack, 0, aside, 0, box, 0, 1.0, 4, 4.0) == (2, 0)
 
 
 def test_boxes_at_infinity_are_tiny_sooner_around_a_minimum():

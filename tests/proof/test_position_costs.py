@@ -14,7 +14,7 @@ from optloc.linear.constraints import box
 from optloc.models import MODELS
 from optloc.problem import Prior
 from optloc.proof.position_costs import position_costs
-from optloc.proof.scope import unsupported
+from optloc.proof.scope import why_unsupported
 
 PLACES = 12
 
@@ -54,7 +54,7 @@ def near(problem, seed=3, count=PLACES):
 
 
 def agree(problem, rtol=1e-9):
-    assert unsupported(problem.flat()) == ""
+    assert why_unsupported(problem.flat()) == ""
     x = near(problem)
     expected = profiled(problem, x)
     assert np.all(np.isfinite(expected))
@@ -197,10 +197,10 @@ def uncertain(problem, variance):
     ],
 )
 def test_what_is_beyond_the_proof_is_named(problem, what):
-    assert what in unsupported(problem().flat())
+    assert what in why_unsupported(problem().flat())
 
 
 def test_a_kind_without_nodes_is_beyond_the_proof(monkeypatch):
     bare = replace(MODELS["rss_difference"], nodes=())
     monkeypatch.setattr("optloc.proof.scope.MODELS", {**MODELS, "rss_difference": bare})
-    assert "neither sums of ranges or rates" in unsupported(CASES["rss_difference-3d"].problem.flat())
+    assert "neither sums of ranges or rates" in why_unsupported(CASES["rss_difference-3d"].problem.flat())

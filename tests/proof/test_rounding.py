@@ -10,9 +10,9 @@ from proof.sampling import many
 
 from optloc.base.linalg import project_out
 from optloc.kernels.jit import plain
-from optloc.proof.box import bound_nodes, rounding
+from optloc.proof.box import bound_nodes, rounding_error
 from optloc.proof.nodes.node import PHI, RANGE
-from optloc.proof.search_space import chart_on, cost_of, empty_box, place
+from optloc.proof.search_space import chart_on, cost_of, empty_box, write_centre
 
 _NEAREST, _FARTHEST = -3.0, 4.0  # tenth powers of standard deviations from the fix to the places that are looked at
 
@@ -61,12 +61,12 @@ def test_residuals_are_off_by_less_than_their_rounding(offset, kind, seed):
             chart, good = chart_on(cost, x, box, np.empty((0, 3)), np.empty(0))
             assert good
             at = rng.standard_normal(3) * 10.0 ** rng.uniform(_NEAREST, _FARTHEST) * (rng.random() < 0.8)
-            place(chart.origin, chart.sense, at, box.centre)
+            write_centre(chart.origin, chart.sense, at, box.centre)
             bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
             true = true_residual(cost, chart, at)
             own = cost.K @ box.nodes[:, PHI] - cost.w
             off = float(sum(((Decimal(float(a)) - b) ** 2 for a, b in zip(own, true, strict=True)), Decimal(0)).sqrt())
-            bound = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+            bound = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
             worst = max(worst, off / bound)
     assert 0.0 < worst < 0.1
 
@@ -82,5 +82,5 @@ def test_a_network_on_the_ground_keeps_its_digits_in_coordinates_from_the_centre
     box = empty_box(count, count)
     with plain():
         chart, _ = chart_on(cost, x, box, np.empty((0, 3)), np.empty(0))
-        noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+        noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     assert 24.0 * noise * noise < 0.25

@@ -5,7 +5,7 @@ import pytest
 
 import optloc
 from optloc import Motion, assemble, constraints, measured, with_bias
-from optloc.proof.scope import MOST_FACTORS, crowded, held_height, is_run, is_scaled, unsupported
+from optloc.proof.scope import MOST_FACTORS, held_height, is_run, is_scaled, why_too_large, why_unsupported
 
 STATIONS = np.array([[0.0, 0.0], [1e3, 0.0], [0.0, 1e3], [1e3, 1e3]])
 SPACE = np.column_stack([STATIONS, [0.0, 200.0, 100.0, 50.0]])
@@ -45,8 +45,8 @@ def two_planes():
     ],
 )
 def test_what_is_beyond_the_proof_is_named(make, words):
-    assert unsupported(make()).startswith(words)
-    assert bool(unsupported(make())) == bool(words)
+    assert why_unsupported(make()).startswith(words)
+    assert bool(why_unsupported(make())) == bool(words)
 
 
 def test_a_run_is_long_only_with_many_different_ranges():
@@ -54,14 +54,14 @@ def test_a_run_is_long_only_with_many_different_ranges():
     assert not is_run(ranging(epochs=50))
     moving = STATIONS + np.arange(50.0)[:, None, None]
     assert is_run(ranging(moving, epochs=50))
-    assert crowded(ranging(moving, epochs=50)).startswith("there are 200 different ranges")
-    assert crowded(ranging()) == ""
+    assert why_too_large(ranging(moving, epochs=50)).startswith("there are 200 different ranges")
+    assert why_too_large(ranging()) == ""
 
 
 def test_an_unknown_factor_makes_a_problem_scaled():
     problem = with_bias(ranging(), "speed", form="scale", per="kind", sigma=0.1)
     assert is_scaled(problem)
-    assert crowded(problem) == "a factor of the rows is unknown"
+    assert why_too_large(problem) == "a factor of the rows is unknown"
     assert not is_scaled(with_bias(ranging(), "late", form="offset", per="kind", sigma=1.0))
 
 

@@ -6,15 +6,15 @@ from proof.costs import random_case
 
 from optloc.proof.search_space import (
     accuracy_floor,
+    axes_of_next_piece,
     chart_at,
     curve_box,
     equal_within,
     is_convex,
-    place,
-    turned,
     value_at,
-    widen,
+    widen_by_rounding,
     without_differences,
+    write_centre,
 )
 from optloc.proof.surface import FIRST, SECOND, UP
 
@@ -66,8 +66,8 @@ def test_a_box_is_widened_by_the_rounding_of_its_place(case):
     cost, box = case.tables
     chart, _ = chart_at(cost, case.minimum(truth), box)
     box.at[:], half = 0.0, np.zeros(3)
-    place(chart.origin, chart.sense, box.at, box.centre)
-    widen(chart, box.centre, half)
+    write_centre(chart.origin, chart.sense, box.at, box.centre)
+    widen_by_rounding(chart, box.centre, half)
     # one unit in the last place of a coordinate, seen in sigma
     ulp = np.abs(chart.back[: case.d, : case.d]) @ np.spacing(np.abs(box.centre[: case.d]))
     assert (half[: case.d] >= ulp).all()
@@ -82,7 +82,7 @@ def test_a_turned_piece_of_a_surface_has_a_third_of_its_axes_upward():
     for first, axis in zip((FIRST, SECOND, UP), np.eye(3), strict=True):
         surface[first : first + 3] = axis
     own = chart._replace(surface=surface)
-    ups = [tuple(turned(cost, own, side).surface[UP : UP + 3]) for side in range(6)]
+    ups = [tuple(axes_of_next_piece(cost, own, side).surface[UP : UP + 3]) for side in range(6)]
     assert len(set(ups)) == 6
     assert ups[0] == (0.0, 0.0, 1.0)
     assert ups[1] == (0.0, 0.0, -1.0)

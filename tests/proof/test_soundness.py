@@ -10,7 +10,7 @@ from proof.layouts import BY_NAME, CELLS, rows
 from optloc import assemble, solve
 from optloc.kernels.jit import enabled
 from optloc.proof.batch import ProofRequest, prove_all
-from optloc.proof.near import UNIQUE, VALUE
+from optloc.proof.local_search import UNIQUE, VALUE
 from optloc.proof.position_costs import position_costs
 
 EQUAL = 1e-6

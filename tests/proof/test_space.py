@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from proof.costs import random_case
 
-from optloc.proof.atlas import atlas_of, home_of
-from optloc.proof.box import cost_at, cube
+from optloc.proof.atlas import atlas_of, piece_of
+from optloc.proof.box import cost_at, station_cube
 from optloc.proof.search_space import chart_at
 from optloc.proof.space import Space, bound_or_halve, floor_of, in_atlas, place_of, set_box, set_nodes, set_place
 
@@ -20,7 +20,7 @@ def looks(request):
     cost, box = case.tables
     x = case.minimum(truth)
     chart, _ = chart_at(cost, x, box)
-    atlas = atlas_of(*cube(cost.kinds, cost.data, x), case.d, 0)
+    atlas = atlas_of(*station_cube(cost.kinds, cost.data, x), case.d, 0)
     return case, cost, box, Space(False, atlas, chart, np.empty((0, 3)), np.empty((0, 3))), in_atlas(atlas, chart)
 
 
@@ -30,7 +30,7 @@ def test_a_place_in_the_atlas_is_the_one_whose_coordinates_were_set(looks):
     for size in (1e3, 1e5, 1e8):
         x = size * rng.normal(size=case.d)
         box.at[:], box.half[:] = 0.0, 0.0
-        piece = home_of(far.atlas, x, box.at)
+        piece = piece_of(far.atlas, x, box.at)
         set_place(far, box, piece)
         place_of(far, box, out)
         np.testing.assert_allclose(out, x, rtol=1e-9, atol=1e-6)

@@ -5,11 +5,11 @@ import pytest
 from proof.layouts import BY_NAME
 from proof.sampling import many
 
-from optloc.proof.atlas import atlas_of, home_of, infinity, set_centre
-from optloc.proof.box import cube
+from optloc.proof.atlas import atlas_of, infinity_coordinate, piece_of, set_centre
+from optloc.proof.box import station_cube
 from optloc.proof.position_costs import position_costs
 from optloc.proof.search_space import chart_at, cost_of, empty_box
-from optloc.proof.squares import bend_of, clip_to_squares, squares_of
+from optloc.proof.squares import change_of_residual, clip_to_squares, squares_of
 
 NAMES = (
     "TDOA, 5 stations, outside, 10 m",
@@ -26,7 +26,7 @@ def scenes(name, count, seed):
         K, data = costs.K[i if len(costs.K) > 1 else 0], costs.data[i if len(costs.data) > 1 else 0]
         cost, box = cost_of(costs.kinds, data, K, costs.w[i]), empty_box(*K.shape)
         chart_at(cost, truth[i], box)
-        middle, radius = cube(cost.kinds, cost.data, truth[i])
+        middle, radius = station_cube(cost.kinds, cost.data, truth[i])
         yield cost, box, squares_of(cost, box, middle, radius), atlas_of(middle, radius, 3, 0), truth[i]
 
 
@@ -53,7 +53,7 @@ def test_no_position_with_a_short_residual_is_clipped(name):
         assert squares.groups == 1
         assert squares.lack < 1e-9
         at = np.zeros(3)
-        piece = home_of(atlas, x, at)
+        piece = piece_of(atlas, x, at)
         for _ in range(20):
             half = 10.0 ** rng.uniform(-4.0, 0.0, 3)
             centre = at + rng.uniform(-1.5, 1.5, 3) * half
@@ -84,11 +84,11 @@ def test_of_all_space_little_is_left():
     share, gone, count = 0.0, 0, many(40, 4)
     for cost, box, squares, atlas, x in scenes(NAMES[0], count, 2):
         own = np.zeros(3)
-        home = home_of(atlas, x, own)
+        home = piece_of(atlas, x, own)
         for piece in range(7):
             box.at[:], box.half[:] = (0.0, 0.0, 0.0 if piece == 6 else 0.5), (1.0, 1.0, 1.0 if piece == 6 else 0.5)
             set_centre(atlas, piece, box.at)
-            assert bend_of(atlas, squares, box.half) > 5.0
+            assert change_of_residual(atlas, squares, box.half) > 5.0
             left = clip_to_squares(cost, atlas, squares, 6.0, box)
             gone += not left
             if piece == home:
@@ -116,14 +116,14 @@ def test_where_rows_are_no_differences_of_ranges_there_are_none():
 @pytest.mark.usefixtures("form")
 def test_infinity_is_reached_along_the_last_coordinate_where_axes_say_so():
     atlas = atlas_of(np.zeros(3), 1.0, 3, 1)
-    assert [infinity(atlas, piece) for piece in range(7)] == [0.0] * 6 + [-np.inf]
+    assert [infinity_coordinate(atlas, piece) for piece in range(7)] == [0.0] * 6 + [-np.inf]
     minima = atlas.minima
     minima.home[0], minima.start[0], minima.axes[0] = 2, (0.1, -0.2, 0.5), np.triu(np.full((3, 3), 0.05))
-    end = infinity(atlas, 7)
+    end = infinity_coordinate(atlas, 7)
     assert end == pytest.approx(-10.0, rel=1e-9)
     set_centre(atlas, 7, np.array([0.3, -0.4, end]))
     assert abs(atlas.scale[0]) < 1e-10
     minima.axes[0, 2, 0] = 0.01
-    assert infinity(atlas, 7) == -np.inf
+    assert infinity_coordinate(atlas, 7) == -np.inf
     minima.home[0] = 6
-    assert infinity(atlas, 7) == -np.inf
+    assert infinity_coordinate(atlas, 7) == -np.inf

@@ -8,7 +8,7 @@ from optloc import Frame, assemble, measured
 from optloc.linear.constraints import height
 from optloc.proof.box import cost_at, least_residual, linearise_rows
 from optloc.proof.nodes.node import PHI, RANGE, SLOPE0
-from optloc.proof.search_space import chart_on, cost_of, empty_box, is_bounded, turned
+from optloc.proof.search_space import axes_of_next_piece, chart_on, cost_of, empty_box, is_bounded
 from optloc.proof.surface import SAG, SIDES, SLIP
 from optloc.solvers.certificates.position_cost import surfaces_of
 
@@ -53,7 +53,7 @@ def test_no_point_of_the_surface_leaves_what_is_said_of_it(level):
         box = empty_box(3, 4)
         around, good = chart_on(cost, x, box, np.empty((0, 3)), surface)
         assert good
-        chart = turned(cost, around, int(rng.integers(1, SIDES)))
+        chart = axes_of_next_piece(cost, around, int(rng.integers(1, SIDES)))
         box.at[:2], box.at[2] = rng.uniform(-0.6, 0.6, 2), 0.0
         box.half[:2], box.half[2] = 0.3 * 10.0 ** rng.uniform(-3.0, 0.0, 2), 0.0
         if not is_bounded(cost, chart, box):

@@ -5,7 +5,7 @@ import pytest
 
 from optloc import InvalidProblem
 from optloc.solvers import back_ends
-from optloc.solvers.back_ends import Backend, backend_kind, kind_of, try_apart, version_of
+from optloc.solvers.back_ends import Backend, backend_kind, kind_of, try_in_process, version_of
 
 HERE = {
     "CLARABEL": Backend("conic", "1", ""),
@@ -49,7 +49,7 @@ def test_the_trial_goes_on_behind_a_solver_that_ends_its_process(monkeypatch):
         return {"a": "", "b": "it ends the process"} if "a" in kinds else {"c": ""}
 
     monkeypatch.setattr(back_ends, "_one_process", one_process)
-    assert try_apart(dict.fromkeys("abc", "conic")) == {"a": "", "b": "it ends the process", "c": ""}
+    assert try_in_process(dict.fromkeys("abc", "conic")) == {"a": "", "b": "it ends the process", "c": ""}
     assert tried == [["a", "b", "c"], ["c"]]
     monkeypatch.setattr(back_ends, "_one_process", lambda kinds: {})
-    assert try_apart({"a": "conic"}) == {"a": "it could not be tried"}
+    assert try_in_process({"a": "conic"}) == {"a": "it could not be tried"}

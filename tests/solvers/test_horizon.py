@@ -6,8 +6,8 @@ import pytest
 import optloc
 from optloc.base.frames import ECEF
 from optloc.base.types import Status
-from optloc.files.convert import understood
-from optloc.files.readings import ColumnHints
+from optloc.files.convert import interpret_table
+from optloc.files.table_import import ColumnHints
 from optloc.solvers.certificates.branch_and_bound import BARRED, LOST
 from optloc.solvers.inequalities import is_hidden
 
@@ -212,7 +212,7 @@ def test_times_from_p_to_s_of_thousands_of_kilometres_place_an_earthquake(lat, l
     (tmp_path / "net.csv").write_text("\n".join(rows))
     kind = "ecef" if frame == "ecef" else None
     told = ColumnHints(stations=tmp_path / "net.csv", sigma="0.2 s", vp="18 km/s", vs="6 km/s", what="sp", frame=kind)
-    problem = understood(tmp_path / "picks.csv", told).read().problem
+    problem = interpret_table(tmp_path / "picks.csv", told).read().problem
     fix = optloc.solve(problem)
     assert fix.answered
     assert np.linalg.norm(problem.frame.to_ecef(fix.position) - epicentre) < 2e3

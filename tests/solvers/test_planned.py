@@ -5,7 +5,7 @@ import pytest
 from model_checks.small import PLACE, SQUARE
 
 from optloc import Status, assemble, measured
-from optloc.solvers.planned import Quick
+from optloc.solvers.planned import PlannedStages
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import gtrs, lsr
 
@@ -19,7 +19,7 @@ def test_a_plan_fixes_what_the_stages_fix(kind, alone):
     z = r + rng.standard_normal((40, 5)) if kind == "range" else r[1:] - r[0] + rng.standard_normal((40, 4))
     rows = measured("range", z, a=A, sigma=1.0) if kind == "range" else measured("tdoa", z, a=A[1:], b=0, sigma=1.0)
     problem = assemble(SQUARE, rows).flat()
-    pool, staged = Quick(alone)(problem, None), lsr(problem, gtrs(problem, None))
+    pool, staged = PlannedStages(alone)(problem, None), lsr(problem, gtrs(problem, None))
     good = staged.code[:, 0] == Status.OK
     assert good.sum() > 30
     np.testing.assert_allclose(pool.cost[good, 0], staged.cost[good, 0], rtol=1e-5, atol=1e-8)
@@ -29,5 +29,5 @@ def test_a_plan_fixes_what_the_stages_fix(kind, alone):
 
 def test_given_starts_are_refined_by_the_stages():
     problem = assemble(SQUARE, measured("range", np.linalg.norm(PLACE - SQUARE, axis=1), a=A, sigma=1.0)).flat()
-    pool = Quick()(problem, begin(problem, PLACE[None] + 20.0))
+    pool = PlannedStages()(problem, begin(problem, PLACE[None] + 20.0))
     np.testing.assert_allclose(pool.x[0, 0], PLACE, atol=1e-3)

@@ -14,7 +14,7 @@ def test_gaps_are_those_of_three_and_five_sigma_of_one_number():
 
 
 def test_what_is_refuted_is_doubted_and_noticed_before():
-    assert 0.0 < policy.REFUTED < policy.DOUBT < policy.NOTICED < 1.0 - policy.COVERED
+    assert 0.0 < policy.P_MISFIT < policy.P_SUSPECT < policy.P_OUTLIER < 1.0 - policy.REGION_LEVEL
     assert policy.FAR < policy.FLAT
 
 

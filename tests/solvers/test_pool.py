@@ -8,7 +8,7 @@ from model_checks.small import PLACE, SQUARE
 
 from optloc import Status, assemble, measured
 from optloc.problem.fix import Stage
-from optloc.solvers.pool import _sum_stages, begin, crowd_of, in_parts, offer, pack, where
+from optloc.solvers.pool import _sum_stages, begin, chunk_size, in_parts, noting_place, offer, pack
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_finite_points_come_first_and_empty_slots_go():
 
 def test_a_failure_is_that_of_its_problem_alone(problem):
     def work(part, own):
-        with where("the square root"):
+        with noting_place("the square root"):
             if (part.z[:, 0] == problem.z[3, 0]).any():
                 raise np.linalg.LinAlgError("Singular matrix")
         return begin(part, np.tile(part.z[:, :1], 2))
@@ -75,4 +75,4 @@ def test_merged_items_replace_those_of_their_numbers(problem):
 def test_seconds_of_parts_are_summed_and_crowds_are_never_empty(problem):
     parts = [(Stage("a", "x", 1.0),), (Stage("a", "x", 2.0), Stage("b", "y", 0.5))]
     assert [(stage.name, stage.seconds) for stage in _sum_stages(parts)] == [("a", 3.0), ("b", 0.5)]
-    assert crowd_of(problem) == 2**12 // 5
+    assert chunk_size(problem) == 2**12 // 5

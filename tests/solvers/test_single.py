@@ -11,7 +11,7 @@ from optloc import Frame, Motion, Status, assemble, measured, prepare, simulate,
 from optloc.kernels.jit import enabled
 from optloc.problem import ECEF
 from optloc.solvers.methods import Method
-from optloc.solvers.single import single
+from optloc.solvers.single import prepare_fix
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no short way without machine code")
 SIGMA, FULL = 5.0, pytest.mark.full
@@ -176,7 +176,7 @@ def test_kinds_of_rows(name, method):
     problem = KINDS[name]
     truth = np.array([1.5e3, -2e3, 3e3])[: problem.dimension]
     z = simulate(problem, np.r_[truth, np.zeros(problem.layout.size - len(truth))], 3, trials=20).z
-    batch, short = solve(problem.with_rows(z=z), method), single(problem, Method.parse(method))
+    batch, short = solve(problem.with_rows(z=z), method), prepare_fix(problem, Method.parse(method))
     told = [short(one) for one in z]
     for fix, other in zip(told, batch, strict=True):
         if fix is not None:
@@ -268,7 +268,7 @@ def test_few_that_differ_in_measurements_alone_take_the_short_way(method, axis, 
     problem, ready = replace(bare, stations=replace(bare.stations, position=place)), prepare(bare, method)
     many = prepare(problem, method)
     monkeypatch.setattr("optloc.solvers.solution.solve_in_stages", None)
-    monkeypatch.setattr("optloc.solvers.prepared.settle_directly", None)
+    monkeypatch.setattr("optloc.solvers.prepared.settle_by_plan", None)
     for fix in (solve(problem.with_rows(z=z), method), many(z)):
         assert fix.shape == (7,)
         for one, own in zip(fix, z, strict=True):

@@ -7,7 +7,17 @@ from scipy.optimize import least_squares
 
 from optloc import InvalidProblem, Status, assemble, measured
 from optloc.solvers.pool import begin
-from optloc.solvers.stages import fix_by, gtrs, lsr, lsr_with_mirror, roots, search, search_widely, taylor, widen
+from optloc.solvers.stages import (
+    add_candidates,
+    fix_by,
+    gtrs,
+    lsr,
+    lsr_with_mirror,
+    roots,
+    search,
+    search_widely,
+    taylor,
+)
 
 ERROR = np.array([0.5, -1.0, 2.0, -0.5, 1.0])
 
@@ -35,7 +45,7 @@ def test_a_mirror_image_is_found_beside_a_start():
     problem = ranges_to(PLACE, 1.0, stations=SQUARE[:2])
     pool = lsr_with_mirror(problem, begin(problem, PLACE[None] + 5.0))
     np.testing.assert_allclose(np.sort(pool.x[0, :2, 1]), [-650.0, 650.0], atol=1e-2)
-    wide = widen(problem, lsr(problem, begin(problem, PLACE[None])))
+    wide = add_candidates(problem, lsr(problem, begin(problem, PLACE[None])))
     assert (np.abs(wide.x[0] - PLACE * [1.0, -1.0]).max(-1) < 1.0).any()
 
 
@@ -52,7 +62,7 @@ def test_a_fix_by_a_start_is_judged():
     assert fix.dof[0] == 3
 
 
-@pytest.mark.parametrize("stage", [lsr, widen, search])
+@pytest.mark.parametrize("stage", [lsr, add_candidates, search])
 def test_a_stage_that_needs_something_before_it_says_so(stage):
     with pytest.raises(InvalidProblem, match=r"refines a start|adds candidates|fills the gaps"):
         stage(ranges_to(PLACE, 1.0), None)

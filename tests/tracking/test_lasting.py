@@ -6,7 +6,7 @@ from often import few
 
 from optloc import Motion, assemble, measured
 from optloc.kernels.filter import COLUMNS, filter_scan
-from optloc.kernels.jit import at_hand
+from optloc.kernels.jit import is_available
 from optloc.problem.epochs import cut
 from optloc.tracking import Rules, State, lasting, polynomial, tracked
 from optloc.tracking.run import Follower
@@ -147,7 +147,7 @@ def test_the_screen_in_machine_code_is_a_score():
     start = State(-1.0, np.r_[50.0, 50.0, 0.0, 0.0], np.diag([900.0, 900.0, 25.0, 25.0]))
     dynamics = polynomial(1, DRIVE)
     state, before, total, variance = start, None, 0.0, 0.0
-    if not at_hand(filter_scan):
+    if not is_available(filter_scan):
         pytest.skip("there is no machine code")
     scans = Scans.of(problem, 1)
     memory = np.zeros(scans.memory)

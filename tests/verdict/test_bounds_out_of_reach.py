@@ -8,7 +8,7 @@ from optloc import Status, assemble, measured, prepare, solve
 from optloc.base.types import Band
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import box, height
-from optloc.solvers.certificates.out_of_reach import edges_of, lay_planes, question
+from optloc.solvers.certificates.out_of_reach import edges_of, lay_planes, new_questions
 from optloc.solvers.methods import Method
 from optloc.solvers.solution import solve_in_stages
 
@@ -78,7 +78,7 @@ def test_a_place_that_leaves_its_plane_proves_nothing():
     problem = assemble(place, rows, constraints=(*box([-1.0, -50.0], [5.0, 50.0]), plane))
     edges = edges_of(problem)
     assert len(edges.levels) == 5
-    asked = question(edges, 1, 2, 4.0)
+    asked = new_questions(edges, 1, 2, 4.0)
     x, slope = np.array([[1.0, 2.0]]), np.array([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0], [1.0, 1.0]]])
     missing = edges.value - (slope * x[:, None]).sum(-1)
     lay_planes(edges, x, np.eye(2)[None], missing, slope, asked)

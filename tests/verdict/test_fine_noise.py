@@ -11,7 +11,7 @@ from optloc import Frame, Motion, Status, assemble, certify, constraints, measur
 from optloc.kernels.jit import enabled
 from optloc.linear.evaluate import predict
 from optloc.problem import ECEF
-from optloc.proof.near import COARSE
+from optloc.proof.local_search import COARSE
 from optloc.solvers.certificates.branch_and_bound import FINE
 from optloc.solvers.certificates.position_cost import eliminate_nuisance, prove
 

@@ -326,13 +326,13 @@ def histories(
 ) -> None:
     """Follow methods on their way down: the cost against evaluations of it and against iterations."""
     from optloc.cli import claim_outputs, write_picture, write_table
-    from optloc.lab.study.histories import histories as followed, question, reach
+    from optloc.lab.study.histories import histories as followed, reach, trials_of
     from optloc.problem import load_plugin
 
     claim_outputs(table=out, picture=plot, inputs=[] if place.is_dir() else [place])
     for name in plugin or ():
         load_plugin(name)
-    found = followed(question(place, methods or (), trials, case, noise))
+    found = followed(trials_of(place, methods or (), trials, case, noise))
     reached = reach(found, tau)
     if out is not None:
         write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})

@@ -26,7 +26,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
-from optloc.files import make_folder, together, write_text, written
+from optloc.files import make_folder, replace_together, write_text, written
 from optloc.problem import InvalidProblem
 from optloc.show import ABSENT, Picture, TextTable
 
@@ -286,7 +286,7 @@ def write(report: Report, folder: Path) -> list[Path]:
     tables = [(folder / f"{table.name}.csv", table) for table in report.tables]
     pictures = [(folder / f"{picture.name}.png", picture) for picture in report.pictures]
     make_folder(folder)
-    with together():
+    with replace_together():
         write_text(page, report.markdown())
         for path, table in tables:
             with written(path) as file, file.open("w", encoding="utf-8", newline="") as lines:

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.bounds import BoundMap, bound_map, extent, map_coordinates
-from optloc.files import claim, harmless_column, make_folder, together, write_text, written
+from optloc.files import claim, harmless_column, make_folder, replace_together, write_text, written
 from optloc.lab.report import figures as drawn
 from optloc.lab.report.sheets import latex, sheets
 from optloc.lab.study import summary
 from optloc.lab.study.design import StudyDesign
-from optloc.lab.study.draws import Case, draw
 from optloc.lab.study.folder import StudyManifest, design_of_manifest, read_frame, read_manifest, references
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import Profiles, profiles
+from optloc.lab.study.simulation import Case, draw
 from optloc.lab.study.summary import case_label, noise_text
 from optloc.problem import Array, InvalidProblem
 from optloc.show import (
@@ -180,7 +180,7 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
     found = _found(folder)
     make_folder(place)
     claim(target)
-    with together():
+    with replace_together():
         files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
         parts = [PagePart("ranking", "Ranking", tables=[found.sheets["ranking"]])]
         for section in _SECTIONS:

@@ -21,20 +21,31 @@ from optloc.engine import (
     depends_on_place,
     differentiate,
     equations_at,
-    mapped,
+    map_on_threads,
     one_position,
     prior_parts,
     step,
     vectors,
-    weighed,
+    with_station_noise,
 )
-from optloc.lab.study.draws import DrawnCase
 from optloc.lab.study.networks import NetworkResult, Networks, each, from_truth, refined
+from optloc.lab.study.simulation import DrawnCase
 from optloc.models import MODELS
-from optloc.problem import Array, Fix, InvalidProblem, Problem, Registry, Stage, Status, tied, whiten, window
+from optloc.problem import (
+    Array,
+    Fix,
+    InvalidProblem,
+    Problem,
+    Registry,
+    Stage,
+    Status,
+    has_correlated_epochs,
+    whiten,
+    window,
+)
 from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood
 from optloc.sites.calibration.network import Network
-from optloc.sites.calibration.rounds import starts_of
+from optloc.sites.calibration.restarts import starts_of
 from optloc.solvers import given, judge, judge_points, offer, spread_of
 
 _ASIDE = 0.2
@@ -113,7 +124,7 @@ def recursion(problem: Problem, start: Array, *, iterations: int = 2) -> Array:
     array (N, size)
         NaN where the steps ran away, and for problems that have unknowns of single epochs.
     """
-    if problem.layout.n_local or tied(problem):
+    if problem.layout.n_local or has_correlated_epochs(problem):
         return np.full_like(start, np.nan)
     x = start
     with np.errstate(all="ignore"):
@@ -159,7 +170,7 @@ _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
-def heard(by: Listener) -> Iterator[None]:
+def listening(by: Listener) -> Iterator[None]:
     """Let somebody hear of every evaluation of a cost that a method of others is given inside."""
     token = _LISTENER.set(by)
     try:
@@ -181,7 +192,7 @@ def weighings(problem: Problem) -> int:
 
 def weighed_at(problem: Problem, x: Array, start: Array) -> Problem:
     """Return problems with the weights of places (N, size), of those of the start where there is no place."""
-    return weighed(problem, np.where(np.isfinite(x).all(-1, keepdims=True), x, start))
+    return with_station_noise(problem, np.where(np.isfinite(x).all(-1, keepdims=True), x, start))
 
 
 # General tools on the same data: SciPy's least squares from a guess, the plain lift of ranges.
@@ -274,7 +285,7 @@ def lifted_sdp(problem: Problem) -> Fix:
     """
     from formulations.lifted import lifted_ranges
 
-    began, problem = perf_counter(), weighed(problem)
+    began, problem = perf_counter(), with_station_noise(problem)
     size, d = problem.batch_shape[0], problem.dimension
     position = np.full((size, 1, d), np.nan)
     models = [MODELS[rows.kind] for rows in problem.rows]
@@ -287,7 +298,7 @@ def lifted_sdp(problem: Problem) -> Fix:
             found = lifted_ranges(K, z, (stations[i, 0] - centre[i]) / scale[i])
             position[i, 0] = found.point * scale[i] + centre[i]
 
-        mapped(relax, range(size), least=WORTH)
+        map_on_threads(relax, range(size), least=WORTH)
     return judge(problem, offer(problem, vectors(problem, position), None, "lifted-sdp", began))
 
 

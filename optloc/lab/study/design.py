@@ -20,11 +20,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optloc.files import conform, join, kind_model, parse_toml, read, read_text, within
+from optloc.files import join, kind_model, parse_toml, read, read_text, validated, within
 from optloc.lab.study.document import Level, NetworkTable, ScenarioTable, StudyFile, sigma_of
-from optloc.lab.study.draws import Case, add_flaws, check_truth, metres, place_stations
 from optloc.lab.study.methods import StudyMethod, methods_of
 from optloc.lab.study.networks import NetworkCase, check_network, noise_of
+from optloc.lab.study.simulation import Case, add_injected_errors, check_truth, metres, place_stations
 from optloc.models import MODELS
 from optloc.problem import (
     SI_UNIT,
@@ -214,7 +214,7 @@ def design_of_text(
     more: Sequence[StudyMethod] = (),
 ) -> StudyDesign:
     """Return the design of the text of a study file; `folder` is where its problem files are."""
-    study = conform(StudyFile, parse_toml(text, source), source)
+    study = validated(StudyFile, parse_toml(text, source), source)
     new = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     study = study.model_copy(update=new)
     try:
@@ -343,7 +343,7 @@ def _sweep(table: _Table, where: str) -> Iterator[tuple[dict[str, Any], _Table]]
                 if not isinstance(at, dict):
                     raise InvalidProblem(f"{name!r} names no key", join(where, "sweep"), "write table.key")
             at[last] = value
-        yield swept, conform(type(table), data, where) if swept else table
+        yield swept, validated(type(table), data, where) if swept else table
 
 
 def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Problem:
@@ -409,7 +409,7 @@ def _check(problem: Problem, table: ScenarioTable, where: str) -> None:
         if name not in known:
             advice = nearest(name, known) if known else "the problem has none"
             raise InvalidProblem(f"unknown bias {name!r}", join(where, "bias"), advice)
-    add_flaws(problem, table, where)
+    add_injected_errors(problem, table, where)
 
 
 def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple[Noise, float, str]:

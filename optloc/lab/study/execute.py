@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, filterwarnings, warn
 
-from optloc.lab.study.apart import WorkerPool
 from optloc.lab.study.design import Chunk, StudyDesign, workers
 from optloc.lab.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
 from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, join_parts, part_of_lost
+from optloc.lab.study.worker_process import WorkerPool
 from optloc.problem import InvalidProblem, nearest, plugins
 
 CONNECT = 10.0

@@ -18,13 +18,13 @@ import numpy as np
 
 from optloc.engine import depends_on_place, equations_at, refine
 from optloc.files import read
-from optloc.lab.study.baselines import Baseline, heard, start_of
-from optloc.lab.study.draws import Case, DrawnCase, draw
+from optloc.lab.study.baselines import Baseline, listening, start_of
 from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest
 from optloc.lab.study.methods import SETTINGS, StudyMethod, added
 from optloc.lab.study.minimizers import baseline_of
 from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import check_accuracy
+from optloc.lab.study.simulation import Case, DrawnCase, draw
 from optloc.lab.study.summary import case_label, noise_text
 from optloc.problem import Array, InvalidProblem, Problem, by_epoch, nearest, separable
 from optloc.solvers import (
@@ -137,7 +137,7 @@ def histories(asked: Trials) -> Histories:
         raise InvalidProblem(what, asked.title, "leave the errors of the stations out")
     ways, remarks = {}, list(asked.remarks)
     for method in asked.methods:
-        found, remark = way_of(method, asked.drawn)
+        found, remark = trace_of(method, asked.drawn)
         if remark:
             remarks.append(f"{method.name}: {remark}")
         if any(len(way.cost) for way in found):
@@ -233,7 +233,7 @@ def reach(found: Histories, tau: float) -> list[Reach]:
 # One method on some trials.
 
 
-def way_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTrace], str]:
+def trace_of(method: StudyMethod, drawn: DrawnCase) -> tuple[list[ConvergenceTrace], str]:
     """Return the way of a method on each trial, empty where it tells none, and what it does not tell in words."""
     if method.baseline is None:
         assert method.method is not None
@@ -255,7 +255,7 @@ def _by_listening(baseline: Baseline, drawn: DrawnCase, start: Array) -> tuple[l
     ways, failed = [], ""
     for i in range(len(start)):
         kept: list[float] = []
-        with heard(lambda _, cost, kept=kept: kept.append(cost)), np.errstate(all="ignore"):  # type: ignore[misc]
+        with listening(lambda _, cost, kept=kept: kept.append(cost)), np.errstate(all="ignore"):  # type: ignore[misc]
             try:
                 baseline.run(drawn.part(i, 1), start[i : i + 1])
             except (Exception, SystemExit) as error:  # noqa: BLE001  (what it asked for until then is its way)
@@ -403,7 +403,7 @@ _FOLLOWED: dict[str, _Follow] = {
 # From a study's folder, or a problem file, to its trials.
 
 
-def question(
+def trials_of(
     place: Path, names: Sequence[str], count: int, case: str | None = None, noise: str | None = None
 ) -> Trials:
     """Return what is asked of a study's folder, or of the epochs of a problem file.

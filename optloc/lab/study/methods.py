@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from optloc.files import Units, join
-from optloc.lab.study.baselines import BASELINES, heard, only_networks, start_of
+from optloc.lab.study.baselines import BASELINES, listening, only_networks, start_of
 from optloc.lab.study.document import MethodTable
-from optloc.lab.study.draws import DrawnCase
 from optloc.lab.study.minimizers import baseline_of, code_of, load_minimizer
 from optloc.lab.study.networks import CALIBRATE, NetworkResult, Networks, calibrated
+from optloc.lab.study.simulation import DrawnCase
 from optloc.problem import ANSWERED, Array, Certificate, Fix, InvalidProblem, Status, nearest
 from optloc.solvers import backend_kind, backends, kind_of, version_of
 
@@ -256,7 +256,7 @@ def run(method: StudyMethod, drawn: DrawnCase | Networks) -> MethodRun:
         choice = Choice(kind_of(method.solver), method.solver, method.settings)
     # What a method does about rounding and division is its own affair, and ends with it.
     asked = np.zeros(len(drawn.seed))
-    with using(choice), counting() as tally, heard(lambda trial, _: _add(asked, trial)), np.errstate():
+    with using(choice), counting() as tally, listening(lambda trial, _: _add(asked, trial)), np.errstate():
         began, busy = perf_counter(), process_time()
         fix = _solved(method, drawn)
         seconds, busy = perf_counter() - began, process_time() - busy

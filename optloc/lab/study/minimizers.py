@@ -14,9 +14,9 @@ from types import ModuleType
 
 import numpy as np
 
-from optloc.engine import FEW, Normal, equations_at, pack, usable, walks
+from optloc.engine import FEW, Normal, equations_at, may_use_code, pack, walks
 from optloc.lab.study.baselines import BASELINES, Baseline, claim, teller, weighed_at, weighings
-from optloc.lab.study.draws import DrawnCase
+from optloc.lab.study.simulation import DrawnCase
 from optloc.problem import Array, Fix, InvalidProblem, Problem, load_plugin, nearest, plugin_module, whiten
 
 Cost = Callable[[Array], tuple[float, Array]]
@@ -68,7 +68,7 @@ def _equations(one: Problem) -> Callable[[Array], Normal]:
 
     white, alone = whiten(one.noise, one.weight), np.zeros(1, dtype=np.int64)
     # A minimizer asks many times: that is worth waiting for.
-    packed = pack(one, white) if usable(normal_block, FEW + 1) and not walks(one) else None
+    packed = pack(one, white) if may_use_code(normal_block, FEW + 1) and not walks(one) else None
     if packed is None:
         return lambda x: equations_at(one, x, white)
     return lambda x: normal_at(packed, x, alone, priors=True)

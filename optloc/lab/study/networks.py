@@ -359,17 +359,17 @@ def found_columns(known: KnownNetworks, found: tuple[NetworkResult, ...]) -> dic
 
 
 def _row(one: NetworkResult, network: Network, truth: NetworkEstimate, bound: Array) -> dict[str, Any]:
-    error = apart(one.stations, truth.stations[0])
+    error = distances_apart(one.stations, truth.stations[0])
     size, located = error.size, bool(np.isfinite(one.stations).all())
     # in the frame of what was found, as its covariance is
-    own = apart(truth.stations[0], one.stations)
+    own = distances_apart(truth.stations[0], one.stations)
     return {
         "status": one.status.label,
         "reason": one.reason,
         "answered": located and one.status in ANSWERED,
         "located": located,
         "error": rms(error),
-        "error_nearest": min([rms(error), *(rms(apart(other, truth.stations[0])) for other in one.others)]),
+        "error_nearest": min([rms(error), *(rms(distances_apart(other, truth.stations[0])) for other in one.others)]),
         "error_bias": np.nan if network.synchronised else float(np.std(one.clocks - truth.clocks[0])),
         "deviation": float(np.sqrt(_squared(error, bound[:size, :size]))),
         "sigma": _spread(one.covariance, network)[0],
@@ -381,7 +381,7 @@ def _row(one: NetworkResult, network: Network, truth: NetworkEstimate, bound: Ar
     }
 
 
-def apart(places: Array, truth: Array) -> Array:
+def distances_apart(places: Array, truth: Array) -> Array:
     """Return what is left between places (m, d) and the truth after the best rigid motion and reflection.
 
     P. H. Schoenemann, "A generalized solution of the orthogonal Procrustes problem", Psychometrika 31 (1966).

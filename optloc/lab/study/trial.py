@@ -18,7 +18,6 @@ import numpy as np
 from optloc.bounds import crlb
 from optloc.engine import TOLERANCE, covariance, eliminated, equations_at, exact, linalg, violation
 from optloc.lab.study.design import Cell, Chunk
-from optloc.lab.study.draws import Case, DrawnCase
 from optloc.lab.study.methods import Nonsense, require_program, run, version_of
 from optloc.lab.study.networks import (
     KnownNetworks,
@@ -29,6 +28,7 @@ from optloc.lab.study.networks import (
     known_networks,
     true_columns,
 )
+from optloc.lab.study.simulation import Case, DrawnCase
 from optloc.problem import PROOFS, Array, Fix, Problem, Status
 
 # The long table of a study, one row for each trial of each method: columns, units and meaning in one place.

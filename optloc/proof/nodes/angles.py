@@ -17,19 +17,19 @@ from optloc.proof.nodes.node import (
     Node,
     NodeRow,
     Triple,
-    blend,
-    excess,
-    inner,
+    hypot_excess,
+    inner_product,
+    is_zero_slope,
+    largest_row_value,
     lay_out,
     length,
     product,
-    pull,
     reach,
-    row_reach,
-    still,
-    triple,
-    unbounded,
-    write,
+    sum_of_forms,
+    triple_at,
+    turned_form,
+    unbounded_curvature,
+    write_triple,
 )
 
 # Azimuths.
@@ -43,7 +43,7 @@ _ROUNDING = 1e-15
 
 
 @compiled
-def departure(back: float, ahead: float, aside: float) -> float:
+def atan_remainder_bound(back: float, ahead: float, aside: float) -> float:
     """Return the greatest ``|atan(t/(1+r)) - t|`` over ``-back <= r <= ahead, |t| <= aside``; back must be below 1.
 
     At t > 0 the difference falls with r. At r = -back it is greatest where ``t^2 = back (1 - back)``; at r = ahead it
@@ -56,7 +56,7 @@ def departure(back: float, ahead: float, aside: float) -> float:
 
 
 @compiled
-def remainder(back: float, ahead: float, aside: float, bilinear: tuple[float, float]) -> tuple[float, float]:
+def atan_remainder(back: float, ahead: float, aside: float, bilinear: tuple[float, float]) -> tuple[float, float]:
     """Return an enclosure of ``atan(t/(1+r)) - t``.
 
     Parameters
@@ -66,7 +66,7 @@ def remainder(back: float, ahead: float, aside: float, bilinear: tuple[float, fl
     bilinear : pair of float
         An enclosure of ``-r t``, its leading term; what is beyond is at most ``|w|^3 / (3 (1 - |w|))``.
     """
-    wide = departure(back, ahead, aside)
+    wide = atan_remainder_bound(back, ahead, aside)
     most = max(back, ahead)
     size = sqrt(most * most + aside * aside)
     if size >= 1.0:  # the series that the third order is cut from ends at the origin
@@ -76,7 +76,7 @@ def remainder(back: float, ahead: float, aside: float, bilinear: tuple[float, fl
 
 
 @compiled
-def arguments(left: float, right: float, down: float, up: float) -> tuple[float, float]:
+def vector_angles(left: float, right: float, down: float, up: float) -> tuple[float, float]:
     """Return the angles of the vectors in a rectangle, radians; all angles where it touches the cut or the origin.
 
     The rectangle is [left, right] along the first axis and [down, up] along the second.
@@ -89,13 +89,13 @@ def arguments(left: float, right: float, down: float, up: float) -> tuple[float,
 
 
 @compiled
-def horizontal(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple]:
+def horizontal_line(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple]:
     """Return the line's components along the first two axes, turned by the measured angle, and their pulls."""
     c, s = cos(data[MEASURED]), sin(data[MEASURED])
-    first, second = triple(data, AXES), triple(data, AXES + 3)
-    ahead, aside = blend(c, first, s, second), blend(c, second, -s, first)
-    away = triple(line, 0)
-    return inner(ahead, away), inner(aside, away), pull(ahead, sense), pull(aside, sense)
+    first, second = triple_at(data, AXES), triple_at(data, AXES + 3)
+    ahead, aside = sum_of_forms(c, first, s, second), sum_of_forms(c, second, -s, first)
+    away = triple_at(line, 0)
+    return inner_product(ahead, away), inner_product(aside, away), turned_form(ahead, sense), turned_form(aside, sense)
 
 
 @compiled
@@ -105,19 +105,19 @@ def bound_azimuth(data: Array, line: Array, sense: Array, half: Array, slope: Ar
     Where the box touches the half-plane behind the measured direction the angle jumps from pi to -pi. A row of its own
     (number `ALONE`) is then given by its absolute value, which does not jump and costs the same.
     """
-    x, y, along, beside = horizontal(data, line, sense)
-    h = triple(half, 0)
+    x, y, along, beside = horizontal_line(data, line, sense)
+    h = triple_at(half, 0)
     squared = x * x + y * y
     value = atan2(y, x)
     if squared > 0.0:
-        radial = blend(x / squared, along, y / squared, beside)
-        around = blend(x / squared, beside, -y / squared, along)
+        radial = sum_of_forms(x / squared, along, y / squared, beside)
+        around = sum_of_forms(x / squared, beside, -y / squared, along)
         back, aside = reach(radial, h), reach(around, h)
         # Neither the station's vertical nor the cut behind the measured direction is in the box.
         if back < 1.0 and abs(value) + atan(aside / (1.0 - back)) < pi:
             low, high = product(radial, around, h)
-            low, high = remainder(back, back, aside, (-high, -low))
-            write(around, slope)
+            low, high = atan_remainder(back, back, aside, (-high, -low))
+            write_triple(around, slope)
             return value, low, high
     return _flat_azimuth(value, (x, reach(along, h)), (y, reach(beside, h)), data[ALONE] != 0.0, slope)
 
@@ -133,7 +133,7 @@ def _flat_azimuth(
         # The greatest sidestep at the farthest advance is the least angle off the measured direction.
         least = atan2(max(up, -down), right) if right < 0.0 else 0.0
         return abs(value), least - abs(value), pi - abs(value)
-    low, high = arguments(ahead[0] - ahead[1], right, down, up)
+    low, high = vector_angles(ahead[0] - ahead[1], right, down, up)
     return value, low - value, high - value
 
 
@@ -143,12 +143,15 @@ def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature
 
     With gamma = radial + i around, the gradient is ``Im(gamma/(1+w))`` and the Hessian ``-Im(gamma gamma'/(1+w)^2)``.
     """
-    x, y, along, beside = horizontal(data, line, sense)
-    h = triple(half, 0)
+    x, y, along, beside = horizontal_line(data, line, sense)
+    h = triple_at(half, 0)
     squared = x * x + y * y
     if squared == 0.0:
-        return unbounded(curvature, turn)
-    radial, around = blend(x / squared, along, y / squared, beside), blend(x / squared, beside, -y / squared, along)
+        return unbounded_curvature(curvature, turn)
+    radial, around = (
+        sum_of_forms(x / squared, along, y / squared, beside),
+        sum_of_forms(x / squared, beside, -y / squared, along),
+    )
     for k in range(3):
         for m in range(3):
             curvature[k, m] = -(radial[k] * around[m] + around[k] * radial[m])
@@ -164,23 +167,27 @@ def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature
     for k in range(3):
         whole = abs(around[k]) * real + abs(radial[k]) * imaginary
         second = abs(around[k]) * real2 + abs(radial[k]) * imaginary2
-        turn[k] = min(whole, row_reach(curvature, k, h) + second)
+        turn[k] = min(whole, largest_row_value(curvature, k, h) + second)
     one, other = length(radial), length(around)
-    mixed = abs(inner(radial, around)) + one * other
+    mixed = abs(inner_product(radial, around)) + one * other
     return max(one, other) ** 2 * 2.0 * imaginary / front + mixed * real * (2.0 + real)
 
 
 @compiled
-def sight(data: Array, x: Array) -> Triple:
+def line_of_sight(data: Array, x: Array) -> Triple:
     """Return the line from a station to a fix in the station's axes."""
     line = (x[0] - data[0], x[1] - data[1], x[2] - data[2])
-    return inner(triple(data, AXES), line), inner(triple(data, AXES + 3), line), inner(triple(data, AXES + 6), line)
+    return (
+        inner_product(triple_at(data, AXES), line),
+        inner_product(triple_at(data, AXES + 3), line),
+        inner_product(triple_at(data, AXES + 6), line),
+    )
 
 
 @compiled
 def _ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
     """Write the horizontal unit vector n across the sight: ``|n.(x' - x)| <= r sin(swing)`` at distance r."""
-    p, q, r = sight(data[j], x)
+    p, q, r = line_of_sight(data[j], x)
     flat = hypot(p, q)
     if not flat > 0.0:
         return -1.0, 0.0
@@ -222,28 +229,34 @@ _UPRIGHT_WIDTH = 16
 @compiled
 def _upright(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple, Triple]:
     """Return horizontal distance and rise of a line, and the pulls of outward, sideways and upward unit vectors."""
-    x, y, along, beside = horizontal(data, line, sense)
+    x, y, along, beside = horizontal_line(data, line, sense)
     rho = sqrt(x * x + y * y)
     # On the station's vertical any direction is outward; what is bounded there is not used.
     ex, ey = (x / rho, y / rho) if rho > 0.0 else (1.0, 0.0)
-    up = triple(data, AXES + 6)
-    return rho, inner(up, triple(line, 0)), blend(ex, along, ey, beside), blend(ex, beside, -ey, along), pull(up, sense)
+    up = triple_at(data, AXES + 6)
+    return (
+        rho,
+        inner_product(up, triple_at(line, 0)),
+        sum_of_forms(ex, along, ey, beside),
+        sum_of_forms(ex, beside, -ey, along),
+        turned_form(up, sense),
+    )
 
 
 @compiled
 def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound an elevation over a box (see `optloc.proof.nodes.node`), radians; it may hold the station's vertical."""
     rho, rise, outward, sideways, upward = _upright(data, line, sense)
-    h = triple(half, 0)
+    h = triple_at(half, 0)
     value = atan2(rise, rho)
     least = rho - reach(outward, h)
-    bulge = excess(least, reach(sideways, h))
+    bulge = hypot_excess(least, reach(sideways, h))
     low, high = -inf, inf
     squared = rho * rho + rise * rise
     radial, around = outward, upward
     if squared > 0.0:
-        radial = blend(rho / squared, outward, rise / squared, upward)
-        around = blend(rho / squared, upward, -rise / squared, outward)
+        radial = sum_of_forms(rho / squared, outward, rise / squared, upward)
+        around = sum_of_forms(rho / squared, upward, -rise / squared, outward)
         back, aside = reach(radial, h), reach(around, h)
         if back < 1.0:
             # rho = (linear part) + q, 0 <= q <= bulge, moves r by q rho/r^2 and t by -q rise/r^2.
@@ -251,14 +264,14 @@ def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: 
             low, high = product(radial, around, h)
             cross = abs(shift) * back + ahead * aside
             bilinear = -high - cross + min(ahead * shift, 0.0), -low + cross + max(ahead * shift, 0.0)
-            low, high = remainder(back, back + ahead, aside + abs(shift), bilinear)
+            low, high = atan_remainder(back, back + ahead, aside + abs(shift), bilinear)
             low, high = low - max(shift, 0.0), high - min(shift, 0.0)
     # Where the line of sight turns by much, two numbers say more than a slope and its remainder.
     bottom, top = _flat_elevation((rise, reach(upward, h)), max(least, 0.0), rho + reach(outward, h) + bulge)
     if top - bottom < high - low:
         slope[0] = slope[1] = slope[2] = 0.0
         return value, bottom - value, top - value
-    write(around, slope)
+    write_triple(around, slope)
     return value, low, high
 
 
@@ -277,24 +290,24 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
     the gradient is b and the Hessian ``-(a b' + b a') - tan(elevation) c c'``; the frame turns over the box.
     """
     bound_elevation(data, line, sense, half, turn)  # for its slope alone: `turn` is overwritten below
-    if still(turn):
-        return unbounded(curvature, turn)
+    if is_zero_slope(turn):
+        return unbounded_curvature(curvature, turn)
     rho, rise, outward, sideways, upward = _upright(data, line, sense)
-    h = triple(half, 0)
+    h = triple_at(half, 0)
     least, swing = rho - reach(outward, h), reach(sideways, h)
     if not least > 0.0:
-        return unbounded(curvature, turn)
+        return unbounded_curvature(curvature, turn)
     squared = rho * rho + rise * rise
     r, tan = sqrt(squared), rise / rho
     a, b = (
-        blend(rho / squared, outward, rise / squared, upward),
-        blend(rho / squared, upward, -rise / squared, outward),
+        sum_of_forms(rho / squared, outward, rise / squared, upward),
+        sum_of_forms(rho / squared, upward, -rise / squared, outward),
     )
-    c = blend(1.0 / r, sideways, 0.0, sideways)
+    c = sum_of_forms(1.0 / r, sideways, 0.0, sideways)
     for k in range(3):
         for m in range(3):
             curvature[k, m] = -(a[k] * b[m] + b[k] * a[m]) - tan * c[k] * c[m]
-    back, aside, bulge = reach(a, h), reach(b, h), excess(least, swing) / r
+    back, aside, bulge = reach(a, h), reach(b, h), hypot_excess(least, swing) / r
     yaw = swing / least  # tangents of the frame's turns about the vertical, and up or down
     pitch = (aside + bulge * abs(rise) / r) / (1.0 - back) if back < 1.0 else inf
     if not (yaw < 1.0 and pitch < 1.0 and abs(tan) * pitch < 1.0):
@@ -304,7 +317,7 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
     near = 1.0 / (1.0 - back)
     stretch = max(back * near, back + aside + bulge)
     steeper = pitch * (1.0 + tan * tan) / (1.0 - abs(tan) * pitch)
-    sweep = blend(1.0 / r, outward, 0.0, outward)
+    sweep = sum_of_forms(1.0 / r, outward, 0.0, outward)
     swung = _swung(sweep, c, yaw, (0.0, 0.0, 0.0), near, 0.0)
     da, db = _swung(a, b, pitch, swung, near, stretch), _swung(b, a, pitch, swung, near, stretch)
     dc = _swung(c, sweep, yaw, (0.0, 0.0, 0.0), near, stretch)
@@ -349,7 +362,7 @@ def _frame_turn(
     for k in range(3):
         along = (abs(a[k]) + da[k]) * high + (abs(b[k]) + db[k]) * wide
         whole = along + tan * (abs(c[k]) + dc[k]) * flank
-        turn[k] = min(whole, row_reach(curvature, k, h) + chi * length(h))
+        turn[k] = min(whole, largest_row_value(curvature, k, h) + chi * length(h))
     return chi
 
 
@@ -360,7 +373,7 @@ def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row:
     At distance r, with e the swing of the elevation and a that of the azimuth beside it, below a quarter turn.
     """
     turn = _azimuth_beside(kinds, data, swing, j)
-    p, q, r = sight(data[j], x)
+    p, q, r = line_of_sight(data[j], x)
     flat = hypot(p, q)
     if not (turn < 0.5 * pi and flat > 0.0):
         return -1.0, 0.0

@@ -20,7 +20,7 @@ from optloc.proof.nodes import node as columns
 from optloc.proof.nodes.angles import HORIZONTAL_ANGLE, VERTICAL_ANGLE
 from optloc.proof.nodes.level import GEODETIC_HEIGHT, LINEAR_FORM
 from optloc.proof.nodes.log_range import LOGARITHM
-from optloc.proof.nodes.node import BALANCED, DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node, range_form, triple
+from optloc.proof.nodes.node import BALANCED, DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node, range_form, triple_at
 from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_centre, curve_difference
 from optloc.proof.nodes.rate import RATE_OF_RANGE
 from optloc.proof.nodes.ratio import RATIO_OF_RANGES
@@ -209,7 +209,7 @@ def text_of(name: str, nodes: list[Node]) -> str:
 
 _KERNELS = ("bound", "curve", "size", "ball", "ray")
 # What the loops name beside the functions of the nodes.
-_NAMED = (range_form, triple, frame_of, set_line, bound_difference, curve_centre, curve_difference)
+_NAMED = (range_form, triple_at, frame_of, set_line, bound_difference, curve_centre, curve_difference)
 _COLUMNS = (
     *("RANGE", "PHI", "SLOPE0", "SLOPE1", "SLOPE2", "LOW", "HIGH", "FORM"),
     *("H00", "H01", "H02", "H11", "H12", "H22", "TURN0", "TURN1", "TURN2", "CHI", "FORCE"),

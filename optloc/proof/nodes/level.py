@@ -20,18 +20,18 @@ from optloc.proof.nodes.node import (
     Node,
     NodeRow,
     Triple,
-    across,
-    blend,
-    excess,
-    inner,
+    hypot_excess,
+    inner_product,
+    largest_row_value,
     lay_out,
     length,
-    pull,
+    length_across,
     reach,
-    row_reach,
-    triple,
-    unbounded,
-    write,
+    sum_of_forms,
+    triple_at,
+    turned_form,
+    unbounded_curvature,
+    write_triple,
 )
 
 # Linear forms.
@@ -43,9 +43,9 @@ ORIGIN, COEFFICIENTS, _NUMBERS = 0, 3, 6
 @compiled
 def bound_linear(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound a linear form over a box (see `optloc.proof.nodes.node`), which has no remainder."""
-    n = triple(data, COEFFICIENTS)
-    write(pull(n, sense), slope)
-    return inner(n, triple(line, 0)), 0.0, 0.0
+    n = triple_at(data, COEFFICIENTS)
+    write_triple(turned_form(n, sense), slope)
+    return inner_product(n, triple_at(line, 0)), 0.0, 0.0
 
 
 @compiled
@@ -106,11 +106,11 @@ def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
 @compiled
 def _ecef(data: Array, line: Array) -> Triple:
     """Return Earth-centred Earth-fixed coordinates of the end of a line."""
-    along, origin = triple(line, 0), triple(data, ECEF)
+    along, origin = triple_at(line, 0), triple_at(data, ECEF)
     return (
-        inner(triple(data, ROTATION), along) + origin[0],
-        inner(triple(data, ROTATION + 3), along) + origin[1],
-        inner(triple(data, ROTATION + 6), along) + origin[2],
+        inner_product(triple_at(data, ROTATION), along) + origin[0],
+        inner_product(triple_at(data, ROTATION + 3), along) + origin[1],
+        inner_product(triple_at(data, ROTATION + 6), along) + origin[2],
     )
 
 
@@ -120,9 +120,9 @@ def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, 
     e, f, g = _ecef(data, line)
     height, p, sp, cp = geodetic(e, f, g)
     ce, se = e / p, f / p
-    first, second, third = triple(data, ROTATION), triple(data, ROTATION + 3), triple(data, ROTATION + 6)
-    outward, east = blend(ce, first, se, second), blend(-se, first, ce, second)
-    return height, blend(cp, outward, sp, third), east, blend(-sp, outward, cp, third), sp
+    first, second, third = triple_at(data, ROTATION), triple_at(data, ROTATION + 3), triple_at(data, ROTATION + 6)
+    outward, east = sum_of_forms(ce, first, se, second), sum_of_forms(-se, first, ce, second)
+    return height, sum_of_forms(cp, outward, sp, third), east, sum_of_forms(-sp, outward, cp, third), sp
 
 
 @compiled
@@ -132,18 +132,18 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
     Deep in the Earth the model's formula is no exact height; there it lies between ``-|x| - a`` and ``|x| - b``.
     """
     height, up, _, _, _ = normal_at(data, line)
-    h = triple(half, 0)
-    n = pull(up, sense)
-    swing, aside = reach(n, h), across(sense, n, h)
+    h = triple_at(half, 0)
+    n = turned_form(up, sense)
+    swing, aside = reach(n, h), length_across(sense, n, h)
     way = sqrt(swing * swing + aside * aside)
     if not height - way > _DEEP:
         slope[0] = slope[1] = slope[2] = 0.0
         farthest = length(_ecef(data, line)) + way
         return height, -farthest - WGS84_A - height, farthest - _B - height
-    write(n, slope)
+    write_triple(n, slope)
     # Bowring's error falls with the height, but the rounding of coordinates grows with it.
     slack = EXACT * max(1.0, height / LEAST_RADIUS)
-    return height, -slack, excess(LEAST_RADIUS + height - swing, aside) + slack
+    return height, -slack, hypot_excess(LEAST_RADIUS + height - swing, aside) + slack
 
 
 @compiled
@@ -155,16 +155,16 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
     turning normal and the stretching tangents, ``3/2 e^2 (1 + e^2)`` (0.01) for curvature that changes with latitude.
     """
     height, up, east, north, sp = normal_at(data, line)
-    h = triple(half, 0)
-    n = pull(up, sense)
-    swing, aside = reach(n, h), across(sense, n, h)
+    h = triple_at(half, 0)
+    n = turned_form(up, sense)
+    swing, aside = reach(n, h), length_across(sense, n, h)
     way = sqrt(swing * swing + aside * aside)
     if not height - way > _DEEP:
-        return unbounded(curvature, turn)
+        return unbounded_curvature(curvature, turn)
     flat = 1.0 - _E2 * sp * sp
     prime = WGS84_A / sqrt(flat)
     meridian = prime * (1.0 - _E2) / flat
-    u, v = pull(east, sense), pull(north, sense)
+    u, v = turned_form(east, sense), turned_form(north, sense)
     # The least radius of curvature anywhere in the box, below its lowest point.
     bend = 1.0 / (LEAST_RADIUS + height - way)
     change = 1.2 * bend * bend * way
@@ -174,7 +174,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
             curvature[k, m] = u[k] * u[m] / (prime + height) + v[k] * v[m] / (meridian + height)
     for k in range(3):
         column = length((sense[0, k], sense[1, k], sense[2, k]))
-        own = row_reach(curvature, k, h)
+        own = largest_row_value(curvature, k, h)
         turn[k] = own + change * column * way
         chi += column * column * change
     return chi
@@ -183,9 +183,9 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
 @compiled
 def earth_ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
     """Return a ball around the Earth's centre: a height is at least the distance from there less the equator's."""
-    origin = triple(data, ECEF)
-    first, second, third = triple(data, ROTATION), triple(data, ROTATION + 3), triple(data, ROTATION + 6)
-    c = blend(1.0, blend(origin[0], first, origin[1], second), origin[2], third)
+    origin = triple_at(data, ECEF)
+    first, second, third = triple_at(data, ROTATION), triple_at(data, ROTATION + 3), triple_at(data, ROTATION + 6)
+    c = sum_of_forms(1.0, sum_of_forms(origin[0], first, origin[1], second), origin[2], third)
     return data[POINT] - c[0], data[POINT + 1] - c[1], data[POINT + 2] - c[2], WGS84_A + most
 
 

@@ -14,17 +14,17 @@ from optloc.proof.nodes.node import (
     Node,
     NodeRow,
     Symmetric,
-    blend,
+    is_zero_slope,
+    largest_entries,
     length,
-    range_bend,
     range_form,
+    range_hessian,
     reach,
-    reaches,
-    still,
-    triple,
-    unbounded,
-    write,
+    sum_of_forms,
+    triple_at,
+    unbounded_curvature,
     write_symmetric,
+    write_triple,
 )
 
 # The least range with a logarithm: a place at the station itself has none.
@@ -38,7 +38,7 @@ def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: 
     With r' = r (1 + t) elsewhere in the box ``log r' = log r + t + (log(1 + t) - t)``. The bracket is never positive,
     and falls with |t|. In a box that may touch the station the logarithm has no lower end.
     """
-    h = triple(half, 0)
+    h = triple_at(half, 0)
     r, u, least, most, far = range_form(line, sense, h)
     phi = log(max(r, _LEAST))
     if not least > 0.0:
@@ -49,7 +49,7 @@ def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: 
     less, more = min(log1p(below) - below, log1p(above) - above), most / r
     # Else two numbers for the whole box say more than a slope and its remainder.
     if more - less <= high - low:
-        write(blend(1.0 / r, u, 0.0, u), slope)
+        write_triple(sum_of_forms(1.0 / r, u, 0.0, u), slope)
         return phi, less, more
     slope[0] = slope[1] = slope[2] = 0.0
     return phi, low, high
@@ -61,13 +61,13 @@ def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvatu
 
     With u the gradient and B the Hessian of the range, they are g = u/r and ``B/r - g g'``.
     """
-    h = triple(half, 0)
+    h = triple_at(half, 0)
     bound_logarithm(data, line, sense, half, turn)
     r, u, least, most, _ = range_form(line, sense, h)
-    if still(turn) or not least > 0.0:
-        return unbounded(curvature, turn)
-    bend, du, chi, norm = range_bend(sense, h, r, u, least, most)
-    g, swing = blend(1.0 / r, u, 0.0, u), reach(u, h) + most
+    if is_zero_slope(turn) or not least > 0.0:
+        return unbounded_curvature(curvature, turn)
+    bend, du, chi, norm = range_hessian(sense, h, r, u, least, most)
+    g, swing = sum_of_forms(1.0 / r, u, 0.0, u), reach(u, h) + most
     own: Symmetric = (
         bend[0] / r - g[0] * g[0],
         bend[1] / r - g[0] * g[1],
@@ -77,11 +77,11 @@ def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvatu
         bend[5] / r - g[2] * g[2],
     )
     # g' - g = (u' - u - g (r' - r)) / r', as of any quotient.
-    wide = blend(1.0 / least, du, swing / least, (abs(g[0]), abs(g[1]), abs(g[2])))
+    wide = sum_of_forms(1.0 / least, du, swing / least, (abs(g[0]), abs(g[1]), abs(g[2])))
     dg = length(wide)
     change = (chi + swing * norm / r) / least + dg * (2.0 * length(g) + dg)
-    (w0, w1, w2), away = reaches(own, h), change * length(h)
-    write((min(wide[0], w0 + away), min(wide[1], w1 + away), min(wide[2], w2 + away)), turn)
+    (w0, w1, w2), away = largest_entries(own, h), change * length(h)
+    write_triple((min(wide[0], w0 + away), min(wide[1], w1 + away), min(wide[2], w2 + away)), turn)
     write_symmetric(own, curvature)
     return change
 

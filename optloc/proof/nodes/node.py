@@ -188,13 +188,13 @@ RangeForm = tuple[float, Triple, float, float, float]
 
 
 @compiled
-def triple(numbers: Array, at: int) -> Triple:
+def triple_at(numbers: Array, at: int) -> Triple:
     """Return three numbers from an index on."""
     return numbers[at], numbers[at + 1], numbers[at + 2]
 
 
 @compiled
-def pull(n: Triple, sense: Array) -> Triple:
+def turned_form(n: Triple, sense: Array) -> Triple:
     """Return the linear form ``n.(sense s)``."""
     return (
         n[0] * sense[0, 0] + n[1] * sense[1, 0] + n[2] * sense[2, 0],
@@ -204,7 +204,7 @@ def pull(n: Triple, sense: Array) -> Triple:
 
 
 @compiled
-def inner(u: Triple, v: Triple) -> float:
+def inner_product(u: Triple, v: Triple) -> float:
     """Return the inner product of two triples."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
@@ -216,25 +216,25 @@ def length(u: Triple) -> float:
 
 
 @compiled
-def blend(p: float, u: Triple, q: float, v: Triple) -> Triple:
+def sum_of_forms(p: float, u: Triple, q: float, v: Triple) -> Triple:
     """Return the linear form ``p u + q v``."""
     return p * u[0] + q * v[0], p * u[1] + q * v[1], p * u[2] + q * v[2]
 
 
 @compiled
-def write(u: Triple, out: Array) -> None:
+def write_triple(u: Triple, out: Array) -> None:
     """Write a triple into an array (3,)."""
     out[0], out[1], out[2] = u[0], u[1], u[2]
 
 
 @compiled
-def still(slope: Array) -> bool:
+def is_zero_slope(slope: Array) -> bool:
     """Return whether a slope (3,) is zero, as that of a node which is only enclosed."""
     return bool(slope[0] == 0.0 and slope[1] == 0.0 and slope[2] == 0.0)
 
 
 @compiled
-def unbounded(curvature: Array, turn: Array) -> float:
+def unbounded_curvature(curvature: Array, turn: Array) -> float:
     """Say that a node's curvature has no bound over a box: no Hessian, infinite change of the gradient; return inf."""
     for k in range(3):
         turn[k] = inf
@@ -250,7 +250,7 @@ def reach(u: Triple, h: Triple) -> float:
 
 
 @compiled
-def row_reach(matrix: Array, k: int, h: Triple) -> float:
+def largest_row_value(matrix: Array, k: int, h: Triple) -> float:
     """Return the greatest value over a box of ``|(matrix s)_k|``: with a Hessian, of the change of a gradient."""
     return float(abs(matrix[k, 0]) * h[0] + abs(matrix[k, 1]) * h[1] + abs(matrix[k, 2]) * h[2])
 
@@ -278,7 +278,7 @@ def scaled(low: float, high: float, least: float, most: float) -> tuple[float, f
 
 
 @inlined
-def excess(along: float, across: float) -> float:
+def hypot_excess(along: float, across: float) -> float:
     """Return a bound of ``hypot(a, b) - a`` for all a >= along and |b| <= across: it falls with a."""
     whole = sqrt(along * along + across * across)
     # The difference of two numbers that are nearly one would lose all digits: as a quotient it loses none.
@@ -286,7 +286,7 @@ def excess(along: float, across: float) -> float:
 
 
 @inlined
-def greatest(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
+def largest_quadratic(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
     """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= 1.
 
     The maximum is at a corner. The signs of a corner make all three mixed terms positive where their product is;
@@ -301,7 +301,7 @@ def greatest(a: float, b: float, c: float, d: float, e: float, f: float) -> floa
 
 
 @inlined
-def across(sense: Array, u: Triple, h: Triple) -> float:
+def length_across(sense: Array, u: Triple, h: Triple) -> float:
     """Return a bound over a box of the length of ``sense s`` without its part along a unit vector.
 
     Parameters
@@ -315,7 +315,9 @@ def across(sense: Array, u: Triple, h: Triple) -> float:
     """
     g = _gram(sense, u)
     h0, h1, h2 = h
-    form = greatest(g[0] * h0 * h0, g[1] * h0 * h1, g[2] * h0 * h2, g[3] * h1 * h1, g[4] * h1 * h2, g[5] * h2 * h2)
+    form = largest_quadratic(
+        g[0] * h0 * h0, g[1] * h0 * h1, g[2] * h0 * h2, g[3] * h1 * h1, g[4] * h1 * h2, g[5] * h2 * h2
+    )
     return sqrt(form)
 
 
@@ -325,18 +327,18 @@ def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
 
     The range is ``r + u.s + q`` with ``0 <= q <= remainder``.
     """
-    n = triple(line, 0)
+    n = triple_at(line, 0)
     r = length(n)
     per = 1.0 / r if r > 0.0 else 0.0
-    u = pull((n[0] * per, n[1] * per, n[2] * per) if r > 0.0 else (1.0, 0.0, 0.0), sense)
-    swing, aside = reach(u, h), across(sense, u, h)
+    u = turned_form((n[0] * per, n[1] * per, n[2] * per) if r > 0.0 else (1.0, 0.0, 0.0), sense)
+    swing, aside = reach(u, h), length_across(sense, u, h)
     # The farthest corner, up to the rounding of its root.
     far = sqrt((r + swing) * (r + swing) + aside * aside) * (1.0 + 1e-15)
-    return r, u, r - swing, excess(r - swing, aside), far
+    return r, u, r - swing, hypot_excess(r - swing, aside), far
 
 
 @inlined
-def range_bend(
+def range_hessian(
     sense: Array, h: Triple, r: float, u: Triple, least: float, remainder: float
 ) -> tuple[Symmetric, Triple, float, float]:
     """Return the Hessian of a range; bounds of the change of its gradient (a triple) and Hessian, and its norm.
@@ -362,7 +364,7 @@ def range_bend(
     trace = hessian[0] + hessian[3] + hessian[5]
     if not least > 0.0:
         return hessian, (inf, inf, inf), inf, trace
-    most, (w0, w1, w2) = 1.0 / least, reaches(hessian, h)
+    most, (w0, w1, w2) = 1.0 / least, largest_entries(hessian, h)
     turn = (
         (w0 * r + remainder * abs(u[0])) * most,
         (w1 * r + remainder * abs(u[1])) * most,
@@ -374,7 +376,7 @@ def range_bend(
 
 
 @inlined
-def reaches(matrix: Symmetric, h: Triple) -> Triple:
+def largest_entries(matrix: Symmetric, h: Triple) -> Triple:
     """Return the greatest values over a box of the entries of ``matrix s``, see `row_reach`."""
     m00, m01, m02, m11, m12, m22 = matrix
     b, c, e = abs(m01), abs(m02), abs(m12)
@@ -386,7 +388,7 @@ def reaches(matrix: Symmetric, h: Triple) -> Triple:
 
 
 @compiled
-def add(a: Symmetric, b: Symmetric) -> Symmetric:
+def add_symmetric(a: Symmetric, b: Symmetric) -> Symmetric:
     """Return the sum of two symmetric matrices."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
 

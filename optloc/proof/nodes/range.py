@@ -36,15 +36,15 @@ from optloc.proof.nodes.node import (
     RangeForm,
     Symmetric,
     Triple,
-    add,
-    blend,
-    greatest,
-    range_bend,
+    add_symmetric,
+    largest_quadratic,
     range_form,
+    range_hessian,
     reach,
-    triple,
+    sum_of_forms,
+    triple_at,
 )
-from optloc.proof.nodes.ratio import quotient, quotient_bend
+from optloc.proof.nodes.ratio import quotient_hessian, quotient_remainder
 
 # How a range curves over a box, see `range_bend`.
 RangeBend = tuple[Symmetric, Triple, float, float]
@@ -89,7 +89,9 @@ def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: A
         g2 = (x * t02 + y * t12 + z * t22) * per
         e0, e1, e2 = g0 * h0, g1 * h1, g2 * h2
         least = r - abs(e0) - abs(e1) - abs(e2)
-        across = greatest(m00 - e0 * e0, m01 - e0 * e1, m02 - e0 * e2, m11 - e1 * e1, m12 - e1 * e2, m22 - e2 * e2)
+        across = largest_quadratic(
+            m00 - e0 * e0, m01 - e0 * e1, m02 - e0 * e2, m11 - e1 * e1, m12 - e1 * e2, m22 - e2 * e2
+        )
         root = sqrt(least * least + across)
         nodes[j, PHI], nodes[j, LOW] = r, 0.0
         nodes[j, SLOPE0], nodes[j, SLOPE1], nodes[j, SLOPE2] = g0, g1, g2
@@ -176,14 +178,14 @@ def bound_difference(
     a, rise, n = scaled_station(frame, data)
     r, u, least, q, far = form = range_form(away, sense, h)
     r0, u0, least0, q0, far0 = centre
-    size, u, most = r + r0, blend(1.0, u, 1.0, u0), q + q0
+    size, u, most = r + r0, sum_of_forms(1.0, u, 1.0, u0), q + q0
     phi, least = rise / size if size > 0.0 else 0.0, max(least, 0.0) + max(least0, 0.0)
     if least > 0.0:
-        g = blend(1.0 / size, n, -phi / size, u)
-        low, high = quotient(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
+        g = sum_of_forms(1.0 / size, n, -phi / size, u)
+        low, high = quotient_remainder(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
         # By the triangle inequality the difference of the two distances is within |a| of zero.
         if high - low <= 2.0 * a:
-            return radius * phi, radius * low, radius * high, blend(radius, g, 0.0, g), form
+            return radius * phi, radius * low, radius * high, sum_of_forms(radius, g, 0.0, g), form
     return radius * phi, radius * (-a - phi), radius * (a - phi), (0.0, 0.0, 0.0), form
 
 
@@ -193,7 +195,7 @@ def curve_centre(slant: Array, centre: RangeForm, h: Triple) -> RangeBend:
     r, u, least, q, _ = centre
     if not least > 0.0:
         return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (inf, inf, inf), inf, inf
-    return range_bend(slant, h, r, u, least, q)
+    return range_hessian(slant, h, r, u, least, q)
 
 
 @inlined
@@ -222,19 +224,21 @@ def curve_difference(
     still, own = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if data[0] == m0 and data[1] == m1 and (data[2] == m2 or not frame.space):  # the node is zero
         return own, still, 0.0
-    r, u, least, q = node[FORM], triple(node, FORM + 1), node[FORM + 4], node[FORM + 5]
+    r, u, least, q = node[FORM], triple_at(node, FORM + 1), node[FORM + 4], node[FORM + 5]
     r0, u0, least0, q0, _ = centre
-    slope = triple(node, SLOPE0)
+    slope = triple_at(node, SLOPE0)
     if slope == still or not (least > 0.0 and least0 > 0.0):
         return own, (inf, inf, inf), inf
     set_line(frame, data, 0, away, sense)
-    second, ds, change, norm = range_bend(sense, h, r, u, least, q)
+    second, ds, change, norm = range_hessian(sense, h, r, u, least, q)
     second0, ds0, change0, norm0 = bent
-    size, u = r + r0, blend(1.0, u, 1.0, u0)
+    size, u = r + r0, sum_of_forms(1.0, u, 1.0, u0)
     # The numerator of the quotient is linear.
-    changes = (still, blend(1.0, ds, 1.0, ds0), 0.0, change + change0, norm + norm0, reach(u, h) + q + q0)
+    changes = (still, sum_of_forms(1.0, ds, 1.0, ds0), 0.0, change + change0, norm + norm0, reach(u, h) + q + q0)
     # In metres: the value, its slope, and so all that becomes of them.
-    return quotient_bend(slope, u, (node[PHI], size, least + least0), changes, h, own, add(second, second0))
+    return quotient_hessian(
+        slope, u, (node[PHI], size, least + least0), changes, h, own, add_symmetric(second, second0)
+    )
 
 
 @compiled

@@ -14,22 +14,22 @@ from optloc.proof.nodes.node import (
     SCALED,
     Node,
     NodeRow,
-    across,
-    blend,
-    inner,
+    inner_product,
+    is_zero_slope,
     lay_out,
     length,
-    pull,
-    range_bend,
+    length_across,
     range_form,
+    range_hessian,
     reach,
-    still,
-    triple,
-    unbounded,
-    write,
+    sum_of_forms,
+    triple_at,
+    turned_form,
+    unbounded_curvature,
     write_symmetric,
+    write_triple,
 )
-from optloc.proof.nodes.ratio import quotient, quotient_bend
+from optloc.proof.nodes.ratio import quotient_hessian, quotient_remainder
 
 # Numbers: the station, and its velocity reversed.
 STATION, VELOCITY, RATE_WIDTH = 0, 3, 6
@@ -38,16 +38,16 @@ STATION, VELOCITY, RATE_WIDTH = 0, 3, 6
 @compiled
 def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound a range rate over a box (see `optloc.proof.nodes.node`): a quotient, or what its directions allow."""
-    h, n, w = triple(half, 0), triple(line, 0), triple(data, VELOCITY)
+    h, n, w = triple_at(half, 0), triple_at(line, 0), triple_at(data, VELOCITY)
     r, u, least, most, far = range_form(line, sense, h)
-    phi = inner(w, n) / r if r > 0.0 else 0.0
-    low, high = _cone(phi, length(w), least, across(sense, u, h))
+    phi = inner_product(w, n) / r if r > 0.0 else 0.0
+    low, high = _cone(phi, length(w), least, length_across(sense, u, h))
     if least > 0.0:
-        g = blend(1.0 / r, pull(w, sense), -phi / r, u)
-        less, more = quotient(phi, g, u, most, (0.0, 0.0), (least, far), h)
+        g = sum_of_forms(1.0 / r, turned_form(w, sense), -phi / r, u)
+        less, more = quotient_remainder(phi, g, u, most, (0.0, 0.0), (least, far), h)
         # Else two numbers for the whole box say more than a slope and its remainder.
         if more - less <= high - low:
-            write(g, slope)
+            write_triple(g, slope)
             return phi, less, more
     slope[0] = slope[1] = slope[2] = 0.0
     return phi, low - phi, high - phi
@@ -73,19 +73,19 @@ def _cone(phi: float, speed: float, least: float, aside: float) -> tuple[float, 
 @compiled
 def curve_rate(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
     """Bound how a range rate curves over a box (see `optloc.proof.nodes.node`)."""
-    h, n, w = triple(half, 0), triple(line, 0), triple(data, VELOCITY)
+    h, n, w = triple_at(half, 0), triple_at(line, 0), triple_at(data, VELOCITY)
     bound_rate(data, line, sense, half, turn)
     r, u, least, most, _ = range_form(line, sense, h)
-    if still(turn) or not least > 0.0:
-        return unbounded(curvature, turn)
-    phi = inner(w, n) / r
-    second, ds, chi, norm = range_bend(sense, h, r, u, least, most)
-    g = blend(1.0 / r, pull(w, sense), -phi / r, u)
+    if is_zero_slope(turn) or not least > 0.0:
+        return unbounded_curvature(curvature, turn)
+    phi = inner_product(w, n) / r
+    second, ds, chi, norm = range_hessian(sense, h, r, u, least, most)
+    g = sum_of_forms(1.0 / r, turned_form(w, sense), -phi / r, u)
     changes = ((0.0, 0.0, 0.0), ds, 0.0, chi, norm, reach(u, h) + most)
     flat = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # a linear form does not bend
-    own, wander, chi = quotient_bend(g, u, (phi, r, least), changes, h, flat, second)
+    own, wander, chi = quotient_hessian(g, u, (phi, r, least), changes, h, flat, second)
     write_symmetric(own, curvature)
-    write(wander, turn)
+    write_triple(wander, turn)
     return chi
 
 

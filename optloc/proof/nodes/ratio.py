@@ -12,22 +12,22 @@ from optloc.proof.nodes.node import (
     NodeRow,
     Symmetric,
     Triple,
-    add,
-    blend,
+    add_symmetric,
+    is_zero_slope,
+    largest_entries,
     lay_out,
     length,
     product,
-    pull,
-    range_bend,
     range_form,
+    range_hessian,
     reach,
-    reaches,
     scaled,
-    still,
-    triple,
-    unbounded,
-    write,
+    sum_of_forms,
+    triple_at,
+    turned_form,
+    unbounded_curvature,
     write_symmetric,
+    write_triple,
 )
 
 # Numbers: stations a and b.
@@ -46,7 +46,7 @@ def bound_ratio(
 
     Where the box may touch station b the ratio has no upper end.
     """
-    h = triple(half, 0)
+    h = triple_at(half, 0)
     ra, ua, least_a, most_a, far_a = range_form(line, sense, h)
     rb, ub, least_b, most_b, far_b = range_form(line_b, sense_b, h)
     phi = ra / rb if rb > 0.0 else inf
@@ -55,16 +55,16 @@ def bound_ratio(
         high = far_a / least_b
         # First the difference, whose numerator is affine, then the ratio from it: a range in the numerator would curve.
         n, q = _squares(line, sense, line_b, sense_b, h)
-        size, u, most = ra + rb, blend(1.0, ua, 1.0, ub), most_a + most_b
+        size, u, most = ra + rb, sum_of_forms(1.0, ua, 1.0, ub), most_a + most_b
         delta = ra - rb
-        g = blend(1.0 / size, n, -delta / size, u)
+        g = sum_of_forms(1.0 / size, n, -delta / size, u)
         least = least_b + max(least_a, 0.0)
-        q = quotient(delta, g, u, most, q, (least, far_a + far_b), h)
-        g = blend(1.0 / rb, g, -(phi - 1.0) / rb, ub)
-        less, more = quotient(phi - 1.0, g, ub, most_b, q, (least_b, far_b), h)
+        q = quotient_remainder(delta, g, u, most, q, (least, far_a + far_b), h)
+        g = sum_of_forms(1.0 / rb, g, -(phi - 1.0) / rb, ub)
+        less, more = quotient_remainder(phi - 1.0, g, ub, most_b, q, (least_b, far_b), h)
         # Else two numbers for the whole box say more than a slope and its remainder.
         if more - less <= high - low:
-            write(g, slope)
+            write_triple(g, slope)
             return phi, less, more
     else:
         high = inf
@@ -73,7 +73,7 @@ def bound_ratio(
 
 
 @compiled
-def quotient(
+def quotient_remainder(
     phi: float,
     g: Triple,
     u: Triple,
@@ -108,12 +108,12 @@ def quotient(
 def _squares(line: Array, sense: Array, line_b: Array, sense_b: Array, h: Triple) -> tuple[Triple, tuple[float, float]]:
     """Return slope and remainder of ``|line|^2 - |line_b|^2`` over a box: the product of difference and sum."""
     apart = (line[0] - line_b[0], line[1] - line_b[1], line[2] - line_b[2])
-    n, low, high = pull(apart, sense), 0.0, 0.0
-    n = blend(1.0, n, 1.0, pull(apart, sense_b))
+    n, low, high = turned_form(apart, sense), 0.0, 0.0
+    n = sum_of_forms(1.0, n, 1.0, turned_form(apart, sense_b))
     for i in range(3):
-        own, other = triple(sense[i], 0), triple(sense_b[i], 0)
-        differ, both = blend(1.0, own, -1.0, other), blend(1.0, own, 1.0, other)
-        n = blend(1.0, n, line[i] + line_b[i], differ)
+        own, other = triple_at(sense[i], 0), triple_at(sense_b[i], 0)
+        differ, both = sum_of_forms(1.0, own, -1.0, other), sum_of_forms(1.0, own, 1.0, other)
+        n = sum_of_forms(1.0, n, line[i] + line_b[i], differ)
         less, more = product(differ, both, h)
         low, high = low + less, high + more
     return n, (low, high)
@@ -131,27 +131,34 @@ def curve_ratio(
     turn: Array,
 ) -> float:
     """Bound how a ratio of ranges curves over a box (`optloc.proof.nodes.node`), in the two steps of `bound_ratio`."""
-    h = triple(half, 0)
+    h = triple_at(half, 0)
     bound_ratio(data, line, sense, line_b, sense_b, half, turn)
     ra, ua, least_a, qa, _ = range_form(line, sense, h)
     rb, ub, least_b, qb, _ = range_form(line_b, sense_b, h)
-    if still(turn) or not (least_a > 0.0 and least_b > 0.0):
-        return unbounded(curvature, turn)
-    own, da, chi_a, norm_a = range_bend(sense, h, ra, ua, least_a, qa)
-    bend, db, chi_b, norm_b = range_bend(sense_b, h, rb, ub, least_b, qb)
+    if is_zero_slope(turn) or not (least_a > 0.0 and least_b > 0.0):
+        return unbounded_curvature(curvature, turn)
+    own, da, chi_a, norm_a = range_hessian(sense, h, ra, ua, least_a, qa)
+    bend, db, chi_b, norm_b = range_hessian(sense_b, h, rb, ub, least_b, qb)
     n, _ = _squares(line, sense, line_b, sense_b, h)
     second = _square_bend(sense, sense_b)
-    size, u, delta = ra + rb, blend(1.0, ua, 1.0, ub), ra - rb
-    g = blend(1.0 / size, n, -delta / size, u)
-    changes = (reaches(second, h), blend(1.0, da, 1.0, db), 0.0, chi_a + chi_b, norm_a + norm_b, reach(u, h) + qa + qb)
+    size, u, delta = ra + rb, sum_of_forms(1.0, ua, 1.0, ub), ra - rb
+    g = sum_of_forms(1.0 / size, n, -delta / size, u)
+    changes = (
+        largest_entries(second, h),
+        sum_of_forms(1.0, da, 1.0, db),
+        0.0,
+        chi_a + chi_b,
+        norm_a + norm_b,
+        reach(u, h) + qa + qb,
+    )
     centre = (delta, size, least_a + least_b)
-    second, wander, chi = quotient_bend(g, u, centre, changes, h, second, add(own, bend))
+    second, wander, chi = quotient_hessian(g, u, centre, changes, h, second, add_symmetric(own, bend))
     # What became of the difference is the numerator of the second step.
-    g = blend(1.0 / rb, g, -delta / (rb * rb), ub)
+    g = sum_of_forms(1.0 / rb, g, -delta / (rb * rb), ub)
     changes = (wander, db, chi, chi_b, norm_b, reach(ub, h) + qb)
-    second, wander, chi = quotient_bend(g, ub, (delta / rb, rb, least_b), changes, h, second, bend)
+    second, wander, chi = quotient_hessian(g, ub, (delta / rb, rb, least_b), changes, h, second, bend)
     write_symmetric(second, curvature)
-    write(wander, turn)
+    write_triple(wander, turn)
     return chi
 
 
@@ -177,7 +184,7 @@ def _square_entry(sense: Array, sense_b: Array, k: int, m: int) -> float:
 
 
 @inlined
-def quotient_bend(
+def quotient_hessian(
     g: Triple,
     u: Triple,
     centre: tuple[float, float, float],
@@ -227,7 +234,7 @@ def quotient_bend(
     dg, du = length((t0, t1, t2)), length(ds)
     mixed = 2.0 * (dg * length(u) + length(g) * du + dg * du)
     chi = (chi_n + mixed + abs(phi) * chi_s + rise * (norm_s + chi_s) + widen * sqrt(norm)) * most
-    (w0, w1, w2), far = reaches(own, h), chi * length(h)
+    (w0, w1, w2), far = largest_entries(own, h), chi * length(h)
     return own, (min(t0, w0 + far), min(t1, w1 + far), min(t2, w2 + far)), chi
 
 

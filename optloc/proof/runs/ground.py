@@ -17,7 +17,7 @@ from optloc.base.types import Array
 from optloc.kernels.jit import compiled
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.proof.nodes.level import EXACT, LEAST_RADIUS, normal_at
-from optloc.proof.nodes.node import Triple, blend, inner, triple, write
+from optloc.proof.nodes.node import Triple, inner_product, sum_of_forms, triple_at, write_triple
 
 # What is carried over the Earth.
 
@@ -64,21 +64,26 @@ _STILL, _E2 = 1e-14, WGS84_F * (2.0 - WGS84_F)
 @compiled
 def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Triple]:
     """Return what is left of the height (metres), the place of two numbers on the surface, and its normal."""
-    data, e, f, up = ground.data, triple(ground.axes[0], 0), triple(ground.axes[1], 0), triple(ground.axes[2], 0)
-    place = blend(first, e, second, f)
+    data, e, f, up = (
+        ground.data,
+        triple_at(ground.axes[0], 0),
+        triple_at(ground.axes[1], 0),
+        triple_at(ground.axes[2], 0),
+    )
+    place = sum_of_forms(first, e, second, f)
     centre = _centre(data)
     # above the Earth's centre by about what a sphere has there
-    aside = (first - inner(e, centre)) ** 2 + (second - inner(f, centre)) ** 2
-    above = inner(up, centre) + sqrt(max((WGS84_A + ground.level) ** 2 - aside, 0.0))
-    place = blend(1.0, place, above, up)
+    aside = (first - inner_product(e, centre)) ** 2 + (second - inner_product(f, centre)) ** 2
+    above = inner_product(up, centre) + sqrt(max((WGS84_A + ground.level) ** 2 - aside, 0.0))
+    place = sum_of_forms(1.0, place, above, up)
     off, normal = inf, up
     for _ in range(_STEPS):
         height, normal, _, _, _ = normal_at(data, np.array(place))
         off = height - ground.level
-        rise = inner(normal, up)
+        rise = inner_product(normal, up)
         if abs(off) <= _CLOSE or not rise > 0.0:
             break
-        place = blend(1.0, place, -off / rise, up)
+        place = sum_of_forms(1.0, place, -off / rise, up)
     return off, place, normal
 
 
@@ -86,34 +91,34 @@ def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Tr
 def _centre(data: Array) -> Triple:
     """Return the Earth's centre in the frame."""
     x, y, z = data[3], data[4], data[5]
-    first, second, third = triple(data, 6), triple(data, 9), triple(data, 12)
-    c = blend(1.0, blend(x, first, y, second), z, third)
+    first, second, third = triple_at(data, 6), triple_at(data, 9), triple_at(data, 12)
+    c = sum_of_forms(1.0, sum_of_forms(x, first, y, second), z, third)
     return data[0] - c[0], data[1] - c[1], data[2] - c[2]
 
 
 @compiled
-def level_way(ground: Ground, normal: Triple, first: float, second: float) -> Triple:
+def horizontal_vector(ground: Ground, normal: Triple, first: float, second: float) -> Triple:
     """Return the vector along the surface that has two components along the axes."""
-    up = triple(ground.axes[2], 0)
-    plan = blend(first, triple(ground.axes[0], 0), second, triple(ground.axes[1], 0))
-    return blend(1.0, plan, -inner(plan, normal) / inner(up, normal), up)
+    up = triple_at(ground.axes[2], 0)
+    plan = sum_of_forms(first, triple_at(ground.axes[0], 0), second, triple_at(ground.axes[1], 0))
+    return sum_of_forms(1.0, plan, -inner_product(plan, normal) / inner_product(up, normal), up)
 
 
 @compiled
-def carried(ground: Ground, start: Triple, way: Triple, rise: float) -> Triple:
+def place_over_ground(ground: Ground, start: Triple, way: Triple, rise: float) -> Triple:
     """Return the place that a target reaches over ground, as `optloc.models.course.carry` does, in the frame."""
     data = ground.data
     height, up, _, _, sp = normal_at(data, np.array(start))
-    climb = inner(way, up)
-    level = blend(1.0, way, -climb, up)
+    climb = inner_product(way, up)
+    level = sum_of_forms(1.0, way, -climb, up)
     radius = WGS84_A * sqrt(1.0 - _E2) / (1.0 - _E2 * sp * sp) + height
-    squared = inner(level, level)
+    squared = inner_product(level, level)
     half = 0.5 * sqrt(squared / (radius * radius) + _STILL)
     share = sin(half) / half
-    place = blend(1.0, start, share * cos(half), level)
-    place = blend(1.0, place, -0.5 * share * share * squared / radius, up)
+    place = sum_of_forms(1.0, start, share * cos(half), level)
+    place = sum_of_forms(1.0, place, -0.5 * share * share * squared / radius, up)
     reached, normal, _, _, _ = normal_at(data, np.array(place))
-    return blend(1.0, place, height + climb + rise - reached, normal)
+    return sum_of_forms(1.0, place, height + climb + rise - reached, normal)
 
 
 # Derivatives at a state.
@@ -161,8 +166,8 @@ def set_reached(
     """Write where some of the states of differences lead (SECOND_ORDER, 3)."""
     for k in range(begin, end):
         first, second = time * state[2] + _STEP * _MOVES[k, 2], time * state[3] + _STEP * _MOVES[k, 3]
-        way = level_way(ground, triple(starts[k], 3), first, second)
-        write(carried(ground, triple(starts[k], 0), way, rise), reached[k])
+        way = horizontal_vector(ground, triple_at(starts[k], 3), first, second)
+        write_triple(place_over_ground(ground, triple_at(starts[k], 0), way, rise), reached[k])
 
 
 @compiled
@@ -206,7 +211,7 @@ Derivatives = tuple[float, float, float]
 
 
 @compiled
-def bends_of(ground: Ground, state: Array, half: Array) -> tuple[bool, float, float, float]:
+def curvature_bounds(ground: Ground, state: Array, half: Array) -> tuple[bool, float, float, float]:
     """Return whether the places of a box of states are bounded, and bounds of their derivatives by (q, w).
 
     The first three derivatives, per metre, metre^2 and metre^3. All functions are looked at along lines of (q, w), one
@@ -225,7 +230,7 @@ def bends_of(ground: Ground, state: Array, half: Array) -> tuple[bool, float, fl
     centre, way2, plan2, high = _centre(ground.data), 0.0, 0.0, 0.0
     for k in range(2):
         # with the places of differences beside the box
-        aside = abs(state[k] - inner(triple(ground.axes[k], 0), centre)) + half[k] + 2.0 * _STEP
+        aside = abs(state[k] - inner_product(triple_at(ground.axes[k], 0), centre)) + half[k] + 2.0 * _STEP
         way = ground.span * (abs(state[2 + k]) + half[2 + k]) + 2.0 * _STEP
         plan2, way2 = plan2 + aside * aside, way2 + way * way
     for rise in ground.rise:
@@ -353,4 +358,4 @@ def corners_on(ground: Ground, corners: Array) -> Array:
 def state_off(ground: Ground, state: Array) -> Array:
     """Return position and velocity (6,) of a state (4,) on the surface."""
     _, place, normal = lift(ground, state[0], state[1])
-    return np.array([*place, *level_way(ground, normal, state[2], state[3])])
+    return np.array([*place, *horizontal_vector(ground, normal, state[2], state[3])])

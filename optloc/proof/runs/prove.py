@@ -7,21 +7,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array
-from optloc.kernels.jit import compiled, enabled, inlined, put, usable, zero
-from optloc.proof.atlas import Atlas, atlas_of, first_minima, home_of, set_centre, with_minima
+from optloc.kernels.jit import compiled, enabled, inlined, may_use_code, put, zero
+from optloc.proof.atlas import Atlas, atlas_of, first_minima, piece_of, set_centre, with_minima
 from optloc.proof.batch import ProofRequest, ProofResult, plainly, without_rivals
 from optloc.proof.box import (
     DEPTH,
     bound_nodes,
-    cube,
     push_around,
+    station_cube,
 )
-from optloc.proof.convex_boxes import accuracy_floor_far, draw_in, is_elsewhere, set_axes, set_hull
-from optloc.proof.curvature import G0, LENGTH0, entry
-from optloc.proof.everywhere import UNBOUNDED
-from optloc.proof.near import (
+from optloc.proof.convex_boxes import accuracy_floor_far, is_elsewhere, limit_half_widths, set_axes, set_hull
+from optloc.proof.curvature import G0, LENGTH0, symmetric_entry
+from optloc.proof.global_search import UNBOUNDED
+from optloc.proof.local_search import (
     BETTER,
     BUDGET,
     CHEAPER,
@@ -43,18 +43,18 @@ from optloc.proof.nodes.node import DIFFERENCE, GROWS
 from optloc.proof.pieces import push_pieces
 from optloc.proof.runs.ground import Ground, axes_at, corners_on, over_ground, state_off, state_on
 from optloc.proof.runs.rows import (
-    blur_of,
-    digits_of,
     is_balanced,
     is_convex_by,
+    relative_rounding_of,
     residual_at,
+    rounding_of_residual,
 )
 from optloc.proof.runs.run_costs import CourseCosts, RunCost, Runs
 from optloc.proof.runs.search import (
     CAPACITY,
     RunTables,
-    blur_beside,
     cost_at_coordinates,
+    rounding_at_place,
     search_run,
     sum_at,
     tables_of,
@@ -69,10 +69,10 @@ from optloc.proof.search_space import (
     KnownMinima,
     LocalAxes,
     accuracy_floor,
+    axes_of_next_piece,
     chart_on,
     equal_within,
-    turned,
-    widen,
+    widen_by_rounding,
     without_differences,
 )
 from optloc.proof.space import Space, floor_of
@@ -120,23 +120,23 @@ def _margin(tables: RunTables, noise: float, eps: float) -> float:
 def _set_far(
     run: RunCost, space: Space, tables: RunTables, i: int, x: Array, value: float, eps: float, limit: float
 ) -> bool:
-    """Write a minimum and its surroundings into an atlas; see `optloc.proof.everywhere.set_minimum`."""
+    """Write a minimum and its surroundings into an atlas; see `optloc.proof.global_search.set_minimum`."""
     atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
     minima, piece = atlas.minima, 2 * d + 1 + i
-    minima.home[i] = home_of(atlas, x, minima.start[i])
+    minima.home[i] = piece_of(atlas, x, minima.start[i])
     if not set_axes(run.look, tables.small, atlas, i):
         return False
     if not cost_at_coordinates(run, space, tables, piece, hull) >= value:
         return False
     for k in range(d):  # the axes of few rows, in units of all
-        own = box.sums[entry(k, k)]
+        own = box.sums[symmetric_entry(k, k)]
         if not own > 0.0:
             return False
         for m in range(d):
             minima.axes[i, m, k] /= sqrt(own)
             minima.back[i, k, m] *= sqrt(own)
     cost_at_coordinates(run, space, tables, piece, hull)
-    margin = _margin(tables, blur_beside(run, space, tables, floor_of(space, run.cost)), eps)
+    margin = _margin(tables, rounding_at_place(run, space, tables, floor_of(space, run.cost)), eps)
     set_hull(atlas, i, hull, limit)
     if not _convex_sides(run, space, tables, np.zeros(3), piece, hull, margin, minima.sides[i]):
         return False
@@ -169,15 +169,15 @@ def _set_near(
         at[2] = 0.0
     if not cost_at_coordinates(run, space, tables, 0, at) >= value:
         return False
-    margin = _margin(tables, blur_beside(run, space, tables, floor_of(space, run.cost)), eps)
+    margin = _margin(tables, rounding_at_place(run, space, tables, floor_of(space, run.cost)), eps)
     if is_elsewhere(chart, box, x):
         return False
     if hidden:
-        draw_in(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
+        limit_half_widths(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
     if not _convex_sides(run, space, tables, at, 0, hull, margin, space.sides[i]):
         return False
     # Where the box is, up to the rounding of its centre.
-    widen(chart, box.centre, shift)
+    widen_by_rounding(chart, box.centre, shift)
     for k in range(3):
         space.sides[i, k] = max(space.sides[i, k] - shift[k], 0.0)
     return True
@@ -248,7 +248,7 @@ def prove_run(
     upper: Array,
     found: Array,
 ) -> tuple[int, int, float]:
-    """Prove of a run what `optloc.proof.near.prove` proves of a cost; arguments and result as there.
+    """Prove of a run what `optloc.proof.local_search.prove_locally` proves of a cost; arguments and result as there.
 
     Over all space where the cost stays finite at infinity; else within a region, around a surface, or within what
     encloses the level of the cost of few rows.
@@ -257,7 +257,7 @@ def prove_run(
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
     chart = without_differences(chart)  # few rows are balanced where all may not be
     least = cost_of_place(run, x, tables)
-    middle, radius = cube(run.cost.kinds, run.cost.data, x)
+    middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
     far = not bound_to and _reaches_infinity(run)
     most, eps = max(COARSEST, eps), equal_within(eps, least, _blur(run, chart, x, far, tables))
@@ -276,12 +276,12 @@ def prove_run(
 @compiled
 def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables) -> float:
     """Return a bound of the rounding errors of a residual (its length) at a fix, and in the atlas of all positions."""
-    middle, radius = cube(run.cost.kinds, run.cost.data, x)
+    middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
     space = Space(False, atlas, chart, none, none)
     cost_at_coordinates(run, space, tables, 0, np.zeros(3))
-    noise = blur_beside(run, space, tables, floor_of(space, run.cost))
-    return float(max(noise, digits_of(run.rows) * accuracy_floor_far(run.cost, atlas)) if far else noise)
+    noise = rounding_at_place(run, space, tables, floor_of(space, run.cost))
+    return float(max(noise, relative_rounding_of(run.rows) * accuracy_floor_far(run.cost, atlas)) if far else noise)
 
 
 @compiled
@@ -333,7 +333,7 @@ def _prove_near(
     if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
         return OPEN, 0, -inf
     for side in range(1 if alone else SIDES):
-        chart = around if side == 0 else turned(run.look, around, side)
+        chart = around if side == 0 else axes_of_next_piece(run.look, around, side)
         if side > 0:
             corners[0], corners[1] = -inf, inf
         if bent:
@@ -400,8 +400,8 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
             if verdict[i] != OPEN or not whole[i]:
                 break
 
-    if usable(prove_run, n):
-        mapped(prove, range(n))
+    if may_use_code(prove_run, n):
+        map_on_threads(prove, range(n))
     else:
         verdict[:], bound[:] = BUDGET, -inf
     return without_rivals(verdict, boxes, bound, whole, asked, found)
@@ -409,7 +409,7 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
 
 def runs_lack_code(costs: Runs | CourseCosts, count: int) -> bool:
     """Return whether proofs of so many long problems were left because there is no machine code of them yet."""
-    return enabled() and not usable(prove_run if isinstance(costs, Runs) else prove_course, count)
+    return enabled() and not may_use_code(prove_run if isinstance(costs, Runs) else prove_course, count)
 
 
 def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
@@ -420,7 +420,7 @@ def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
         for p, place in enumerate(plainly(x[i])):
             out[0, i, p] = cost_of_place(run, place, tables)
             floor = accuracy_floor(run.cost.kinds, run.cost.data, run.cost.weight, run.cost.w, tables.box.centre, LINES)
-            out[1, i, p] = blur_of(run.rows, floor, tables.box.nodes)
+            out[1, i, p] = rounding_of_residual(run.rows, floor, tables.box.nodes)
     return out[0], out[1]
 
 
@@ -451,8 +451,8 @@ def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
         )
         found[i] = state_off(ground, another) if over_ground(ground) else another
 
-    if usable(prove_course, n):
-        mapped(prove, range(n))
+    if may_use_code(prove_course, n):
+        map_on_threads(prove, range(n))
     return without_rivals(verdict, boxes, bound, np.zeros(n, np.bool_), asked, found)
 
 

@@ -28,7 +28,7 @@ from optloc.proof.curvature import (
     G0,
     LENGTH0,
     NOISE0,
-    entry,
+    symmetric_entry,
 )
 from optloc.proof.nodes.node import (
     CHI,
@@ -101,7 +101,7 @@ class RunWorkspace(NamedTuple):
 
 
 @compiled
-def sheet_of(rows: RunRows) -> RunWorkspace:
+def workspace_of(rows: RunRows) -> RunWorkspace:
     """Return working memory for rows."""
     q, J = rows.w.shape[0], rows.weight.shape[0]
     return RunWorkspace(np.empty(q), np.empty(J), np.empty((3, q)), np.empty((3, J)), np.empty(J), np.empty(q))
@@ -118,7 +118,7 @@ def multiply(rows: RunRows, values: Array, out: Array) -> None:
 
 
 @compiled
-def pull_back(rows: RunRows, values: Array, out: Array) -> None:
+def multiply_transposed(rows: RunRows, values: Array, out: Array) -> None:
     """Write ``S'values``."""
     out[:] = 0.0
     for i in range(values.shape[0]):
@@ -128,7 +128,7 @@ def pull_back(rows: RunRows, values: Array, out: Array) -> None:
 
 
 @compiled
-def project(rows: RunRows, values: Array) -> None:
+def project_out_unknowns(rows: RunRows, values: Array) -> None:
     """Take off values (q,) what other unknowns can change."""
     for _ in range(2):  # twice is exact (Parlett)
         for k in range(rows.basis.shape[0]):
@@ -152,7 +152,7 @@ def greatest_length(rows: RunRows, values: Array, out: Array) -> float:
 
 
 @compiled
-def blur_of(rows: RunRows, floor: float, nodes: Array) -> float:
+def rounding_of_residual(rows: RunRows, floor: float, nodes: Array) -> float:
     """Return a bound of the rounding errors of a residual (its length).
 
     Parameters
@@ -167,11 +167,11 @@ def blur_of(rows: RunRows, floor: float, nodes: Array) -> float:
     size = floor
     for j in range(nodes.shape[0]):
         size += rows.weight[j] * (abs(nodes[j, PHI]) + abs(nodes[j, LOW]) + abs(nodes[j, HIGH]))
-    return digits_of(rows) * size
+    return relative_rounding_of(rows) * size
 
 
 @compiled
-def digits_of(rows: RunRows) -> float:
+def relative_rounding_of(rows: RunRows) -> float:
     """Return the relative rounding error of sums over nodes and rows: one a term, and 32 within a node."""
     return float((_WITHIN + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
 
@@ -191,10 +191,10 @@ def residual_at(rows: RunRows, nodes: Array, sheet: RunWorkspace) -> float:
         for n in range(rows.start[i], rows.start[i + 1]):
             value += rows.factor[n] * nodes[rows.column[n], PHI]
         e[i] = value
-    project(rows, e)
+    project_out_unknowns(rows, e)
     for i in range(e.shape[0]):
         total += e[i] * e[i]
-    pull_back(rows, e, sheet.force)
+    multiply_transposed(rows, e, sheet.force)
     return total
 
 
@@ -207,7 +207,7 @@ def is_balanced(rows: RunRows, ones: Array, out: Array) -> bool:
     """Return whether equal changes of some nodes (J,) change no row but by what the other unknowns explain."""
     size = greatest_length(rows, ones, out)
     multiply(rows, ones, out)
-    project(rows, out)
+    project_out_unknowns(rows, out)
     left = 0.0
     for i in range(out.shape[0]):
         left += out[i] * out[i]
@@ -295,24 +295,24 @@ def sum_up_rows(
     """
     sums[:] = 0.0
     residual, lines, pulls, q = sheet.residual, sheet.lines, sheet.pulls, rows.w.shape[0]
-    longest, share = 0.0, digits_of(rows)
+    longest, share = 0.0, relative_rounding_of(rows)
     for i in range(q):
         longest += residual[i] * residual[i]
     longest = sqrt(longest)
     for k in range(3):
         multiply(rows, nodes[:, SLOPE0 + k], lines[k])
-        project(rows, lines[k])
-        pull_back(rows, lines[k], pulls[k])
+        project_out_unknowns(rows, lines[k])
+        multiply_transposed(rows, lines[k], pulls[k])
     for k in range(3):
         for m in range(k, 3):
             total = 0.0
             for i in range(q):
                 total += lines[k, i] * lines[m, i]
-            sums[entry(k, m)] = total
+            sums[symmetric_entry(k, m)] = total
         total = 0.0
         for i in range(q):
             total += lines[k, i] * residual[i]
-        sums[G0 + k], sums[LENGTH0 + k] = total, sqrt(sums[entry(k, k)])
+        sums[G0 + k], sums[LENGTH0 + k] = total, sqrt(sums[symmetric_entry(k, k)])
     for j in range(nodes.shape[0]):
         for k in range(6):
             sums[k] += sheet.force[j] * curves[j, k]
@@ -336,11 +336,13 @@ def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None
         for b in range(a, 3):
             change = 0.0
             for k in range(3):
-                turn = third[k, entry(a, b)] + third[a, entry(k, b)] + third[b, entry(k, a)]
+                turn = (
+                    third[k, symmetric_entry(a, b)] + third[a, symmetric_entry(k, b)] + third[b, symmetric_entry(k, a)]
+                )
                 change += half[k] * abs(turn)
             # The rounding of J'J counts as change, twice: for the mean over a line half of a change counts.
             blur = sums[LENGTH0 + a] * sums[BLUR0 + b] + sums[LENGTH0 + b] * sums[BLUR0 + a]
-            sums[C00 + entry(a, b)] = change + 2.0 * blur
+            sums[C00 + symmetric_entry(a, b)] = change + 2.0 * blur
 
 
 @compiled

@@ -10,8 +10,8 @@ import numpy as np
 
 from optloc.base.linalg import project_out, span_of
 from optloc.base.types import Array
-from optloc.kernels.jit import plain, usable
-from optloc.linear.normal import prior_parts, weighed
+from optloc.kernels.jit import may_use_code, plain
+from optloc.linear.normal import prior_parts, with_station_noise
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.proof.batch import plainly
@@ -98,7 +98,7 @@ class Runs:
 
 def run_costs(problem: Problem) -> Runs:
     """Return the costs of a flat batch of N long problems over the position."""
-    problem, count = weighed(problem), problem.batch_shape[0]
+    problem, count = with_station_noise(problem), problem.batch_shape[0]
     with _quickest(count):
         costs = [_run_cost(problem.take(np.array([i]))) for i in range(count)]
     return Runs(tuple(run for run, _ in costs), np.array([level for _, level in costs]))
@@ -106,13 +106,13 @@ def run_costs(problem: Problem) -> Runs:
 
 def _quickest(count: int) -> AbstractContextManager[None]:
     """Return a context with plain kernels, unless machine code is at hand or worth its compilation."""
-    return nullcontext() if usable(cost_of, count) else plain()
+    return nullcontext() if may_use_code(cost_of, count) else plain()
 
 
 def few_costs(problem: Problem) -> PositionCosts:
     """Return the cost of few rows of one long problem, a batch of one."""
     with _quickest(1):
-        run, level = _run_cost(weighed(problem))
+        run, level = _run_cost(with_station_noise(problem))
     look = run.look
     return PositionCosts(look.kinds, look.data[None], look.K[None], look.w[None], np.array([level]))
 
@@ -178,7 +178,7 @@ class CourseCosts:
 
 def course_costs(problem: Problem) -> CourseCosts:
     """Return the costs of a flat batch of N problems over position and velocity, all else at its best values."""
-    problem = weighed(problem)
+    problem = with_station_noise(problem)
     costs = [_course_cost(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
     return CourseCosts(tuple(courses for courses, _ in costs), np.array([level for _, level in costs]))
 

@@ -18,31 +18,31 @@ from optloc.proof.atlas import set_centre
 from optloc.proof.box import (
     PIECE,
     cost_at,
+    exceeds_level,
     least_left,
     least_residual,
     linearise_rows,
     pop,
     push_halves,
-    reaches,
+    reset_cut,
     steepest_side,
-    uncut,
 )
 from optloc.proof.convex_boxes import is_known
 from optloc.proof.curvature import has_no_infimum
 from optloc.proof.descents import damped_step
-from optloc.proof.near import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, Goal
+from optloc.proof.local_search import ANOTHER, CHEAPER, CLEAR, INFINITE, SPENT, Goal
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
 from optloc.proof.pieces import is_listed
 from optloc.proof.runs.rows import (
     RunWorkspace,
-    blur_of,
     least_length,
     multiply,
-    project,
+    project_out_unknowns,
     residual_at,
-    sheet_of,
+    rounding_of_residual,
     sum_up_rows,
+    workspace_of,
 )
 from optloc.proof.runs.run_costs import RunCost
 from optloc.proof.search_space import (
@@ -66,7 +66,7 @@ def tables_of(run: RunCost) -> RunTables:
     """Return tables for a run."""
     box = empty_box(0, run.cost.kinds.shape[0])
     box.lean[:], box.graph[:] = 0.0, 0.0  # which only a surface writes
-    return RunTables(empty_box(run.look.K.shape[0], run.look.K.shape[1]), box, sheet_of(run.rows))
+    return RunTables(empty_box(run.look.K.shape[0], run.look.K.shape[1]), box, workspace_of(run.rows))
 
 
 @compiled
@@ -80,7 +80,7 @@ def sum_at(run: RunCost, space: Space, tables: RunTables, floor: float) -> tuple
         return inf, inf
     set_curves(space, run.cost, box)
     here = residual_at(run.rows, box.nodes, sheet)
-    noise = blur_of(run.rows, floor, box.nodes)
+    noise = rounding_of_residual(run.rows, floor, box.nodes)
     return here, sum_up_rows(run.rows, box.half, box.nodes, box.curves, noise, sheet, box.sums)
 
 
@@ -90,7 +90,7 @@ def sum_at(run: RunCost, space: Space, tables: RunTables, floor: float) -> tuple
 # dropped by few as well.
 _WORTH = 4.0
 # The test for stationary points is made where the cost at the centre is within so many levels, as in
-# `optloc.proof.everywhere`; and boxes at infinity are not split below a size.
+# `optloc.proof.global_search`; and boxes at infinity are not split below a size.
 _NEAR, _TINY = 100.0, 1e-5
 # Boxes on the stack: pieces, slabs around known minima, and one for each halving of the deepest.
 CAPACITY = 4096
@@ -131,7 +131,7 @@ def search_run(
     Returns
     -------
     outcome, boxes, bound
-        As of `optloc.proof.everywhere.search_everywhere`.
+        As of `optloc.proof.global_search.search_globally`.
     """
     look, small, d, boxes, looks, lows = run.look, tables.small, found.shape[0], 0, 0, 0
     floors = floor_of(space, look), floor_of(space, run.cost)
@@ -148,7 +148,7 @@ def search_run(
             continue
         linearise_rows(look.K, look.w, small.nodes, small.rows)
         low = least_residual(look.K, look.weight, floors[0], small.half, small.nodes, small.rows)
-        if reaches(low, aim.level):
+        if exceeds_level(low, aim.level):
             continue
         side = steepest_side(small.half, small.rows, d)
         if cost_at(look.K, look.w, small.nodes) < _WORTH * (aim.level + 1.0):
@@ -187,13 +187,13 @@ def _is_done(
     floor: float,
 ) -> bool:
     """Return whether a box that has a cost at its centre and a bound need not be split."""
-    if reaches(low, aim.level):
+    if exceeds_level(low, aim.level):
         return True
-    if not (aim.whole or reaches(low, aim.value)) or not here < _NEAR * (aim.level + 1.0):
+    if not (aim.whole or exceeds_level(low, aim.value)) or not here < _NEAR * (aim.level + 1.0):
         return False
     box, d = tables.box, space.atlas.dimension if space.far else 3
     _, ball = sum_at(run, space, tables, floor)
-    uncut(box.half, box.cut)
+    reset_cut(box.half, box.cut)
     return has_no_infimum(d, touching, box.half, box.sums, ball, box.cut, box.solve)
 
 
@@ -217,9 +217,9 @@ def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: f
     here = residual_at(rows, box.nodes, sheet)
     if here < level:  # no bound will do
         return here, -1.0
-    noise, slip = blur_of(rows, floor, box.nodes), box.graph[SLIP]
+    noise, slip = rounding_of_residual(rows, floor, box.nodes), box.graph[SLIP]
     low = least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, False) - noise
-    if reaches(low, level):
+    if exceeds_level(low, level):
         return here, low
     set_curves(space, run.cost, box)
     return here, max(low, least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, True) - noise)
@@ -244,7 +244,7 @@ def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found
         for k in range(d):
             u[k] = space.atlas.place[1 + k]
     now, damping, floor = cost_at_coordinates(run, space, tables, home, u), 1e-3, floor_of(space, run.cost)
-    noise = blur_beside(run, space, tables, floor)
+    noise = rounding_at_place(run, space, tables, floor)
     for _ in range(_STEPS):
         length = _step(box, damping)
         if not length >= 0.0:
@@ -257,7 +257,7 @@ def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found
         inside = inside and not (face and not u[d - 1] > 0.0)
         after = cost_at_coordinates(run, space, tables, home, u) if inside else inf
         if after <= now + noise * (2.0 * sqrt(now) + noise):
-            now, damping, noise = after, 0.1 * damping, blur_beside(run, space, tables, floor)
+            now, damping, noise = after, 0.1 * damping, rounding_at_place(run, space, tables, floor)
             if length < _CLOSE * _CLOSE + noise * noise:
                 place_of(space, box, found)
                 known = is_listed(space.atlas, found) if space.far else is_known(u, box.half, space.minima, space.sides)
@@ -280,17 +280,17 @@ def cost_at_coordinates(run: RunCost, space: Space, tables: RunTables, home: int
 
 
 @compiled
-def blur_beside(run: RunCost, space: Space, tables: RunTables, floor: float) -> float:
+def rounding_at_place(run: RunCost, space: Space, tables: RunTables, floor: float) -> float:
     """Return a bound of the rounding errors of a residual (its length) at a place whose nodes are bounded.
 
-    On a surface that of the height as well, see `optloc.proof.search_space.blur_at`.
+    On a surface that of the height as well, see `optloc.proof.search_space.rounding_at_centre`.
     """
     box, values, total = tables.box, tables.sheet.length, 0.0
     multiply(run.rows, box.lean, values)  # zero but on a surface
-    project(run.rows, values)
+    project_out_unknowns(run.rows, values)
     for value in values:
         total += value * value
-    return float(blur_of(run.rows, floor, box.nodes) + sqrt(total) * box.graph[SLIP])
+    return float(rounding_of_residual(run.rows, floor, box.nodes) + sqrt(total) * box.graph[SLIP])
 
 
 @compiled

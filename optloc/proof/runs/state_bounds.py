@@ -13,11 +13,11 @@ from optloc.proof.batch import plainly
 from optloc.proof.nodes.node import HIGH, LOW, SLOPE0
 from optloc.proof.runs.ground import errors_of
 from optloc.proof.runs.rows import (
-    digits_of,
     greatest_length,
     multiply,
-    project,
-    pull_back,
+    multiply_transposed,
+    project_out_unknowns,
+    relative_rounding_of,
     residual_at,
 )
 from optloc.proof.runs.states import STATE, ConstantVelocityCost, StateAxes, StateTable, set_bends, set_box, table_of
@@ -36,7 +36,7 @@ def set_lines(course: ConstantVelocityCost, table: StateTable) -> None:
                 for i in range(d):
                     values[j] += table.nodes[j, SLOPE0 + i] * table.lever[k, i, m]
         multiply(course.rows, values, table.lines[m])
-        project(course.rows, table.lines[m])
+        project_out_unknowns(course.rows, table.lines[m])
 
 
 # Bounds of the residual over a box.
@@ -55,7 +55,7 @@ def _reach(course: ConstantVelocityCost, table: StateTable, direction: Array, cu
         total += direction[i] * table.sheet.residual[i]
     if not length > 0.0:
         return -1.0
-    pull_back(course.rows, direction, force)
+    multiply_transposed(course.rows, direction, force)
     table.along[:], table.solve[:] = 0.0, 0.0
     for k in range(course.since.shape[0]):
         lever = table.lever[k]
@@ -124,14 +124,14 @@ def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tup
     and Jacobian are set, `noise` is the rounding of a residual.
     """
     rows, sheet, lines, pulls, n = course.rows, table.sheet, table.lines, table.pulls, table.at.shape[0]
-    pull_back(rows, sheet.residual, sheet.force)
+    multiply_transposed(rows, sheet.residual, sheet.force)
     longest, widest = 0.0, 0.0
     for value in sheet.residual:
         longest += value * value
     longest = sqrt(longest)
     table.hessian[:] = 0.0
     for m in range(n):
-        pull_back(rows, lines[m], pulls[m])
+        multiply_transposed(rows, lines[m], pulls[m])
         table.slope[m] = 0.0
         for i in range(lines.shape[1]):
             table.slope[m] += lines[m, i] * sheet.residual[i]
@@ -148,7 +148,7 @@ def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tup
             n
         ):  # the rounding of J'J counts as change, twice: for the mean over a line half of it counts
             table.change[m, other] += 4.0 * sqrt(widest) * blur
-    ball = _rest(course, table, noise + digits_of(rows) * longest)
+    ball = _rest(course, table, noise + relative_rounding_of(rows) * longest)
     return ball, sqrt(widest) * noise + blur * (longest + noise)
 
 
@@ -163,7 +163,7 @@ def _blur_of_lines(course: ConstantVelocityCost, table: StateTable) -> float:
                 for i in range(table.lever.shape[1]):
                     total += course.rows.weight[j] * abs(table.nodes[j, SLOPE0 + i] * table.lever[k, i, m])
         most = max(most, total)
-    return float(digits_of(course.rows) * most + missed)
+    return float(relative_rounding_of(course.rows) * most + missed)
 
 
 @compiled

@@ -10,8 +10,8 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, zero
 from optloc.kernels.systems import invert
-from optloc.proof.box import reaches
-from optloc.proof.near import (
+from optloc.proof.box import exceeds_level
+from optloc.proof.local_search import (
     ANOTHER,
     BETTER,
     BUDGET,
@@ -25,7 +25,7 @@ from optloc.proof.near import (
     VALUE,
     Goal,
 )
-from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.rows import residual_at, rounding_of_residual
 from optloc.proof.runs.state_bounds import has_no_minimum, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import (
     SHIFT,
@@ -111,13 +111,13 @@ def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: i
         if where < 0 or _is_known(search, small.at, small.half):
             continue
         here, low = _look(search.few, axes, small, search.floors[1], aim.level)
-        if reaches(low, aim.level):
+        if exceeds_level(low, aim.level):
             continue
         if here < _WORTH * (aim.level + 1.0):
             boxes += 1
             put(table, small.at, small.half)
             here, low = _look(search.whole, axes, table, search.floors[0], aim.level)
-            if reaches(low, aim.level):
+            if exceeds_level(low, aim.level):
                 continue
             inside = _is_inside(axes, table.at, found)
             if inside and here < aim.better:
@@ -142,12 +142,12 @@ def _look(
     """Return the cost at the centre of a box that is set and a lower bound of the residual over it."""
     set_box(course, axes, table)
     here = residual_at(course.rows, table.nodes, table.sheet)
-    noise = blur_of(course.rows, floor, table.nodes)
+    noise = rounding_of_residual(course.rows, floor, table.nodes)
     set_lines(course, table)
     if here < level:  # no bound will do
         return here, -1.0
     low = least_length(course, table, here, False) - noise
-    if reaches(low, level):
+    if exceeds_level(low, level):
         return here, low
     set_bends(course, axes, table)
     return here, max(low, least_length(course, table, here, True) - noise)
@@ -156,7 +156,7 @@ def _look(
 @compiled
 def _curve(search: Search, table: StateTable) -> tuple[float, float]:
     """Fill the sums of a box that was looked at with all rows, see `sum_up`."""
-    noise = blur_of(search.whole.rows, search.floors[0], table.nodes)
+    noise = rounding_of_residual(search.whole.rows, search.floors[0], table.nodes)
     set_bends(search.whole, search.axes, table)
     return sum_up(search.whole, table, noise)
 
@@ -244,7 +244,7 @@ def _descends(search: Search, level: float, found: Array) -> bool:
     table = search.table
     before, damping = table.at.copy(), 1e-3
     now = _linearise(search, table)
-    noise = blur_of(search.whole.rows, search.floors[0], table.nodes)
+    noise = rounding_of_residual(search.whole.rows, search.floors[0], table.nodes)
     for _ in range(_STEPS):
         length = _step(table, damping)
         if not length >= 0.0:
@@ -362,7 +362,7 @@ def prove_course(
     budget: int,
     found: Array,
 ) -> tuple[int, int, float]:
-    """Prove of a course what `optloc.proof.near.prove` proves of a cost, within a region.
+    """Prove of a course what `optloc.proof.local_search.prove_locally` proves of a cost, within a region.
 
     Parameters
     ----------
@@ -389,7 +389,7 @@ def prove_course(
     floors = floor_of(whole, x), floor_of(few, x)
     search = Search(whole, few, axes, table, small, floors, room[0], room[1])
     least = _linearise(search, table)
-    most, eps = max(COARSEST, eps), equal_within(eps, least, blur_of(whole.rows, floors[0], table.nodes))
+    most, eps = max(COARSEST, eps), equal_within(eps, least, rounding_of_residual(whole.rows, floors[0], table.nodes))
     if not eps <= most:
         return COARSE, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps

@@ -17,16 +17,16 @@ from optloc.base.types import Array
 from optloc.kernels.jit import compiled
 from optloc.models.primitives import WGS84_A
 from optloc.proof.box import bound_nodes
-from optloc.proof.curvature import curve_nodes, entry
-from optloc.proof.nodes.node import CHI, CURVE_WIDTH, H00, HIGH, LOW, NODE_WIDTH, SLOPE0, TURN0, triple, write
+from optloc.proof.curvature import curve_nodes, symmetric_entry
+from optloc.proof.nodes.node import CHI, CURVE_WIDTH, H00, HIGH, LOW, NODE_WIDTH, SLOPE0, TURN0, triple_at, write_triple
 from optloc.proof.runs.ground import (
     FIRST_ORDER,
     SECOND_ORDER,
     Ground,
-    bends_of,
-    carried,
+    curvature_bounds,
     errors_of,
     over_ground,
+    place_over_ground,
     set_reached,
     set_second,
     set_starts,
@@ -35,11 +35,11 @@ from optloc.proof.runs.ground import (
 from optloc.proof.runs.rows import (
     RunRows,
     RunWorkspace,
-    blur_of,
     norm_of,
     residual_at,
+    rounding_of_residual,
     share_within,
-    sheet_of,
+    workspace_of,
 )
 from optloc.proof.search_space import accuracy_floor
 
@@ -183,7 +183,7 @@ def table_of(course: ConstantVelocityCost) -> StateTable:
         np.zeros((J, CURVE_WIDTH)),
         np.zeros((J, n, n)),
         np.zeros((J, 3)),
-        sheet_of(course.rows),
+        workspace_of(course.rows),
         np.zeros((n, q)),
         np.zeros((n, J)),
         vectors[3],
@@ -260,7 +260,7 @@ def _carry(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> 
             size += abs(axes.turn[i, m]) * (abs(table.at[m]) + table.half[m])
         if half[i] > 0.0:
             half[i] += WIDER * half[i] + SHIFT * STATE * size
-    _, table.limits[0], table.limits[1], table.limits[2] = bends_of(ground, state, half)
+    _, table.limits[0], table.limits[1], table.limits[2] = curvature_bounds(ground, state, half)
     blur, _ = errors_of(table.limits[2])
     set_starts(ground, state, 0, FIRST_ORDER, table.starts)
     for k in range(course.since.shape[0]):
@@ -342,7 +342,7 @@ def _pull_back(curve: Array, lever: Array, out: Array) -> None:
         for i in range(d):
             along = 0.0
             for k in range(d):
-                along += curve[H00 + entry(i, k)] * lever[k, m]
+                along += curve[H00 + symmetric_entry(i, k)] * lever[k, m]
             for other in range(m, n):
                 out[other, m] += along * lever[i, other]
 
@@ -421,10 +421,12 @@ def cost_of_state(course: ConstantVelocityCost, state: Array) -> tuple[float, fl
         if d == 3:
             time = course.since[k]
             way = (time * state[3], time * state[4], time * state[5])
-            write(carried(course.ground, triple(state, 0), way, course.ground.rise[k]), table.places[k, 0])
+            write_triple(
+                place_over_ground(course.ground, triple_at(state, 0), way, course.ground.rise[k]), table.places[k, 0]
+            )
     _bound(course, table)
     cost = residual_at(course.rows, table.nodes, table.sheet)
-    return cost, blur_of(course.rows, floor_of(course, state), table.nodes)
+    return cost, rounding_of_residual(course.rows, floor_of(course, state), table.nodes)
 
 
 @compiled

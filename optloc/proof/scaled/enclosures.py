@@ -12,7 +12,7 @@ from optloc.kernels.systems import invert
 from optloc.proof.box import reaches_infinity
 from optloc.proof.enclosure import SLACK, around_node
 from optloc.proof.groups import NONE, empty_groups
-from optloc.proof.near import region_of
+from optloc.proof.local_search import region_of
 from optloc.proof.nodes.node import LOG_RANGE, RANGE
 from optloc.proof.scaled.reduction import Scaled
 from optloc.proof.search_space import Cost, LocalAxes, chart_at, cost_of, empty_box

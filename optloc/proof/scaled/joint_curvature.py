@@ -14,10 +14,17 @@ from math import inf, sqrt
 
 from optloc.kernels.jit import compiled, inlined
 from optloc.kernels.systems import positive_along
-from optloc.proof.box import digits, is_empty, uncut
-from optloc.proof.curvature import C00, G0, LENGTH0, NOISE0, bends_down, clip_newton, entry
+from optloc.proof.box import is_empty, relative_rounding, reset_cut
+from optloc.proof.curvature import C00, G0, LENGTH0, NOISE0, contract_newton, is_concave_along, symmetric_entry
 from optloc.proof.nodes.node import CHI, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, SLOPE0, TURN0
-from optloc.proof.scaled.reduction import Scaled, ScaledWorkspace, blur_of, is_bounded, is_positive, size_of_factor
+from optloc.proof.scaled.reduction import (
+    Scaled,
+    ScaledWorkspace,
+    is_bounded,
+    is_positive,
+    rounding_of_residual,
+    size_of_factor,
+)
 from optloc.proof.search_space import Box
 
 # Share of the information that its rounding is below: sums over some tens of rows and nodes.
@@ -46,7 +53,7 @@ def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) 
     for j in range(box.nodes.shape[0]):
         if not (box.nodes[j, HIGH] - box.nodes[j, LOW] < inf and box.curves[j, CHI] < inf):
             return inf
-    noise = blur_of(scaled, sheet)
+    noise = rounding_of_residual(scaled, sheet)
     box.sums[:], sheet.cross[:], sheet.third[:] = 0.0, 0.0, 0.0
     _derive(scaled, noise, box, sheet)
     _add_information(scaled, noise, box, sheet)
@@ -165,16 +172,16 @@ def _set_turn(scaled: Scaled, j: int, box: Box, sheet: ScaledWorkspace) -> None:
 @inlined
 def _add_information(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Add ``E'E`` and the gradient to the sums, and their rounding to the bounds of change."""
-    sums, E, weight, share, longest = box.sums, sheet.E, scaled.cost.weight, digits(scaled.cost.K), 0.0
+    sums, E, weight, share, longest = box.sums, sheet.E, scaled.cost.weight, relative_rounding(scaled.cost.K), 0.0
     for i in range(E.shape[0]):
         longest += sheet.w[i] * sheet.w[i]
         for k in range(3):
             sums[G0 + k] -= E[i, k] * sheet.w[i]
             for m in range(k, 3):
-                sums[entry(k, m)] += E[i, k] * E[i, m]
+                sums[symmetric_entry(k, m)] += E[i, k] * E[i, m]
     longest = sqrt(longest)
     for k in range(3):
-        sums[LENGTH0 + k] = sqrt(sums[entry(k, k)])
+        sums[LENGTH0 + k] = sqrt(sums[symmetric_entry(k, k)])
     for k in range(3):
         blur = 0.0
         for j in range(weight.shape[0]):
@@ -184,13 +191,13 @@ def _add_information(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorksp
             blur += share * weight[j] * size
         sums[NOISE0 + k] = sums[LENGTH0 + k] * noise + blur * (longest + noise)
         for m in range(3):
-            sums[C00 + entry(k, m)] += 2.0 * blur * (sums[LENGTH0 + m] + blur)
+            sums[C00 + symmetric_entry(k, m)] += 2.0 * blur * (sums[LENGTH0 + m] + blur)
 
 
 @inlined
 def _second(scaled: Scaled, j: int, k: int, m: int, box: Box, sheet: ScaledWorkspace) -> float:
     """Return the second derivative along two offsets of a node times its factor."""
-    own, g = factor_of(scaled, sheet, j) * box.curves[j, entry(k, m)], scaled.group[j]
+    own, g = factor_of(scaled, sheet, j) * box.curves[j, symmetric_entry(k, m)], scaled.group[j]
     if g < 0:
         return float(own)
     p = box.nodes[j]
@@ -227,7 +234,7 @@ def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorks
     whole = abs(force) + linear + rest
     for k in range(3):
         for m in range(k, 3):
-            at, second = entry(k, m), _second(scaled, j, k, m, box, sheet)
+            at, second = symmetric_entry(k, m), _second(scaled, j, k, m, box, sheet)
             sums[at] += force * second
             sums[C00 + at] += rest * abs(second)
             for n in range(3 + G):
@@ -282,7 +289,7 @@ def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace
                     for other in range(A.shape[0]):
                         change += abs(A[j, other]) * turn[j, k] * turn[other, m]
                 if m < 3:
-                    sums[C00 + entry(k, m)] += change
+                    sums[C00 + symmetric_entry(k, m)] += change
                 else:
                     sheet.cross[m - 3, k] += change
                     if k >= 3 and k != m:
@@ -318,14 +325,20 @@ def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: ScaledWorks
 def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
     """Clip a box to where a minimum with a short residual may be; or return False for no such place.
 
-    Interval Newton in the offsets, as `optloc.proof.curvature.clip_to_minima`. The coordinates of the factors of a
+    Interval Newton in the offsets, as `optloc.proof.curvature.contract_to_minima`. The coordinates of the factors of a
     stationary point are as far from zero as the entries of their rows change.
     """
-    uncut(box.half, box.cut)
+    reset_cut(box.half, box.cut)
     ball = sum_scaled(scaled, True, box, sheet)
     if not ball < inf:
         return True
-    sums, cross, reach, noise, G = box.sums, sheet.cross, sheet.reach, blur_of(scaled, sheet), sheet.back.shape[0]
+    sums, cross, reach, noise, G = (
+        box.sums,
+        sheet.cross,
+        sheet.reach,
+        rounding_of_residual(scaled, sheet),
+        sheet.back.shape[0],
+    )
     for _ in range(_ROUNDS):
         for g in range(G):
             own = 0.0
@@ -335,8 +348,8 @@ def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
     for k in range(3):
         for g in range(G):
             sums[NOISE0 + k] += 0.5 * cross[g, k] * reach[3 + g]
-    clip_newton(box.half, sums, ball, box.cut, box.solve)
-    return not is_empty(box.cut) and not bends_down(sums, ball, box.solve)
+    contract_newton(box.half, sums, ball, box.cut, box.solve)
+    return not is_empty(box.cut) and not is_concave_along(sums, ball, box.solve)
 
 
 @compiled

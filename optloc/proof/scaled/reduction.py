@@ -25,7 +25,15 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined
-from optloc.proof.box import DIRECTION, ROW_WIDTH, digits, least_residual, linearise_rows, shrink, uncut
+from optloc.proof.box import (
+    DIRECTION,
+    ROW_WIDTH,
+    contract_box,
+    least_residual,
+    linearise_rows,
+    relative_rounding,
+    reset_cut,
+)
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, SLOPE0
 from optloc.proof.search_space import Box, Cost
 
@@ -127,7 +135,7 @@ class ScaledWorkspace(NamedTuple):
 
 
 @compiled
-def sheet_of(scaled: Scaled) -> ScaledWorkspace:
+def workspace_of(scaled: Scaled) -> ScaledWorkspace:
     """Return working memory for boxes of a cost."""
     q, J = scaled.cost.K.shape
     G = scaled.lift.shape[1]
@@ -304,7 +312,7 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) 
     So the greatest factors solve a system whose inverse has no negative entry, or they have priors.
     """
     G, least, most, spin = sheet.best.shape[0], sheet.least, sheet.most, sheet.spin
-    blur, bounded = digits(scaled.cost.K) * sheet.span[FLOOR], True
+    blur, bounded = relative_rounding(scaled.cost.K) * sheet.span[FLOOR], True
     least[:], most[:], spin[:] = -inf if scaled.free else 0.0, inf, rho + blur
     if not scaled.free:
         _bound_by_priors(scaled, rho, sheet)
@@ -528,7 +536,7 @@ def _has_signs(scaled: Scaled, sheet: ScaledWorkspace) -> bool:
             for i in range(sheet.K.shape[0]):
                 total += sheet.K[i, j] * sheet.rows[i, DIRECTION]
                 square += sheet.rows[i, DIRECTION] ** 2
-            good = good and -total > digits(sheet.K) * scaled.cost.weight[j] * sqrt(square)
+            good = good and -total > relative_rounding(sheet.K) * scaled.cost.weight[j] * sqrt(square)
     return good
 
 
@@ -580,16 +588,16 @@ def size_of(sheet: ScaledWorkspace) -> float:
 
 
 @inlined
-def blur_of(scaled: Scaled, sheet: ScaledWorkspace) -> float:
+def rounding_of_residual(scaled: Scaled, sheet: ScaledWorkspace) -> float:
     """Return a bound of the rounding errors of a residual (its length) in a box."""
-    return float(digits(scaled.cost.K) * size_of(sheet))
+    return float(relative_rounding(scaled.cost.K) * size_of(sheet))
 
 
 @compiled
 def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
     """Write the ends of what is left of a box where residuals may be shorter than rho; its rows are bounded."""
-    uncut(box.half, box.cut)
+    reset_cut(box.half, box.cut)
     if not is_bounded(sheet):
         return
-    noise, flat = blur_of(scaled, sheet), box.half[2] == 0.0
-    shrink(sheet.K, sheet.weight, rho + noise, box.half, flat, sheet.nodes, sheet.rows, box.cut, box.solve)
+    noise, flat = rounding_of_residual(scaled, sheet), box.half[2] == 0.0
+    contract_box(sheet.K, sheet.weight, rho + noise, box.half, flat, sheet.nodes, sheet.rows, box.cut, box.solve)

@@ -7,23 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.threads import mapped
+from optloc.base.threads import map_on_threads
 from optloc.base.types import Array
-from optloc.kernels.jit import compiled, enabled, plain, put, usable, worth_loading, zero
+from optloc.kernels.jit import compiled, enabled, may_use_code, plain, put, worth_loading, zero
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import Atlas, atlas_of, first_minima, with_minima
 from optloc.proof.batch import FIRST_BOXES, ProofRequest, ProofResult, empty_answer, plainly
-from optloc.proof.box import DEPTH, bound_nodes, cube, digits, push_around
+from optloc.proof.box import DEPTH, bound_nodes, push_around, relative_rounding, station_cube
 from optloc.proof.convex_boxes import accuracy_floor_far, widen_core
-from optloc.proof.everywhere import verdict_of
-from optloc.proof.near import BUDGET, COARSE, INFINITE, OPEN, STATIONARY
+from optloc.proof.global_search import verdict_of
+from optloc.proof.local_search import BUDGET, COARSE, INFINITE, OPEN, STATIONARY
 from optloc.proof.pieces import CAPACITY, push_pieces
 from optloc.proof.position_costs import costs_of_groups, costs_of_velocity, factors_of_rows, roots
 from optloc.proof.scaled.enclosures import first_enclosed, stays_finite
-from optloc.proof.scaled.reduction import HERE, Scaled, blur_of, reduce_rows
+from optloc.proof.scaled.reduction import HERE, Scaled, reduce_rows, rounding_of_residual
 from optloc.proof.scaled.scaled_search import (
     ScaledSearchWorkspace,
     ScaledTables,
@@ -165,7 +165,7 @@ def velocity_costs(problem: Problem) -> ScaledCosts:
 def prove_scaled(
     scaled: Scaled, x: Array, others: Array, gaps: Array, eps: float, budget: int, rivals: Array, found: Array
 ) -> tuple[int, int, float, float, int]:
-    """Prove of a cost with unknown factors what `optloc.proof.everywhere.prove_everywhere` proves of a cost.
+    """Prove of a cost with unknown factors what `optloc.proof.global_search.prove_globally` proves of a cost.
 
     Parameters
     ----------
@@ -187,14 +187,17 @@ def prove_scaled(
     look_at(scaled, tables.sheet, tables.near, tables.look)
     chart, good = chart_at(tables.look, x, tables.near)
     tables.near.at[:] = 0.0
-    least, noise = cost_near(scaled, chart, tables), blur_of(scaled, tables.sheet)
+    least, noise = cost_near(scaled, chart, tables), rounding_of_residual(scaled, tables.sheet)
     for g in range(scaled.lift.shape[1]):
         good = good and tables.sheet.best[g] > (-inf if scaled.free else 0.0)
     if not good:
         return STATIONARY, 0, -inf, gaps[0], 0
-    middle, radius = cube(cost.kinds, cost.data, x)
+    middle, radius = station_cube(cost.kinds, cost.data, x)
     atlas = atlas_of(middle, radius, D, (1 + (others.shape[0] if gaps[0] > 0.0 else 0)) if far else 0)
-    most, noise = max(COARSEST, eps), max(noise, digits(cost.K) * accuracy_floor_far(cost, atlas) if far else 0.0)
+    most, noise = (
+        max(COARSEST, eps),
+        max(noise, relative_rounding(cost.K) * accuracy_floor_far(cost, atlas) if far else 0.0),
+    )
     eps = equal_within(eps, least, noise)
     if not eps <= most:
         return COARSE, 0, -inf, gaps[0], 0
@@ -307,14 +310,14 @@ def prove_all_scaled(costs: ScaledCosts, asked: ProofRequest) -> ProofResult:
                 prove(i, few)
         # with more boxes a larger gap may be proven than with few, and minima may be met
         left = [i for i in left if out.boxes[i] >= few and asked.budget[i] > few]
-    if left and enabled() and usable(prove_scaled, n):
-        mapped(lambda i: prove(i, int(asked.budget[i])), left)
+    if left and enabled() and may_use_code(prove_scaled, n):
+        map_on_threads(lambda i: prove(i, int(asked.budget[i])), left)
     return out
 
 
 def scaled_lack_code(count: int) -> bool:
     """Return whether proofs ended early because there is no machine code of them yet."""
-    return enabled() and not usable(prove_scaled, count)
+    return enabled() and not may_use_code(prove_scaled, count)
 
 
 @compiled
@@ -333,7 +336,7 @@ def _evaluate(scaled: Scaled, x: Array, out: Array) -> None:
         floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, near.centre, LINES)
         reduce_rows(scaled, floor, near, tables.sheet)
         tables.sheet.most[:] = inf  # the best factors alone count
-        out[0, p], out[1, p] = tables.sheet.span[HERE], blur_of(scaled, tables.sheet)
+        out[0, p], out[1, p] = tables.sheet.span[HERE], rounding_of_residual(scaled, tables.sheet)
 
 
 def costs_at_scaled(costs: ScaledCosts, x: Array) -> tuple[Array, Array]:

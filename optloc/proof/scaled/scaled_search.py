@@ -8,22 +8,22 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.kernels.jit import compiled, inlined, with_constants, zero
-from optloc.proof.atlas import Atlas, home_of, infinity
+from optloc.kernels.jit import compiled, inlined, specialise, zero
+from optloc.proof.atlas import Atlas, infinity_coordinate, piece_of
 from optloc.proof.box import (
     PIECE,
     bound_nodes,
+    contract_box,
     cost_at,
+    exceeds_level,
     is_empty,
     least_residual,
     linearise_rows,
     pop,
-    reaches,
-    rounding,
+    reset_cut,
+    rounding_error,
     share_left,
-    shrink,
     steepest_side,
-    uncut,
     widest,
 )
 from optloc.proof.convex_boxes import is_known, set_axes, set_hull
@@ -34,7 +34,7 @@ from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import PHI
 from optloc.proof.pieces import (
     SHRUNK,
-    end_at_infinity,
+    contract_at_infinity,
     is_left,
 )
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled, slope_of
@@ -47,9 +47,18 @@ from optloc.proof.scaled.reduction import (
     clip_rows,
     is_bounded,
     reduce_rows,
-    sheet_of,
+    workspace_of,
 )
-from optloc.proof.search_space import Box, Cost, LocalAxes, cost_of, curve_at, empty_box, place, widen
+from optloc.proof.search_space import (
+    Box,
+    Cost,
+    LocalAxes,
+    cost_of,
+    curve_at,
+    empty_box,
+    widen_by_rounding,
+    write_centre,
+)
 from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, set_nodes, set_place
 
 
@@ -68,7 +77,7 @@ def tables_of(scaled: Scaled) -> ScaledTables:
     cost = scaled.cost
     q, J = cost.K.shape
     look = Cost(cost.kinds, cost.data, np.zeros((q, J)), np.zeros(q), cost.A, cost.weight, cost.groups)
-    return ScaledTables(empty_box(q, J), sheet_of(scaled), empty_box(q, J), look)
+    return ScaledTables(empty_box(q, J), workspace_of(scaled), empty_box(q, J), look)
 
 
 # The cost at a position, and descents.
@@ -93,7 +102,7 @@ def cost_near(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
     """Return the least cost over the factors at the centre of the box around a position; its sums are filled."""
     near, cost = tables.near, scaled.cost
     near.half[:] = 0.0
-    place(chart.origin, chart.sense, near.at, near.centre)
+    write_centre(chart.origin, chart.sense, near.at, near.centre)
     bound_nodes(cost.kinds, cost.data, near.centre, chart.sense, chart.gram, near.half, near.line, near.nodes)
     reduce_rows(scaled, chart.floor, near, tables.sheet)
     look_at(scaled, tables.sheet, near, tables.look)
@@ -191,7 +200,7 @@ def set_scaled_minimum(
     """
     minima, d, hull = atlas.minima, atlas.dimension, np.zeros(3)
     space, piece = in_atlas(atlas, chart), 2 * d + 1 + i
-    minima.home[i] = home_of(atlas, x, minima.start[i])
+    minima.home[i] = piece_of(atlas, x, minima.start[i])
     minima.axes[i, :], minima.back[i, :] = 0.0, 0.0
     for k in range(3):
         minima.axes[i, k, k] = minima.back[i, k, k] = 1.0
@@ -234,7 +243,7 @@ def set_near_minimum(
     margin = slope_of(tables.box, eps)
     if not _grow(scaled, tables, space, 0, at, hull, rho, margin, sides):
         return False
-    widen(space.chart, tables.box.centre, shift)
+    widen_by_rounding(space.chart, tables.box.centre, shift)
     for k in range(3):
         sides[k] = max(sides[k] - shift[k], 0.0)
     return True
@@ -323,19 +332,19 @@ def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
 def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
-    end_at_infinity(box, space.atlas.dimension - 1, infinity(space.atlas, piece) if space.far else -inf)
+    contract_at_infinity(box, space.atlas.dimension - 1, infinity_coordinate(space.atlas, piece) if space.far else -inf)
     set_box(space, box, piece)
     if is_left(space.atlas, box, piece) if space.far else is_known(box.at, box.half, space.minima, space.sides):
         return inf, inf
     least = _bound_rest(work, space, box)
-    if reaches(least, level):
+    if exceeds_level(least, level):
         return inf, inf
     set_nodes(space, scaled.cost, box)
     reduce_rows(scaled, work.floor, box, sheet)
     if not bound_factors(scaled, sqrt(max(level, 0.0)), box, sheet):
         return inf, inf
     low = max(bound_rows(scaled, box, sheet), least)
-    return (inf, inf) if reaches(low, level) else (low, sheet.span[HERE])
+    return (inf, inf) if exceeds_level(low, level) else (low, sheet.span[HERE])
 
 
 @compiled
@@ -366,12 +375,12 @@ def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho
 def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
     """Clip a box whose factors have no bound by the rows without factors; return what `side_of_rest` does."""
     rest, box = work.rest, work.box
-    uncut(box.half, box.cut)
+    reset_cut(box.half, box.cut)
     if rest.w.shape[0] == 0:
         return int(widest(box.half))
     rows, flat = box.rows[: rest.w.shape[0]], box.half[2] == 0.0
-    noise = rounding(rest.K, rest.weight, work.floor, box.nodes)
-    shrink(rest.K, rest.weight, rho + noise, box.half, flat, box.nodes, rows, box.cut, box.solve)
+    noise = rounding_error(rest.K, rest.weight, work.floor, box.nodes)
+    contract_box(rest.K, rest.weight, rho + noise, box.half, flat, box.nodes, rows, box.cut, box.solve)
     return -1 if is_empty(box.cut) else int(steepest_side(box.half, rows, d))
 
 
@@ -403,7 +412,7 @@ def _cost_set(work: ScaledSearchWorkspace, atlas: Atlas) -> float:
     return float(work.tables.sheet.span[HERE])
 
 
-search_scaled = with_constants(
+search_scaled = specialise(
     search_levels,
     "scaled",
     {

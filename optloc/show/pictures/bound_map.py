@@ -11,7 +11,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.bounds.over_area import BoundMap, Grid
 from optloc.show.pictures.outlines import feature, line_geometry, point_geometry
-from optloc.show.pictures.style import BLACK, GREY, apart, figure_class, literal
+from optloc.show.pictures.style import BLACK, GREY, figure_class, literal, separate_notes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,7 +114,7 @@ def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: 
     bar.ax.minorticks_off()
     if title:
         axes.set_title(literal(title), fontsize=11, wrap=True)
-    apart(figure)
+    separate_notes(figure)
     return figure
 
 

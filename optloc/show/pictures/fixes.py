@@ -33,12 +33,12 @@ from optloc.show.pictures.style import (
     YELLOW,
     PictureScene,
     View,
-    apart,
     figure_class,
     finish,
     local_frame,
     placed_points,
     scene_of,
+    separate_notes,
     unit_of,
     xy,
 )
@@ -118,7 +118,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     for panel in panels[:: len(panels) - 1] if near else panels[:1]:
         if panel.axison:
             style.scale_bar(panel, panel.get_xlabel().rpartition("(")[2].rstrip(")"))
-    apart(figure)
+    separate_notes(figure)
     return figure
 
 

@@ -20,11 +20,11 @@ from optloc.show.pictures.style import (
     PLAN,
     YELLOW,
     PictureScene,
-    apart,
     figure_class,
     finish,
     placed_points,
     scene_of,
+    separate_notes,
     unit_of,
 )
 from optloc.solvers.landscape import Basins, End, basins, profile_cost
@@ -89,7 +89,7 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
     _whole(whole, flat, answer, scene)
     _near(near, flat, answer, scene)
     finish(figure, title, (whole, near))
-    apart(figure)
+    separate_notes(figure)
     return figure
 
 
@@ -252,7 +252,7 @@ def plot_convergence(
     _legend(figure, panels[2])
     finish(figure, f"{title}: from which starts is the best fit found?" if title else "")
     _inset(panels[2], scene)
-    apart(figure)
+    separate_notes(figure)
     return figure
 
 

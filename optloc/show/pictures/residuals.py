@@ -11,7 +11,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
 from optloc.base.units import SI_UNIT
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import weighed
+from optloc.linear.normal import with_station_noise
 from optloc.models import MODELS
 from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
@@ -75,7 +75,7 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
         raise InvalidProblem("nothing was fixed, so there are no residuals", "plot", "see `optloc fix` for the reasons")
     part, vectors = flat.take(good), answers.x[good]
     residual = differentiate(part, vectors)[0]
-    sigma = np.broadcast_to(np.sqrt(variances(weighed(part, vectors).noise, part.count)), residual.shape)
+    sigma = np.broadcast_to(np.sqrt(variances(with_station_noise(part, vectors).noise, part.count)), residual.shape)
     weight = np.broadcast_to(part.weight, residual.shape)
     sets = [
         _sets(part, rows, rows.sense * residual[:, cols], sigma[:, cols], weight[:, cols])

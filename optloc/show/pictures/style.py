@@ -169,7 +169,7 @@ def scale_bar(panel: Axes, unit: str) -> None:
 # Notes that keep apart.
 
 
-def apart(figure: Figure) -> None:
+def separate_notes(figure: Figure) -> None:
     """Move the notes at points of a finished figure until none covers another or a mark, or leaves its panel.
 
     Each takes the first free place around its point; a note that finds none stands above it to the right.
@@ -543,13 +543,13 @@ def ellipses(panel: Axes, scene: PictureScene, view: View, size: float, **style:
         if region is not None:
             label = "95 % region, cut off" if region.cut else "95 % region"
         dashes = {"linestyle": ":"} if local[i] else {}
-        line = np.concatenate(around) if around else place + ring(covariance[np.ix_(view, view)])
+        line = np.concatenate(around) if around else place + ellipse_line(covariance[np.ix_(view, view)])
         if around or np.isfinite(line).all():
             panel.plot(*(line.T / size), **(look | dashes | {"label": None if label in seen else label}))
             seen.add(label)
 
 
-def ring(covariance: Array) -> Array:
+def ellipse_line(covariance: Array) -> Array:
     """Return the 95 % ellipse of a covariance (2, 2) about the origin as a closed line; NaN where there is none."""
     angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
     semi_axes, directions = error_ellipse(covariance)

@@ -20,10 +20,10 @@ from optloc.show.pictures.style import (
     PURPLE,
     SKY,
     YELLOW,
+    ellipse_line,
     figure_class,
     finish,
     literal,
-    ring,
     unit_of,
 )
 from optloc.tracking.entry import Entry
@@ -185,7 +185,7 @@ def _near(stations: Array, known: Array) -> Array:
 def _ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> None:
     known = np.flatnonzero(np.isfinite(line.cov).all((-1, -2)))
     for i in known[:: max(1, len(known) // _ELLIPSES)]:
-        edge = (line.position[i, :2] + ring(line.cov[i, :2, :2])) / size
+        edge = (line.position[i, :2] + ellipse_line(line.cov[i, :2, :2])) / size
         panel.plot(*edge.T, color=GREY, linewidth=0.8, zorder=2, label=label)
         label = None
 

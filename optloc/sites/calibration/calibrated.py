@@ -9,7 +9,6 @@ import numpy as np
 
 from optloc.engine import STRAIGHT
 from optloc.problem import PRECEDENCE, Array, InvalidProblem, NoSolution, Status, no_station, tail_probability
-from optloc.sites.calibration.agreement import AGREEING, NetworkSearchResult, frame_size, proven, search
 from optloc.sites.calibration.blocks import StationBlock, blocks, moved_pulses, place_pulses
 from optloc.sites.calibration.gauge import (
     GaugeRank,
@@ -22,10 +21,11 @@ from optloc.sites.calibration.gauge import (
     with_mean_clock,
 )
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
+from optloc.sites.calibration.multi_start import AGREEING, NetworkSearchResult, frame_size, proven, search
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.outliers import PRICE, outliers
-from optloc.sites.calibration.rounds import laid
-from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, REFUTED, Finding, objections
+from optloc.sites.calibration.restarts import laid
+from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, Finding, objections
 
 # Pulses that starts are made from: those with most rows. More find nothing that so many do not.
 _CORE = 60
@@ -400,7 +400,7 @@ _FINDINGS = (
     Finding(Status.CURVED, lambda e: e.departure > STRAIGHT, lambda e: [_curved_words(e.departure)]),
     Finding(
         Status.MISFIT,
-        lambda e: e.p < REFUTED,
+        lambda e: e.p < P_MISFIT,
         lambda e: [f"The residuals are larger than the stated noise allows: p = {e.p:.2g}."],
     ),
     Finding(

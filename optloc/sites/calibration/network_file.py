@@ -16,7 +16,6 @@ from optloc.files import (
     Table,
     Units,
     claim,
-    conform,
     distinct,
     ends_of,
     join,
@@ -27,8 +26,9 @@ from optloc.files import (
     sigma_of,
     table_of,
     toml_text,
+    validated,
     values_of,
-    worded,
+    with_standard_columns,
     write_text,
 )
 from optloc.models import MODELS, kind_named
@@ -102,10 +102,12 @@ def read_network(path: Path) -> Network:
     if foreign:
         what = f"the key {foreign[0]!r} is that of a problem whose stations are known, not of a network"
         raise InvalidProblem(what, source, "use optloc fix, or see optloc new calibration")
-    file = conform(NetworkFile, data, source)
+    file = validated(NetworkFile, data, source)
     stated, where = file.propagation_speed, join(source, "key 'propagation_speed'")
     speed = SPEED_OF_LIGHT if stated is None else positive_speed(stated, "speed", where)
-    table = worded(table_of(file.stations, folder, where := join(source, "[stations]")), file.stations.unit)
+    table = with_standard_columns(
+        table_of(file.stations, folder, where := join(source, "[stations]")), file.stations.unit
+    )
     names = tuple(str(name) for name in table.labels("name"))
     place, place_sigma = _places(file.stations, table, where)
     rows: list[tuple[str, Array, Array, Array, Array, Array]] = []

@@ -18,7 +18,7 @@ from optloc.problem import Array, Problem, variances
 from optloc.sites.calibration.blocks import minima, pulses_alone, stations_alone
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.network import Network
-from optloc.sites.calibration.rounds import Starts, starts_of
+from optloc.sites.calibration.restarts import Starts, starts_of
 
 PRICE = 16.0
 """Cost of a row that is left out: beyond four sigma it is cheaper than what it says, as with suspects of a fix."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.bounds import BoundMap
 from optloc.problem import Array
-from optloc.show import BLACK, COLOURS, GREY, apart, figure_class, levels, literal
+from optloc.show import BLACK, COLOURS, GREY, figure_class, levels, literal, separate_notes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,7 +74,7 @@ def plot_placement(
     figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
     for axes in figure.axes[:2]:
         axes.tick_params(labelsize=8)
-    apart(figure)
+    separate_notes(figure)
     return figure
 
 

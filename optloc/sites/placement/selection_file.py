@@ -23,7 +23,6 @@ from optloc.files import (
     Units,
     assemble,
     claim,
-    conform,
     distinct,
     join,
     kind_model,
@@ -36,6 +35,7 @@ from optloc.files import (
     table_of,
     toml_text,
     validate,
+    validated,
     within,
     write_text,
 )
@@ -227,7 +227,7 @@ def read_selection(path: Path) -> LoadedSelection:
         Naming the file, the row and the column or key.
     """
     source, folder = name_of(path), path.parent
-    file = conform(SelectionFile, parse_toml(read_text(path), source), source)
+    file = validated(SelectionFile, parse_toml(read_text(path), source), source)
     candidates = table_of(_bare(file.candidates), folder, join(source, "[candidates]"))
     tables = [(candidates, file.candidates)]
     if file.stations is not None:

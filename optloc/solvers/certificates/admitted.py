@@ -30,14 +30,14 @@ from optloc.linear.constraints import (
 )
 from optloc.linear.vectors import vectors
 from optloc.model_checks.truncation import has_law
-from optloc.problem.claims import GLOBAL, REGION, Claims, untried
+from optloc.problem.claims import GLOBAL, REGION, Claims, empty_claims
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import ProofRequest
-from optloc.proof.near import BETTER, STATIONARY, VALUE
+from optloc.proof.local_search import BETTER, STATIONARY, VALUE
 from optloc.proof.position_costs import PositionCosts
-from optloc.proof.scope import is_run, unsupported
+from optloc.proof.scope import is_run, why_unsupported
 from optloc.solvers.certificates.branch_and_bound import (
     HELD,
     RESTLESS,
@@ -45,15 +45,15 @@ from optloc.solvers.certificates.branch_and_bound import (
     certified_freely,
     certify_stage,
     claims_before,
+    fixes_to_prove,
     keep_evidence,
     state_claims,
-    to_prove,
-    unknown,
+    unknown_claim,
 )
 from optloc.solvers.certificates.out_of_reach import edges_of, out_of_reach
 from optloc.solvers.certificates.position_cost import (
     Costs,
-    admitted,
+    admitted_states,
     costs_of,
     eliminate_nuisance,
     is_free,
@@ -64,9 +64,9 @@ from optloc.solvers.certificates.position_cost import (
 from optloc.solvers.inequalities import is_minimum
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
-from optloc.solvers.pool import Pool, in_parts, offer, pack, where
+from optloc.solvers.pool import Pool, in_parts, noting_place, offer, pack
 from optloc.solvers.stages import lsr
-from optloc.solvers.verdict.judge import failed, fill, judge, verdict
+from optloc.solvers.verdict.judge import failed_fixes, filled_objects, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
 # Begins of a proof that a face costs too much: each where it met a place at less than halfway to the level, or so many
@@ -86,11 +86,11 @@ def certified(
     `effort` multiplies the boxes that a proof may take.
     """
     limited = any(not is_exact(constraint) for constraint in problem.constraints)
-    if pool is None or region is not None or not limited or unsupported(problem) or problem.motions[0].order:
+    if pool is None or region is not None or not limited or why_unsupported(problem) or problem.motions[0].order:
         return certified_freely(problem, pool, region, margin, effort)
     began, stages, fix = perf_counter(), pool.stages, judge(problem, pool)
     proven = claims_before(pool)
-    asked, same = to_prove(pool, fix)
+    asked, same = fixes_to_prove(pool, fix)
     if pool.tried_before is not None:
         proven.write(same, take(pool.tried_before.proven, same))
     items, more = np.flatnonzero(asked & ~same), 0
@@ -107,12 +107,12 @@ def certified(
         changed = np.flatnonzero(_is_new(fix[items], better))
         proven.write(items, told)
         if not has_law(problem):  # the covariance of a fix that an inequality holds is that along the edge alone
-            proven.write(items[~is_free(problem, fix, items)], unknown(HELD))
+            proven.write(items[~is_free(problem, fix, items)], unknown_claim(HELD))
         more += len(changed)
         pool = pool.merge(items[changed], take(new, changed))
         fix = overwrite(fix, items[changed], better[changed])
         items = items[changed[better.answered[changed]]]
-    proven.write(items, unknown(RESTLESS))
+    proven.write(items, unknown_claim(RESTLESS))
     detail = f"{int(asked.sum())} within {violation_names(problem)}" + (f", {more} other minima found" if more else "")
     return replace(pool, proven=proven, stages=(*stages, certify_stage(detail, began)))
 
@@ -126,7 +126,7 @@ def _prove_freely(
     """
     edges, part = edges_of(problem), problem.take(items)
     if edges is None or is_run(problem) or not len(items):
-        return pool, untried(len(items)), np.zeros(len(items), dtype=bool)
+        return pool, empty_claims(len(items)), np.zeros(len(items), dtype=bool)
     new = certified_freely(part, take(pool, items), None, margin, effort)
     fix, told = judge(part, new), new.proven
     assert told is not None
@@ -205,7 +205,7 @@ def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort:
     """Return claims (n,) about fixes, and all minima that are admitted."""
     sides, known, found, costs = faces(problem), dict[Face, Along](), list[Minima](), eliminate_nuisance(problem)
     sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
-    why, seeds, tight = fill(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
+    why, seeds, tight = filled_objects(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
     for number, face in enumerate(sides):
         # on an edge of an edge nothing costs less than on that
         above = _least_around(known, face, len(pool))
@@ -226,7 +226,7 @@ def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort:
     listed = (fix.alternatives.gap < sure[:, None]).sum(1)
     bound = fix.cost - equal_cost(fix.cost)
     claims, lost = state_claims(fix.cost, bound, sure, boxes, listed), sure < 0.0
-    claims.write(lost, unknown(""))
+    claims.write(lost, unknown_claim(""))
     claims.reason[lost], claims.boxes[lost] = why[lost], boxes[lost]
     x, cost, face_of = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
     return claims, (x, cost, face_of)
@@ -249,11 +249,11 @@ def _know_along(
     """
     n, size = len(seeds), seeds.shape[-1]
     dear, boxes = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
-    if len(face) > len(exact(problem)) and not unsupported(on_face(problem, face)):
-        limits = admitted(problem, problem.dimension)
+    if len(face) > len(exact(problem)) and not why_unsupported(on_face(problem, face)):
+        limits = admitted_states(problem, problem.dimension)
         dear, boxes = _is_dear(on_face(problem, face), limits, costs, seeds, fix.cost + margin, effort)
     least = np.full(n, margin)
-    out = Along(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, fill(n, ""))
+    out = Along(np.full((n, 1, size), np.nan), np.full((n, 1), np.inf), least, least, boxes, filled_objects(n, ""))
     rest = np.flatnonzero(~dear)
     if not len(rest):
         return out
@@ -336,24 +336,24 @@ def _question(on: Problem, limits: Array, costs: Costs, x: Array, less: Array, e
 
 def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: float) -> Along:
     """Return what is known of n problems along a face, looked for from seeds (n, q, size)."""
-    began, on, limits = perf_counter(), on_face(problem, face), admitted(problem, problem.dimension)
+    began, on, limits = perf_counter(), on_face(problem, face), admitted_states(problem, problem.dimension)
     names = " and ".join(face_names(problem, face)) or "inside"
     pool = lsr(on, offer(on, seeds, None, "certify", began))
     alone = judge(on, pool)
-    corner, reason = is_corner(problem, face), unsupported(on)
+    corner, reason = is_corner(problem, face), why_unsupported(on)
     if corner or reason:
         lost = np.full(len(seeds), -np.inf)
         none, least = np.zeros(len(seeds), dtype=np.int64), _gain(alone.cost, fix.cost) if corner else lost
         # a corner is the only minimum of itself
         rest = np.where(np.isfinite(least), np.inf, -np.inf)
-        return Along(*_minima(alone), least, rest, none, fill(len(seeds), UNFOLLOWED.format(names, reason)))
+        return Along(*_minima(alone), least, rest, none, filled_objects(len(seeds), UNFOLLOWED.format(names, reason)))
     gain = _gain(alone.cost, fix.cost)
     # nothing on a face that costs so much more need be told apart; where a minimum that is not admitted costs less than
     # the fix, all up to the margin above the fix must be found: in whole numbers, so that fixes of a batch ask alike
     above = np.where(gain > -LISTED_GAP, max(margin, AMBIGUOUS_GAP) - gain, max(margin, AMBIGUOUS_GAP))
     wanted = np.where(gain >= margin, 0.0, np.where(gain < 0.0, np.ceil(above), margin))
-    proven = untried(len(seeds))
-    proven.write(np.arange(len(seeds)), unknown(LEFT.format(names)))
+    proven = empty_claims(len(seeds))
+    proven.write(np.arange(len(seeds)), unknown_claim(LEFT.format(names)))
 
     def prove(asked: Array) -> None:
         nonlocal pool
@@ -477,10 +477,10 @@ def certify(
     given = fix.reshape((flat.batch_shape[0],))
 
     def work(some: Problem, part: slice) -> Fix:
-        with where("certify"):
+        with noting_place("certify"):
             return verdict(some, certified(some, accept(some, given[part]), corners, margin, _EFFORT))
 
-    return in_parts(flat, work, failed=failed).reshape(shape)
+    return in_parts(flat, work, failed=failed_fixes).reshape(shape)
 
 
 def value_certified(problem: Problem, pool: Pool | None) -> Pool:

@@ -16,33 +16,33 @@ from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
 from optloc.linear.vectors import vectors
 from optloc.problem.chart import quantile
-from optloc.problem.claims import GLOBAL, PROOFS, REGION, UNKNOWN, Claims, claim, untried
+from optloc.problem.claims import GLOBAL, PROOFS, REGION, UNKNOWN, Claims, claim, empty_claims
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import ProofRequest, ProofResult
-from optloc.proof.everywhere import UNBOUNDED
-from optloc.proof.near import BETTER, BUDGET, COARSE, OPEN, OTHER, UNIQUE, VALUE
+from optloc.proof.global_search import UNBOUNDED
+from optloc.proof.local_search import BETTER, BUDGET, COARSE, OPEN, OTHER, UNIQUE, VALUE
 from optloc.proof.scaled.scaled_proof import ScaledCosts
-from optloc.proof.scope import is_moment, unsupported
+from optloc.proof.scope import has_one_epoch_velocity, why_unsupported
 from optloc.proof.search_space import HIDDEN_REACH
 from optloc.solvers.certificates.position_cost import (
     Costs,
-    agrees,
-    around,
+    boxes_around,
     eliminate_nuisance,
     is_free,
     lacks,
+    matches_problem_cost,
     prove,
     regions_of,
     state_columns,
     surfaces_of,
-    unlimited,
+    why_unlimited,
 )
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, TriedBefore, offer, pack
 from optloc.solvers.stages import lsr
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, surviving_candidates
 
 # What a proof lets a certificate say, in sentences.
 
@@ -69,7 +69,7 @@ RESTLESS = "minima kept turning up"
 MISMATCHED = "the cost of the proof is not that of the fix"
 
 
-def unknown(reason: str) -> Claims:
+def unknown_claim(reason: str) -> Claims:
     """Return the claim () about fixes of which nothing is proven, with the reason."""
     return claim(Certificate("unknown", reason, METHOD))
 
@@ -92,12 +92,14 @@ def state_claims(
     everywhere : bool array (n,)
         Whether a claim is about all positions.
     """
-    out = replace(untried(len(cost)), bound=bound, gap=cost - bound, unique=margin > 0.0, margin=margin, boxes=boxes)
+    out = replace(
+        empty_claims(len(cost)), bound=bound, gap=cost - bound, unique=margin > 0.0, margin=margin, boxes=boxes
+    )
     out.proof[:], out.method[:] = np.where(everywhere, GLOBAL, REGION), METHOD
     # a batch has few different claims but many fixes
     for gap in np.unique(margin):
         for count in np.unique(listed[margin == gap]):
-            out.reason[(margin == gap) & (listed == count)] = sentence(float(gap), int(count), None)
+            out.reason[(margin == gap) & (listed == count)] = claim_sentence(float(gap), int(count), None)
     return out
 
 
@@ -106,7 +108,7 @@ _SPACE = 3
 
 
 @lru_cache(maxsize=256)  # the fixes of a call have few different margins, and formatting numbers is slow
-def sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
+def claim_sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
     """Return the claim about a proven fix, over all positions or over a region, in words.
 
     Another position means another local minimum: chi-square rises continuously around the fix. See `state_claims`.
@@ -221,7 +223,7 @@ class BoundWorkspace:
             eliminate_nuisance(problem),
             np.full((size, 0, d), np.nan),
             corners,
-            around(problem, state),
+            boxes_around(problem, state),
             np.array(gaps_below(margin, d)),
             np.zeros(size, dtype=np.int64),
             np.array(answered),
@@ -267,7 +269,7 @@ def _compare(work: BoundWorkspace, items: Array) -> None:
     proven = items[np.isin(work.proven.proof[items], (GLOBAL, REGION))]
     if not len(proven):
         return
-    off = proven[~agrees(work.problem.take(proven), work.fix[proven], work.costs.take(proven))]
+    off = proven[~matches_problem_cost(work.problem.take(proven), work.fix[proven], work.costs.take(proven))]
     _give_up(work, off, MISMATCHED)
     work.mismatched += len(off)
 
@@ -307,7 +309,9 @@ def _round(work: BoundWorkspace, items: Array) -> None:
     _give_up(work, items[fine], FINE)
     # Boxes ran out over all of the surface of a height before a region of it was tried.
     scaled = isinstance(work.costs, ScaledCosts)
-    unbounded = (FAST if is_moment(work.problem) else SCALED) if scaled else _unfinished(work.costs, len(items))
+    unbounded = (
+        (FAST if has_one_epoch_velocity(work.problem) else SCALED) if scaled else _unfinished(work.costs, len(items))
+    )
     _give_up(work, items[unclosed], AROUND if work.limited and not scaled else unbounded)
     _give_up(work, items[~(done | short | remote | found | fine | unclosed)], UNSETTLED)
 
@@ -367,7 +371,7 @@ def _lower(work: BoundWorkspace, items: Array, why: str, *, remote: bool = False
 
 
 def _give_up(work: BoundWorkspace, items: Array, why: str) -> None:
-    work.proven.write(items, unknown(why))
+    work.proven.write(items, unknown_claim(why))
     work.proven.boxes[items] = work.spent[items]
     work.pending[items] = False
 
@@ -385,7 +389,7 @@ def _claim(work: BoundWorkspace, items: Array, asked: ProofRequest, answer: Proo
         corners = (asked.fallback if whole else asked.region)[done[k]]
         low, high = corners[:, np.isfinite(corners).all(0)].tolist()  # what a known height says is not limited
         told.region[k] = region = tuple(low), tuple(high)
-        told.reason[k] = sentence(float(kappa[k]), int(listed[k]), region)
+        told.reason[k] = claim_sentence(float(kappa[k]), int(listed[k]), region)
     work.proven.write(proven, told)
     work.pending[proven] = False
 
@@ -416,7 +420,7 @@ def _compete(work: BoundWorkspace, items: Array, points: Array) -> tuple[Array, 
     """Refine points (n, P, d) beside some fixes; return which fixes they replaced, and of which they say more, (n,)."""
     began = perf_counter()
     part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
-    x = pack(np.concatenate([standing(before, own), vectors(part, points)], axis=1))
+    x = pack(np.concatenate([surviving_candidates(before, own), vectors(part, points)], axis=1))
     pool = keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
     new = judge(part, pool)
     with np.errstate(invalid="ignore"):
@@ -500,13 +504,13 @@ def certified_freely(
         raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
     began = perf_counter()
     fix = judge(problem, pool)
-    answered, proven_before = to_prove(pool, fix)
-    why = unsupported(problem)
+    answered, proven_before = fixes_to_prove(pool, fix)
+    why = why_unsupported(problem)
     if not why and region is None and effort <= 1:  # who calls `certify` wants what can be had
-        why = unlimited(problem)
+        why = why_unlimited(problem)
     if why or not answered.any():
         proven = claims_before(pool)
-        proven.write(answered, unknown(why))
+        proven.write(answered, unknown_claim(why))
         return replace(pool, proven=proven, stages=(*pool.stages, certify_stage(why or "nothing to prove", began)))
 
     work = BoundWorkspace.begin(problem, pool, fix, answered & ~proven_before, region, margin, effort)
@@ -526,14 +530,14 @@ def tried_before(pool: Pool, fix: Fix, items: Array) -> TriedBefore | None:
 
 def claims_before(pool: Pool) -> Claims:
     """Return what was proven of a pool before, to be written anew."""
-    return untried(len(pool)) if pool.proven is None else change(pool.proven, lambda array, core: np.array(array))
+    return empty_claims(len(pool)) if pool.proven is None else change(pool.proven, lambda array, core: np.array(array))
 
 
 def _count_listed(fix: Fix) -> Array:
     return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
 
 
-def to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
+def fixes_to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
     """Return which fixes (N,) there is something to prove of, and of which of these a claim of before holds still."""
     answered = fix.answered & np.isfinite(fix.cost)
     if pool.conclusion is not None:

@@ -18,10 +18,10 @@ from optloc.linear.constraints import Level, exact, levels
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.batch import ProofRequest, ProofResult, cost_here, costs_at, empty_answer, prove_all, prove_here
-from optloc.proof.near import VALUE
+from optloc.proof.local_search import VALUE
 from optloc.proof.position_costs import Affine, PositionCosts
 from optloc.solvers.certificates.branch_and_bound import budgets
-from optloc.solvers.certificates.position_cost import admitted, state_columns
+from optloc.solvers.certificates.position_cost import admitted_states, state_columns
 from optloc.solvers.policy import LISTED_GAP, equal_cost
 
 # Share of the distance between fix and plane by which rounding may move a place off the plane.
@@ -64,12 +64,12 @@ def edges_of(problem: Problem) -> Edges | None:
             return None
         sides = (("lower", float(band.lower)), ("upper", float(band.upper)))
         found += [(Level(i, side), value) for side, value in sides if np.isfinite(value)]
-    region = admitted(problem, problem.dimension)
+    region = admitted_states(problem, problem.dimension)
     region = region if np.isfinite(region).all() else np.full_like(region, np.nan)
     return Edges(tuple(level for level, _ in found), np.array([value for _, value in found]), region)
 
 
-def question(edges: Edges, count: int, d: int, nodes: float) -> ProofRequest:
+def new_questions(edges: Edges, count: int, d: int, nodes: float) -> ProofRequest:
     """Return arrays for the questions about the edges of a number of fixes, in d coordinates."""
     n = count * len(edges.levels)
     none = np.zeros(n, dtype=np.int64)
@@ -127,11 +127,13 @@ class ReachWorkspace(NamedTuple):
     found: Array
 
 
-def scratch(affine: Affine, edges: Edges, count: int, d: int) -> ReachWorkspace:
+def new_workspace(affine: Affine, edges: Edges, count: int, d: int) -> ReachWorkspace:
     """Return arrays for a number of fixes."""
     n = count * len(edges.levels)
     costs = affine.room(n)
-    return ReachWorkspace(costs, question(edges, count, d, len(costs.kinds)), empty_answer(n, d), np.zeros((2, n, 1)))
+    return ReachWorkspace(
+        costs, new_questions(edges, count, d, len(costs.kinds)), empty_answer(n, d), np.zeros((2, n, 1))
+    )
 
 
 def are_out_of_reach(
@@ -195,7 +197,7 @@ def out_of_reach(problem: Problem, edges: Edges, costs: PositionCosts, fix: Fix,
     """
     own, count = state_columns(problem), len(edges.levels)
     values, gradients = levels(problem, edges.levels, fix.x)
-    asked = question(edges, len(fix.x), own.stop - own.start, costs.dense)
+    asked = new_questions(edges, len(fix.x), own.stop - own.start, costs.dense)
     lay_planes(edges, fix.x[:, own], fix.cov[:, own, own], -values, gradients[..., own], asked)
     every = costs.take(np.repeat(np.arange(len(fix.x)), count))
     level = np.repeat(fix.cost + gap, count)

@@ -25,7 +25,7 @@ from optloc.proof.scaled.scaled_proof import (
     scaled_lack_code,
     velocity_costs,
 )
-from optloc.proof.scope import held_height, is_moment, is_run, is_scaled
+from optloc.proof.scope import has_one_epoch_velocity, held_height, is_run, is_scaled
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 from optloc.solvers.starts.position import spread_of
 
@@ -37,7 +37,7 @@ Costs = PositionCosts | ScaledCosts | Runs | CourseCosts
 
 def eliminate_nuisance(problem: Problem) -> Costs:
     """Return the costs of a flat batch of problems over the target's state, all other unknowns at their best values."""
-    if is_moment(problem):
+    if has_one_epoch_velocity(problem):
         return velocity_costs(problem)
     if problem.motions[0].order > 0:
         return course_costs(problem)
@@ -79,7 +79,7 @@ def state_columns(problem: Problem) -> slice:
 
 def _state_size(problem: Problem) -> int:
     """Return the size of the state, without a velocity at one epoch: it is linear, and projected out."""
-    return problem.dimension * (1 if is_moment(problem) else problem.motions[0].order + 1)
+    return problem.dimension * (1 if has_one_epoch_velocity(problem) else problem.motions[0].order + 1)
 
 
 # Equalities: planes and surfaces along which a proof looks.
@@ -161,13 +161,13 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
         Corners that are asked for.
     """
     size, n = state.shape
-    out = np.full((size, 2, n), np.nan) if n == problem.dimension else around(problem, state)
+    out = np.full((size, 2, n), np.nan) if n == problem.dimension else boxes_around(problem, state)
     given = 0 if region is None else min(region.shape[-1], n)
     if region is not None:
         out[..., :given] = region[..., :given]
     if n == problem.dimension:
         return out, given > 0
-    limits = admitted(problem, n)
+    limits = admitted_states(problem, n)
     known = np.flatnonzero(np.isfinite(limits).all(0) & (np.arange(n) >= given))
     out[..., known] = limits[:, known]
     free = _across(problem)
@@ -175,10 +175,10 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
     return out, set(range(n)) <= {*range(given), *known.tolist(), *free}
 
 
-def unlimited(problem: Problem) -> str:
+def why_unlimited(problem: Problem) -> str:
     """Return why a proof of a moving target is worth nothing unless somebody asks for a region, or nothing."""
     n = _state_size(problem)
-    if n == problem.dimension or np.isfinite(np.delete(admitted(problem, n), _across(problem), axis=1)).all():
+    if n == problem.dimension or np.isfinite(np.delete(admitted_states(problem, n), _across(problem), axis=1)).all():
         return ""
     return "the target could be anywhere at any speed; state a box and a greatest speed as constraints"
 
@@ -188,7 +188,7 @@ def _across(problem: Problem) -> list[int]:
     return [2, 5] if held_height(problem) is not None and problem.frame.kind != "ecef" else []
 
 
-def admitted(problem: Problem, n: int) -> Array:
+def admitted_states(problem: Problem, n: int) -> Array:
     """Return the least and greatest state (2, n) that constraints on coordinates and speed admit; NaN for none."""
     d = problem.dimension
     out = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
@@ -209,7 +209,7 @@ def admitted(problem: Problem, n: int) -> Array:
     return out
 
 
-def around(problem: Problem, state: Array) -> Array:
+def boxes_around(problem: Problem, state: Array) -> Array:
     """Return the corners (N, 2, n) of boxes that hold states (N, n) well inside.
 
     Positions lie in cubes around the stations, velocities of targets that move in cubes around none.
@@ -239,7 +239,7 @@ _OPEN = 1e-12
 _STEPS = 6
 
 
-def agrees(problem: Problem, fix: Fix, costs: Costs) -> Array:
+def matches_problem_cost(problem: Problem, fix: Fix, costs: Costs) -> Array:
     """Return of which of a flat batch of N problems the position cost is their own (N,), at the fix and beside it.
 
     Parameters

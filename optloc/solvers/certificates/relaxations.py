@@ -13,11 +13,11 @@ import numpy as np
 from formulations.range_enclosure import EnclosingBox, Ranged, ball, enclosure
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.linalg import centre_and_spread
-from optloc.base.threads import WORTH, mapped
+from optloc.base.threads import WORTH, map_on_threads
 from optloc.base.types import Array
 from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.linear.mirror import one_position
-from optloc.linear.vectors import hold_still
+from optloc.linear.vectors import problem_at_rest
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import angle_bounds, bearings
@@ -164,7 +164,7 @@ def _by_directions(problem: Problem, fix: Fix) -> Reference:
 def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
     from formulations.moment_sdp import moment_bound
 
-    out, found = _nothing(problem, "moment", ""), ranges(hold_still(problem))
+    out, found = _nothing(problem, "moment", ""), ranges(problem_at_rest(problem))
     assert found is not None
     position = np.broadcast_to(
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
@@ -198,7 +198,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
         if answer.rank_ratio < _RANK_ONE:
             out.point[i] = centre + size * answer.point
 
-    mapped(bounded, range(len(place)), least=WORTH)
+    map_on_threads(bounded, range(len(place)), least=WORTH)
     return out
 
 

@@ -11,7 +11,7 @@ from optloc.kernels.least_squares import refine
 from optloc.kernels.sums import equations_at, summed
 from optloc.linear.constraints import Face
 from optloc.linear.evaluate import predict
-from optloc.linear.normal import Normal, marginal, weighed, with_priors
+from optloc.linear.normal import Normal, marginal, with_priors, with_station_noise
 from optloc.models import MODELS, wrap
 from optloc.problem.loss import LATE, Loss
 from optloc.problem.noise import Noise, variances, whiten
@@ -77,7 +77,7 @@ class Doubt:
     @classmethod
     def of(cls, problem: Problem, at: Array) -> Doubt:
         """Return what a loss needs to know of N problems; noise that depends on the place is that at x (N, size)."""
-        noise, size = weighed(problem, at).noise, len(at)
+        noise, size = with_station_noise(problem, at).noise, len(at)
         base = np.broadcast_to(problem.weight, (size, problem.count))
         own = np.broadcast_to(variances(noise, problem.count), base.shape)
         given = own / np.where(base > 0.0, base, 1.0)

@@ -19,11 +19,11 @@ from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import bound_pool, least_finished
 from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
-from optloc.solvers.pool import Pool, crowd_of, in_parts, pack
+from optloc.solvers.pool import Pool, chunk_size, in_parts, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
 from optloc.solvers.robust.starts import flip_rows, robust_starts
 from optloc.solvers.robust.statement import stated
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, surviving_candidates
 from optloc.solvers.verdict.minima import settle
 
 Minimise = Callable[[Problem, Array | None], Pool]
@@ -110,14 +110,14 @@ class Robust:
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled minima for a flat batch of problems; their weights are those of the loss."""
-        start = None if pool is None else pack(standing(pool, judge(problem, pool)))
+        start = None if pool is None else pack(surviving_candidates(pool, judge(problem, pool)))
         stages = () if pool is None else pool.stages
 
         def work(some: Problem, part: slice) -> Pool:
             own = None if start is None else start[part]
             return by_arrivals(some, own, lambda one, x: self._minima(one, x, stages))
 
-        return in_parts(problem, work, crowd_of(problem))
+        return in_parts(problem, work, chunk_size(problem))
 
     def _minima(self, problem: Problem, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
         found = _minimise(problem, self.loss, start, stages)
@@ -140,7 +140,7 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     pool = replace(pool, stages=stages, free=free, loss=loss.name)
     found = settle(problem, pool, stage, lambda some, x: _equations(some, loss, x)[0])
     # rows are doubted at a place; where the verdict leaves none they keep the weights that they had
-    answered = np.asarray(np.isfinite(standing(found, judge(problem, found))[:, 0]).all(-1))
+    answered = np.asarray(np.isfinite(surviving_candidates(found, judge(problem, found))[:, 0]).all(-1))
     weights = _equations(problem, loss, np.where(answered[:, None], found.x[:, 0], 0.0))[1]
     return replace(found, refined=False, weights=np.where(answered[:, None], weights, found.weights))
 

@@ -12,7 +12,7 @@ from optloc.kernels.least_squares import refine
 from optloc.linear.constraints import exact
 from optloc.linear.courses import elapsed
 from optloc.linear.mirror import one_position, rows_of_stations
-from optloc.linear.normal import depends_on_place, weighed
+from optloc.linear.normal import depends_on_place, with_station_noise
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.vectors import vectors
 from optloc.problem.loss import LOSSES, Loss
@@ -22,9 +22,9 @@ from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.pool import Pool, pack
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
-from optloc.solvers.starts.position import registrable
+from optloc.solvers.starts.position import is_registration_run
 from optloc.solvers.starts.registration import mirror_courses, split_epochs
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, surviving_candidates
 
 # Subsets of a problem at most: each is a closed form and a few steps. Stations up to which three are left out (92 sets
 # of eight, of which 80 are taken), and rows up to which single ones are: of more, a station covers the likely errors.
@@ -114,14 +114,14 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
         Whose cost decides which starts are kept.
     """
     plain = search_widely(problem)
-    pool = standing(plain, judge(problem, plain))[:, :_KEPT]
+    pool = surviving_candidates(plain, judge(problem, plain))[:, :_KEPT]
     parts = [pool, _graduate(problem, pool[:, :1])]
     if one_position(problem):
         # two rows that are left out are no rival of a cost below the price of one: a rival may cost that much more
         parts.append(_leave_out(problem, loss, plain.cost[:, 0] < AMBIGUOUS_GAP))
     else:
         parts.append(_annealed(problem, pool, loss))
-        if registrable(problem):
+        if is_registration_run(problem):
             # what gross errors have drawn to one side of the stations belongs to the other
             parts.append(_annealed(problem, mirror_courses(problem, parts[-1]), loss))
         if len(problem.motions) == 1 and problem.motions[0].known is None and problem.motions[0].span == "run":
@@ -162,7 +162,7 @@ def _annealed(problem: Problem, pool: Array, loss: Loss) -> Array:
 def _leave_out(problem: Problem, loss: Loss, clean: Array) -> Array:
     """Return the best starts (N, q, size) from closed forms of all subsets."""
     # Correlation matters for the answer, hardly for where to look for it, and it costs time.
-    noise = weighed(problem).noise if not depends_on_place(problem) else problem.noise
+    noise = with_station_noise(problem).noise if not depends_on_place(problem) else problem.noise
     problem = replace(problem, noise=independent(variances(noise, problem.count)))
     size = problem.batch_shape[0]
     each = [np.arange(i, min(i + _EACH, size)) for i in range(0, size, _EACH)]

@@ -18,12 +18,12 @@ from optloc.problem.fix import Fix
 from optloc.problem.loss import Loss
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.admitted import certified
-from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, NOTICED, REJECTED
+from optloc.solvers.policy import AMBIGUOUS_GAP, P_OUTLIER, REGION_LEVEL, REJECTED
 from optloc.solvers.pool import Pool, begin
 from optloc.solvers.robust.reweighting import Doubt, reweight, robust_equations
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.findings import is_improbable
-from optloc.solvers.verdict.judge import fill, judge, verdict
+from optloc.solvers.verdict.judge import filled_objects, judge, verdict
 from optloc.solvers.verdict.repeats import TOLERANCE, Repeats, holds, is_repeatable, repeated
 
 # Squared distance in standard deviations up to which the minima of the loss and of the rows that count are one
@@ -57,10 +57,10 @@ def stated(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     """
     curvature, count = pool.curvature, len(pool)
     assert curvature is not None
-    kept, remark = np.zeros(count, dtype=bool), fill(count, SEARCHED)
+    kept, remark = np.zeros(count, dtype=bool), filled_objects(count, SEARCHED)
     pool = replace(pool, robust=kept, remark=remark)
     if problem.constraints or problem.count > _ROWS or not is_repeatable(problem):
-        return replace(pool, remark=fill(count, NEEDS))
+        return replace(pool, remark=filled_objects(count, NEEDS))
     fix = judge(problem, pool)
     present = np.broadcast_to(problem.weight, pool.weights.shape) > 0.0
     doubted = present & (pool.weights < REJECTED * problem.weight)
@@ -86,12 +86,12 @@ def _examine(problem: Problem, loss: Loss, x: Array, doubted: Array) -> tuple[Ar
     """Return flags (N,) of fixes that pass, reasons (N,) of the others, and shares of repeats (N, 3)."""
     rest = problem.with_rows(weight=np.where(doubted, 0.0, problem.weight))
     fix = verdict(rest, certified(rest, lsr(rest, begin(rest, x))))
-    reason, repeats = fill(len(x), ""), np.full((len(x), 3), np.nan)
+    reason, repeats = filled_objects(len(x), ""), np.full((len(x), 3), np.nan)
     good = fix.code == Status.OK
     for i in np.flatnonzero(~good):
         reason[i] = f"the rows that count do not prove the place: {fix[int(i)].status.label}"
     # rejected rows may be too few of the wrong ones: then the rest hardly fits
-    poor = good & doubted.any(1) & is_improbable(fix.cost, fix.dof, NOTICED)
+    poor = good & doubted.any(1) & is_improbable(fix.cost, fix.dof, P_OUTLIER)
     reason[poor] = "the rows that count hardly agree: p is below 0.01"
     good &= ~poor
     apart = _squared(fix, x - fix.x)
@@ -143,7 +143,7 @@ def _decides(problem: Problem, fix: Fix, doubted: Array) -> Array:
             done = refine(part, fix.x[own])
             as_good = (done.cost - fix.cost[own] < limit[some]) & (done.status == Status.OK)
         moved = _squared_position(problem, fix[own], done.x - fix.x[own])
-        out[own[as_good & ~(moved <= quantile(COVERED, problem.dimension))]] = True
+        out[own[as_good & ~(moved <= quantile(REGION_LEVEL, problem.dimension))]] = True
     return out
 
 

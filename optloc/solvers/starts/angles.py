@@ -10,7 +10,7 @@ from formulations.bearing_course import BearingCourses, sight_courses
 from formulations.bearing_ls import rays, sight
 from formulations.bistatic import course, triad
 from optloc.base.linalg import centre_and_spread
-from optloc.base.threads import WORTH, mapped
+from optloc.base.threads import WORTH, map_on_threads
 from optloc.base.types import Array, Rows
 from optloc.linear.courses import elapsed
 from optloc.problem.noise import variances
@@ -193,7 +193,7 @@ def by_directions(seen: Bearings) -> Array:
         axes = None if seen.axes is None else seen.axes[i, use]
         out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
 
-    mapped(relax, _complete_bearings(seen), least=WORTH)
+    map_on_threads(relax, _complete_bearings(seen), least=WORTH)
     return seen.metres(out)
 
 
@@ -237,7 +237,7 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
             sigma = 1.0 / seen.weight[i, use]
             out[i] = angle_bound(seen.angle[i, use], sigma, seen.station[i, use], scaled[i], axes=axes).bound
 
-    mapped(bound, _complete_bearings(seen), least=WORTH)
+    map_on_threads(bound, _complete_bearings(seen), least=WORTH)
     return out
 
 

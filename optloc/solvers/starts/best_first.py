@@ -34,7 +34,7 @@ def best_first_starts(problem: Problem) -> Array:
     Parameters
     ----------
     problem : Problem
-        N problems within the scope of the proof (`optloc.proof.scope.unsupported`).
+        N problems within the scope of the proof (`optloc.proof.scope.why_unsupported`).
     """
     size, d = problem.batch_shape[0], problem.dimension
     centre, spread = spread_of(problem)

@@ -9,11 +9,11 @@ import numpy as np
 from scipy import sparse
 
 from optloc.base.types import Array, Bias, Rows, Stations
-from optloc.linear.normal import weighed
+from optloc.linear.normal import with_station_noise
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem.epochs import cut, epochs_of, joined
-from optloc.problem.noise import Block, Noise, together
+from optloc.problem.noise import Block, Noise, group_members
 from optloc.problem.problem import Problem
 
 # A block that lasts this many times longer than usual has a gap in it, and the line through it means nothing.
@@ -117,7 +117,7 @@ class _Mean:
 
 def _with_station_noise(problem: Problem) -> Problem:
     """Return the problem with its station errors of each epoch in the noise."""
-    return weighed(replace(problem, stations=problem.stations.with_noise()))
+    return with_station_noise(replace(problem, stations=problem.stations.with_noise()))
 
 
 def _reference(problem: Problem, reference: float | None) -> float:
@@ -209,7 +209,7 @@ def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
     C = sparse.csr_array((coefficient, (place, old)), shape=(size, count))
     covariance = (C @ _sparse(problem) @ C.T).tocsr()
     blocks = []
-    for members in together(block):
+    for members in group_members(block):
         one, two = np.broadcast_arrays(members[:, :, None], members[:, None, :])
         values = np.asarray(covariance[one.ravel(), two.ravel()]).reshape(one.shape)
         blocks.append(Block(members, values))

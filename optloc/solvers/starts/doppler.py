@@ -10,7 +10,7 @@ import numpy as np
 from formulations.doppler_sdp import SIZE, blocks, doppler, lifted_size, normal_points
 from formulations.range_height import Ellipsoid, ellipsoid
 from optloc.base.linalg import whitening
-from optloc.base.threads import WORTH, mapped
+from optloc.base.threads import WORTH, map_on_threads
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import block_links
 from optloc.linear.mirror import one_position
@@ -24,7 +24,7 @@ from optloc.solvers.starts.position import known_height
 _AXES = WGS84_A * np.array([1.0, 1.0, 1.0 - WGS84_F])
 
 
-def dopplered(problem: Problem) -> bool:
+def has_doppler_of_rest(problem: Problem) -> bool:
     """Return whether a single source at rest is sought, and rows tell its range rates."""
     if len(problem.motions) != 1 or problem.stations.velocity is None:
         return False
@@ -58,7 +58,7 @@ def doppler_starts(problem: Problem) -> Array:
         position[i] = _start(problem, i, every, surface)
 
     if len(every.row):
-        mapped(start, range(size), least=WORTH)
+        map_on_threads(start, range(size), least=WORTH)
     return position if one_position(problem) else vectors(problem, position)
 
 

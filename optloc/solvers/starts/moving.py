@@ -17,12 +17,12 @@ from optloc.base.types import Array
 from optloc.kernels.jit import plain
 from optloc.linear.constraints import exact
 from optloc.problem.problem import Problem
-from optloc.proof.atlas import Atlas, atlas_of, position, set_centre
-from optloc.proof.box import cube, reaches_infinity
+from optloc.proof.atlas import Atlas, atlas_of, set_centre, write_position
+from optloc.proof.box import reaches_infinity, station_cube
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, RATE, SLOPE0
 from optloc.proof.position_costs import PositionCosts, position_costs
-from optloc.proof.scope import is_run, is_scaled, unsupported
+from optloc.proof.scope import is_run, is_scaled, why_unsupported
 
 # Boxes for each problem, by its dimension; centres that are kept, the cheapest of them. In space 600 boxes missed the
 # best place of 10 emitters of 100, and 2 400 none.
@@ -42,11 +42,11 @@ def moves_at_once(problem: Problem) -> bool:
         return False
     if problem.epochs > 1 or exact(problem) or not any(slot.name == "velocity" for slot in problem.layout.shared):
         return False
-    still = held(problem)
-    return not (unsupported(still) or is_run(still) or is_scaled(still))
+    still = problem_at_rest(problem)
+    return not (why_unsupported(still) or is_run(still) or is_scaled(still))
 
 
-def held(problem: Problem) -> Problem:
+def problem_at_rest(problem: Problem) -> Problem:
     """Return the problem of a target that stays: priors on its velocity have nothing to say then."""
     motions = tuple(replace(motion, order=0) for motion in problem.motions)
     priors = tuple(prior for prior in problem.priors if prior.name != "velocity")
@@ -61,7 +61,7 @@ def moving_starts(problem: Problem) -> Array:
     problem : Problem
         N problems of which `moves_at_once` holds.
     """
-    costs, d = position_costs(held(problem)), problem.dimension
+    costs, d = position_costs(problem_at_rest(problem)), problem.dimension
     out = np.full((problem.batch_shape[0], _MOST, d), np.nan)
     for i in range(len(out)):
         found = _search(costs.take(slice(i, i + 1)), d)
@@ -75,7 +75,7 @@ def _search(costs: PositionCosts, d: int) -> Array:
     with plain():
         if not reaches_infinity(kinds, K):
             return np.empty((0, d))
-        middle, radius = cube(kinds, data, np.zeros(d))
+        middle, radius = station_cube(kinds, data, np.zeros(d))
         atlas = atlas_of(middle, radius, d, 0)
         rows, nodes, centre = _MovingRows(K, w, data, kinds == RATE), np.zeros((len(kinds), NODE_WIDTH)), np.empty(d)
         queue = [(0.0, piece, *_whole(piece, d)) for piece in range(2 * d + 1)]
@@ -87,7 +87,7 @@ def _search(costs: PositionCosts, d: int) -> Array:
             bound_pieces(atlas, kinds, data, np.array(half), nodes)
             cost, low, side = rows.bound(atlas, nodes, np.array(half), d)
             if atlas.scale[0] > 0.0:
-                position(atlas, centre)
+                write_position(atlas, centre)
                 met.append((cost, tuple(centre)))
             for sign in (-0.5, 0.5):
                 moved = tuple(a + sign * half[k] * (k == side) for k, a in enumerate(at))

@@ -8,13 +8,13 @@ import numpy as np
 
 from formulations.range_height import Ellipsoid, ellipsoid, locate, locate_by_ranges
 from optloc.base.linalg import centre_and_spread
-from optloc.base.threads import WORTH, mapped
+from optloc.base.threads import WORTH, map_on_threads
 from optloc.base.types import Array, Band
 from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.linear.mirror import is_of_ranges, one_position, rows_of_stations
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
-from optloc.solvers.starts.squared_range import Pick, candidates, every
+from optloc.solvers.starts.squared_range import Pick, candidates, stationary_points
 
 # Where other minima are looked for beside a badly determined fix. With these places the Monte Carlo of cases in
 # docs/measured/global.md misses no minimum silently.
@@ -92,7 +92,7 @@ def subarray_starts(problem: Problem) -> Array:
         touching = np.flatnonzero((weight != problem.weight).any(1) & (weight > 0.0).any(1))
         if len(touching):
             rest = problem.with_rows(weight=weight).take(touching)
-            found = squared_range_starts(rest, every)
+            found = squared_range_starts(rest, stationary_points)
             spread = np.full((problem.batch_shape[0], *found.shape[1:]), np.nan)
             spread[touching] = found
             parts.append(spread)
@@ -128,7 +128,7 @@ def over_ground(problem: Problem) -> bool:
     return told and problem.frame.geodetic and problem.dimension == 3 and one_position(problem)
 
 
-def registrable(problem: Problem) -> bool:
+def is_registration_run(problem: Problem) -> bool:
     """Return whether a problem is a run of sums or ratios of ranges whose only target lasts it, and is not one fix."""
     if len(problem.motions) != 1 or problem.epochs < 2:
         return False
@@ -238,7 +238,7 @@ def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: 
         below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
         out[i, 0] = lift(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
 
-    mapped(relax, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
+    map_on_threads(relax, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
     return out
 
 

@@ -19,12 +19,12 @@ from optloc.linear.least_squares_ranges import Ranges, ranges
 from optloc.linear.normal import covariance, prior_parts
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.vectors import complete, vectors
-from optloc.linear.walks import places, walks
+from optloc.linear.walks import state_columns, walks
 from optloc.problem.clocks import rate_name, state_of
-from optloc.problem.epochs import by_epoch, untied
+from optloc.problem.epochs import by_epoch, without_epoch_correlation
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import DOUBT
+from optloc.solvers.policy import P_SUSPECT
 from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.position import distance_of, spread_of
 
@@ -145,7 +145,7 @@ def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
     since = (problem.times - problem.origin)[:, None]
     for bias in walks(problem):
         parts = [straight.layout.take(x, name) for name in state_of(bias)]
-        place = places(layout, bias)
+        place = state_columns(layout, bias)
         if not straight.layout.shares(bias.name):  # only splines are straight
             local[..., place] = np.stack(parts, axis=-1)
             continue
@@ -215,7 +215,7 @@ def _is_settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
     x, cost = pool[0][:, 0], pool[1][:, 0]
     found, dof = np.isfinite(cost), np.maximum(degrees_of_freedom(blocks), 1)
     # the chi-square of the averages, at the threshold at which a verdict calls residuals too large
-    fits = found & (gammaincc(dof / 2.0, np.where(found, cost, np.inf) / 2.0) > DOUBT)
+    fits = found & (gammaincc(dof / 2.0, np.where(found, cost, np.inf) / 2.0) > P_SUSPECT)
     deviation = np.sqrt(np.trace(_covariance(blocks, x), axis1=-2, axis2=-1))
     with np.errstate(invalid="ignore"):
         return np.asarray(fits & (deviation < _WEAK * distance_of(blocks, blocks.layout.take(x, "position"))))
@@ -458,7 +458,7 @@ def run_of(problem: Problem) -> RegistrationRun | None:
 
 def split_epochs(problem: Problem) -> Problem:
     """Return the epochs of a run as a batch (N, k), without its biases, priors and constraints."""
-    return by_epoch(untied(replace(problem, biases=(), priors=(), constraints=())))
+    return by_epoch(without_epoch_correlation(replace(problem, biases=(), priors=(), constraints=())))
 
 
 def _most_common(values: Array) -> int:

@@ -13,9 +13,9 @@ from optloc.base.types import Array, Band, Motion, Polygon, Stations
 from optloc.linear.constraints import is_exact, needs_velocity
 from optloc.linear.courses import elapsed
 from optloc.linear.mirror import one_position
-from optloc.linear.vectors import hold_still, vectors, without_biases
+from optloc.linear.vectors import problem_at_rest, vectors, without_biases
 from optloc.models import MODELS
-from optloc.problem.epochs import by_epoch, untied
+from optloc.problem.epochs import by_epoch, without_epoch_correlation
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.noise import Block, Noise, group
@@ -121,7 +121,7 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     """Return the state (N, k or 1, order + 1, d) of the only target; NaN where it has no fix."""
     motion, size = problem.motions[0], problem.batch_shape[0]
     if one_position(problem):
-        position = fixed(hold_still(problem)).position
+        position = fixed(problem_at_rest(problem)).position
         state = np.zeros((size, 1, motion.order + 1, problem.dimension))
         state[:, 0, 0] = position
         return state
@@ -136,7 +136,7 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     if seen is not None and np.isfinite(seen).all():
         return seen[:, None]
     # else epoch by epoch, and a polynomial through the fixes: rough where epochs are weak, but a start
-    free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch", rise=motion.rise),))))
+    free = by_epoch(without_epoch_correlation(replace(problem, motions=(Motion(span="epoch", rise=motion.rise),))))
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
         state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))

@@ -11,7 +11,7 @@ import numpy as np
 from formulations.squared_range import Quadric, cone, minimiser, paraboloid, stationary
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
-from optloc.base.threads import WORTH, mapped
+from optloc.base.threads import WORTH, map_on_threads
 from optloc.base.types import Array, Rows
 from optloc.engine.lifts import KnownLift, LiftEntry, azimuths_beside, enter, pair_elevation
 from optloc.linear.least_squares_ranges import Ranges
@@ -92,7 +92,7 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
     distance = np.maximum(np.sqrt(((point[:, None, :] - squared.place) ** 2).sum(-1)), _NEAR)
     second = _pick(squared, distance, point, pick)
     # both weightings have stationary points of their own; of a single answer the better weighted one is enough
-    points = np.concatenate([second, first], axis=1) if pick is every else second
+    points = np.concatenate([second, first], axis=1) if pick is stationary_points else second
     return points * squared.scale[:, None, None] + squared.origin[:, None, :]
 
 
@@ -119,7 +119,7 @@ def minimum(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
     return both, valid
 
 
-def every(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
+def stationary_points(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
     """Return all real stationary points (N, K, n) of squared-range problems, best first, and which are valid."""
     y, _, valid = stationary(rows, right, quadric, positive=quadric.shape == "cone")
     return y, valid
@@ -149,7 +149,7 @@ def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Q
         found = relax(rows[i], right[i], quadric, bound=False)
         y[i, 0], y[i, 1:] = found.y, found.points
 
-    mapped(solve_one, np.flatnonzero(usable).tolist(), least=WORTH)
+    map_on_threads(solve_one, np.flatnonzero(usable).tolist(), least=WORTH)
     return y, np.isfinite(y).all(-1)
 
 

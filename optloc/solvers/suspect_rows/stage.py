@@ -27,26 +27,26 @@ from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.outside import accept
-from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED
-from optloc.solvers.pool import Pool, begin, crowd_of, in_parts, offer
+from optloc.solvers.policy import AMBIGUOUS_GAP, REGION_LEVEL
+from optloc.solvers.pool import Pool, begin, chunk_size, in_parts, offer
 from optloc.solvers.robust.stage import doubted_minima
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.suspect_rows.subsets import (
-    Alike,
     Outcome,
-    Rest,
+    RemainingFix,
+    SameRows,
     begin_without,
     enumerable,
     explain,
-    fix_rest,
-    grow,
-    joined,
+    explain_from_beginnings,
+    fix_remaining,
+    grow_explanation,
     leave_out_of,
-    prove_rests,
-    rest_of,
+    prove_remaining,
+    remaining_fix_of,
 )
 from optloc.solvers.verdict.conclusion import Conclusion, list_names
-from optloc.solvers.verdict.judge import failed, fill, judge, standing, verdict
+from optloc.solvers.verdict.judge import failed_fixes, filled_objects, judge, surviving_candidates, verdict
 
 # A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
 # that is tested, and who fits is taken back.
@@ -122,7 +122,7 @@ def suspects(
         pool = search_widely(part) if given is None else accept(part, given[own])
         return judge(part, suspect(part, pool, kinds, together=together))
 
-    return in_parts(flat, work, failed=failed).reshape(shape)
+    return in_parts(flat, work, failed=failed_fixes).reshape(shape)
 
 
 def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS, *, together: bool = True) -> Pool:
@@ -137,7 +137,9 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     doubted = _Doubted(rejected, judge(problem, pool).x if rejected.any() else pool.x[:, 0])
     if not np.array_equal(pool.weights, present):
         # a robust fix has its minima elsewhere: the test is that of least squares with every row
-        pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
+        pool = lsr(
+            problem, offer(problem, surviving_candidates(pool, judge(problem, pool)), pool, "start", perf_counter())
+        )
     before = pool.stages
     asked = partial(_explain, present=present, doubted=doubted, by=by)
     louder, found = _weigh(problem, pool, asked, together)
@@ -153,8 +155,8 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
 def _with_conclusions(problem: Problem, pool: Pool, found: _Explained) -> Pool:
     """Return pools with the conclusions that explanations lead to."""
     pool = replace(pool, asked=True)
-    fix, conclusion = judge(problem, pool), fill(len(pool), None)
-    step = crowd_of(problem)
+    fix, conclusion = judge(problem, pool), filled_objects(len(pool), None)
+    step = chunk_size(problem)
     for items, groups, outcomes in found:
         for first in range(0, len(items), step):
             part = slice(first, first + step)
@@ -233,7 +235,7 @@ def _louder(problem: Problem, pool: Pool, fix: Fix) -> _Louder | None:
         if larger
     ]
     loud = used.scale(problem)
-    refined = lsr(loud, offer(loud, standing(pool, fix), pool, "start", perf_counter()))
+    refined = lsr(loud, offer(loud, surviving_candidates(pool, fix), pool, "start", perf_counter()))
     return _Louder(loud, refined, used.sizes(problem), f"{' and '.join(said)}: the upper end of the interval is used")
 
 
@@ -245,7 +247,7 @@ def _fix_by_louder_noise(louder: _Louder, found: _Explained) -> Array:
     items = np.flatnonzero(fix.answered)
     marks[items] |= Status.RESCALED.mark
     reason[items] = [f"{louder.reason}; {own}" if own else louder.reason for own in reason[items]]
-    out, fix = fill(len(reason), None), replace(fix, marks=marks, reason=reason)
+    out, fix = filled_objects(len(reason), None), replace(fix, marks=marks, reason=reason)
     for i in range(len(out)):
         out[i] = fix[i]
     return out
@@ -296,7 +298,7 @@ def _group_alike(present: Array) -> list[Array]:
     return [np.flatnonzero(pattern.reshape(-1) == i) for i in range(int(pattern.max()) + 1)]
 
 
-def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) -> Alike:
+def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) -> SameRows:
     """Return problems in which the same rows are present, by arrivals where that is the same, and their groups."""
     part = problem.take(items)
     arrivals = as_arrivals(part)
@@ -304,11 +306,11 @@ def _alike(problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind]) ->
     present = np.broadcast_to(work.weight, (len(items), work.count))[0] > 0.0
     groups = groups_of(work, present, by)
     if arrivals is None:
-        return Alike(problem, items, groups, fix[items])
-    return Alike(work, np.arange(len(items)), groups, fix[items])
+        return SameRows(problem, items, groups, fix[items])
+    return SameRows(work, np.arange(len(items)), groups, fix[items])
 
 
-def _with_grown(alike: Alike, doubted: _Doubted, outcomes: list[Outcome]) -> list[Outcome]:
+def _with_grown(alike: SameRows, doubted: _Doubted, outcomes: list[Outcome]) -> list[Outcome]:
     """Return outcomes where sets that were too many to be tried are sought group by group from the best found."""
     dof = alike.whole.dof
     untried = [not own.rests and own.tried < most - 1 for own, most in zip(outcomes, dof, strict=True)]
@@ -320,9 +322,9 @@ def _with_grown(alike: Alike, doubted: _Doubted, outcomes: list[Outcome]) -> lis
 
 def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: Sequence[Outcome]) -> Array:
     """Return what is concluded of problems (N,) in which the same rows are present, None where nothing is."""
-    arrivals, out = as_arrivals(problem), fill(len(outcomes), None)
+    arrivals, out = as_arrivals(problem), filled_objects(len(outcomes), None)
     cases: list[SuspectCase] = []
-    chosen: dict[int, Rest] = {}
+    chosen: dict[int, RemainingFix] = {}
     for i, outcome in enumerate(outcomes):
         item = np.array([i])
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(item))
@@ -336,7 +338,7 @@ def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: S
         items = [i for i, best in chosen.items() if (best.fix.layout == problem.layout) == given]
         if items:
             work = problem if given or arrivals is None else arrivals.problem
-            proven = prove_rests(work.take(np.array(items)), groups, [chosen[i] for i in items])
+            proven = prove_remaining(work.take(np.array(items)), groups, [chosen[i] for i in items])
             chosen |= dict(zip(items, proven, strict=True))
     rests = {i: (best, *outcomes[i].rests[1:]) for i, best in chosen.items()}
     told = _errors(problem if arrivals is None else arrivals.problem, groups, rests)
@@ -345,7 +347,7 @@ def _conclude(problem: Problem, fix: Fix, groups: tuple[Group, ...], outcomes: S
     return out
 
 
-def _grow(alike: Alike, i: int, doubted: _Doubted, start: Rest | None) -> Outcome:
+def _grow(alike: SameRows, i: int, doubted: _Doubted, start: RemainingFix | None) -> Outcome:
     """Return what explains the i-th of some problems, found group by group.
 
     The fix of all rows is where wrong ones have drawn it, perhaps to another minimum, from which the right ones look
@@ -357,16 +359,16 @@ def _grow(alike: Alike, i: int, doubted: _Doubted, start: Rest | None) -> Outcom
         n = one.layout.n_shared
         known = np.isfinite(own.x[:n]).all()
         near = complete(one, own.x[None, None, :n]) if known else None
-        own = (fix_rest(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
+        own = (fix_remaining(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
     handed = doubted.rows.shape[1] == one.count and doubted.rows[i].any()
     if handed:
         start = begin_without(one, groups, doubted.rows[i], doubted.x[i])
-    first = grow(one, groups, own, start or rest_of(groups, (), own))
+    first = grow_explanation(one, groups, own, start or remaining_fix_of(groups, (), own))
     if not first.rests and not first.note:
         return first
     minima = doubted_minima(one, LOSSES["truncated"], _MINIMA)
     begun = [begin_without(one, groups, rows, x) for x, rows in minima]
-    return joined([first, *(grow(one, groups, own, each) for each in begun)], groups)
+    return explain_from_beginnings([first, *(grow_explanation(one, groups, own, each) for each in begun)], groups)
 
 
 # From what explains the data of one problem to explanations: who is left out, how large an error, what evidence.
@@ -418,7 +420,7 @@ def _unexplained(case: SuspectCase, outcome: Outcome) -> Conclusion | None:
     return Conclusion((), case.whole, case.whole.alternatives, tried=_name_closest(case, outcome))
 
 
-def _best_rest(case: SuspectCase, outcome: Outcome) -> Rest | None:
+def _best_rest(case: SuspectCase, outcome: Outcome) -> RemainingFix | None:
     """Return the rest that explains a problem best, to be proven; None where the fix of all data is kept."""
     best, *others = outcome.rests
     if not best.left and all(_same_place(best.fix, rest.fix) for rest in others):
@@ -426,7 +428,7 @@ def _best_rest(case: SuspectCase, outcome: Outcome) -> Rest | None:
     return best
 
 
-def _explained(case: SuspectCase, outcome: Outcome, rests: Sequence[Rest], told: Sequence[_Told]) -> Conclusion:
+def _explained(case: SuspectCase, outcome: Outcome, rests: Sequence[RemainingFix], told: Sequence[_Told]) -> Conclusion:
     """Return the conclusion of a problem of which the first rest is proven, with the errors of each rest."""
     (best, *_), (first, *others) = rests, outcome.rests
     elsewhere = [rest for rest in others if not _same_place(first.fix, rest.fix)]
@@ -450,7 +452,7 @@ def _same_place(best: Fix, other: Fix) -> bool:
     if not (np.isfinite(step).all() and np.isfinite(covariance).all()):
         return False
     inverse, regular = linalg.inverse(covariance)
-    return bool(regular) and float(step @ inverse @ step) <= quantile(COVERED, len(step))
+    return bool(regular) and float(step @ inverse @ step) <= quantile(REGION_LEVEL, len(step))
 
 
 def _in_layout(case: SuspectCase, fix: Fix) -> Fix:
@@ -477,7 +479,7 @@ def _name_closest(case: SuspectCase, outcome: Outcome) -> str:
     return reason + (f"; {outcome.note}" if outcome.note else "")
 
 
-def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, told: _Told) -> Explanation:
+def _explanation(case: SuspectCase, rest: RemainingFix, outcome: Outcome, told: _Told) -> Explanation:
     fix = rest.fix
     p_without = float(fix.p_value)
     # Errors of compass bearings are reported in the sense of the readings.
@@ -495,13 +497,15 @@ def _explanation(case: SuspectCase, rest: Rest, outcome: Outcome, told: _Told) -
     return Explanation(tuple(suspects), case.vector(fix), float(fix.cost), int(fix.dof), p_without, rest.score)
 
 
-def _errors(work: Problem, groups: Sequence[Group], rests: dict[int, tuple[Rest, ...]]) -> dict[int, list[_Told]]:
+def _errors(
+    work: Problem, groups: Sequence[Group], rests: dict[int, tuple[RemainingFix, ...]]
+) -> dict[int, list[_Told]]:
     """Return the estimated errors of what each rest of some problems leaves out, by number of the group.
 
     Rests with the same offsets have the same unknowns: they are linearised together.
     """
     out: dict[int, list[_Told]] = {i: [{} for _ in own] for i, own in rests.items()}
-    alike: dict[tuple[int, ...], list[tuple[int, Rest, _Told]]] = {}
+    alike: dict[tuple[int, ...], list[tuple[int, RemainingFix, _Told]]] = {}
     for i, own in rests.items():
         for rest, told in zip(own, out[i], strict=True):
             if not np.isfinite(rest.fix.x).all() or not rest.left:
@@ -536,7 +540,7 @@ def _p_with(fix: Fix, error: Error | None) -> float:
     return float(gammaincc((int(fix.dof) + error.dof) / 2, (float(fix.cost) + error.statistic) / 2))
 
 
-def _alternatives(case: SuspectCase, best: Rest, elsewhere: Sequence[Rest]) -> Alternatives:
+def _alternatives(case: SuspectCase, best: RemainingFix, elsewhere: Sequence[RemainingFix]) -> Alternatives:
     """Return the other positions of the best explanation and those of the others, by score, cheapest first."""
     first = best.fix
     x = [case.vector(first, first.alternatives.x), *(case.vector(rest.fix)[None] for rest in elsewhere)]

@@ -22,10 +22,10 @@ from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, is_scaled
 from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.outside import accept
-from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, NOTICED, REFUTED
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, P_OUTLIER
 from optloc.solvers.pool import Pool, begin, offer, pack
-from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
-from optloc.solvers.verdict.judge import judge, standing, verdict
+from optloc.solvers.stages import add_candidates, fix_by, gtrs, lsr, roots, search
+from optloc.solvers.verdict.judge import judge, surviving_candidates, verdict
 
 # Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and rows of all
 # subsets that are fixed together, at 2.5 kB a row: 40 MB, and larger parts are not faster.
@@ -46,7 +46,7 @@ _Set = tuple[tuple[int, ...], Array, frozenset[int]]
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
+class RemainingFix:
     """The fix to what is left without some groups.
 
     Parameters
@@ -86,27 +86,27 @@ class Outcome:
         Redundancy of what has it.
     """
 
-    rests: tuple[Rest, ...]
+    rests: tuple[RemainingFix, ...]
     p_value: dict[tuple[int, ...], float]
     note: str = ""
-    closest: Rest | None = None
+    closest: RemainingFix | None = None
     tried: int = 0
     least: float = np.inf
     dof: int = 0
 
 
-def rest_of(groups: Sequence[Group], left: tuple[int, ...], fix: Fix) -> Rest:
+def remaining_fix_of(groups: Sequence[Group], left: tuple[int, ...], fix: Fix) -> RemainingFix:
     """Return what one problem is without some groups, with its score."""
-    return Rest(left, fix, float(fix.cost) + sum(groups[i].price for i in left))
+    return RemainingFix(left, fix, float(fix.cost) + sum(groups[i].price for i in left))
 
 
-def passes(fix: Fix) -> Array:
+def passes_noise_test(fix: Fix) -> Array:
     """Return which rests (N,) the noise allows; one without redundancy shows nothing.
 
     Rests that fit at infinity only count too.
     """
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.isfinite(fix.cost) & (fix.dof > 0) & (fix.p_value >= REFUTED))
+        return np.asarray(np.isfinite(fix.cost) & (fix.dof > 0) & (fix.p_value >= P_MISFIT))
 
 
 def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
@@ -115,7 +115,7 @@ def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Alike:
+class SameRows:
     """Problems of a flat batch in which the same rows are present.
 
     Parameters
@@ -140,13 +140,13 @@ class Alike:
 class _Request:
     """Sets of groups (C,) that are left out of some of the problems of an `Alike`, and the least scores so far."""
 
-    alike: Alike
+    alike: SameRows
     items: Array
     sets: Sequence[_Set]
     best: Array
 
 
-def explain(alike: Sequence[Alike]) -> list[list[Outcome]]:
+def explain(alike: Sequence[SameRows]) -> list[list[Outcome]]:
     """Return the explanations of each problem: all sets of groups within the gap of the best.
 
     Sets of one, of two and so on are tried, as long as their prices alone do not exceed what has been found, the rest
@@ -167,13 +167,13 @@ def explain(alike: Sequence[Alike]) -> list[list[Outcome]]:
     return out
 
 
-def _search(alike: Alike) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
+def _search(alike: SameRows) -> Generator[list[_Request], list[list[_Tried]], list[Outcome]]:
     """Yield the sets to be tried, size by size, and return the outcomes (N,)."""
     groups, whole, count = alike.groups, alike.whole, alike.batch.count
     prices = np.cumsum(np.sort([group.price for group in groups]))
-    rests = [[rest_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes(whole))]
+    rests = [[remaining_fix_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes_noise_test(whole))]
     probability: list[dict[tuple[int, ...], float]] = [{(): float(p)} for p in whole.p_value]
-    closest: list[Rest | None] = [None] * len(rests)
+    closest: list[RemainingFix | None] = [None] * len(rests)
     least = [(float(c), int(r)) for c, r in zip(whole.cost, whole.dof, strict=True)]
     tried = np.zeros(len(rests), dtype=np.int64)
     for size in range(1, len(groups) + 1):
@@ -202,10 +202,10 @@ def _search(alike: Alike) -> Generator[list[_Request], list[list[_Tried]], list[
                 closest[item], least[item] = one.closest, min(least[item], one.least)
     notes = ["" if dof > 1 else _BLIND for dof in whole.dof]
     parts = zip(rests, probability, notes, closest, tried, least, strict=True)
-    return [Outcome(listed(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
+    return [Outcome(within_gap(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
 
 
-def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
+def within_gap(rests: Sequence[RemainingFix], groups: Sequence[Group]) -> tuple[RemainingFix, ...]:
     """Return the rests whose score comes within the gap of the least, the best first.
 
     One that leaves out more than another is listed where the cost falls by more than the data may fall by chance: for
@@ -214,7 +214,7 @@ def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
     if not rests:
         return ()
     order = sorted(rests, key=lambda rest: (rest.score, rest.left))
-    kept: list[tuple[frozenset[tuple[int, int]], Rest]] = []
+    kept: list[tuple[frozenset[tuple[int, int]], RemainingFix]] = []
     for rest in order:
         if rest.score > order[0].score + AMBIGUOUS_GAP:
             break
@@ -224,7 +224,7 @@ def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
     return tuple(rest for _, rest in kept)
 
 
-def _adds_nothing(rest: Rest, size: int, other: Rest, fewer: int) -> bool:
+def _adds_nothing(rest: RemainingFix, size: int, other: RemainingFix, fewer: int) -> bool:
     if size == fewer:  # the same under other names: their costs differ by rounding
         return True
     return float(other.fix.cost - rest.fix.cost) <= (ROW_PRICE - AMBIGUOUS_GAP) * (size - fewer)
@@ -240,9 +240,9 @@ def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int,
 class _Tried:
     """What the sets of one size say about one problem, collected."""
 
-    rests: list[Rest]
+    rests: list[RemainingFix]
     p_value: dict[tuple[int, ...], float]
-    closest: Rest | None = None
+    closest: RemainingFix | None = None
     least: tuple[float, int] = (np.inf, 0)
     best: float = np.inf
     cheapest: float = np.inf
@@ -290,7 +290,7 @@ def _try_requests(asked: dict[int, list[_Request]]) -> dict[int, list[list[_Trie
 class _Pair(NamedTuple):
     """One problem of an `Alike`, a set that is left out of it, and where the result goes."""
 
-    alike: Alike
+    alike: SameRows
     item: int
     left: _Set
     tried: _Tried
@@ -301,11 +301,11 @@ def _try_pairs(pairs: Sequence[_Pair]) -> None:
     alike, others = pairs[0].alike, sorted(pairs[0].left[2])
     items = np.array([pair.alike.items[pair.item] for pair in pairs])
     rows, changed = np.stack([pair.left[1] for pair in pairs]), [alike.groups[i] for i in others]
-    fix = fix_rest(leave_out(alike.batch.take(items), rows, changed))
+    fix = fix_remaining(leave_out(alike.batch.take(items), rows, changed))
     cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf)
     price = np.array([sum(pair.alike.groups[i].price for i in pair.left[0]) for pair in pairs])
     begins = all(group.offset is None for group in changed)  # what begins at the closest has no offset
-    good, kept, near = passes(fix), list[int](), dict[int, int]()
+    good, kept, near = passes_noise_test(fix), list[int](), dict[int, int]()
     for j, (pair, p, c, score) in enumerate(
         zip(pairs, fix.p_value.tolist(), cost.tolist(), (cost + price).tolist(), strict=True)
     ):
@@ -320,7 +320,7 @@ def _try_pairs(pairs: Sequence[_Pair]) -> None:
     chosen = sorted({*kept, *near.values()})
     # copies: a view of one fix would keep all of them in memory
     own = fix[np.array(chosen, dtype=int)]
-    rests = {j: rest_of(pairs[j].alike.groups, pairs[j].left[0], own[k]) for k, j in enumerate(chosen)}
+    rests = {j: remaining_fix_of(pairs[j].alike.groups, pairs[j].left[0], own[k]) for k, j in enumerate(chosen)}
     for j in kept:
         pairs[j].tried.rests.append(rests[j])
     for j in near.values():
@@ -341,7 +341,7 @@ def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[_Set]:
             yield left, rows, frozenset(i for i in left if not groups[i].rows)
 
 
-def fix_rest(problem: Problem) -> Fix:
+def fix_remaining(problem: Problem) -> Fix:
     """Return the fixes of a flat batch by the cheapest start, and in more ways where that one may have missed.
 
     A rest that fails by less than `_NEAR` gets every stationary point of the squared-range problem as a start, and one
@@ -351,7 +351,7 @@ def fix_rest(problem: Problem) -> Fix:
     # a proof of a good rest takes a fraction of the time of other starts
     unproven = ~_is_proven(problem, pool)
     pool = _redo(problem, pool, unproven, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
-    pool = _redo(problem, pool, unproven, _CLOSE, lambda part, own: lsr(part, widen(part, own)))
+    pool = _redo(problem, pool, unproven, _CLOSE, lambda part, own: lsr(part, add_candidates(part, own)))
     if not np.isfinite(pool.cost[:, 0]).any() and (pool.dof >= 0).any():
         pool = search(problem, pool)  # no closed form starts from these kinds
     return judge(problem, pool)
@@ -379,7 +379,7 @@ def _redo(problem: Problem, pool: Pool, unproven: Array, near: float, better: Ca
 
 
 def _beside(problem: Problem, start: Pool, pool: Pool) -> Pool:
-    x = np.concatenate([start.x, standing(pool, judge(problem, pool))], axis=1)
+    x = np.concatenate([start.x, surviving_candidates(pool, judge(problem, pool))], axis=1)
     return offer(problem, pack(x), None, "roots", perf_counter())
 
 
@@ -387,7 +387,7 @@ def _limit(dof: Array) -> Array:
     """Return the cost (N,) at which the test fails."""
     from scipy.special import gammainccinv
 
-    return np.asarray(2.0 * gammainccinv(np.maximum(dof, 1) / 2, REFUTED))
+    return np.asarray(2.0 * gammainccinv(np.maximum(dof, 1) / 2, P_MISFIT))
 
 
 # Many groups: the worst is left out and the rest fixed anew, until none stands out; then who fits again is taken back.
@@ -404,7 +404,7 @@ _LARGE = 16
 _MOST_LEFT_OUT, _RIVALS = 8, 3
 
 
-def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Outcome:
+def grow_explanation(problem: Problem, groups: Sequence[Group], fix: Fix, start: RemainingFix) -> Outcome:
     """Return what explains one problem, found group by group.
 
     Parameters
@@ -419,7 +419,7 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Ou
         Where to begin.
     """
     # Bonferroni: clean data are accused once in a hundred, whatever the number of groups
-    level = float(np.log(NOTICED / len(groups)))
+    level = float(np.log(P_OUTLIER / len(groups)))
     left, rest = list(start.left), start.fix
     while (worst := _worst(problem, groups, left, rest, level)) is not None:
         # nothing would be left to agree
@@ -433,22 +433,22 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, start: Rest) -> Ou
     left, rest = _take_back(problem, groups, left, rest, level)
     if not left or not rest.answered:
         return Outcome((), {(): float(fix.p_value)}, "" if rest.answered else str(rest.reason))
-    found = [rest_of(groups, tuple(sorted(left)), rest), *_rivals(problem, groups, left, rest, level)]
-    if passes(fix):
-        found.append(rest_of(groups, (), fix))
-    return Outcome(listed(found, groups), {(): float(fix.p_value)})
+    found = [remaining_fix_of(groups, tuple(sorted(left)), rest), *_rivals(problem, groups, left, rest, level)]
+    if passes_noise_test(fix):
+        found.append(remaining_fix_of(groups, (), fix))
+    return Outcome(within_gap(found, groups), {(): float(fix.p_value)})
 
 
-def joined(outcomes: Sequence[Outcome], groups: Sequence[Group]) -> Outcome:
+def explain_from_beginnings(outcomes: Sequence[Outcome], groups: Sequence[Group]) -> Outcome:
     """Return what explains one problem, found from several beginnings: the first one's where none explains it."""
     rests = {rest.left: rest for outcome in outcomes for rest in outcome.rests}
-    return replace(outcomes[0], rests=listed([*rests.values()], groups)) if rests else outcomes[0]
+    return replace(outcomes[0], rests=within_gap([*rests.values()], groups)) if rests else outcomes[0]
 
 
-def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> Rest:
+def begin_without(problem: Problem, groups: Sequence[Group], rows: Array, x: Array) -> RemainingFix:
     """Return one problem without some rows (m,), refined from a vector (size,): where `grow` may begin."""
     left = tuple(i for i, group in enumerate(groups) if len(group.rows) == 1 and rows[group.rows[0]])
-    return rest_of(groups, left, fix_without(problem, groups, left, x))
+    return remaining_fix_of(groups, left, fix_without(problem, groups, left, x))
 
 
 def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Fix:
@@ -457,7 +457,7 @@ def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], 
     return fix_by(part, lambda one: begin(one, x[None]))[0]
 
 
-def prove_rests(problem: Problem, groups: Sequence[Group], rests: Sequence[Rest]) -> list[Rest]:
+def prove_remaining(problem: Problem, groups: Sequence[Group], rests: Sequence[RemainingFix]) -> list[RemainingFix]:
     """Return the rests of problems (N,), one each, after all tests that `ok` needs; unanswered ones stay."""
     out, alike = list(rests), dict[tuple[int, ...], list[int]]()
     for i, rest in enumerate(rests):
@@ -470,7 +470,7 @@ def prove_rests(problem: Problem, groups: Sequence[Group], rests: Sequence[Rest]
         fixes = join([rests[i].fix.flat() for i in items], len(items))
         proven = verdict(part, certified(part, accept(part, fixes)))
         for place, i in enumerate(items):
-            out[i] = rest_of(groups, rests[i].left, proven[place])
+            out[i] = remaining_fix_of(groups, rests[i].left, proven[place])
     return out
 
 
@@ -529,9 +529,9 @@ def _take_back(
     return left, rest
 
 
-def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float) -> list[Rest]:
+def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float) -> list[RemainingFix]:
     """Return other sets of as many groups: one of them in the place of another, if then none stands out either."""
-    found: dict[tuple[int, ...], Rest] = {}
+    found: dict[tuple[int, ...], RemainingFix] = {}
     for i in left if len(left) <= _MOST_LEFT_OUT else ():
         others = [j for j in left if j != i]
         fix = fix_without(problem, groups, others, rest.x)
@@ -546,7 +546,7 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
                 continue
             other = fix_without(problem, groups, key, fix.x)
             if bool(other.answered) and _worst(problem, groups, key, other, level) is None:
-                found[key] = rest_of(groups, key, other)
+                found[key] = remaining_fix_of(groups, key, other)
     return list(found.values())
 
 

@@ -20,7 +20,7 @@ from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quanti
 from optloc.problem.claims import GLOBAL, Claims, claim
 from optloc.problem.problem import Problem
 from optloc.problem.truncated import Truncated
-from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, NOTICED, REFUTED
+from optloc.solvers.policy import AMBIGUOUS_GAP, P_MISFIT, P_OUTLIER, P_SUSPECT, REGION_LEVEL
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.verdict.repeats import holds, is_repeatable, repeat
 
@@ -135,7 +135,7 @@ def objections(table: Sequence[Finding], evidence: Any) -> list[tuple[Status, st
     return sorted(found, key=lambda one: PRECEDENCE.index(one[0]))
 
 
-def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
+def finding_marks(problem: Problem, pool: Pool, gap: Array) -> Array:
     """Return the marks (N,) of all findings against settled answers that are finished; zero without one.
 
     An answer is `ok` where the data do not reject the model, no other minimum within `AMBIGUOUS_GAP` is left (which is
@@ -152,15 +152,15 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
     """
     cost, kappa = pool.cost[:, 0], None if pool.curvature is None else pool.curvature.kappa
     # a loss bears gross errors: their cost refutes nothing
-    improbable = np.zeros(len(pool), dtype=bool) if pool.loss else is_improbable(cost, pool.dof, REFUTED)
+    improbable = np.zeros(len(pool), dtype=bool) if pool.loss else is_improbable(cost, pool.dof, P_MISFIT)
     blind: Any = False
     if pool.asked:  # without redundancy a search for suspects sees nothing, and with one it cannot tell who it is
-        blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, NOTICED))
+        blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, P_OUTLIER))
     with np.errstate(invalid="ignore"):
         marks: Array = marks_of(
             improbable,
             np.nan if pool.infinity is None else pool.infinity - cost,
-            quantile(COVERED, problem.dimension),
+            quantile(REGION_LEVEL, problem.dimension),
             _apart(pool, gap).min(1, initial=np.inf),
             np.nan if kappa is None else kappa[:, 0],
             _is_unique(pool),
@@ -259,7 +259,7 @@ def _with_repeats(problem: Problem, pool: Pool, good: Array) -> Pool:
     cost = pool.cost[:, 0]
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
-    items = np.flatnonzero(good & (pool.face[:, 0] == 0) & (mark(problem, pool, gap) == Status.CURVED.mark))
+    items = np.flatnonzero(good & (pool.face[:, 0] == 0) & (finding_marks(problem, pool, gap) == Status.CURVED.mark))
     if pool.pair is not None:  # no Gaussian describes both sides of a plane
         items = items[np.isnan(pool.pair[items, 0]).any(-1)]
     if not len(items):
@@ -438,7 +438,7 @@ def explain(finished: Finished, code: Array, reason: Array) -> None:
         items = np.flatnonzero(empty & (code == finding.status))
         if len(items):
             reason[items] = finding.sentence(finished, items)
-    doubtful = np.flatnonzero(empty & (code == Status.OK) & is_improbable(pool.cost[:, 0], pool.dof, DOUBT))
+    doubtful = np.flatnonzero(empty & (code == Status.OK) & is_improbable(pool.cost[:, 0], pool.dof, P_SUSPECT))
     if len(doubtful):
         reason[doubtful] = _name_residuals(finished, doubtful)
 
@@ -446,7 +446,7 @@ def explain(finished: Finished, code: Array, reason: Array) -> None:
 def _name_residuals(finished: Finished, items: Array) -> Any:
     """Return the sentences on residuals: one for all fixes of a problem, or one for each."""
     pool = finished.pool
-    improbable = is_improbable(pool.cost[items, 0], pool.dof[items], DOUBT)
+    improbable = is_improbable(pool.cost[items, 0], pool.dof[items], P_SUSPECT)
     told = tail_probability(pool.cost[items, 0], pool.dof[items])
     said = [f"the residuals are larger than the noise allows (p = {p:.1g})" for p in told]
     return np.where(improbable, np.array(said, dtype=object), "")

@@ -17,11 +17,11 @@ from optloc.model_checks.advice import misfit_of
 from optloc.model_checks.truncation import covariance_of
 from optloc.models import MODELS
 from optloc.models.layers import Layers
-from optloc.problem.claims import Claims, alike, choose, claim
+from optloc.problem.claims import Claims, claim, merged_claims, repeated_claims
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.problem.truncated import Truncated
-from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
+from optloc.solvers.policy import FAR, FLAT, P_SUSPECT, REJECTED, WEAK
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.conclusion import Conclusion, conclude
@@ -32,9 +32,9 @@ from optloc.solvers.verdict.findings import (
     chart_of,
     examine,
     explain,
+    finding_marks,
     is_improbable,
     law_at,
-    mark,
     reach_of,
 )
 from optloc.solvers.verdict.minima import is_measured, station_direction, unmeasured_direction, weak_direction
@@ -66,7 +66,7 @@ class Ruling:
     gone: Array
 
 
-def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
+def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     """Return the statuses that settled pools deserve.
 
     Parameters
@@ -80,7 +80,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     """
     curvature = pool.curvature
     assert curvature is not None
-    code, reason = np.array(pool.code[:, 0]), fill(len(pool), "")
+    code, reason = np.array(pool.code[:, 0]), filled_objects(len(pool), "")
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     broken = _is_broken(problem, len(pool))
     few = (pool.dof < 0) & ~broken
@@ -90,7 +90,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
     with np.errstate(invalid="ignore"):
-        improbable = is_improbable(cost, pool.dof, DOUBT)
+        improbable = is_improbable(cost, pool.dof, P_SUSPECT)
     far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | improbable)
     # No minimum in sight fits, and one that fits is hidden: that says more than where a refinement in sight broke off.
     barred = answered & _has_hidden(pool) & ((code != Status.OK) | ((weak | far) & improbable))
@@ -109,8 +109,8 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         reason[i] = _open(problem, _information(curvature)[i])
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
-    marks = np.where(finished, mark(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
-    proven = choose(finished, _claims(pool), NO_ANSWER)
+    marks = np.where(finished, finding_marks(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
+    proven = merged_claims(finished, _claims(pool), NO_ANSWER)
     if pool.free is not None:
         _hold_against_constraints(pool, cost, finished, marks, reason)
     code = first_status(marks)
@@ -118,7 +118,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     if pool.hidden is not None:
         _name_hidden(pool.hidden, finished & (code == Status.MISFIT), reason)
     if pool.loss:
-        _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, DOUBT), reason)
+        _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, P_SUSPECT), reason)
     if pool.asked:
         _weigh_redundancy(pool, finished, reason)
     return Ruling(marks, reason, proven, broken | few | missing | barred | weak | far)
@@ -130,7 +130,7 @@ def _is_broken(problem: Problem, count: int) -> Array:
     return ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), (count,))
 
 
-def fill(count: int, value: object) -> Array:
+def filled_objects(count: int, value: object) -> Array:
     """Return an object array (count,) of one value."""
     out = np.empty(count, dtype=object)
     out.fill(value)
@@ -273,8 +273,8 @@ def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: A
     held = np.array([len(active) for active in pool.curvature.active])
     with np.errstate(invalid="ignore"):
         # whether the data agree without constraints; without redundancy they always do
-        noise = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= DOUBT)
-        dear = chdtrc(np.maximum(held, 1), np.maximum(cost - free, 0.0)) < DOUBT
+        noise = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= P_SUSPECT)
+        dear = chdtrc(np.maximum(held, 1), np.maximum(cost - free, 0.0)) < P_SUSPECT
     for i in np.flatnonzero((held > 0) & finished & np.isfinite(free) & noise & dear):
         names = " and ".join(active.name for active in pool.curvature.active[i])
         marks[i] |= Status.CONTRADICTORY.mark
@@ -355,7 +355,7 @@ def _concluded(problem: Problem, item: int, told: Conclusion | Fix) -> Fix:
     return told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([item])), told)
 
 
-def standing(pool: Pool, fix: Fix) -> Array:
+def surviving_candidates(pool: Pool, fix: Fix) -> Array:
     """Return the candidates (N, q, size) of a pool that its verdict lets stand: those without a position are NaN."""
     if pool.curvature is None:
         return pool.x
@@ -371,11 +371,11 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     truncated = None if law is None else law.truncated
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
-    marks, reason, chart = np.zeros(count, dtype=np.int32), fill(count, ""), None
+    marks, reason, chart = np.zeros(count, dtype=np.int32), filled_objects(count, ""), None
     if pool.plain is not None or truncated is not None:
         chart = chart_of(problem, pool.x[:, 0], covariance, curvature, truncated)
     if pool.plain is not None:
-        marks = mark(problem, pool, gap)
+        marks = finding_marks(problem, pool, gap)
     code = first_status(marks)
     if pool.plain is not None:
         explain(Finished(problem, pool, gap, proven), code, reason)
@@ -392,9 +392,9 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         pool.dof,
         pool.weights,
         pool.stages,
-        fill(count, ()) if curvature.active is None else curvature.active,
+        filled_objects(count, ()) if curvature.active is None else curvature.active,
         curvature.local,
-        fill(count, ()) if pool.asked else None,
+        filled_objects(count, ()) if pool.asked else None,
         marks,
         chart,
         np.full(count, np.nan) if pool.infinity is None else pool.infinity - cost,
@@ -421,17 +421,17 @@ def _claims(pool: Pool) -> Claims:
     """Return the claims (N,) of refined answers: what was proven of them, or that they are minima."""
     if pool.proven is None:
         return _without_proof(len(pool))
-    return choose(pool.proven.tried, pool.proven, NO_PROOF)
+    return merged_claims(pool.proven.tried, pool.proven, NO_PROOF)
 
 
 @lru_cache(maxsize=64)  # read-only views
 def _without_proof(count: int) -> Claims:
-    return alike(NO_PROOF, count)
+    return repeated_claims(NO_PROOF, count)
 
 
 def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
     """Return the fixes with the statuses of the rules."""
-    ruling = rule(problem, pool, fix.alternatives.gap)
+    ruling = decide_statuses(problem, pool, fix.alternatives.gap)
     assert pool.curvature is not None
     regular = pool.curvature.regular
     unknown = ruling.gone if regular is None else ruling.gone | ~regular
@@ -454,7 +454,7 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
     """Return starts as fixes whose status says that they are not refined, or why there is none."""
     count, n = len(pool), problem.layout.n_shared
     name = pool.stages[-1].name if pool.stages else "start"
-    code, reason = np.full(count, int(Status.UNREFINED), dtype=np.int8), fill(count, "not refined")
+    code, reason = np.full(count, int(Status.UNREFINED), dtype=np.int8), filled_objects(count, "not refined")
     empty, broken = pool.empty, _is_broken(problem, count)
     few = (pool.dof < 0) & empty & ~broken
     code[broken & empty], code[few], reason[broken & empty] = Status.REJECTED, Status.TOO_FEW_ROWS, ""
@@ -468,7 +468,7 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
         problem.frame,
         code,
         reason,
-        alike(claim(Certificate("unknown", "a start, not refined", name)), count),
+        repeated_claims(claim(Certificate("unknown", "a start, not refined", name)), count),
         Alternatives(pool.x[:, 1:], np.full((count, pool.x.shape[1] - 1), np.nan)),
         np.full(count, np.nan),
         pool.dof,
@@ -477,7 +477,7 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
     )
 
 
-def failed(problem: Problem, cause: str) -> Fix:
+def failed_fixes(problem: Problem, cause: str) -> Fix:
     """Return fixes (N,) without an answer, whose status is `numerical` and whose reason is the cause."""
     count, size, n = problem.batch_shape[0], problem.layout.size, problem.layout.n_shared
     code = np.full(count, int(Status.NUMERICAL), dtype=np.int8)
@@ -487,8 +487,8 @@ def failed(problem: Problem, cause: str) -> Fix:
         problem.layout,
         problem.frame,
         code,
-        fill(count, cause),
-        alike(NO_ANSWER, count),
+        filled_objects(count, cause),
+        repeated_claims(NO_ANSWER, count),
         Alternatives(np.full((count, 0, size), np.nan), np.full((count, 0), np.inf)),
         np.full(count, np.nan),
         # nothing is computed here, since whatever is may fail again: without a cost no redundancy is of use

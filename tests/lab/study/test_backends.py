@@ -16,7 +16,7 @@ from optloc.lab.study.design import design_of_text
 from optloc.lab.study.folder import progress, read_frame
 from optloc.lab.study.summary import COLUMNS, judged, methods
 from optloc.solvers import back_ends as module
-from optloc.solvers.back_ends import backend_kind, backends, faults_of, installed, try_apart
+from optloc.solvers.back_ends import backend_kind, backends, faults_of, installed, try_in_process
 from optloc.solvers.methods import Choice, using
 
 RUN = CliRunner()
@@ -75,9 +75,9 @@ def test_what_was_tried_once_is_kept(monkeypatch):
 @pytest.mark.slow
 def test_who_ends_the_process_is_named_and_the_others_are_tried(monkeypatch):
     monkeypatch.setattr(module, "_PATIENCE", 1e-3)  # the first that is tried has no time
-    assert "does not end within" in try_apart({"sqpmethod": "nonlinear"})["sqpmethod"]
+    assert "does not end within" in try_in_process({"sqpmethod": "nonlinear"})["sqpmethod"]
     monkeypatch.undo()
-    found = try_apart({"nobody": "nonlinear", "nothing": "conic", "ipopt": "nonlinear"})
+    found = try_in_process({"nobody": "nonlinear", "nothing": "conic", "ipopt": "nonlinear"})
     assert found["nobody"]
     assert found["nothing"]
     assert found["ipopt"] == ""

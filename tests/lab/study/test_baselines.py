@@ -8,7 +8,7 @@ from optloc.base.types import Status
 from optloc.lab.papers.registration import PRINTED, RegistrationSetting
 from optloc.lab.papers.registration_recursion import recursion as printed
 from optloc.lab.study.baselines import BASELINES, recursion, single_step
-from optloc.lab.study.draws import draw
+from optloc.lab.study.simulation import draw
 from optloc.lab.study.trial import compute
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr

@@ -14,7 +14,7 @@ from lab.study.texts import QUICK, assert_identical, design, run_here, values
 from pyarrow import parquet
 
 from optloc.base.errors import InvalidProblem
-from optloc.lab.study import draws, execute
+from optloc.lab.study import execute, simulation
 from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import (
     finished_parts,
@@ -197,8 +197,10 @@ def test_studies_are_compared_cell_by_cell(whole, tmp_path):
 @pytest.fixture
 def elsewhere(monkeypatch):
     """Draw what a machine draws whose last digit is another."""
-    here = draws.simulate
-    monkeypatch.setattr(draws, "simulate", lambda *given: (made := here(*given)).with_rows(z=np.nextafter(made.z, 1e9)))
+    here = simulation.simulate
+    monkeypatch.setattr(
+        simulation, "simulate", lambda *given: (made := here(*given)).with_rows(z=np.nextafter(made.z, 1e9))
+    )
 
 
 def test_the_same_seed_is_not_the_same_data(whole, tmp_path, elsewhere):
@@ -236,13 +238,15 @@ def test_parts_that_contradict_each_other_are_refused(whole, tmp_path):
 def test_a_part_with_other_data_is_not_stored(tmp_path, monkeypatch):
     """Two methods, of which the second is computed where the same seed draws other data."""
     made = design(QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]'))
-    here = draws.simulate
+    here = simulation.simulate
 
     def strays(chunks, by):
         for i, chunk in enumerate(chunks):
             with monkeypatch.context() as patch:
                 if i:
-                    patch.setattr(draws, "simulate", lambda *a: (d := here(*a)).with_rows(z=np.nextafter(d.z, 1e9)))
+                    patch.setattr(
+                        simulation, "simulate", lambda *a: (d := here(*a)).with_rows(z=np.nextafter(d.z, 1e9))
+                    )
                 yield compute(chunk)
 
     monkeypatch.setattr(execute, "compute_all", strays)

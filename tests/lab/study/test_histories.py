@@ -16,12 +16,12 @@ from optloc.cli import app
 from optloc.lab.report.figures import history_picture, profile_picture
 from optloc.lab.study.baselines import BASELINES, Baseline, start_of, whiten_one
 from optloc.lab.study.design import design_of
-from optloc.lab.study.draws import draw
 from optloc.lab.study.folder import read_frame
-from optloc.lab.study.histories import Histories, band, histories, question, reach, way_of
+from optloc.lab.study.histories import Histories, band, histories, reach, trace_of, trials_of
 from optloc.lab.study.methods import added, run
 from optloc.lab.study.minimizers import Minimizer
 from optloc.lab.study.profiles import profiles
+from optloc.lab.study.simulation import draw
 from optloc.lab.study.summary import COLUMNS
 from optloc.show.drawing import marks
 from optloc.show.pictures.style import save
@@ -35,7 +35,7 @@ DRAWN = draw(CASE, 0, 5)
 
 def ways(name):
     (method,) = added([name])
-    return way_of(method, DRAWN)
+    return trace_of(method, DRAWN)
 
 
 def listened(function, monkeypatch):
@@ -146,7 +146,7 @@ def folder(tmp_path_factory):
 
 
 def test_a_study_knows_its_trials_and_the_least_cost_of_each(folder):
-    asked = question(folder, ["scipy"], 3)
+    asked = trials_of(folder, ["scipy"], 3)
     frame = read_frame(folder)
     own = frame[(frame["scenario"] == "differences") & (frame["noise_label"] == "1 m") & (frame["trial"] < 3)]
     assert asked.least == pytest.approx(own.groupby("trial")["cost"].min().to_numpy())
@@ -164,22 +164,22 @@ def test_a_study_knows_its_trials_and_the_least_cost_of_each(folder):
     assert found.frame["above"].min() == 0.0
     assert {one.method: one.reached for one in reach(found, 1e-3)}["gtrs+lsr"] == 3
     assert (found.frame.groupby(["method", "trial"])["best"].diff().dropna() <= 0.0).all()
-    assert question(folder, [], 3, "arrivals", "3 m").title == "arrivals, 3 m"
+    assert trials_of(folder, [], 3, "arrivals", "3 m").title == "arrivals, 3 m"
 
 
 def test_what_cannot_be_followed_is_a_sentence(folder, tmp_path):
     for options, words in (({"case": "arrival"}, "did you mean 'arrivals'"), ({"noise": "4 m"}, "no noise '4 m'")):
         with pytest.raises(InvalidProblem, match=words):
-            question(folder, [], 3, **options)
+            trials_of(folder, [], 3, **options)
     flown = 'truth = { kind = "hull" }\nnoise = ["3 m"]\n\n[[method]]'
     held = TEXT.replace("layout = { stations = 6, kinds", 'layout = { survey = "20 m", stations = 6, kinds')
     held = held.replace('["toa"]', '["azimuth"]').replace(flown, flown.replace("3 m", "1 deg"))
     drawn = draw(design(held).cells[2].case, 0, 2)
-    asked = question(folder, [], 2)
+    asked = trials_of(folder, [], 2)
     with pytest.raises(InvalidProblem, match="depend on the place"):
         histories(type(asked)("t", drawn, asked.methods, asked.least))
     with pytest.raises(InvalidProblem):
-        question(tmp_path, [], 3)
+        trials_of(tmp_path, [], 3)
     with pytest.raises(InvalidProblem, match="no method tells its way"):
         histories(type(asked)("t", DRAWN.part(0, 2), tuple(added(["suspects"])), asked.least))
     with pytest.raises(InvalidProblem, match="is not positive"):
@@ -227,6 +227,6 @@ def test_the_pictures_of_the_page_are_of_the_public_test_set(tmp_path):
     found = profiles(read_frame(out, COLUMNS), out=["truth"])
     assert found.spent.shape == (8, 240)
     save(profile_picture(found, marks(list(found.methods))), DOCS / "measured" / "profiles.png")
-    ways = histories(question(out, names, 40, "differences, far"))
+    ways = histories(trials_of(out, names, 40, "differences, far"))
     assert len(ways.methods) == 8
     save(history_picture(ways, marks(list(ways.methods))), DOCS / "measured" / "histories.png")

@@ -17,12 +17,12 @@ from optloc.cli import app
 from optloc.kernels.sums import equations_at
 from optloc.lab.study.baselines import BASELINES, start_of, whiten_one
 from optloc.lab.study.design import design_of_text
-from optloc.lab.study.draws import draw
 from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import part_files, progress, read_frame
 from optloc.lab.study.methods import added
 from optloc.lab.study.minimizers import Minimizer, baseline_of, cost_of
 from optloc.lab.study.paired import paired
+from optloc.lab.study.simulation import draw
 from optloc.lab.study.summary import COLUMNS, judged
 
 RUN, HERE = CliRunner(), executor("processes", 1)

@@ -7,7 +7,7 @@ from scipy.linalg import orthogonal_procrustes
 from scipy.stats import chi2
 
 from optloc.base.errors import InvalidProblem
-from optloc.lab.study.networks import apart, rms
+from optloc.lab.study.networks import distances_apart, rms
 from optloc.lab.study.trial import compute
 
 HALL = """
@@ -41,11 +41,11 @@ def test_errors_are_what_the_best_motion_and_reflection_leave():
     rng = np.random.default_rng(0)
     truth, noise = rng.standard_normal((7, 3)), 0.1 * rng.standard_normal((7, 3))
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0] * [1.0, 1.0, -1.0]
-    assert rms(apart(truth @ turn + 5.0, truth)) < 1e-14
+    assert rms(distances_apart(truth @ turn + 5.0, truth)) < 1e-14
     places = (truth + noise) @ turn - 2.0
     a, b = places - places.mean(axis=0), truth - truth.mean(axis=0)
-    assert apart(places, truth) == pytest.approx(a @ orthogonal_procrustes(a, b)[0] - b, abs=1e-12)
-    assert rms(apart(places, truth)) <= rms(noise)
+    assert distances_apart(places, truth) == pytest.approx(a @ orthogonal_procrustes(a, b)[0] - b, abs=1e-12)
+    assert rms(distances_apart(places, truth)) <= rms(noise)
 
 
 def test_a_trial_does_not_depend_on_the_others_and_has_the_flaws_that_were_asked_for():

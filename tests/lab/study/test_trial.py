@@ -7,8 +7,8 @@ from lab.study.texts import design
 import optloc
 from optloc.lab.study import trial
 from optloc.lab.study.design import Chunk
-from optloc.lab.study.draws import draw
 from optloc.lab.study.methods import run
+from optloc.lab.study.simulation import draw
 from optloc.lab.study.trial import COLUMNS, DIED, arrow_schema, compute
 
 

@@ -5,7 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optloc.proof.nodes.node import NodeRow, across, excess, lay_out, product, range_bend, range_form, reach, scaled
+from optloc.proof.nodes.node import (
+    NodeRow,
+    hypot_excess,
+    lay_out,
+    length_across,
+    product,
+    range_form,
+    range_hessian,
+    reach,
+    scaled,
+)
 
 pytestmark = pytest.mark.usefixtures("plainly")
 
@@ -33,9 +43,9 @@ def test_quotients_are_enclosed_by_the_right_ends():
 
 
 def test_the_excess_of_a_hypotenuse_keeps_its_digits():
-    assert excess(3.0, 4.0) == pytest.approx(2.0)
-    assert excess(1e9, 1.0) == pytest.approx(0.5e-9, rel=1e-12)
-    assert excess(-3.0, 4.0) == pytest.approx(8.0)
+    assert hypot_excess(3.0, 4.0) == pytest.approx(2.0)
+    assert hypot_excess(1e9, 1.0) == pytest.approx(0.5e-9, rel=1e-12)
+    assert hypot_excess(-3.0, 4.0) == pytest.approx(8.0)
 
 
 def test_a_range_over_a_box_is_between_its_linear_form_and_the_remainder():
@@ -51,7 +61,7 @@ def test_a_range_over_a_box_is_between_its_linear_form_and_the_remainder():
         assert least <= r + (s @ np.array(u)).min()
         assert ranges.max() <= far
         if least > 0.0:
-            hessian = np.array(range_bend(sense, half, r, u, least, rest)[0])
+            hessian = np.array(range_hessian(sense, half, r, u, least, rest)[0])
             n = line / r
             expected = sense.T @ (np.eye(3) - np.outer(n, n)) @ sense / r
             np.testing.assert_allclose(hessian, expected[np.triu_indices(3)], atol=1e-12)
@@ -62,7 +72,7 @@ def test_what_is_across_a_unit_vector_is_no_longer_than_bounded():
     sense, half, n = rng.normal(size=(3, 3)), np.array([1.0, 0.5, 2.0]), np.array([0.6, 0.0, 0.8])
     moved = inside(rng, half) @ sense.T
     left = np.linalg.norm(moved - np.outer(moved @ n, n), axis=1)
-    assert left.max() <= across(sense, n @ sense, half)
+    assert left.max() <= length_across(sense, n @ sense, half)
 
 
 def test_a_row_reads_the_stations_of_its_own_epoch():

@@ -5,10 +5,10 @@ import pytest
 from proof.costs import WIDTH, random_case
 
 from optloc.kernels.jit import enabled
-from optloc.proof.box import bound_nodes, cut_out, least_residual, linearise_rows, shrink
-from optloc.proof.nodes.node import NODE_WIDTH, RANGE, greatest
+from optloc.proof.box import bound_nodes, contract_box, cut_out, least_residual, linearise_rows
+from optloc.proof.nodes.node import NODE_WIDTH, RANGE, largest_quadratic
 from optloc.proof.nodes.range import bound_ranges
-from optloc.proof.search_space import chart_at, cost_of, empty_box, place
+from optloc.proof.search_space import chart_at, cost_of, empty_box, write_centre
 
 pytestmark = pytest.mark.usefixtures("form")
 
@@ -63,7 +63,7 @@ def test_quadratic_form_is_greatest_at_a_corner():
         s = corners * h
         exact = ((s @ M) * s).sum(1).max()
         M *= h[:, None] * h
-        own = greatest(M[0, 0], M[0, 1], M[0, 2], M[1, 1], M[1, 2], M[2, 2])
+        own = largest_quadratic(M[0, 0], M[0, 1], M[0, 2], M[1, 1], M[1, 2], M[2, 2])
         assert own == pytest.approx(exact, rel=1e-12)
 
 
@@ -113,7 +113,7 @@ def charted(case, x):
 
 def bound_box(cost, chart, box):
     """Fill the first tables of a box; return the bound of its residuals."""
-    place(chart.origin, chart.sense, box.at, box.centre)
+    write_centre(chart.origin, chart.sense, box.at, box.centre)
     bound_nodes(*cost[:2], box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     return least_residual(cost.K, cost.weight, chart.floor, box.half, box.nodes, box.rows)
@@ -155,7 +155,7 @@ def test_a_clipped_box_loses_no_short_residual(d):
         length = np.sqrt(case.cost((chart.origin + (box.at + s) @ chart.sense.T)[:, :d]))
         rho = np.quantile(length, 0.2)
         box.cut[:3], box.cut[3:] = -box.half, box.half
-        shrink(cost.K, cost.weight, rho, box.half, d == 2, box.nodes, box.rows, box.cut, box.solve)
+        contract_box(cost.K, cost.weight, rho, box.half, d == 2, box.nodes, box.rows, box.cut, box.solve)
         inside = s[length <= rho]
         assert (inside >= box.cut[:3]).all()
         assert (inside <= box.cut[3:]).all()

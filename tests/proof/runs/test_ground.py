@@ -16,12 +16,12 @@ from optloc.problem import Prior
 from optloc.proof.runs.ground import (
     Ground,
     axes_at,
-    bends_of,
-    carried,
     corners_on,
+    curvature_bounds,
     errors_of,
-    level_way,
+    horizontal_vector,
     lift,
+    place_over_ground,
     set_reached,
     set_second,
     set_starts,
@@ -29,11 +29,11 @@ from optloc.proof.runs.ground import (
     state_off,
     state_on,
 )
-from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.rows import residual_at, rounding_of_residual
 from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import has_no_minimum, hessian_of_state, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import StateAxes, cost_of_state, put, set_bends, set_box, table_of
-from optloc.proof.scope import unsupported
+from optloc.proof.scope import why_unsupported
 from optloc.solvers.certificates.position_cost import state_columns
 
 Array = np.ndarray
@@ -91,7 +91,7 @@ def surface(rng: np.random.Generator, span: float) -> Ground:
 def place_of(ground: Ground, q: Array, way: Array, rise: float) -> Array:
     off, place, normal = lift(ground, q[0], q[1])
     assert abs(off) < 1e-6
-    return np.array(carried(ground, place, level_way(ground, normal, way[0], way[1]), rise))
+    return np.array(place_over_ground(ground, place, horizontal_vector(ground, normal, way[0], way[1]), rise))
 
 
 @pytest.mark.usefixtures("form")
@@ -102,7 +102,7 @@ def test_places_are_those_of_the_model(seed):
         turn = ground.data[6:15].reshape(3, 3)
         start = np.array(lift(ground, *rng.uniform(-2e5, 2e5, 2))[1]) + rng.normal(0.0, 100.0, 3)
         way, rise = rng.normal(size=3) * 10.0 ** rng.uniform(0.0, 5.5), rng.normal(0.0, 100.0)
-        own = np.array(carried(ground, tuple(start), tuple(way), rise))
+        own = np.array(place_over_ground(ground, tuple(start), tuple(way), rise))
         begun, led = turn @ start + ground.data[3:6], turn @ (start + way) + ground.data[3:6]
         model = np.array(carry(tuple(begun), tuple(led), rise))
         assert np.allclose(turn @ own + ground.data[3:6], model, rtol=0.0, atol=2e-8)
@@ -136,7 +136,7 @@ def test_bounds_of_derivatives_hold_along_any_line(seed):
         ground = surface(rng, 1.0)
         state = np.concatenate([rng.uniform(-4e5, 4e5, 2), rng.uniform(-3e5, 3e5, 2)])
         half = 10.0 ** rng.uniform(0.0, 5.0) * rng.uniform(size=4)
-        good, *bounds = bends_of(ground, state, half + 2.0 * step)
+        good, *bounds = curvature_bounds(ground, state, half + 2.0 * step)
         assert good
         at, way = state + rng.uniform(-1.0, 1.0, 4) * half, rng.normal(size=4)
         way /= np.linalg.norm(way)
@@ -160,7 +160,7 @@ def test_differences_are_as_exact_as_they_say(seed):
         starts, reached, own = np.zeros((21, 6)), np.zeros((21, 3)), np.zeros((4, 4))
         set_starts(ground, state, 0, 21, starts)
         set_reached(ground, state, time, 10.0, starts, 0, 21, reached)
-        _, _, _, third = bends_of(ground, state, np.zeros(4))
+        _, _, _, third = curvature_bounds(ground, state, np.zeros(4))
         first, second = errors_of(third)
         slope = np.array([[slope_of(reached, i, a) for a in range(4)] for i in range(3)])
         bent = np.empty((3, 4, 4))
@@ -207,7 +207,7 @@ def test_no_point_costs_less_than_its_box(seed):
     rng, told = np.random.default_rng([5, seed]), 0
     for course, axes, table in boxes(rng, 25):
         here = residual_at(course.rows, table.nodes, table.sheet)
-        noise = blur_of(course.rows, 1e7, table.nodes)
+        noise = rounding_of_residual(course.rows, 1e7, table.nodes)
         set_lines(course, table)
         low = least_length(course, table, here, False)
         set_bends(course, axes, table)
@@ -226,7 +226,7 @@ def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
         residual_at(course.rows, table.nodes, table.sheet)
         set_lines(course, table)
         set_bends(course, axes, table)
-        ball, noise = sum_up(course, table, blur_of(course.rows, 1e7, table.nodes))
+        ball, noise = sum_up(course, table, rounding_of_residual(course.rows, 1e7, table.nodes))
         states, good = inside(rng, axes, table, many(20, 6)), is_convex(table, ball, 0.0)
         convex += good
         for state in states if ball < np.inf else ():
@@ -427,7 +427,7 @@ def test_covariances_of_heights_that_are_kept_are_covered():
     ],
 )
 def test_what_is_not_covered_is_said(what, word):
-    assert word in unsupported(simple(**what)[0].flat())
+    assert word in why_unsupported(simple(**what)[0].flat())
 
 
 @pytest.mark.parametrize("number", few((1, 0, 2), 1))  # the first is proven in a second, the next in half a minute

@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 
 from optloc.kernels.jit import enabled, plain
 from optloc.proof.batch import ProofRequest
-from optloc.proof.everywhere import UNBOUNDED
-from optloc.proof.near import (
+from optloc.proof.global_search import UNBOUNDED
+from optloc.proof.local_search import (
     ANOTHER,
     BETTER,
     BUDGET,

@@ -6,18 +6,18 @@ import pytest
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI
 from optloc.proof.runs.rows import (
     RunRows,
-    blur_of,
-    digits_of,
     greatest_length,
     is_balanced,
     is_convex_by,
     multiply,
+    multiply_transposed,
     norm_of,
-    project,
-    pull_back,
+    project_out_unknowns,
+    relative_rounding_of,
     residual_at,
+    rounding_of_residual,
     share_within,
-    sheet_of,
+    workspace_of,
 )
 
 pytestmark = pytest.mark.usefixtures("plainly")
@@ -37,20 +37,20 @@ def test_products_are_those_of_the_dense_matrix():
     made, values, out = rows(), np.array([1.0, -2.0, 0.5, 4.0]), np.empty(4)
     multiply(made, values, out)
     np.testing.assert_allclose(out, S @ values)
-    pull_back(made, values, out)
+    multiply_transposed(made, values, out)
     np.testing.assert_allclose(out, S.T @ values)
 
 
 def test_what_others_can_change_is_taken_off():
     values = np.array([5.0, 2.0, -1.0, 7.0])
-    project(rows(), values)
+    project_out_unknowns(rows(), values)
     np.testing.assert_allclose(values, [3.0, 0.0, -3.0, 7.0], atol=1e-12)
 
 
 def test_the_cost_is_that_of_the_best_offset():
     made, nodes = rows(), np.zeros((4, NODE_WIDTH))
     nodes[:, PHI] = [10.0, 4.0, -3.0, 1.0]
-    sheet = sheet_of(made)
+    sheet = workspace_of(made)
     e = S @ nodes[:, PHI] - W
     best = np.append(e[:3] - e[:3].mean(), e[3])
     assert residual_at(made, nodes, sheet) == pytest.approx((best**2).sum())
@@ -72,9 +72,9 @@ def test_differences_are_balanced_and_a_change_of_one_node_is_not():
 
 def test_rounding_grows_with_nodes_and_their_enclosures():
     made, nodes = rows(), np.zeros((4, NODE_WIDTH))
-    assert blur_of(made, 2.0, nodes) == pytest.approx(2.0 * digits_of(made))
+    assert rounding_of_residual(made, 2.0, nodes) == pytest.approx(2.0 * relative_rounding_of(made))
     nodes[1, PHI], nodes[1, LOW], nodes[1, HIGH] = -3.0, -1.0, 2.0
-    assert blur_of(made, 0.0, nodes) == pytest.approx(digits_of(made) * np.sqrt(5.0) * 6.0)
+    assert rounding_of_residual(made, 0.0, nodes) == pytest.approx(relative_rounding_of(made) * np.sqrt(5.0) * 6.0)
     assert share_within(made) == pytest.approx(0.8)
 
 

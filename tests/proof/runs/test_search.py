@@ -13,11 +13,11 @@ from optloc import Frame, Stations, assemble, measured, with_bias
 from optloc.kernels.jit import enabled
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.batch import costs_at
-from optloc.proof.box import cube
-from optloc.proof.curvature import C00, entry
+from optloc.proof.box import station_cube
+from optloc.proof.curvature import C00, symmetric_entry
 from optloc.proof.position_costs import position_costs
 from optloc.proof.runs.prove import costs_of_runs
-from optloc.proof.runs.rows import blur_of, least_length, residual_at
+from optloc.proof.runs.rows import least_length, residual_at, rounding_of_residual
 from optloc.proof.runs.run_costs import run_costs
 from optloc.proof.runs.search import sum_at, tables_of
 from optloc.proof.search_space import chart_on
@@ -77,7 +77,7 @@ def spaces(problem, run, x: Array):
     """Yield where boxes of a run lie, with functions that draw a box there and return its half-widths."""
     tables, (planes, surface) = tables_of(run), surfaces_of(problem, x[None])
     chart, _ = chart_on(run.look, x, tables.small, planes[0], surface[0])
-    middle, radius = cube(run.cost.kinds, run.cost.data, x)
+    middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     atlas, none = atlas_of(middle, radius, len(x), 0), np.empty((0, 3))
     yield Space(False, atlas, chart, none, none), tables
     if not len(surface[0]) and not {"range"} & {rows.kind for rows in problem.rows}:
@@ -153,7 +153,11 @@ def test_no_point_of_a_box_costs_less_than_its_bound(seed, count):
                 at, half, piece = put(space, tables, rng, len(x))
                 if not place(space, tables, run.cost, at, half, piece):
                     continue
-                here, noise, slip = residual_at(run.rows, box.nodes, sheet), blur_of(run.rows, floor, box.nodes), 0.0
+                here, noise, slip = (
+                    residual_at(run.rows, box.nodes, sheet),
+                    rounding_of_residual(run.rows, floor, box.nodes),
+                    0.0,
+                )
                 if len(space.chart.surface):
                     slip = box.graph[SLIP]
                 lows = [least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, False)]
@@ -183,8 +187,8 @@ def test_no_point_of_a_box_has_a_hessian_beyond_its_bounds(seed, count):
                     set_centre(space.atlas, piece, at)
                 _, ball = sum_at(run, space, tables, floor)
                 sums = tables.box.sums.copy()
-                whole = np.array([[sums[entry(k, m)] for m in range(3)] for k in range(3)])
-                return whole, np.array([[sums[C00 + entry(k, m)] for m in range(3)] for k in range(3)]), ball
+                whole = np.array([[sums[symmetric_entry(k, m)] for m in range(3)] for k in range(3)])
+                return whole, np.array([[sums[C00 + symmetric_entry(k, m)] for m in range(3)] for k in range(3)]), ball
 
             for _ in range(many(count, 2)):
                 at, half, piece = put(space, tables, rng, len(x))

@@ -13,7 +13,7 @@ from proof.sampling import many
 from optloc import Motion, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
 from optloc.kernels.jit import enabled
 from optloc.problem import Prior
-from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.rows import residual_at, rounding_of_residual
 from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import (
     has_no_minimum,
@@ -24,7 +24,7 @@ from optloc.proof.runs.state_bounds import (
     sum_up,
 )
 from optloc.proof.runs.states import StateAxes, cost_of_state, put, set_bends, set_box, table_of
-from optloc.proof.scope import unsupported
+from optloc.proof.scope import why_unsupported
 from optloc.solvers.certificates.position_cost import state_columns
 
 Array = np.ndarray
@@ -100,7 +100,7 @@ def test_no_point_costs_less_than_its_box(seed, count):
     rng, told = np.random.default_rng([1, seed]), 0
     for course, axes, table in boxes(rng, many(count, 14)):
         here = residual_at(course.rows, table.nodes, table.sheet)
-        noise = blur_of(course.rows, 1.0, table.nodes)
+        noise = rounding_of_residual(course.rows, 1.0, table.nodes)
         set_lines(course, table)
         low = least_length(course, table, here, False)
         set_bends(course, axes, table)
@@ -119,7 +119,7 @@ def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed, count):
         residual_at(course.rows, table.nodes, table.sheet)
         set_lines(course, table)
         set_bends(course, axes, table)
-        ball, noise = sum_up(course, table, blur_of(course.rows, 1.0, table.nodes))
+        ball, noise = sum_up(course, table, rounding_of_residual(course.rows, 1.0, table.nodes))
         states, good = inside(rng, axes, table, many(20, 8)), is_convex(table, ball, 0.0)
         convex += good
         for state in states if ball < np.inf else ():
@@ -315,4 +315,4 @@ def test_what_is_admitted_is_what_is_claimed():
 def test_what_is_not_covered_is_said(what, word):
     rows = measured("range", a=[0, 1, 2, 0], epoch=[0, 0, 0, 0], sigma=1.0)
     settings = {"times": [0.0, 5.0], "motions": (Motion(1),)} | what()
-    assert word in unsupported(assemble(np.eye(3)[:, :2] * 1e3, rows, **settings).flat())
+    assert word in why_unsupported(assemble(np.eye(3)[:, :2] * 1e3, rows, **settings).flat())

@@ -5,7 +5,7 @@ import pytest
 from proof.runs.small import STATE, course as problem, residual
 from scipy.optimize import least_squares
 
-from optloc.proof.near import UNIQUE
+from optloc.proof.local_search import UNIQUE
 from optloc.proof.runs.run_costs import course_costs
 from optloc.proof.runs.state_bounds import axes_of, hessian_of_state
 from optloc.proof.runs.state_search import (

@@ -8,17 +8,17 @@ from waves import air, plate
 
 from optloc import Problem, assemble, measured, solve, with_bias
 from optloc.kernels.jit import enabled
-from optloc.proof.atlas import atlas_of, position, set_centre
-from optloc.proof.box import cube
+from optloc.proof.atlas import atlas_of, set_centre, write_position
+from optloc.proof.box import station_cube
 from optloc.proof.convex_boxes import accuracy_floor_far
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled
 from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_rows, reduce_rows
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, scaled_costs
 from optloc.proof.scaled.scaled_search import set_scaled_minimum, tables_of
-from optloc.proof.scope import unsupported
+from optloc.proof.scope import why_unsupported
 from optloc.proof.search_space import chart_at
-from optloc.solvers.certificates.position_cost import agrees
+from optloc.solvers.certificates.position_cost import matches_problem_cost
 
 PRIORS = [0.02, 0.1, 0.3, None]
 COUNT = many(60, 3)
@@ -52,7 +52,7 @@ class Look:
         self.scene, self.d = scene, scene.place.shape[1]
         self.scaled = costs(scene.problem.flat()).one(0)
         cost = self.scaled.cost
-        self.tables, (middle, radius) = tables_of(self.scaled), cube(cost.kinds, cost.data, scene.truth)
+        self.tables, (middle, radius) = tables_of(self.scaled), station_cube(cost.kinds, cost.data, scene.truth)
         self.atlas = atlas_of(middle, radius, self.d, 1)
         self.floor = accuracy_floor_far(cost, self.atlas)
 
@@ -91,7 +91,7 @@ class Look:
         out = np.empty((len(inside), self.d))
         for i, offset in enumerate(inside):
             set_centre(self.atlas, piece, at + offset)
-            position(self.atlas, out[i])
+            write_position(self.atlas, out[i])
         set_centre(self.atlas, piece, at)
         return out
 
@@ -184,7 +184,7 @@ def test_position_costs_are_the_costs_of_the_problem(d, seed):
         np.testing.assert_allclose(costs_at_scaled(costs, x)[0][0], profiled(scene, x[0])[0], rtol=1e-7)
         fix = solve(scene.problem)
         if fix.answered:
-            assert agrees(scene.problem.flat(), fix[None], costs).all()
+            assert matches_problem_cost(scene.problem.flat(), fix[None], costs).all()
 
 
 @pytest.mark.parametrize("rounds", [1, pytest.param(30, marks=pytest.mark.full)])
@@ -240,24 +240,24 @@ def arrivals(**more):
 
 
 def test_problems_beyond_the_proof_are_named():
-    assert unsupported(arrivals().flat()) == ""
+    assert why_unsupported(arrivals().flat()) == ""
     one = with_bias(arrivals(), "more", form="scale", per="station", kind="toa", members=["S0"], sigma=0.1)
-    assert "several scales" in unsupported(one.flat())
+    assert "several scales" in why_unsupported(one.flat())
     place = np.random.default_rng(1).uniform(0.0, 10.0, (6, 2))
     ranges = assemble(place, measured("range", a=np.arange(6), z=np.full(6, 5.0), sigma=0.1))
-    assert "no prior" in unsupported(with_bias(ranges, "speed", form="scale", per="kind").flat())
+    assert "no prior" in why_unsupported(with_bias(ranges, "speed", form="scale", per="kind").flat())
     mixed = assemble(
         place,
         measured("toa", a=np.arange(6), z=np.arange(6.0), sigma=0.1),
         measured("azimuth", a=np.arange(2), z=np.zeros(2), sigma=0.1),
     )
-    assert "azimuth" in unsupported(with_bias(mixed, "speed", form="scale", per="kind", kind="toa").flat())
+    assert "azimuth" in why_unsupported(with_bias(mixed, "speed", form="scale", per="kind", kind="toa").flat())
     levels = assemble(
         place,
         measured("rss_difference", a=np.arange(1, 6), b=np.zeros(5, dtype=int), z=np.arange(5.0), sigma=1.0),
         measured("tdoa", a=np.arange(1, 6), b=np.zeros(5, dtype=int), z=np.arange(5.0), sigma=1.0),
     )
     free = with_bias(levels, "exponent", form="scale", per="kind", kind="rss_difference")
-    assert "rss_difference rows has no prior" in unsupported(free.flat())
+    assert "rss_difference rows has no prior" in why_unsupported(free.flat())
     many = with_bias(ranges, "each", form="scale", per="station", sigma=0.1)
-    assert "several scales (6)" in unsupported(many.flat())
+    assert "several scales (6)" in why_unsupported(many.flat())

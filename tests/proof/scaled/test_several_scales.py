@@ -19,8 +19,8 @@ from optloc.problem import Prior
 from optloc.proof.scaled.joint_curvature import clip_stationary, is_convex_scaled
 from optloc.proof.scaled.reduction import HERE, bound_factors, bound_rows, clip_rows, is_positive
 from optloc.proof.scaled.scaled_proof import costs_at_scaled, scaled_costs
-from optloc.proof.scope import unsupported
-from optloc.solvers.certificates.position_cost import agrees
+from optloc.proof.scope import why_unsupported
+from optloc.solvers.certificates.position_cost import matches_problem_cost
 
 # Dimension, stations, priors and whether rows are levels.
 KINDS = [
@@ -119,10 +119,10 @@ def test_position_costs_are_the_costs_of_the_problem(d, n, priors, levels, seed)
     expected, k = scene.profiled(x[0])
     good = (k > 0.0).all(1)
     np.testing.assert_allclose(costs_at_scaled(costs, x)[0][0, good], expected[good], rtol=1e-7)
-    assert unsupported(scene.problem.flat()) == ""
+    assert why_unsupported(scene.problem.flat()) == ""
     fix = solve(scene.problem)
     if fix.answered:
-        assert agrees(scene.problem.flat(), fix[None], costs).all()
+        assert matches_problem_cost(scene.problem.flat(), fix[None], costs).all()
 
 
 @pytest.mark.parametrize("rounds", [1, pytest.param(30, marks=pytest.mark.full)])
@@ -222,7 +222,7 @@ def test_two_waves_of_one_emission_are_proven_within_balls(d, seed):
                 assert min(np.linalg.norm(one.x[:d] - x) for x in known) < 0.1
     assert proven >= (2 if enabled() else 0)
     free = tuple(replace(bias, sigma=None) for bias in problem.biases)
-    assert "emission time" in unsupported(replace(problem, biases=free).flat())
+    assert "emission time" in why_unsupported(replace(problem, biases=free).flat())
     alike = tuple(replace(bias, mean=np.zeros(1), sigma=np.array([0.4])) for bias in problem.biases)
     assert "nothing bounds the position" in solve(replace(problem, biases=alike)).certificate.reason
 

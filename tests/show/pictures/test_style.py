@@ -6,7 +6,18 @@ from scipy.stats import chi2
 from show.ranging import ranged
 
 from optloc import InvalidProblem
-from optloc.show.pictures.style import PLAN, literal, panels_for, ring, save, scene_of, states_of, thinned, unit_of, xy
+from optloc.show.pictures.style import (
+    PLAN,
+    ellipse_line,
+    literal,
+    panels_for,
+    save,
+    scene_of,
+    states_of,
+    thinned,
+    unit_of,
+    xy,
+)
 
 
 def test_text_is_shown_letter_by_letter():
@@ -23,7 +34,7 @@ def test_lengths_are_in_the_unit_that_reads_best(reach, unit):
 
 def test_a_ring_is_where_the_chi_square_is_that_of_95_percent():
     cov = np.array([[9.0, 2.0], [2.0, 4.0]])
-    edge = ring(cov)
+    edge = ellipse_line(cov)
     assert np.einsum("ni,ij,nj->n", edge, np.linalg.inv(cov), edge) == pytest.approx(
         np.full(len(edge), chi2.ppf(0.95, 2))
     )

@@ -13,9 +13,9 @@ from optloc.base.types import Band
 from optloc.kernels.jit import enabled
 from optloc.linear.constraints import height
 from optloc.models.primitives import WGS84_A, WGS84_F
-from optloc.proof.everywhere import UNBOUNDED
-from optloc.proof.near import BUDGET
-from optloc.proof.scope import unsupported
+from optloc.proof.global_search import UNBOUNDED
+from optloc.proof.local_search import BUDGET
+from optloc.proof.scope import why_unsupported
 from optloc.solvers.certificates import branch_and_bound
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
@@ -243,12 +243,12 @@ def moving(span, move):
 
 
 def test_station_errors_of_a_run_are_refused_where_stations_move():
-    assert "while stations move" in unsupported(moving("run", 500.0).flat())
+    assert "while stations move" in why_unsupported(moving("run", 500.0).flat())
     fix = solve(moving("run", 500.0))
     assert fix.certificate.proof == "unknown"
     assert "while stations move" in fix.certificate.reason
     for span, move in (("run", 0.0), ("epoch", 500.0)):
-        assert unsupported(moving(span, move).flat()) == ""
+        assert why_unsupported(moving(span, move).flat()) == ""
 
 
 @machine_code
@@ -263,7 +263,7 @@ def test_station_errors_that_are_posed_agree_with_the_problem(span, move):
 def test_places_that_only_look_different_are_not_moving():
     problem = moving("run", 0.0)
     still = replace(problem.stations, position=problem.stations.position.copy())
-    assert unsupported(replace(problem, stations=still).flat()) == ""
+    assert why_unsupported(replace(problem, stations=still).flat()) == ""
 
 
 def test_differences_that_repeat_are_proven_to_infinity():

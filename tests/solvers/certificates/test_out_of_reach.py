@@ -6,7 +6,7 @@ import numpy as np
 from model_checks.small import PLACE, ranges_to
 
 from optloc import constraints
-from optloc.solvers.certificates.out_of_reach import edges_of, lay_planes, question
+from optloc.solvers.certificates.out_of_reach import edges_of, lay_planes, new_questions
 
 
 def boxed(*bounds):
@@ -30,7 +30,7 @@ def test_an_equality_and_a_greatest_speed_are_no_edges():
 def test_the_place_on_a_plane_is_where_the_quadratic_model_is_least():
     edges = edges_of(boxed([0.0, -np.inf], [np.inf, np.inf]))
     covariance = np.array([[4.0, 3.0], [3.0, 9.0]])
-    asked = question(edges, 1, 2, 5)
+    asked = new_questions(edges, 1, 2, 5)
     missing, slope = np.array([[-300.0]]), np.array([[[1.0, 0.0]]])
     lay_planes(edges, PLACE[None], covariance[None], missing, slope, asked)
     np.testing.assert_allclose(asked.planes[0, 0], [1.0, 0.0, 0.0])

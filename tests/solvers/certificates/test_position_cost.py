@@ -8,16 +8,16 @@ from model_checks.small import PLACE, SQUARE, ranges_to
 
 from optloc import Motion, assemble, constraints, measured, solve
 from optloc.solvers.certificates.position_cost import (
-    admitted,
-    agrees,
-    around,
+    admitted_states,
+    boxes_around,
     costs_of,
     eliminate_nuisance,
     is_free,
+    matches_problem_cost,
     regions_of,
     state_columns,
     surfaces_of,
-    unlimited,
+    why_unlimited,
 )
 
 ERROR = np.array([0.5, -1.0, 2.0, -0.5, 1.0])
@@ -41,19 +41,21 @@ def test_arrivals_cost_the_scatter_about_the_best_emission_time():
 def test_costs_agree_with_their_own_problem_alone():
     problem = ranges_to(PLACE, 2.0, ERROR)
     fix, costs = solve(problem, "gtrs+lsr"), eliminate_nuisance(problem)
-    assert agrees(problem, fix, costs).tolist() == [True]
-    assert agrees(problem, fix, eliminate_nuisance(ranges_to(PLACE, 2.0, 1.1 * ERROR))).tolist() == [False]
-    assert agrees(problem, replace(fix, cost=fix.cost + 1.0), costs).tolist() == [False]
+    assert matches_problem_cost(problem, fix, costs).tolist() == [True]
+    assert matches_problem_cost(problem, fix, eliminate_nuisance(ranges_to(PLACE, 2.0, 1.1 * ERROR))).tolist() == [
+        False
+    ]
+    assert matches_problem_cost(problem, replace(fix, cost=fix.cost + 1.0), costs).tolist() == [False]
     assert is_free(problem, fix, np.array([0])).tolist() == [True]
 
 
 def test_what_constraints_admit_is_the_box_of_their_sides():
     problem = moving(constraints=(*constraints.box([0.0, -np.inf], [900.0, 800.0]), *constraints.speed(30.0)))
     expected = [[0.0, -np.inf, -30.0, -30.0], [900.0, 800.0, 30.0, 30.0]]
-    np.testing.assert_array_equal(admitted(problem, 4), expected)
-    assert "anywhere at any speed" in unlimited(moving())
+    np.testing.assert_array_equal(admitted_states(problem, 4), expected)
+    assert "anywhere at any speed" in why_unlimited(moving())
     limited = moving(constraints=(*constraints.box([0.0, 0.0], [900.0, 800.0]), *constraints.speed(30.0)))
-    assert unlimited(limited) == ""
+    assert why_unlimited(limited) == ""
     region, asked = regions_of(limited, np.zeros((1, 4)), None)
     np.testing.assert_array_equal(region[0], [[0.0, 0.0, -30.0, -30.0], [900.0, 800.0, 30.0, 30.0]])
     assert asked
@@ -70,7 +72,7 @@ def test_a_target_that_stays_is_looked_for_everywhere():
 def test_regions_around_states_hold_them_well_inside():
     problem = moving()
     spread = np.linalg.norm(SQUARE - SQUARE.mean(0), axis=1).max()
-    near, far = around(problem, np.array([[300.0, 650.0, 5.0, 0.0], [1e5, 0.0, 900.0, 0.0]]))
+    near, far = boxes_around(problem, np.array([[300.0, 650.0, 5.0, 0.0], [1e5, 0.0, 900.0, 0.0]]))
     np.testing.assert_allclose(near[1, :2] - near[0, :2], 20.0 * spread)
     np.testing.assert_allclose(near[:, 2:], [[-700.0, -700.0], [700.0, 700.0]])
     assert far[1, 0] > 1.9e5

@@ -8,7 +8,7 @@ from optloc import Frame, Motion, Stations, assemble, measured, simulate, solve
 from optloc.base.frames import geodetic_to_ecef
 from optloc.linear.constraints import height
 from optloc.problem import ECEF, Bias
-from optloc.solvers.starts.doppler import doppler_starts, dopplered
+from optloc.solvers.starts.doppler import doppler_starts, has_doppler_of_rest
 
 EARTH_RATE = 7.292115e-5  # rad/s
 
@@ -107,9 +107,9 @@ def test_rows_beside_and_stations_by_the_dozen():
 
 def test_who_is_served():
     bare, truth = aircraft()
-    assert dopplered(bare)
-    assert not dopplered(aircraft(motion=Motion(1))[0])
-    assert not dopplered(assemble(np.eye(2), measured("range", a=[0, 1], sigma=1.0)))
+    assert has_doppler_of_rest(bare)
+    assert not has_doppler_of_rest(aircraft(motion=Motion(1))[0])
+    assert not has_doppler_of_rest(assemble(np.eye(2), measured("range", a=[0, 1], sigma=1.0)))
     # without a row of rates that is present there is nothing to start from
     problem = seen(bare, truth).flat()
     assert np.isnan(doppler_starts(problem.with_rows(weight=np.zeros(problem.count)))).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optloc import Motion, Problem, Stations, assemble, measured, solve
-from optloc.solvers.starts.moving import _apart, held, moves_at_once
+from optloc.solvers.starts.moving import _apart, moves_at_once, problem_at_rest
 
 Array = np.ndarray
 SEED = 20261123
@@ -59,7 +59,7 @@ def test_only_a_target_of_unknown_velocity_at_one_epoch_moves_at_once():
     stations = Stations(np.zeros((1, 6, 2)) + np.arange(6.0)[:, None], tuple("ABCDEF"), velocity=np.ones((1, 6, 2)))
     moving = assemble(stations, rows, motions=(Motion(1),)).flat()
     assert moves_at_once(moving)
-    assert held(moving).motions[0].order == 0
+    assert problem_at_rest(moving).motions[0].order == 0
     assert not moves_at_once(assemble(stations, rows, motions=(Motion(0),)).flat())
 
 

@@ -12,14 +12,14 @@ from optloc.solvers.starts.position import (
     along_the_valley,
     distance_of,
     height_starts,
+    is_registration_run,
     known_height,
     over_ground,
-    registrable,
     spread_of,
     squared_range_starts,
     subarray_starts,
 )
-from optloc.solvers.starts.squared_range import every
+from optloc.solvers.starts.squared_range import stationary_points
 
 PEAK = geodetic_to_ecef(np.radians(47.0), np.radians(8.0), 1500.0)
 
@@ -76,7 +76,7 @@ def test_a_measured_height_is_known_where_it_is_present():
 
 def test_all_arrays_that_lack_a_station_start_exact_data_at_the_target():
     problem = ranges_to(PLACE, 1.0)
-    assert nearest(squared_range_starts(problem, every)[0], PLACE) < 1e-6
+    assert nearest(squared_range_starts(problem, stationary_points)[0], PLACE) < 1e-6
     starts = subarray_starts(problem)[0]
     # five arrays of four stations, each with the target among its points
     assert (np.linalg.norm(starts - PLACE, axis=-1) < 1e-6).sum() >= 5
@@ -96,6 +96,6 @@ def test_other_minima_are_looked_for_along_the_line_and_the_longest_axis():
 
 def test_a_run_of_ranges_with_a_moving_target_is_registrable():
     rows = measured("range", np.ones(10), a=np.tile(np.arange(5), 2), epoch=np.repeat([0, 1], 5), sigma=1.0)
-    assert registrable(assemble(SQUARE, rows, times=[0.0, 1.0], motions=(Motion(1),)).flat())
-    assert not registrable(assemble(SQUARE, rows, times=[0.0, 1.0]).flat())
-    assert not registrable(ranges_to(PLACE, 1.0))
+    assert is_registration_run(assemble(SQUARE, rows, times=[0.0, 1.0], motions=(Motion(1),)).flat())
+    assert not is_registration_run(assemble(SQUARE, rows, times=[0.0, 1.0]).flat())
+    assert not is_registration_run(ranges_to(PLACE, 1.0))

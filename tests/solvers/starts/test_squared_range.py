@@ -6,7 +6,7 @@ from model_checks.small import PLACE, SQUARE
 
 from optloc import assemble, measured
 from optloc.linear.least_squares_ranges import ranges
-from optloc.solvers.starts.squared_range import candidates, every, hull, minimum, shor, squared_rows
+from optloc.solvers.starts.squared_range import candidates, hull, minimum, shor, squared_rows, stationary_points
 
 A = np.arange(5)
 R = np.linalg.norm(PLACE - SQUARE, axis=1)
@@ -33,7 +33,7 @@ def test_the_target_of_exact_data_satisfies_all_rows(kinds):
     np.testing.assert_allclose(squared.ranged[0] @ full, squared.ranged_right[0], atol=1e-9)
     for other in squared.others:
         np.testing.assert_allclose(other.row[0] @ full, other.right[0], atol=1e-9)
-    points = candidates(problem, found, every)[0]
+    points = candidates(problem, found, stationary_points)[0]
     assert np.nanmin(np.linalg.norm(points - PLACE, axis=-1)) < 1e-4
 
 

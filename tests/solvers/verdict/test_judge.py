@@ -10,7 +10,14 @@ from optloc import Status, assemble, measured
 from optloc.solvers.certificates.admitted import certified
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import gtrs, lsr
-from optloc.solvers.verdict.judge import failed, fill, judge, rule, standing, verdict
+from optloc.solvers.verdict.judge import (
+    decide_statuses,
+    failed_fixes,
+    filled_objects,
+    judge,
+    surviving_candidates,
+    verdict,
+)
 
 ERROR = np.array([0.5, -1.0, 2.0, -0.5, 1.0])
 
@@ -60,19 +67,19 @@ def test_stations_without_a_common_row_are_disconnected():
 def test_a_ruling_hides_what_has_no_place():
     problem = ranges_to(PLACE, 2.0, ERROR)
     pool = settled(problem)
-    ruling = rule(problem, pool, np.full((1, 0), np.inf))
+    ruling = decide_statuses(problem, pool, np.full((1, 0), np.inf))
     assert not ruling.gone[0]
     assert ruling.marks[0] & Status.UNPROVEN.mark
     short = replace(pool, dof=np.array([-1]))
-    assert rule(problem, short, np.full((1, 0), np.inf)).gone[0]
+    assert decide_statuses(problem, short, np.full((1, 0), np.inf)).gone[0]
     fix = judge(problem, short)
     assert np.isnan(fix.x).all()
-    assert np.isnan(standing(short, fix)[:, 0]).all()
-    np.testing.assert_array_equal(standing(pool, judge(problem, pool)), pool.x)
+    assert np.isnan(surviving_candidates(short, fix)[:, 0]).all()
+    np.testing.assert_array_equal(surviving_candidates(pool, judge(problem, pool)), pool.x)
 
 
 def test_a_numerical_failure_is_a_status_with_its_cause():
-    fix = failed(ranges_to(PLACE, 2.0), "lsr: Singular matrix")
+    fix = failed_fixes(ranges_to(PLACE, 2.0), "lsr: Singular matrix")
     assert fix.code[0] == Status.NUMERICAL
     assert fix.reason[0] == "lsr: Singular matrix"
-    assert fill(3, ()).tolist() == [(), (), ()]
+    assert filled_objects(3, ()).tolist() == [(), (), ()]

@@ -12,7 +12,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined, put, put_rows, zero
-from optloc.proof.atlas import Atlas, atlas_of, one_more, within
+from optloc.proof.atlas import Atlas, atlas_of, is_near_minimum, with_room_for_minimum
 from optloc.proof.box import (
     CENTRE,
     DEPTH,
@@ -23,9 +23,8 @@ from optloc.proof.box import (
     MIDDLE,
     PIECE,
     bound_nodes,
-    clip,
+    contract_coordinate,
     cost_at,
-    cube,
     cut_out,
     least_residual,
     linearise_rows,
@@ -33,16 +32,17 @@ from optloc.proof.box import (
     push,
     push_halves,
     reaches_infinity,
-    rounding,
+    reset_cut,
+    rounding_error,
+    station_cube,
     steepest_side,
-    uncut,
 )
 from optloc.proof.convex_boxes import set_minimum
 from optloc.proof.enclosure import enclose
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW
 from optloc.proof.pieces import SHRUNK, push_faces
-from optloc.proof.search_space import Box, Cost, LocalAxes, chart_at, place
+from optloc.proof.search_space import Box, Cost, LocalAxes, chart_at, write_centre
 from optloc.proof.space import Space, floor_of, set_box, set_place
 
 # Share of its bend that halving a side must leave a box at most, to be preferred to what its slopes say: nodes that are
@@ -63,7 +63,7 @@ _OUT, _IN, _SMALLER, _ACROSS = range(4)
 
 
 @compiled
-def cover(
+def cover_region(
     cost: Cost, box: Box, x: Array, above: float, most: int, bent: bool, base: Array, cells: Array, ends: Array
 ) -> tuple[int, int, float]:
     """Cover the region around a fix with boxes: inside an enclosure, or with pieces of an atlas of all space.
@@ -101,7 +101,7 @@ def cover(
     level = cost_at(cost.K, cost.w, box.nodes) + above
     level += _EQUAL * (1.0 + level)
     lists, endless, size = np.zeros((3, 2 * most, DEPTH)), reaches_infinity(cost.kinds, cost.K), zero()
-    middle, radius = cube(cost.kinds, cost.data, x)
+    middle, radius = station_cube(cost.kinds, cost.data, x)
     atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
     space = Space(False, atlas, chart, none, none)
     if good and not (bent and endless):
@@ -140,7 +140,7 @@ def _push_atlas(cost: Cost, atlas: Atlas, box: Box, x: Array, level: float, boxe
 
     A long thin region is cut along the axes of the fix, where the fix has them.
     """
-    size, wider = push_faces(boxes, atlas.dimension), one_more(atlas)
+    size, wider = push_faces(boxes, atlas.dimension), with_room_for_minimum(atlas)
     if not set_minimum(cost, box, wider, 0, x, 0.0, 1e-6 * (1.0 + level), inf):
         return size, atlas
     boxes[size] = 0.0
@@ -183,14 +183,19 @@ def _look(cost: Cost, space: Space, box: Box, front: Array, i: int, level: float
     pop(front, i, box.at, box.half)
     set_box(space, box, piece)
     # The boxes around the fix cover the part of a piece there.
-    if space.far and piece <= faces and space.atlas.minima.home.shape[0] > 0 and within(space.atlas, box.half, 0)[1]:
+    if (
+        space.far
+        and piece <= faces
+        and space.atlas.minima.home.shape[0] > 0
+        and is_near_minimum(space.atlas, box.half, 0)[1]
+    ):
         return _OUT
     _bound(cost, space, box)
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
     if low > 0.0 and low * low > level:
         return _OUT
-    noise = rounding(cost.K, cost.weight, floor, box.nodes)
+    noise = rounding_error(cost.K, cost.weight, floor, box.nodes)
     return _IN if _most_residual(cost, box) + noise <= sqrt(level) else _clip(cost, box, sqrt(level) + noise)
 
 
@@ -200,11 +205,11 @@ def _clip(cost: Cost, box: Box, longest: float) -> int:
 
     With J_k the derivative of the residual along side k every point of the box obeys ``J_k.residual = J_k.middle +
     |J_k|^2 s_k + sum_m J_k.J_m s_m + J_k.K dq``, dq the remainders from their middle. Unlike
-    `optloc.proof.box.shrink` this needs no inverse: it works where the rows do not determine a position, whatever the
-    rounding. Over 18 fixes of all shapes both together left no fewer cells.
+    `optloc.proof.box.contract_box` this needs no inverse: it works where the rows do not determine a position, whatever
+    the rounding. Over 18 fixes of all shapes both together left no fewer cells.
     """
     rows, nodes, half = box.rows, box.nodes, box.half
-    uncut(half, box.cut)
+    reset_cut(half, box.cut)
     for k in range(3):
         own, middle, reach = 0.0, 0.0, 0.0
         for i in range(rows.shape[0]):
@@ -226,7 +231,7 @@ def _clip(cost: Cost, box: Box, longest: float) -> int:
                     total += rows[i, J0 + k] * cost.K[i, j]
                 reach += abs(total) * radius
         if reach < inf:  # nor where a node is not bounded, which may leave no number at all
-            clip(box.cut, k, -middle / own, (longest * sqrt(own) + reach) / own)
+            contract_coordinate(box.cut, k, -middle / own, (longest * sqrt(own) + reach) / own)
     share = cut_out(box.cut, box.at, half)
     return _OUT if not share > 0.0 else _SMALLER if share < SHRUNK else _ACROSS
 
@@ -245,7 +250,7 @@ def _bound(cost: Cost, space: Space, box: Box) -> None:
 
 @compiled
 def _bound_near(cost: Cost, chart: LocalAxes, box: Box) -> None:
-    place(chart.origin, chart.sense, box.at, box.centre)
+    write_centre(chart.origin, chart.sense, box.at, box.centre)
     bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
 
 

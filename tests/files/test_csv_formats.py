@@ -5,7 +5,7 @@ import json
 import pytest
 
 from optloc import InvalidProblem
-from optloc.files.foreign import read_table, records, with_lists
+from optloc.files.csv_formats import read_table, records, with_lists
 from optloc.files.table import of_rows
 
 

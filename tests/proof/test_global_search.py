@@ -13,10 +13,10 @@ from optloc import Status, assemble, measured, solve
 from optloc.kernels.jit import enabled
 from optloc.proof.atlas import atlas_of
 from optloc.proof.batch import ProofRequest, prove_all
-from optloc.proof.box import cube, reaches_infinity
+from optloc.proof.box import reaches_infinity, station_cube
 from optloc.proof.convex_boxes import set_minimum
-from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
-from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE, prove
+from optloc.proof.global_search import UNBOUNDED, prove_atlas, prove_globally
+from optloc.proof.local_search import BETTER, BUDGET, OTHER, UNIQUE, VALUE, prove_locally
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import cost_of, empty_box
@@ -93,7 +93,7 @@ def by_atlas(cost, box, x, others, kappa, eps, budget, found):
 
 
 def by_both(cost, box, x, others, kappa, eps, budget, found):
-    verdict, boxes, bound, gap, _ = prove_everywhere(
+    verdict, boxes, bound, gap, _ = prove_globally(
         cost, box, x, others, down_from(kappa), eps, budget, no_rivals(len(x)), found
     )
     return verdict if gap == kappa else BUDGET, boxes, bound
@@ -101,7 +101,7 @@ def by_both(cost, box, x, others, kappa, eps, budget, found):
 
 def by_enclosure(cost, box, x, others, kappa, eps, budget, found):
     nowhere = np.full(len(x), np.nan)
-    return prove(cost, box, x, others, kappa, eps, budget, np.inf, nowhere, nowhere, False, found)
+    return prove_locally(cost, box, x, others, kappa, eps, budget, np.inf, nowhere, nowhere, False, found)
 
 
 @pytest.mark.usefixtures("form")
@@ -349,7 +349,7 @@ def test_the_box_around_a_minimum_is_convex_in_every_sample():
     rng = np.random.default_rng(10)
     for problem, minima in flat_cell(many(8, 2), 11):
         _, data, K, w = problem
-        middle, radius = cube(*problem[:2], minima[0][1])
+        middle, radius = station_cube(*problem[:2], minima[0][1])
         atlas, cost, box = atlas_of(middle, radius, 3, 1), cost_of(*problem), empty_box(*K.shape)
         assert set_minimum(cost, box, atlas, 0, minima[0][1], 0.0, 1e-6, np.inf)
         for s in rng.uniform(-1.0, 1.0, (50, 3)) * atlas.minima.sides[0]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from proof.costs import random_case
 
-from optloc.proof.cover import cover
+from optloc.proof.subpaving import cover_region
 
 pytestmark = pytest.mark.usefixtures("plainly")
 
@@ -17,7 +17,7 @@ def test_every_cheap_point_is_in_a_box_and_inner_boxes_hold_cheap_points_alone()
     cost, box = case.tables
     x = case.minimum(truth)
     base, cells, ends = np.zeros(3), np.zeros((2 * MOST, 3, 3)), np.zeros(2 * MOST)
-    count, inside, level = cover(cost, box, x, 9.0, MOST, False, base, cells, ends)
+    count, inside, level = cover_region(cost, box, x, 9.0, MOST, False, base, cells, ends)
     assert 0 < inside < count <= 2 * MOST
     assert level == pytest.approx(case.cost(x) + 9.0)
     centre, edges = base[:2] + cells[:count, 0, :2], np.swapaxes(cells[:count, 1:, :2], 1, 2)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from optloc.kernels import kept, manifest
+from optloc.kernels import code_cache, manifest
 from optloc.kernels.jit import enabled
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
@@ -64,7 +64,7 @@ forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot f
 def asking(folder: Path, **environment: str) -> Iterator[Callable[[], tuple[int, int, Path]]]:
     """Yield a function with the answer of a small package, how much was compiled for it, and where it is kept."""
     # Without bytecode: a file that is written twice in a second would be taken for what was read before.
-    path = {"PYTHONPATH": f"{folder}{os.pathsep}{Path(kept.__file__).parents[2]}", "PYTHONDONTWRITEBYTECODE": "1"}
+    path = {"PYTHONPATH": f"{folder}{os.pathsep}{Path(code_cache.__file__).parents[2]}", "PYTHONDONTWRITEBYTECODE": "1"}
     everything, pipe = {**os.environ, **path, **environment}, subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", ASK], env=everything, stdin=pipe, stdout=pipe, text=True) as process:
 
@@ -123,7 +123,7 @@ def test_users_keep_no_callees(tmp_path):
     (tmp_path / "callee.py").write_text(CALLEE.format(step=1))
     with asking(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"), OPTLOC_CALLEES="") as asked:
         _, _, place = asked()
-    assert bool(list(place.rglob("callee.*.nbi"))) == kept.is_checkout()
+    assert bool(list(place.rglob("callee.*.nbi"))) == code_cache.is_checkout()
     assert list(place.glob("caller.answer-*.nbi"))
 
 
@@ -131,12 +131,12 @@ def test_old_versions_of_a_function_leave_but_for_the_newest(tmp_path):
     for name in ("f.g", "f.gg"):
         for age in range(8):
             for ending in (".nbi", ".1.nbc", ".2.nbc"):
-                file = tmp_path / f"{kept.base_of(name, f'{age:016}')}{ending}"
+                file = tmp_path / f"{code_cache.file_prefix_of(name, f'{age:016}')}{ending}"
                 file.touch()
                 os.utime(file, (1e9 - age, 1e9 - age))
-    kept._leave_last(tmp_path, "f.g", kept.base_of("f.g", f"{7:016}"))
+    code_cache._leave_last(tmp_path, "f.g", code_cache.file_prefix_of("f.g", f"{7:016}"))
     left = sorted(path.stem for path in tmp_path.glob("f.g-*.nbi"))
-    assert left == [kept.base_of("f.g", f"{age:016}") for age in (0, 1, 2, 7)]
+    assert left == [code_cache.file_prefix_of("f.g", f"{age:016}") for age in (0, 1, 2, 7)]
     assert len(list(tmp_path.glob("f.g-*.nbc"))) == 2 * len(left)
     assert len(list(tmp_path.glob("f.gg-*.nbi"))) == 8
 
@@ -147,5 +147,5 @@ def test_old_folders_leave_but_for_the_last_used(tmp_path):
         folder.mkdir()
         os.utime(folder, (1e9 - age, 1e9 - age))
     (tmp_path / "other").mkdir()
-    kept._clear(tmp_path / "optloc-7")
+    code_cache._clear(tmp_path / "optloc-7")
     assert sorted(path.name for path in tmp_path.iterdir()) == [*(f"optloc-{age}" for age in (0, 1, 2, 3, 7)), "other"]

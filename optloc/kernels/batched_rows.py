@@ -86,7 +86,7 @@ _LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
 
 
 @compiled
-def arrange(t: Tables, c: Numbers, size: int) -> LaneCells:
+def cell_layout(t: Tables, c: Numbers, size: int) -> LaneCells:
     """Return where things stand for problems of p = `size` unknowns."""
     n, local, largest = t.shared, t.local, 0
     for i in range(t.groups, c.place.shape[0]):
@@ -146,7 +146,7 @@ def load(
 
 
 @compiled
-def blur_of(sigma: Array, size: Array, m: Array, room: LaneCells, lane: int, item: int) -> float:
+def rounding_of_residuals(sigma: Array, size: Array, m: Array, room: LaneCells, lane: int, item: int) -> float:
     """Return the rounding error of the whitened residuals: arrival times that count from long ago are coarse."""
     row, squares = item if sigma.shape[0] > 1 else 0, 0.0
     for i in range(sigma.shape[1]):
@@ -183,7 +183,7 @@ def memory(t: Tables, room: LaneCells, lanes: Constant) -> tuple[Array, Array]:
 
 
 @compiled
-def run(code: Array, first: int, last: int, r: Array, count: Constant) -> None:
+def run_operations(code: Array, first: int, last: int, r: Array, count: Constant) -> None:
     """Run operations on the first numbers of registers; see `Tape` and `symbol.OPERATIONS`."""
     # The operation is chosen once for all lanes, and each loop is one that the compiler turns into vector
     # instructions.
@@ -235,7 +235,7 @@ def _rare(operation: int, r: Array, to: int, u: int, v: int, count: Constant) ->
 
 
 @compiled
-def measure(
+def write_derivatives(
     t: Tables, common: Array, m: Array, r: Array, room: LaneCells, packet: int, x: int, lanes: Constant
 ) -> None:
     """Write derivatives and residuals of a packet: columns of the row's group, then the residual.
@@ -269,7 +269,7 @@ def measure(
             for i in range(index[kind, KIND_CONSTANT], index[kind + 1, KIND_CONSTANT]):
                 for j in range(count):
                     r[index[t.constant + i, REGISTER], j] = t.real[i]
-            run(index, t.code + index[kind, KIND_CODE], t.code + index[kind + 1, KIND_CODE], r, count)
+            run_operations(index, t.code + index[kind, KIND_CODE], t.code + index[kind + 1, KIND_CODE], r, count)
             for one in range(row, end):
                 line, low = t.row + one, (one - row) * lanes
                 to = room.rows + index[line, ROW_PLACE] * t.width
@@ -378,7 +378,7 @@ def _mask(m: Array, value: int, present: int, lanes: Constant) -> None:
 
 
 @compiled
-def gather(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, priors: bool, lanes: Constant) -> None:
+def write_equations(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, priors: bool, lanes: Constant) -> None:
     """Write the normal equations at `room.trial` into `room.after`.
 
     Parameters
@@ -406,13 +406,13 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, priors: b
 
 
 @compiled
-def price(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, lanes: Constant) -> None:
+def write_cost(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, lanes: Constant) -> None:
     """Write the cost at `room.trial`, the last cell of `room.after`."""
     total = room.after + (t.shared + t.local + 1) ** 2 - 1
     for b in range(lanes):
         m[total, b] = 0.0
     for packet in range(t.packets):
-        measure(t, c.common, m, r, room, packet, room.trial, lanes)
+        write_derivatives(t, c.common, m, r, room, packet, room.trial, lanes)
         for group in range(t.table[t.packet + packet, FIRST], t.table[t.packet + packet + 1, FIRST]):
             residual = whiten_group(t, c.common, c.place, m, room, group, True, lanes)
             for i in range(t.table[t.group + group, GROUP_ROWS]):
@@ -446,7 +446,7 @@ def add_groups(
     """
     while group < t.groups and (epoch == ALL or t.table[t.group + group, GROUP_EPOCH] == epoch):
         if packet < t.packets and t.table[t.packet + packet, FIRST] == group:
-            measure(t, c.common, m, r, room, packet, x, lanes)
+            write_derivatives(t, c.common, m, r, room, packet, x, lanes)
             packet += 1
         add_group(t, c.common, c.place, m, room, group, lanes)
         group += 1

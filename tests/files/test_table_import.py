@@ -5,7 +5,8 @@ from decimal import Decimal
 import pytest
 
 from optloc import InvalidProblem
-from optloc.files.readings import (
+from optloc.files.table import of_rows
+from optloc.files.table_import import (
     ColumnHints,
     in_unit,
     marks_of,
@@ -13,9 +14,8 @@ from optloc.files.readings import (
     sigmas_by_kind,
     sort_named,
     unused_measurement,
-    without,
+    without_ignored_columns,
 )
-from optloc.files.table import of_rows
 from optloc.models import MODELS
 
 
@@ -60,6 +60,6 @@ def test_a_column_may_measure_if_its_name_is_that_of_a_kind():
 
 def test_an_ignored_column_is_left_out_and_an_unknown_one_is_refused():
     table = of_rows([{"a": 1, "note": "x"}], "t.csv", {})
-    assert list(without(table, ["note"]).columns) == ["a"]
+    assert list(without_ignored_columns(table, ["note"]).columns) == ["a"]
     with pytest.raises(InvalidProblem, match="no column 'nota'"):
-        without(table, ["nota"])
+        without_ignored_columns(table, ["nota"])

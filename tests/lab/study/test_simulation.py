@@ -6,7 +6,7 @@ from lab.study.texts import design
 from scipy.spatial import Delaunay
 
 from optloc.engine import predict
-from optloc.lab.study.draws import block_size, draw
+from optloc.lab.study.simulation import block_size, draw
 from optloc.models import MODELS
 
 HEAD = 'format = 1\nname = "x"\nseed = 3\ntrials = 2000\n[[method]]\nmethod = "gtrs+lsr"\n[[scenario]]\nname = "s"\n'

@@ -5,7 +5,9 @@ import pytest
 from sites.calibration.scenes import hall, reflected
 
 from optloc.sites.calibration import network_of
-from optloc.sites.calibration.agreement import (
+from optloc.sites.calibration.blocks import settled
+from optloc.sites.calibration.likelihood import likelihood, together
+from optloc.sites.calibration.multi_start import (
     AGREEING,
     NetworkSearchResult,
     _added,
@@ -15,9 +17,7 @@ from optloc.sites.calibration.agreement import (
     frame_size,
     search,
 )
-from optloc.sites.calibration.blocks import settled
-from optloc.sites.calibration.likelihood import likelihood, together
-from optloc.sites.calibration.rounds import RoundEnds
+from optloc.sites.calibration.restarts import RoundEnds
 
 
 def test_the_frame_has_six_unknowns_in_space_three_in_the_plane_and_one_more_with_clocks():

@@ -5,7 +5,7 @@ import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 
 from optloc import assemble, measured
-from optloc.model_checks.misread import advise_on_values
+from optloc.model_checks.unit_mistakes import advise_on_values
 
 NOISE = np.array([0.6, -0.4, 0.9, -0.7, 0.2])
 

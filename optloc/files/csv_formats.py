@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.inputs import at_most, decoded, json_of, read_bytes
+from optloc.base.inputs import check_budget, decoded, json_of, read_bytes
 from optloc.files.columns import any_unit, stem
 from optloc.files.table import Table, csv, of_rows, parquet
 
@@ -51,7 +51,7 @@ def records(data: Any, source: str) -> Table:
         rows = list(_clusters(data, source))
     else:
         rows = [row for i, record in enumerate(data) for row in _rows(record, f"{source}, row {i + 1}")]
-    at_most("cells", sum(map(len, rows)), source)
+    check_budget("cells", sum(map(len, rows)), source)
     if not any(rows):
         raise InvalidProblem("there is no list of records", source, "write it as a list of objects, or as CSV")
     return of_rows(rows, source, {})
@@ -66,7 +66,7 @@ def with_lists(table: Table) -> Table:
     columns |= {name: [_list_of(cell) for cell in columns[name]] for name in lists}
     rows = [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
     found = [row for i, one in enumerate(rows) for row in _rows(one, f"{table.source}, row {i + 1}")]
-    at_most("cells", sum(map(len, found)), table.source)
+    check_budget("cells", sum(map(len, found)), table.source)
     return replace(of_rows(found, table.source, {}), others=table.others, notes=table.notes)
 
 

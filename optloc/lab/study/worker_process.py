@@ -46,7 +46,7 @@ pickle.loads(run)(die_with)
 """
 
 
-class Apart:
+class WorkerProcess:
     """A process apart that computes chunks, one at a time; what it begins ends with it."""
 
     def __init__(self) -> None:
@@ -123,8 +123,8 @@ class WorkerPool:
 
     def __init__(self, count: int) -> None:
         self._memory, self._lock, self._closed = memory_of(count), Lock(), False
-        self._all: set[Apart] = set()
-        self._idle: list[Apart] = []
+        self._all: set[WorkerProcess] = set()
+        self._idle: list[WorkerProcess] = []
 
     def compute(self, chunk: Chunk, seconds: float, names: Sequence[str] | None = None) -> TrialPart | Lost:
         """Return the part of a chunk, computed in a process apart, or what came of it in so many seconds.
@@ -172,7 +172,7 @@ class WorkerPool:
         for apart in left:
             apart.end()
 
-    def _take(self, *, again: bool = True) -> Apart:
+    def _take(self, *, again: bool = True) -> WorkerProcess:
         """Return a process that waits, or another."""
         with self._lock:
             while self._idle:
@@ -188,11 +188,11 @@ class WorkerPool:
             advice = "what it said stands above; check the installation, and the memory that is left"
             raise InvalidProblem(f"no process can be begun ({error})", sys.executable, advice) from None
 
-    def _begin(self) -> Apart:
+    def _begin(self) -> WorkerProcess:
         with self._lock:
             if self._closed:
                 raise InvalidProblem("the run was stopped", "study", "the same command goes on")
-            self._all.add(apart := Apart())
+            self._all.add(apart := WorkerProcess())
         # What runs there is found when the path is that of this process.
         apart.ask(([str(place) for place in sys.path], pickle.dumps(partial(serve, self._memory))), _START)
         return apart

@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.kernels.jit import compiled, inlined, put, with_constants, zero
+from optloc.kernels.jit import compiled, inlined, put, specialise, zero
 from optloc.proof.atlas import (
     Atlas,
     atlas_of,
-    clip_to_corners,
+    contract_to_corners,
     first_minima,
-    infinity,
+    infinity_coordinate,
     set_centre,
     widen_around,
     with_minima,
@@ -22,21 +22,21 @@ from optloc.proof.atlas import (
 from optloc.proof.box import (
     DEPTH,
     PIECE,
+    contract_box,
     cost_at,
-    cube,
     cut_out,
-    digits,
+    exceeds_level,
     is_empty,
     least_residual,
     linearise_rows,
     pop,
-    reaches,
     reaches_infinity,
-    rounding,
+    relative_rounding,
+    reset_cut,
+    rounding_error,
     share_left,
-    shrink,
+    station_cube,
     steepest_side,
-    uncut,
 )
 from optloc.proof.convex_boxes import accuracy_floor_far, set_minimum, widen_core
 from optloc.proof.curvature import has_no_infimum, most_curved_side, spread_of, sum_up
@@ -49,7 +49,7 @@ from optloc.proof.level_search import (
     set_rival,
     side_of_rest,
 )
-from optloc.proof.near import (
+from optloc.proof.local_search import (
     ANOTHER,
     BETTER,
     BUDGET,
@@ -63,14 +63,14 @@ from optloc.proof.near import (
     STATIONARY,
     UNIQUE,
     VALUE,
-    prove,
+    prove_locally,
     region_of,
 )
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.pieces import (
     CAPACITY,
     SHRUNK,
-    end_at_infinity,
+    contract_at_infinity,
     is_left,
     push_pieces,
 )
@@ -86,7 +86,7 @@ from optloc.proof.search_space import (
     equal_within,
 )
 from optloc.proof.space import Space, in_atlas
-from optloc.proof.squares import Squares, bend_of, clip_to_squares, squares_of
+from optloc.proof.squares import Squares, change_of_residual, clip_to_squares, squares_of
 
 # Branch and bound over all positions, for costs that nothing encloses.
 
@@ -110,7 +110,7 @@ class GlobalWorkspace(NamedTuple):
     squares : Squares
         Squared rows, of which boxes are clipped.
     floor : float
-        The sizes that `optloc.proof.box.rounding` counts beside the nodes.
+        The sizes that `optloc.proof.box.rounding_error` counts beside the nodes.
     box, near : Box
         Tables for a box of the atlas, and for one around a position.
     """
@@ -131,7 +131,7 @@ def _bound_row(work: GlobalWorkspace, space: Space, stack: Array, row: int, leve
     if not _squeeze(cost, atlas, work.squares, level, box, piece):
         return inf, inf
     low = _bound(cost, atlas, box, work.floor)
-    return (inf, inf) if reaches(low, level) else (low, cost_at(cost.K, cost.w, box.nodes))
+    return (inf, inf) if exceeds_level(low, level) else (low, cost_at(cost.K, cost.w, box.nodes))
 
 
 @inlined
@@ -145,10 +145,10 @@ def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
 @inlined
 def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
     cost, atlas, box = work.cost, space.atlas, work.box
-    noise = rounding(cost.K, cost.weight, work.floor, box.nodes)
-    uncut(box.half, box.cut)
+    noise = rounding_error(cost.K, cost.weight, work.floor, box.nodes)
+    reset_cut(box.half, box.cut)
     flat = box.half[2] == 0.0
-    shrink(cost.K, cost.weight, rho + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
+    contract_box(cost.K, cost.weight, rho + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
     if is_empty(box.cut):
         return -1
     # What that leaves little of is looked at anew, which is cheaper.
@@ -168,7 +168,7 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array
     """
     faces = 2 * atlas.dimension
     pop(stack, row, box.at, box.half)
-    end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
+    contract_at_infinity(box, atlas.dimension - 1, infinity_coordinate(atlas, piece))
     set_centre(atlas, piece, box.at)
     if piece > faces:
         widen_around(atlas, piece - faces - 1, box.half)
@@ -176,11 +176,11 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array
         return False
     if isnan(corners[0, 0]):
         return True
-    uncut(box.half, box.cut)
-    clip_to_corners(atlas, chart.origin, chart.back, corners, box.half, box.cut)
+    reset_cut(box.half, box.cut)
+    contract_to_corners(atlas, chart.origin, chart.back, corners, box.half, box.cut)
     share = cut_out(box.cut, box.at, box.half)
     if 0.0 < share < 1.0:
-        end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
+        contract_at_infinity(box, atlas.dimension - 1, infinity_coordinate(atlas, piece))
         set_centre(atlas, piece, box.at)
     return share > 0.0
 
@@ -188,7 +188,7 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array
 @compiled
 def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box, piece: int) -> bool:
     """Clip a box whose centre is set to its squared rows, again while that helps; return whether anything is left."""
-    if squares.groups == 0 or bend_of(atlas, squares, box.half) ** 2 <= _BENT * level:
+    if squares.groups == 0 or change_of_residual(atlas, squares, box.half) ** 2 <= _BENT * level:
         return True
     for _ in range(_LOOKS):
         if not clip_to_squares(cost, atlas, squares, sqrt(max(level, 0.0)), box):
@@ -197,7 +197,7 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
         if not share > 0.0:
             return False
         if share < 1.0:
-            end_at_infinity(box, atlas.dimension - 1, infinity(atlas, piece))
+            contract_at_infinity(box, atlas.dimension - 1, infinity_coordinate(atlas, piece))
             set_centre(atlas, piece, box.at)
         if share > SHRUNK:
             break
@@ -205,10 +205,10 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
 
 
 @compiled
-def leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
+def excludes_infimum(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
     """Return whether no infimum of the cost can lie in a box whose nodes are bounded; `touching`: infinity is there."""
-    uncut(box.half, box.cut)
-    return _clips_away(cost, atlas, box, touching, rounding(cost.K, cost.weight, floor, box.nodes))
+    reset_cut(box.half, box.cut)
+    return _clips_away(cost, atlas, box, touching, rounding_error(cost.K, cost.weight, floor, box.nodes))
 
 
 @inlined
@@ -245,7 +245,7 @@ def _cost_set(work: GlobalWorkspace, atlas: Atlas) -> float:
     return cost_at(work.cost.K, work.cost.w, work.box.nodes)
 
 
-search_everywhere = with_constants(
+search_everywhere = specialise(
     search_levels,
     "everywhere",
     {
@@ -258,7 +258,7 @@ search_everywhere = with_constants(
 )
 
 
-# A verdict beside those of `optloc.proof.near`: the cost at infinity is within the gap.
+# A verdict beside those of `optloc.proof.local_search`: the cost at infinity is within the gap.
 UNBOUNDED = 8
 # How many times as large as the convex box around the fix an enclosure may be for its search to be tried, of a fix
 # between the stations and of others, and boxes after which that is given up for the atlas. What is six times as large
@@ -269,7 +269,7 @@ _CLOSE = 1e-3
 
 
 @inlined
-def prove_everywhere(
+def prove_globally(
     cost: Cost,
     box: Box,
     x: Array,
@@ -289,7 +289,7 @@ def prove_everywhere(
     Parameters
     ----------
     cost, box, x, beside, eps, budget, found
-        As of `optloc.proof.near.prove`.
+        As of `optloc.proof.local_search.prove_locally`.
     gaps : array (G,)
         Gaps that will do, falling, the last 0 for the value alone. Only the atlas tries more than the first.
     rivals : array (F, D)
@@ -298,7 +298,8 @@ def prove_everywhere(
     Returns
     -------
     verdict : int
-        As of `optloc.proof.near.prove`. UNBOUNDED: the cost at infinity is below that of the fix plus every gap.
+        As of `optloc.proof.local_search.prove_locally`. UNBOUNDED: the cost at infinity is below the cost of the fix
+        plus every gap.
     boxes : int
         How many boxes were looked at.
     bound : float
@@ -311,7 +312,9 @@ def prove_everywhere(
     nowhere, bound_to = np.full(x.shape[0], np.nan), beside.planes.shape[0] + beside.surface.shape[0] > 0
     open_end = not bound_to and reaches_infinity(cost.kinds, cost.K)  # the atlas is of all space
     first, reach = (min(budget, _SOON), _reach_of(cost, x)) if open_end else (budget, inf)
-    verdict, boxes, bound = prove(cost, box, x, beside, gaps[0], eps, first, reach, nowhere, nowhere, False, found)
+    verdict, boxes, bound = prove_locally(
+        cost, box, x, beside, gaps[0], eps, first, reach, nowhere, nowhere, False, found
+    )
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))
     if not open_end or not again or boxes >= budget:
         return verdict, boxes, bound, gaps[0], 0
@@ -322,7 +325,7 @@ def prove_everywhere(
 @compiled
 def _reach_of(cost: Cost, x: Array) -> float:
     """Return how many times as large as a convex box an enclosure may be for its search to be tried."""
-    middle, radius = cube(cost.kinds, cost.data, x)
+    middle, radius = station_cube(cost.kinds, cost.data, x)
     between = True
     for k in range(x.shape[0]):
         between = between and abs(x[k] - middle[k]) < radius
@@ -344,14 +347,14 @@ def prove_atlas(
     """Prove the same as `prove_everywhere` with the atlas alone, where `optloc.proof.box.reaches_infinity` holds."""
     chart, _ = chart_at(cost, x, box)
     least, corners, nowhere = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), np.full(x.shape[0], nan)
-    noise = rounding(cost.K, cost.weight, chart.floor, box.nodes)
+    noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     if not region_of(cost, chart, box, sqrt(least + gaps[0]), nowhere, nowhere, corners[0], corners[1]):
         corners[:] = nan
     others = beside.points
-    middle, radius = cube(cost.kinds, cost.data, x)
+    middle, radius = station_cube(cost.kinds, cost.data, x)
     squares = squares_of(cost, box, middle, radius)
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if gaps[0] > 0.0 else 0))
-    most, noise = max(COARSEST, eps), max(noise, digits(cost.K) * accuracy_floor_far(cost, atlas))
+    most, noise = max(COARSEST, eps), max(noise, relative_rounding(cost.K) * accuracy_floor_far(cost, atlas))
     eps = equal_within(eps, least, noise)
     if not eps <= most:
         return COARSE, 0, -inf, gaps[0], 0

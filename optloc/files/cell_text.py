@@ -224,7 +224,7 @@ def is_dated(table: Table, name: str) -> bool:
     return isinstance(first, str) and _DATE.match(first.strip()) is not None
 
 
-def instants(table: Table, name: str, zone: str | None) -> NumberColumn:
+def date_seconds(table: Table, name: str, zone: str | None) -> NumberColumn:
     """Return a column of dates as seconds since 1970, UTC.
 
     Parameters
@@ -275,7 +275,7 @@ def _zone(name: str) -> ZoneInfo:
         raise InvalidProblem(f"there is no time zone {name[:40]!r}", "--zone", advice) from None
 
 
-def moments(roles: Roles, name: str, zone: str | None, told_unit: str | None = None) -> Array | None:
+def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | None = None) -> Array | None:
     """Return a column of times as seconds (m,), None where its numbers have no unit: then they are mere labels.
 
     Parameters
@@ -291,7 +291,7 @@ def moments(roles: Roles, name: str, zone: str | None, told_unit: str | None = N
     """
     table = roles.table
     if is_dated(table, name):
-        held, factor = instants(table, name, zone), 1.0
+        held, factor = date_seconds(table, name, zone), 1.0
     else:
         unit = unit_of(name, UNITS["time"])
         if told_unit is not None and told_unit not in UNITS["time"]:

@@ -6,7 +6,7 @@ from sites.calibration.scenes import distances, hall
 
 from optloc.sites.calibration import network_of
 from optloc.sites.calibration.likelihood import likelihood, together
-from optloc.sites.calibration.rounds import RoundEnds, arrivals, joined, laid, starts_of
+from optloc.sites.calibration.restarts import RoundEnds, arrivals, joined, laid, starts_of
 
 
 def test_random_places_lead_to_the_minimum():

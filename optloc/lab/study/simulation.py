@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.engine import arrays, simulate, walks, wander
+from optloc.engine import arrays, simulate, simulate_walks, walks
 from optloc.files import Units, join
 from optloc.lab.study.document import LayoutTable, ScenarioTable, TruthTable, sigma_of
 from optloc.problem import Amount, Array, Bias, Frame, InvalidProblem, Problem, form_of, nearest, state_names, with_bias
@@ -195,7 +195,7 @@ def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Arr
         if table.layout.placement != "frozen":  # the template holds the one draw of frozen ones
             stations = place_stations(table.layout, case.where, rng, size)
         problem = _at(problem, stations)
-    real, flaws = add_flaws(problem, table, case.where)
+    real, flaws = add_injected_errors(problem, table, case.where)
     where, names = join(case.where, "truth"), case.state
     # The order of these draws decides the data, like the seed.
     values = {names[0]: place_targets(table.truth, problem.frame, stations, where, rng)}
@@ -226,7 +226,7 @@ def _vector(problem: Problem, values: dict[str, Array], size: int, steps: np.ran
     for base, slot in (*((0, slot) for slot in layout.shared), *((layout.n_shared, slot) for slot in layout.local)):
         if slot.name in values:
             vectors[:, base + slot.start : base + slot.start + slot.size] = values[slot.name]
-    return wander(problem, vectors, steps) if walks(problem) else vectors
+    return simulate_walks(problem, vectors, steps) if walks(problem) else vectors
 
 
 def _length(problem: Problem, name: str) -> int:
@@ -472,7 +472,7 @@ def _amount(case: Case, bias: Bias, value: Amount, where: str) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Flaw:
+class InjectedError:
     """Errors of the stations in rows of one kind: constant ones of every station, or gross ones of a few.
 
     Parameters
@@ -493,7 +493,9 @@ class Flaw:
     late: bool = False
 
 
-def add_flaws(problem: Problem, table: ScenarioTable, where: str) -> tuple[Problem, tuple[Flaw, ...]]:
+def add_injected_errors(
+    problem: Problem, table: ScenarioTable, where: str
+) -> tuple[Problem, tuple[InjectedError, ...]]:
     """Return the problem as it really is, with the errors that no method is told, and what they are.
 
     Parameters
@@ -514,10 +516,12 @@ def add_flaws(problem: Problem, table: ScenarioTable, where: str) -> tuple[Probl
     offset, outliers = table.error.offset, table.error.outliers
     if offset is not None:
         sizes = _sizes(problem, offset, join(place, "offset"))
-        found += [(kind, Flaw(f"unmodelled {kind}", size)) for kind, size in sizes.items()]
+        found += [(kind, InjectedError(f"unmodelled {kind}", size)) for kind, size in sizes.items()]
     if outliers is not None:
         sizes = _sizes(problem, outliers.size, join(place, "outliers"))
-        found += [(kind, Flaw(f"gross {kind}", size, outliers.share, outliers.late)) for kind, size in sizes.items()]
+        found += [
+            (kind, InjectedError(f"gross {kind}", size, outliers.share, outliers.late)) for kind, size in sizes.items()
+        ]
     for kind, flaw in found:
         problem = with_bias(problem, flaw.name, kind=kind)
     return problem, tuple(flaw for _, flaw in found)
@@ -533,7 +537,7 @@ def _sizes(problem: Problem, given: Amount | dict[str, Amount], where: str) -> d
     return {kind: sigma_of(kind, amount, where) for kind, amount in named.items()}
 
 
-def _draw_errors(flaws: tuple[Flaw, ...], lengths: dict[str, int], rng: Rng, size: int) -> dict[str, Array]:
+def _draw_errors(flaws: tuple[InjectedError, ...], lengths: dict[str, int], rng: Rng, size: int) -> dict[str, Array]:
     """Return the errors (size, stations) of each flaw, which has so many stations."""
     small = [flaw for flaw in flaws if flaw.share is None]
     drawn: dict[str, Array] = {f.name: f.size * rng.standard_normal((size, lengths[f.name])) for f in small}

@@ -15,8 +15,8 @@ from optloc.base.arrays import first_rows
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.cells import NOTHING, Decimals
-from optloc.files.columns import any_unit, bare, is_sigma, role_of, sigma_kind, stem, tokens, unit_of
+from optloc.files.cell_text import NOTHING, Decimals
+from optloc.files.columns import any_unit, is_sigma, role_of, sigma_kind, stem, tokens, unit_of, without_unit
 from optloc.files.roles import Roles
 from optloc.files.table import Table
 from optloc.files.words import numbered
@@ -268,7 +268,7 @@ def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named
     exact = {name.strip(): name for name in stations}
     found = []
     for column in columns:
-        text = bare(column)
+        text = without_unit(column)
         ends, rest = ([exact[text]], []) if text in exact else _stations_in(tokens(text), known)
         words = [word for word in rest if word not in _ENDS and not is_sigma(word)]
         form = _form_of("".join(words), any_unit(column))
@@ -309,7 +309,7 @@ def _form_of(word: str, unit: str | None) -> str | None:
     return role if role == "sp" or role in _SEEN else None
 
 
-def sigma_told(told: ColumnHints, kind: str) -> str | None:
+def stated_sigma(told: ColumnHints, kind: str) -> str | None:
     """Return the standard deviation that the user states for a kind, None where --sigma does not name the kind."""
     if told.sigma is None or "=" not in told.sigma:
         return told.sigma
@@ -328,7 +328,7 @@ def holds_names(table: Table, column: str, stations: Sequence[str]) -> bool:
     return bool(cells) and cells <= {name.strip() for name in stations}
 
 
-def without(table: Table, ignored: Sequence[str]) -> Table:
+def without_ignored_columns(table: Table, ignored: Sequence[str]) -> Table:
     """Return a table without the columns that the user ignores; raise InvalidProblem for one that it does not have."""
     known = [*table.columns, *table.others]
     lacking = next((name for name in ignored if name not in known), None)
@@ -368,7 +368,7 @@ def _check_times_alone(roles: Roles) -> None:
 
 def _kind_within(column: str, unit: str | None) -> str | None:
     """Return the kind that words of a column's name and a unit suggest, such as "range" of "dist_raw_m"; else None."""
-    words = [word for word in tokens(bare(column)) if not word.isdigit()]
+    words = [word for word in tokens(without_unit(column)) if not word.isdigit()]
     parts = ["_".join(words[i:j]) for i in range(len(words)) for j in range(len(words), i, -1)]
     named = [part if unit is None else f"{part}_{unit}" for part in parts if len(part) >= _LETTERS]
     return next((role for name in named if (role := role_of(name)) is not None and role in MODELS), None)

@@ -5,7 +5,7 @@ import pytest
 from proof.costs import NO_REGION, beside, combined, differences, random_case
 
 from optloc.kernels.jit import enabled
-from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
+from optloc.proof.local_search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove_locally
 from optloc.proof.search_space import cost_of, empty_box
 
 # A form of the search that these tests alone call is made for them.
@@ -23,7 +23,7 @@ def proof(case, x, kappa=0.0, others=(), region=None, budget=BUDGET_HERE, closed
     eps = 1e-6 * (1.0 + case.cost(x))
     K = np.ascontiguousarray(case.K)
     cost, box = cost_of(case.kinds, case.data, K, case.w), empty_box(*K.shape)
-    answer = prove(cost, box, x, known, kappa, eps, budget, np.inf, low, high, closed, found)
+    answer = prove_locally(cost, box, x, known, kappa, eps, budget, np.inf, low, high, closed, found)
     return *answer, found
 
 

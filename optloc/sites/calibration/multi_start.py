@@ -12,8 +12,8 @@ from optloc.sites.calibration.blocks import MOVED, StationBlock, blocks, elsewhe
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.motions import bent
 from optloc.sites.calibration.network import CLOCKED, Network
-from optloc.sites.calibration.rounds import RoundEnds, joined, rounds, starts_of
-from optloc.solvers import REFUTED, equal_cost
+from optloc.sites.calibration.restarts import RoundEnds, joined, rounds, starts_of
+from optloc.solvers import P_MISFIT, equal_cost
 
 AGREEING = 3
 """Starts that must arrive at the least cost: with fewer, one network in ten was found in another minimum."""
@@ -191,7 +191,7 @@ def _straightened(
 
 def _fits(net: Network, cost: float) -> bool:
     dof = np.array(net.rows - net.unknowns + frame_size(net))
-    return not float(tail_probability(np.array(cost), dof)) < REFUTED
+    return not float(tail_probability(np.array(cost), dof)) < P_MISFIT
 
 
 def frame_size(network: Network) -> int:

@@ -5,7 +5,7 @@ from decimal import Decimal
 import numpy as np
 from hypothesis import given, settings, strategies as st
 
-from optloc.files.cells import Decimals, numbers
+from optloc.files.cell_text import Decimals, numbers
 from optloc.files.table import Table
 from optloc.files.words import Words, distinct, equal_rows, numbered, words_of
 

@@ -12,7 +12,7 @@ from lab.study.texts import assert_identical, design, run_here
 from recipes import installed, write_package
 
 from optloc.base.errors import InvalidProblem
-from optloc.lab.study import apart
+from optloc.lab.study import worker_process
 from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import read_frame
 from optloc.lab.study.trial import DIED, FAILED, INVALID, LATE
@@ -127,7 +127,7 @@ def test_a_method_that_forks_answers_once(tmp_path):
 
 @FULL
 def test_a_method_that_keeps_memory_harms_no_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(apart, "memory_of", lambda count: 3 << 30)
+    monkeypatch.setattr(worker_process, "memory_of", lambda count: 3 << 30)
     found = run_design(design(study(["hoard"])), tmp_path / "out", executor("processes", 1))
     assert found.methods["gtrs+lsr", "unproven"] == 3
     assert found.methods["hoard", DIED] == 3
@@ -154,7 +154,7 @@ def check(folder, names):
 )
 def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_path, monkeypatch):
     # Little more than libraries reserve: what is asked for beyond is never touched.
-    monkeypatch.setattr(apart, "memory_of", lambda count: 3 << 30)
+    monkeypatch.setattr(worker_process, "memory_of", lambda count: 3 << 30)
     deadly = {"exit", "exit-well", "segfault", "kill", "interrupt", "garbage", "small-memory"}
     names = [name for name in ROGUES if (name in deadly) == (some == "processes")]
     names = ["raise", "nan", "segfault"] if some == "few" else names
@@ -208,7 +208,7 @@ def test_of_many_trials_one_is_to_blame(way, tmp_path, monkeypatch):
 
 
 def test_a_process_that_cannot_begin_is_a_sentence_and_stores_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(apart, "_BEGIN", "import sys; sys.exit(7)")
+    monkeypatch.setattr(worker_process, "_BEGIN", "import sys; sys.exit(7)")
     with pytest.raises(InvalidProblem, match=r"no process can be begun \(its process ended with exit code 7\)"):
         run_design(design(), tmp_path / "out", executor("processes", 1))
     assert not list((tmp_path / "out" / "parts").iterdir())

@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from cases import CASES, dense_covariance, plain_predict, wrapped
 
+from optloc.kernels.batched_rows import (
+    blocks,
+    cell_layout,
+    load,
+    memory,
+    rounding_of_residuals,
+    run_operations,
+    write_equations,
+)
 from optloc.kernels.jit import plain
-from optloc.kernels.lanes import arrange, blocks, blur_of, gather, load, memory, run
 from optloc.kernels.pack import pack
 from optloc.kernels.trace import OPERATIONS, operate
 from optloc.linear.normal import whitener_at
@@ -23,7 +31,7 @@ def test_operations_on_registers_are_those_of_numpy(name):
     operation = OPERATIONS.index(name)
     r = np.array([[0.3, 1.7, 2.0, 9.0], [1.1, 0.4, 3.0, 9.0], [7.0, 7.0, 7.0, 7.0]])
     expected = operate(operation, r[0], r[1])
-    run(np.array([[operation, 2, 0, 1]]), 0, 1, r, 3)
+    run_operations(np.array([[operation, 2, 0, 1]]), 0, 1, r, 3)
     np.testing.assert_allclose(r[2, :3], expected[:3], rtol=1e-15)
     assert r[2, 3] == 7.0  # beyond the lanes that count
 
@@ -31,7 +39,7 @@ def test_operations_on_registers_are_those_of_numpy(name):
 def loaded(problem, x):
     """Return packed problems, where things stand, and a memory of two lanes with the problem in each."""
     packed = pack(problem, whitener_at(problem, x))
-    room = arrange(packed.tables, packed.numbers, x.shape[-1])
+    room = cell_layout(packed.tables, packed.numbers, x.shape[-1])
     m, r = memory(packed.tables, room, 2)
     c = packed.numbers
     for lane in range(2):
@@ -46,7 +54,7 @@ def test_normal_equations_are_those_of_differences_of_plain_predictions(name):
     x = case.truth + 7.0
     packed, room, m, r = loaded(case.problem, x)
     n = packed.tables.shared
-    gather(packed.tables, packed.numbers, m, r, room, False, 2)
+    write_equations(packed.tables, packed.numbers, m, r, room, False, 2)
     weight = np.linalg.pinv(dense_covariance(case.problem), rcond=1e-12, hermitian=True)
     for lane in range(2):
         at, step = x + lane, 1e-2
@@ -74,5 +82,5 @@ def test_the_parts_of_a_memory_follow_each_other():
 def test_rounding_errors_grow_with_the_size_of_measurements_in_standard_deviations():
     packed, room, m, _ = loaded(CASES["range-2d"].problem, CASES["range-2d"].truth)
     c, z = packed.numbers, CASES["range-2d"].problem.observed
-    found = blur_of(c.sigma, c.size, m, room, 0, 0)
+    found = rounding_of_residuals(c.sigma, c.size, m, room, 0, 0)
     assert found == pytest.approx(4.0 * np.finfo(float).eps * np.linalg.norm(z / 5.0))

@@ -105,7 +105,7 @@ def _entries() -> tuple[Any, Any]:
     class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
         def __init__(self, place: _KeptPlace, function: Callable[..., Any]) -> None:
             self._locator, self._lineno = place, function.__code__.co_firstlineno
-            self._filename_base = base_of(name_of(function), place.get_disambiguator())
+            self._filename_base = file_prefix_of(name_of(function), place.get_disambiguator())
 
     class CachedCallee(Impl):
         def rebuild(self, target_context: Any, payload: Any) -> Any:
@@ -186,13 +186,13 @@ def _cache_type() -> Any:
     return CachedKernel
 
 
-def kept(kernel: Compilable, *, callee: bool) -> Any:
+def code_cache_of(kernel: Compilable, *, callee: bool) -> Any:
     """Return a cache for the machine code of a kernel, as a dispatcher of numba holds one; None without a folder."""
-    place = _callees() if callee else kept_in()
+    place = _callees() if callee else folder_in_use()
     return None if place is None else _cache_type()(kernel, place, callee=callee)
 
 
-def kept_in() -> Path | None:
+def folder_in_use() -> Path | None:
     """Return the folder that machine code is kept in, or was installed in where nothing can be written."""
     return folder() or _installed_folder()
 
@@ -211,14 +211,14 @@ def is_checkout() -> bool:
     return (PACKAGE.parent / "pyproject.toml").is_file()
 
 
-def is_kept(kernel: Compilable) -> bool:
+def is_cached(kernel: Compilable) -> bool:
     """Return whether there is machine code of a kernel on disk."""
     return bool(files_of(kernel, _installed_folder(), folder()))
 
 
 def files_of(kernel: Compilable, *places: Path | None) -> list[Path]:
     """Return the files that machine code of a kernel is kept in, in the first folder that has some; [] without any."""
-    index = f"{base_of(name_of(kernel.function), digest_of(kernel))}.nbi"
+    index = f"{file_prefix_of(name_of(kernel.function), digest_of(kernel))}.nbi"
     found = next((place for place in places if place is not None and (place / index).exists()), None)
     return [] if found is None else [found / index, *found.glob(index.replace(".nbi", ".*.nbc"))]
 
@@ -228,7 +228,7 @@ def name_of(function: Callable[..., Any]) -> str:
     return f"{function.__module__}.{function.__qualname__}"
 
 
-def base_of(name: str, digest: str) -> str:
+def file_prefix_of(name: str, digest: str) -> str:
     """Return how the names of files of machine code begin, of a function by its whole name."""
     # Windows forbids the brackets of a function inside another.
     version = f"py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, 'abiflags', '')}"
@@ -237,7 +237,7 @@ def base_of(name: str, digest: str) -> str:
 
 def _leave_last(place: Path, name: str, base: str) -> None:
     """Remove files of other digests of a function, but the newest."""
-    others = [path for path in place.glob(f"{base_of(name, '*')}.nbi") if path.stem != base]
+    others = [path for path in place.glob(f"{file_prefix_of(name, '*')}.nbi") if path.stem != base]
     for path in sorted(others, key=_used, reverse=True)[_LEFT - 1 :]:
         for file in (path, *place.glob(f"{path.stem}.*.nbc")):
             file.unlink(missing_ok=True)
@@ -249,7 +249,7 @@ def _installed_folder() -> Path | None:
 
 
 @cache
-def begin_child() -> None:
+def start_background_compiler() -> None:
     """Begin a process in the background that makes all machine code, if none does so already; it may outlive this one.
 
     Its absence is no failure: what it would have made is made later, or never, and answers come in plain Python.
@@ -284,7 +284,7 @@ def _holds(file: IO[bytes], *, wait: bool) -> bool:
 
 
 @contextmanager
-def alone() -> Iterator[bool]:
+def sole_compiler() -> Iterator[bool]:
     """Tell whether no other process makes all machine code, and be the one that does."""
     place = folder()
     if place is None:
@@ -298,7 +298,7 @@ def alone() -> Iterator[bool]:
 def locked(kernel: Compilable) -> Iterator[None]:
     """Hold the machine code of a kernel while it is made: a process that waits for it loads it afterwards."""
     place = folder()
-    if place is None or is_kept(kernel):
+    if place is None or is_cached(kernel):
         yield
         return
     with ExitStack() as stack:

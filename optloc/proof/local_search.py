@@ -13,7 +13,9 @@ from optloc.proof.box import (
     DEPTH,
     DIRECTION,
     bound_nodes,
+    contract_box,
     cost_at,
+    exceeds_level,
     is_empty,
     least_left,
     least_residual,
@@ -21,14 +23,12 @@ from optloc.proof.box import (
     pop,
     push_around,
     push_halves,
-    reaches,
-    rounding,
-    shrink,
-    uncut,
+    reset_cut,
+    rounding_error,
     widest,
 )
 from optloc.proof.convex_boxes import is_known, known_minima
-from optloc.proof.curvature import G0, G1, G2, clip_to_minima, convex, curve_nodes, sum_up
+from optloc.proof.curvature import G0, G1, G2, contract_to_minima, curve_nodes, is_convex_over_box, sum_up
 from optloc.proof.descents import descend
 from optloc.proof.enclosure import around_node, enclose
 from optloc.proof.nodes.node import (
@@ -47,17 +47,17 @@ from optloc.proof.search_space import (
     Cost,
     KnownMinima,
     LocalAxes,
-    blur_at,
+    axes_of_next_piece,
     chart_on,
     curve_along,
     curve_box,
     equal_within,
-    lay_down,
-    place,
+    lay_on_surface,
+    rounding_at_centre,
     shapes_of,
-    turned,
     value_at,
-    widen,
+    widen_by_rounding,
+    write_centre,
 )
 from optloc.proof.surface import DATA, LEVEL, MIDDLE, SIDES, is_beyond, is_one_side, reach_of_piece
 
@@ -99,7 +99,7 @@ class Goal(NamedTuple):
 
 
 @compiled
-def branch(
+def search_boxes(
     cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal, budget: int, stack: Array, size: int
 ) -> tuple[int, int, float]:
     """Look at the boxes of a stack until none is left.
@@ -144,8 +144,8 @@ def branch(
         size -= 1
         pop(stack, size, at, half)
         boxes += 1
-        place(origin, sense, at, centre)
-        widen(chart, centre, half)
+        write_centre(origin, sense, at, centre)
+        widen_by_rounding(chart, centre, half)
         if bent:
             left = lay_or_halve(cost, chart, box, stack, size)
             if left >= 0:
@@ -156,15 +156,15 @@ def branch(
         linearise_rows(K, w, nodes, rows)
         low = least_residual(K, weight, floor, half, nodes, rows)
         # A length, where the level is a cost: below 1 the length is the larger, so it is squared.
-        if reaches(low, aim.level):
+        if exceeds_level(low, aim.level):
             continue
-        here, noise = cost_at(K, w, nodes), rounding(K, weight, floor, nodes)
+        here, noise = cost_at(K, w, nodes), rounding_error(K, weight, floor, nodes)
         if here < aim.better:
             return CHEAPER, boxes, 0.0
         # What cannot hold a residual shorter than rho, and below what no minimum, is cut off from all sides.
-        uncut(half, cut)
-        shrink(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
-        sound = aim.whole or reaches(low, aim.value)
+        reset_cut(half, cut)
+        contract_box(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
+        sound = aim.whole or exceeds_level(low, aim.value)
         if _is_done(at, half, minima, sides, aim, (unique or aim.whole) and sound):
             continue
         if unique or aim.whole:
@@ -173,13 +173,13 @@ def branch(
             else:
                 curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
             sum_up(K, w, weight, noise, nodes, curves, sums)
-            if sound and not clip_to_minima(A, half, nodes, curves, sums, cut, solve):
+            if sound and not contract_to_minima(A, half, nodes, curves, sums, cut, solve):
                 continue
             if here < aim.level and not is_empty(cut):
                 low_points += 1
                 # Early, then more and more seldom, and wherever a box holds one minimum at most.
                 seldom = low_points & (low_points - 1) == 0
-                if seldom or convex(shapes, A, half, nodes, curves, sums, 0.0):
+                if seldom or is_convex_over_box(shapes, A, half, nodes, curves, sums, 0.0):
                     outcome = _follow(cost, chart, box, minima, sides, aim)
                     if outcome != CLEAR:
                         return outcome, boxes, 0.0
@@ -259,7 +259,7 @@ def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int
     half, sense = box.half, chart.sense
     if is_beyond(chart.surface, box.centre, sense, half):
         return size
-    if lay_down(cost, chart, box):
+    if lay_on_surface(cost, chart, box):
         return -1
     first = (sense[0, 0] * sense[0, 0] + sense[1, 0] * sense[1, 0] + sense[2, 0] * sense[2, 0]) * half[0] * half[0]
     second = (sense[0, 1] * sense[0, 1] + sense[1, 1] * sense[1, 1] + sense[2, 1] * sense[2, 1]) * half[1] * half[1]
@@ -285,7 +285,7 @@ COARSE = 9
 
 
 @compiled
-def prove(
+def prove_locally(
     cost: Cost,
     box: Box,
     x: Array,
@@ -348,7 +348,7 @@ def prove(
     if not good:
         return SINGULAR, 0, -inf
     least, sums, bent = cost_at(cost.K, cost.w, box.nodes), box.sums, chart.surface.shape[0] > 0
-    slope, noise = (sums[G0], sums[G1], sums[G2]), blur_at(cost, chart, box) if not bent else 0.0
+    slope, noise = (sums[G0], sums[G1], sums[G2]), rounding_at_centre(cost, chart, box) if not bent else 0.0
     low, high, alone, most, there = np.empty(3), np.empty(3), True, max(COARSEST, eps), least
     if not region_of(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
@@ -379,7 +379,7 @@ def prove(
     level = least + kappa if kappa > 0.0 else least - eps
     aim, stack = Goal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, hole, 0)
-    outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
+    outcome, boxes, bound = search_boxes(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
     if outcome == CLEAR and not alone:
         outcome, boxes = _search_sides(cost, chart, box, known, aim, budget, boxes, stack)
     if outcome == CLEAR:
@@ -435,7 +435,7 @@ def _laid(cost: Cost, chart: LocalAxes, box: Box) -> tuple[float, float]:
     box.at[:], box.half[:] = 0.0, 0.0
     there, noise = value_at(cost, chart, box), 0.0
     if there < inf:
-        noise = blur_at(cost, chart, box)
+        noise = rounding_at_centre(cost, chart, box)
         curve_box(cost, chart, box)
     return there, noise
 
@@ -454,7 +454,7 @@ def _search_sides(
     """Search all other pieces of a surface than that of the fix; return the outcome and the boxes with those before."""
     corners, outcome = np.empty((2, 3)), CLEAR
     for side in range(1, SIDES):
-        chart = turned(cost, around, side)
+        chart = axes_of_next_piece(cost, around, side)
         low, high = corners[0], corners[1]
         low[:], high[:] = -inf, inf
         reach_of_piece(chart.surface, chart.origin, chart.sense, low, high)
@@ -464,7 +464,9 @@ def _search_sides(
         own = Goal(aim.level, aim.value, aim.better, aim.whole, free, own=0)
         # No hole: the origin of a piece is no minimum.
         size = push_around(stack, 0, low, high, np.zeros(3), 0)
-        outcome, more, _ = branch(cost, chart, box, minima[:count], sides[:count], own, budget - boxes, stack, size)
+        outcome, more, _ = search_boxes(
+            cost, chart, box, minima[:count], sides[:count], own, budget - boxes, stack, size
+        )
         boxes += more
         if outcome != CLEAR:
             break
