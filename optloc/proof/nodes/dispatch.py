@@ -118,7 +118,7 @@ def curve_others(kinds, data, centre, sense, half, line, second, nodes, curves):
     "bound_pieces": """
 def bound_pieces(atlas, kinds, data, half, nodes):
     away, away_b, sense, sense_b = atlas.away, atlas.away_b, atlas.sense, atlas.sense_b
-    frame, h = frame_of(atlas), triple(half, 0)
+    frame, h = frame_of(atlas), triple_at(half, 0)
     centre = range_form(atlas.point, atlas.slant, h)
     for j in range(kinds.shape[0]):
         kind, own = kinds[j], data[j]
@@ -137,7 +137,7 @@ def bound_pieces(atlas, kinds, data, half, nodes):
     "curve_pieces": """
 def curve_pieces(atlas, kinds, data, half, nodes, curves):
     away, away_b, sense, sense_b, bend = atlas.away, atlas.away_b, atlas.sense, atlas.sense_b, atlas.bend
-    frame, h = frame_of(atlas), triple(half, 0)
+    frame, h = frame_of(atlas), triple_at(half, 0)
     centre = range_form(atlas.point, atlas.slant, h)
     bent = curve_centre(atlas.slant, centre, h)
     for j in range(kinds.shape[0]):
