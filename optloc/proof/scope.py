@@ -1,4 +1,4 @@
-"""What the proof covers: one target, the kinds of rows, biases and constraints; and what is a run."""
+"""Scope of the proof: the targets, kinds of rows, biases and constraints that it covers, and what counts as a run."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.position_costs import factors_of_rows, own_epochs
 
-# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time: a
-# box of ten thousand nodes takes a millisecond, and plain Python takes a thousand times longer.
+# Greatest number of different ranges, angles and ratios, and of unknowns other than the position, for which a proof is
+# worth its time. A box of ten thousand nodes takes a millisecond; plain Python takes a thousand times longer.
 MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 10_000, 24, 128
-# Nodes beyond which a proof is that of a run, whose time goes with the nodes, not with their square: of stations that
-# move (of 25 nodes of five epochs no box was looked at within the budget of dense rows; up to here plain Python begins
-# where there is no machine code), and of those that stay, whose batches share their rows.
+# Beyond these numbers of nodes, the proof for runs is used. Its time is proportional to the number of nodes, not to
+# the square. SHORT is for stations that move: with 25 nodes of five epochs, the budget of dense rows did not suffice
+# for one box. Without compiled code, plain Python begins proofs up to this number. MOST_DENSE is for stations that
+# stay, whose batches share their rows.
 SHORT, MOST_DENSE = 24, 128
-# Unknown factors of rows: each box solves a system of this size, and each factor adds three columns to its rows.
+# Greatest number of unknown factors of rows: each box solves a system of this size, and each factor adds three columns
+# to its rows.
 MOST_FACTORS = 3
 
 
 def unsupported(problem: Problem) -> str:
-    """Return why a problem is beyond the proof, in a sentence that names what, or nothing where it is within.
+    """Return the first reason why the proof does not cover a problem, or an empty string if it does.
 
     Parameters
     ----------
@@ -54,14 +56,15 @@ def _reasons(problem: Problem) -> Iterator[str]:
     yield from _beyond_constraints(problem)
     known = {"position", "velocity", *(bias.name for bias in problem.biases)}
     known |= {name for name, _, _ in problem.stations.errors}
-    # What `optloc.proof.position_costs` does not write as rows would be left out of the cost without a word.
+    # `optloc.proof.position_costs` writes priors on known names as rows. Other priors would silently be left out of
+    # the cost.
     for name, _, _ in prior_parts(problem):
         if name not in known:
             yield f"the prior on {name} is not covered"
 
 
 def _beyond_courses(problem: Problem) -> Iterator[str]:
-    """Yield what of a target that moves is beyond the proof: its node at an epoch is one of the place it has then."""
+    """Yield the reasons against a moving target: a node at an epoch must depend on the position at that epoch."""
     motion = problem.motions[0]
     if motion.order > 1:
         yield "the target accelerates, and the proof is for one that stays or moves uniformly"
@@ -80,7 +83,7 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
 
 
 def is_moment(problem: Problem) -> bool:
-    """Return whether the rows are of one epoch, and show by rates how fast the target moves."""
+    """Return whether all rows are of one epoch and contain rates, so that they show the velocity of the target."""
     motion = problem.motions[0]
     if motion.order != 1 or motion.known is not None or problem.epochs > 1:
         return False
@@ -88,7 +91,7 @@ def is_moment(problem: Problem) -> bool:
 
 
 def _beyond_moments(problem: Problem) -> Iterator[str]:
-    """Yield what of rates of one epoch is beyond the proof: they are linear in the velocity."""
+    """Yield the reasons against rates of one epoch: the proof needs rates that are linear in the velocity."""
     motion = problem.motions[0]
     if motion.over != "space" or motion.rise is not None:
         yield "the target moves over ground, and the proof of that needs several epochs"
@@ -107,7 +110,7 @@ def _beyond_moments(problem: Problem) -> Iterator[str]:
 
 
 def held_height(problem: Problem) -> Band | None:
-    """Return the height that a target which moves over ground keeps, or nothing."""
+    """Return the constraint on the height of a target that moves over ground, or None."""
     for band in problem.constraints:
         if not isinstance(band, Band) or band.kind != "height" or not is_exact(band):
             continue
@@ -132,13 +135,13 @@ def _beyond_rows(problem: Problem) -> Iterator[str]:
 
 
 def is_run(problem: Problem) -> bool:
-    """Return whether a proof is that of a run (`optloc.proof.runs`): its rows have too many nodes for dense ones."""
+    """Return whether a proof uses the method for runs (`optloc.proof.runs`): too many nodes for dense rows."""
     most = SHORT if own_epochs(problem) > 1 else MOST_DENSE
     return 2 * problem.count > most and _nodes(problem) > most
 
 
 def crowded(problem: Problem) -> str:
-    """Return why a problem is beyond what works with dense rows, in a sentence, or nothing where it is within."""
+    """Return the reason why a problem does not fit methods with dense rows, or an empty string if it fits."""
     number = _nodes(problem)
     if is_scaled(problem):
         return "the velocity is unknown" if is_moment(problem) else "a factor of the rows is unknown"
@@ -146,7 +149,7 @@ def crowded(problem: Problem) -> str:
 
 
 def _nodes(problem: Problem) -> int:
-    """Return how many different ranges, rates, angles, ratios and heights the rows are made of."""
+    """Return the number of different ranges, rates, angles, ratios and heights in the rows."""
     moving, own = own_epochs(problem) > 1, 0
     found: set[tuple[bool, int, int]] = set()
     for rows in problem.rows:
@@ -170,12 +173,12 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
 
 
 def is_scaled(problem: Problem) -> bool:
-    """Return whether unknown factors multiply rows, or a velocity does; `optloc.proof.scaled` proves such fixes."""
+    """Return whether rows have unknown factors or an unknown velocity; `optloc.proof.scaled` proves these fixes."""
     return any(form_of(bias).enters == "scales" for bias in problem.biases) or is_moment(problem)
 
 
 def _beyond_scale(problem: Problem) -> Iterator[str]:
-    """Yield the reasons against a proof with unknown factors: it covers a few, each of a group of rows."""
+    """Yield the reasons against unknown factors: the proof covers a few factors, each of a group of rows."""
     scales = [bias for bias in problem.biases if form_of(bias).enters == "scales"]
     name, count, factor = scales[0].name, sum(len(bias.members) for bias in scales), factors_of_rows(problem)
     if count > MOST_FACTORS:
@@ -193,7 +196,7 @@ def _beyond_scale(problem: Problem) -> Iterator[str]:
 
 
 def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
-    """Yield the reasons against kinds of rows with factors (m,), of which some have no prior."""
+    """Yield the reasons against kinds of rows with factors `factor` (m,); `free` marks factors without a prior."""
     emitting, kinds = set[int](), {rows.kind for rows in problem.rows}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model, own = MODELS[rows.kind], {int(one) for one in factor[start : start + rows.count]}
@@ -216,7 +219,8 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
             yield f"errors of the stations' velocities enter {rates[0]} rows in a way that depends on the place"
     if problem.stations.covariance is None:
         return
-    # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
+    # If station errors are isotropic, the admitted station position nearest to the surveyed one is on the line to the
+    # target.
     if not problem.stations.isotropic:
         yield "the station errors differ from axis to axis"
     if problem.stations.unknown_for == "run" and _move(problem):
@@ -227,7 +231,7 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
 
 
 def _move(problem: Problem) -> bool:
-    """Return whether a station that rows of several epochs name is at different places in them."""
+    """Return whether a station of rows of several epochs has different positions at these epochs."""
     place = problem.stations.position
     if place.shape[-3] < 2:
         return False
