@@ -230,7 +230,7 @@ def _written(name: str, nodes: list[Node]) -> Callable[..., Any]:
     }
     space |= {function.__name__: function for function in _NAMED}
     space |= {f"{field}_{code}": kernel for code, own in enumerate(nodes) for field, kernel in _kernels(own)}
-    exec(compile(text_of(name, nodes), __file__, "exec"), space)  # generated text
+    exec(compile(text_of(name, nodes), __file__, "exec"), space)  # noqa: S102  # generated text
     made: Callable[..., Any] = space[name]
     return made
 
