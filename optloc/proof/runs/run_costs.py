@@ -181,7 +181,7 @@ class CourseCosts:
 
 
 def course_costs(problem: Problem) -> CourseCosts:
-    """Return the costs of a flat batch of N problems over position and velocity, other unknowns at their best values."""
+    """Return the costs of a flat batch of N problems over position and velocity, with other unknowns at their best."""
     problem = weighed(problem)
     costs = [_course_cost(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
     return CourseCosts(tuple(courses for courses, _ in costs), np.array([level for _, level in costs]))

@@ -144,9 +144,7 @@ def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tup
     for m in range(n):
         for other in range(m):
             table.hessian[other, m] = table.hessian[m, other]
-        for other in range(
-            n
-        ):  # the rounding of J'J, doubled as in `sum_up_rows`
+        for other in range(n):  # the rounding of J'J, doubled as in `sum_up_rows`
             table.change[m, other] += 4.0 * sqrt(widest) * blur
     ball = _rest(course, table, noise + digits_of(rows) * longest)
     return ball, sqrt(widest) * noise + blur * (longest + noise)
