@@ -86,8 +86,8 @@ def cover(
     base : array (3,)
         Written: a position m, metres.
     cells : array (2 * most, 1 + D, 1 + D)
-        Written: the centre of each box, then half of each edge, in homogeneous coordinates (P, v): the position is ``m
-        + P / v``.
+        Written: the centre of each box, then half of each edge, in homogeneous coordinates (P, v): the position is
+        ``m + P / v``.
     ends : array (2 * most,)
         Written: for each box that reaches infinity, the cost at infinity in the direction of its centre; else
         infinity.

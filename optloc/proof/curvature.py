@@ -246,8 +246,7 @@ def clip_to_minima(A: Array, half: Array, nodes: Array, curves: Array, sums: Arr
     This is an interval Newton method. The gradient at c + s is ``g + H s``, with H the mean of the Hessian between
     centre and s. Bounds of the change over t times the box are at most t times the bounds over the box
     (`optloc.proof.nodes.node`), so the mean changes by half of them. With Y the inverse of the Hessian at the centre,
-    a zero of the gradient obeys ``s = -Y g
-    - (Y H - 1) s``.
+    a zero of the gradient obeys ``s = -Y g - (Y H - 1) s``.
 
     Parameters
     ----------

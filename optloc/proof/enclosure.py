@@ -227,9 +227,9 @@ def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Arr
 def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: float) -> bool:
     """Return whether the error of the left inverse is negligible against the widths of an enclosure.
 
-    Let E = (left inverse) (rows) - 1 in search coordinates and the last unknown. Differences y to the fix obey ``|y_k|
-    <= b_k + sum_m |E_km y_m|``, where b_k are the bounds without E. If these terms are below a small share of the
-    widths at y = b, then no y exceeds the widths by more than this share.
+    Let E = (left inverse) (rows) - 1 in search coordinates and the last unknown. Differences y to the fix obey
+    ``|y_k| <= b_k + sum_m |E_km y_m|``, where b_k are the bounds without E. If these terms are below a small share of
+    the widths at y = b, then no y exceeds the widths by more than this share.
 
     Parameters
     ----------
@@ -304,9 +304,9 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
     """Contract a box of search coordinates by angles that differ little from the angles of the fix.
 
     Let n be the horizontal unit vector across the direction from a station to the fix, and v the other one. A point at
-    distance r whose azimuth and elevation differ by at most a and e obeys ``|n.(x - x^)| <= r sin a`` and ``|v.(x -
-    x^)| <= r (sin e + 1 - cos a)``. The distance r is at most the distance of the fix plus ``y = |x - x^|``. A left
-    inverse of these rows bounds y first, then each coordinate.
+    distance r whose azimuth and elevation differ by at most a and e obeys ``|n.(x - x^)| <= r sin a`` and
+    ``|v.(x - x^)| <= r (sin e + 1 - cos a)``. The distance r is at most the distance of the fix plus ``y = |x - x^|``.
+    A left inverse of these rows bounds y first, then each coordinate.
 
     Parameters
     ----------

@@ -41,11 +41,11 @@ def unsupported(problem: Problem) -> str:
 
 def _reasons(problem: Problem) -> Iterator[str]:
     if len(problem.motions) != 1:
-        yield f"there are {len(problem.motions)} targets, and the proof is for one"
+        yield f"there are {len(problem.motions)} targets, but the proof covers one"
         return
     motion = problem.motions[0]
     if motion.known is not None or not problem.layout.shares("position"):
-        yield "no position is common to all rows"
+        yield "the rows do not share one position"
     if motion.order > 0:
         yield from _beyond_courses(problem)
     yield from _beyond_rows(problem)
@@ -67,19 +67,19 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
     """Yield the reasons against a moving target: a node at an epoch must depend on the position at that epoch."""
     motion = problem.motions[0]
     if motion.order > 1:
-        yield "the target accelerates, and the proof is for one that stays or moves uniformly"
+        yield "the target accelerates, but the proof covers fixed targets and uniform motion"
     if is_moment(problem):
         yield from _beyond_moments(problem)
         return
     if problem.epochs < 2:
-        yield "the target moves, and the proof of that needs several epochs"
+        yield "the target moves, and the proof then needs several epochs"
     if problem.dimension > 2 and held_height(problem) is None:
-        yield "the target moves in space, and the proof is for the plane and for heights that are kept over ground"
+        yield "the target moves in space, but the proof covers the plane and known heights over ground"
     if problem.dimension > 2 and any(name == "velocity" for name, _, _ in prior_parts(problem)):
-        yield "the prior on velocity is not covered where the target moves over ground"
+        yield "the target moves over ground, and the proof then covers no prior on velocity"
     for rows in problem.rows:
         if MODELS[rows.kind].velocity:
-            yield f"the target moves, and {rows.kind} rows depend on how fast"
+            yield f"the target moves, and {rows.kind} rows depend on its velocity"
 
 
 def is_moment(problem: Problem) -> bool:
@@ -94,19 +94,19 @@ def _beyond_moments(problem: Problem) -> Iterator[str]:
     """Yield the reasons against rates of one epoch: the proof needs rates that are linear in the velocity."""
     motion = problem.motions[0]
     if motion.over != "space" or motion.rise is not None:
-        yield "the target moves over ground, and the proof of that needs several epochs"
+        yield "the target moves over ground, and the proof then needs several epochs"
     if problem.times[0] != problem.origin:
-        yield "the target moves, and its state holds at another time than the rows"
+        yield "the target moves, and its state is for another time than the rows"
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.velocity and {node for _, node in model.nodes} != {"range_rate"}:
-            yield f"the target moves, and {rows.kind} rows depend on how fast"
+            yield f"the target moves, and {rows.kind} rows depend on its velocity"
     if problem.constraints:
-        yield "the velocity at one epoch comes with constraints, and its proof is for all positions"
+        yield "the velocity at one epoch is unknown, and the proof then covers no constraints"
     if any(form_of(bias).enters == "scales" for bias in problem.biases):
-        yield "the velocity at one epoch comes with unknown scales, and the proof takes either"
+        yield "the velocity at one epoch is unknown, and the proof then covers no unknown scales"
     if is_run(problem):
-        yield f"the velocity at one epoch is of many rows, and the proof takes {MOST_DENSE} different ranges and rates"
+        yield f"the velocity at one epoch is unknown; the proof then covers {MOST_DENSE} different ranges and rates"
 
 
 def held_height(problem: Problem) -> Band | None:
@@ -123,15 +123,15 @@ def _beyond_rows(problem: Problem) -> Iterator[str]:
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.straight is not None:
-            yield f"{model.straight} rows follow rays that bend, and the proof takes straight ones"
+            yield f"{model.straight} rows follow rays that bend, but the proof covers straight rays"
         elif model.ranges is None and not model.nodes:
-            yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind whose bounds are known"
+            yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind with known bounds"
     most = MOST_NODES if enabled() else MOST_NODES_PLAIN
     if problem.count > most and _nodes(problem) > most:
-        without = "" if enabled() else " without machine code"
-        yield f"there are {_nodes(problem)} different ranges, rates and angles, and the proof takes {most}{without}"
+        without = "" if enabled() else " without compiled code"
+        yield f"there are {_nodes(problem)} different ranges, rates and angles, but the proof covers {most}{without}"
     if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
-        yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
+        yield f"there are {problem.layout.size} unknowns, but the proof covers {MOST_UNKNOWNS}"
 
 
 def is_run(problem: Problem) -> bool:
@@ -145,7 +145,9 @@ def crowded(problem: Problem) -> str:
     number = _nodes(problem)
     if is_scaled(problem):
         return "the velocity is unknown" if is_moment(problem) else "a factor of the rows is unknown"
-    return "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, over {MOST_DENSE}"
+    return (
+        "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, more than {MOST_DENSE}"
+    )
 
 
 def _nodes(problem: Problem) -> int:
@@ -169,7 +171,7 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
         if why := form_of(bias).beyond_proof:
             yield f"the {bias.form} {bias.name!r} {why}"
         elif bias.sigma is None and angular[bias.row].any():
-            yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
+            yield f"the bias {bias.name!r} of angles has no prior, so it may include whole turns"
 
 
 def is_scaled(problem: Problem) -> bool:
@@ -182,17 +184,17 @@ def _beyond_scale(problem: Problem) -> Iterator[str]:
     scales = [bias for bias in problem.biases if form_of(bias).enters == "scales"]
     name, count, factor = scales[0].name, sum(len(bias.members) for bias in scales), factors_of_rows(problem)
     if count > MOST_FACTORS:
-        yield f"there are several scales ({count}), and the proof takes {MOST_FACTORS}"
+        yield f"there are several scales ({count}), but the proof covers {MOST_FACTORS}"
     elif (factor < -1).any():
-        yield "rows have several scales, or a multiple of one, and the proof takes one scale for each row"
+        yield "rows have several scales, or a multiple of a scale, but the proof covers one scale for each row"
     free = np.concatenate([np.full(len(bias.members), bias.sigma is None) for bias in scales])
     yield from _beyond_factors(problem, factor, [*free, False, False])
     if problem.constraints:
-        yield f"the scale {name!r} comes with constraints, and its proof is for all positions"
+        yield f"the scale {name!r} is unknown, and the proof then covers no constraints"
     if problem.stations.unknown_for:
-        yield f"the scale {name!r} comes with unknown station errors, which it multiplies"
+        yield f"the scale {name!r} multiplies unknown station errors, which the proof does not cover"
     if is_run(problem):
-        yield f"the scale {name!r} is of a long run, and the proof takes {MOST_DENSE} different ranges"
+        yield f"the scale {name!r} belongs to a long run, but the proof covers {MOST_DENSE} different ranges"
 
 
 def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
@@ -203,9 +205,9 @@ def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> It
         emitting |= own if model.emission else set()
         without_prior = any(free[one] for one in own)
         if model.ranges is None and {node for _, node in model.nodes} != {"log range"}:
-            yield f"scales come with {rows.kind} rows, and the proof takes times, ranges and levels"
+            yield f"a scale is unknown; the proof then covers times, ranges and levels, but no {rows.kind} rows"
         elif model.ranges is None and without_prior and (len(kinds) > 1 or len(own) > 1):
-            yield f"the scale of {rows.kind} rows has no prior, and other rows do not have it"
+            yield f"the scale of {rows.kind} rows has no prior, and other rows do not have this scale"
         elif without_prior and sum(model.ranges or ()) != 0 and not model.emission:
             yield f"the scale of {rows.kind} rows has no prior, so that nothing bounds the position"
     if len(emitting) > 1 and any(free[one] for one in emitting):
@@ -216,7 +218,7 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
     if problem.stations.velocity_covariance is not None:
         rates = [rows.kind for rows in problem.rows if MODELS[rows.kind].velocity]
         if rates:
-            yield f"errors of the stations' velocities enter {rates[0]} rows in a way that depends on the place"
+            yield f"errors of the stations' velocities change {rates[0]} rows by amounts that depend on the position"
     if problem.stations.covariance is None:
         return
     # If station errors are isotropic, the admitted station position nearest to the surveyed one is on the line to the
@@ -224,10 +226,10 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
     if not problem.stations.isotropic:
         yield "the station errors differ from axis to axis"
     if problem.stations.unknown_for == "run" and _move(problem):
-        yield "station errors last the whole run while stations move, and the proof takes one line of sight for each"
+        yield "station errors last the whole run while stations move; the proof covers one line of sight for each"
     bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
     if bent:
-        yield f"station errors enter {bent[0]} rows in a way that depends on the place"
+        yield f"station errors change {bent[0]} rows by amounts that depend on the position"
 
 
 def _move(problem: Problem) -> bool:
@@ -247,9 +249,9 @@ def _move(problem: Problem) -> bool:
 def _beyond_constraints(problem: Problem) -> Iterator[str]:
     levels = [constraint for constraint in problem.constraints if is_exact(constraint)]
     if len(levels) > 1 and any(isinstance(level, Band) and level.kind == "height" for level in levels):
-        yield "a height that is known together with another equality leaves a line, which the proof does not follow"
+        yield "a known height and another equality leave a line, which the proof does not follow"
     if len(levels) >= problem.dimension:
-        yield "the equalities leave no way to move"
+        yield "the equalities leave no free direction"
     for constraint in problem.constraints:
         if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):
             yield f"the equality {constraint.name!r} is neither a height nor a plane"

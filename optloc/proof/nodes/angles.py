@@ -319,8 +319,8 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
 def _swung(u: Triple, v: Triple, tangent: float, more: Triple, near: float, stretch: float) -> Triple:
     """Return bounds of the change of u when it turns towards v, changes further by `more`, and the range changes.
 
-    For an angle whose tangent is at most `tangent`, ``u cos + v sin - u`` is at most ``tangent^2/2 |u| + tangent
-    |v|``. `near` and `stretch` bound r/r' and its difference from 1.
+    For an angle whose tangent is at most `tangent`, ``u cos + v sin - u`` is at most
+    ``tangent^2/2 |u| + tangent |v|``. `near` and `stretch` bound r/r' and its difference from 1.
     """
     bent = 0.5 * tangent * tangent
     return (

@@ -40,7 +40,7 @@ def named(node: str | Node) -> Node:
     if isinstance(node, Node):
         return node
     if node not in _NAMES:
-        raise InvalidProblem(f"the proof knows no node {node!r}", "nodes", nearest(node, list(_NAMES)))
+        raise InvalidProblem(f"the proof has no node {node!r}", "nodes", nearest(node, list(_NAMES)))
     return _NAMES[node]
 
 

@@ -64,7 +64,7 @@ def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
 
 def _of_row(row: NodeRow) -> Array:
     """Raise an error: no measurement is linear in the position. Priors make linear nodes directly."""
-    raise NotImplementedError("a row of measurements does not say which linear form it is of")
+    raise NotImplementedError("a row of measurements does not name a linear form")
 
 
 LINEAR_FORM = Node("linear", _NUMBERS, 1, _of_row, bound_linear, shape=FLAT, size=size_linear)
@@ -130,8 +130,8 @@ def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, 
 def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound a geodetic height over a box (see `optloc.proof.nodes.node`), metres.
 
-    Deep in the Earth the model's formula is not an exact height. There the height is between ``-|x| - a`` and ``|x| -
-    b``.
+    Deep in the Earth the model's formula is not an exact height. There the height is between ``-|x| - a`` and
+    ``|x| - b``.
     """
     height, up, _, _, _ = normal_at(data, line)
     h = triple(half, 0)
@@ -153,9 +153,9 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
     """Bound the second derivatives of a geodetic height over a box (see `optloc.proof.nodes.node`).
 
     The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian
-    and prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2. This is the sum of ``3 p q^2`` with ``p^2 + q^2
-    = 1`` (1.155), for the turning normal and the stretching tangents, and ``3/2 e^2 (1 + e^2)`` (0.01), for curvature
-    that changes with latitude.
+    and prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2. This is the sum of ``3 p q^2`` with
+    ``p^2 + q^2 = 1`` (1.155), for the turning normal and the stretching tangents, and ``3/2 e^2 (1 + e^2)`` (0.01),
+    for curvature that changes with latitude.
     """
     height, up, east, north, sp = normal_at(data, line)
     h = triple(half, 0)
