@@ -144,6 +144,7 @@ def _prove_few(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
 
 
 def _prove_plainly(costs: PositionCosts, asked: ProofRequest, boxes: int) -> ProofResult:
+    """Return the results of proofs in plain Python, with at most `boxes` boxes for each fix."""
     with plain():
         return _prove(costs, asked._replace(budget=np.minimum(asked.budget, boxes)))
 
@@ -177,6 +178,7 @@ def without_rivals(
 
 
 def _prove(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
+    """Return the results of all proofs, by compiled code in several threads or by plain Python."""
     n, d = asked.x.shape
     out = empty_answer(n, d)
     costs, asked = (

@@ -420,6 +420,7 @@ def widest(half: Array) -> int:
 
 @compiled
 def _steepness(rows: Array, m: int) -> float:
+    """Return the length of the derivative of the residual along side m."""
     total = 0.0
     for i in range(rows.shape[0]):
         total += rows[i, J0 + m] * rows[i, J0 + m]

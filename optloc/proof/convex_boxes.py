@@ -367,6 +367,7 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
 
 @compiled
 def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
+    """Return whether the Hessian of f/2 exceeds `margin` over a box with half-widths (3,) around minimum i."""
     _tables(cost, box, atlas, i, half)
     # Here ranges are differences, whose Hessians have no fixed sign, so the test must treat them as any node.
     return convex(np.full_like(cost.kinds, ANY), cost.A, box.half, box.nodes, box.curves, box.sums, margin)

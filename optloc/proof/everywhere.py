@@ -127,6 +127,7 @@ class GlobalWorkspace(NamedTuple):
 
 @compiled
 def _bound_row(work: GlobalWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+    """Return the result of `optloc.proof.level_search.bound_row` for a cost without unknown scales."""
     atlas, box, cost, piece = space.atlas, work.box, work.cost, int(stack[row, PIECE])
     if not _take(stack, row, atlas, space.chart, work.corners, box, piece):
         return inf, inf
@@ -146,6 +147,7 @@ def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
 
 @inlined
 def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
+    """Return the result of `optloc.proof.level_search.side_of_rest` for a cost without unknown scales."""
     cost, atlas, box = work.cost, space.atlas, work.box
     noise = rounding(cost.K, cost.weight, work.floor, box.nodes)
     uncut(box.half, box.cut)
@@ -224,6 +226,7 @@ def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float
 
 @compiled
 def _descend_near(work: GlobalWorkspace, chart: LocalAxes) -> float:
+    """Return the result of `optloc.proof.level_search.descend_near` for a cost without unknown scales."""
     return descend(work.cost, chart, work.near)
 
 
@@ -238,11 +241,13 @@ def _set_rival(
     eps: float,
     _rho: float,
 ) -> bool:
+    """Return the result of `optloc.proof.level_search.set_rival` for a cost without unknown scales."""
     return set_minimum(work.cost, work.near, atlas, i, x, value, eps, inf)
 
 
 @compiled
 def _cost_set(work: GlobalWorkspace, atlas: Atlas) -> float:
+    """Return the result of `optloc.proof.level_search.cost_set` for a cost without unknown scales."""
     bound_pieces(atlas, work.cost.kinds, work.cost.data, work.box.half, work.box.nodes)
     return cost_at(work.cost.K, work.cost.w, work.box.nodes)
 

@@ -40,6 +40,7 @@ def unsupported(problem: Problem) -> str:
 
 
 def _reasons(problem: Problem) -> Iterator[str]:
+    """Yield all reasons why the proof does not cover a problem."""
     if len(problem.motions) != 1:
         yield f"there are {len(problem.motions)} targets, but the proof covers one"
         return
@@ -120,6 +121,7 @@ def held_height(problem: Problem) -> Band | None:
 
 
 def _beyond_rows(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the kinds of rows, and against the numbers of nodes and unknowns."""
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.straight is not None:
@@ -166,6 +168,7 @@ def _nodes(problem: Problem) -> int:
 
 
 def _beyond_biases(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the biases."""
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
         if why := form_of(bias).beyond_proof:
@@ -215,6 +218,7 @@ def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> It
 
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the errors of station positions and velocities."""
     if problem.stations.velocity_covariance is not None:
         rates = [rows.kind for rows in problem.rows if MODELS[rows.kind].velocity]
         if rates:
@@ -247,6 +251,7 @@ def _move(problem: Problem) -> bool:
 
 
 def _beyond_constraints(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the constraints."""
     levels = [constraint for constraint in problem.constraints if is_exact(constraint)]
     if len(levels) > 1 and any(isinstance(level, Band) and level.kind == "height" for level in levels):
         yield "a known height and another equality leave a line, which the proof does not follow"

@@ -193,6 +193,7 @@ def _ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) 
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the azimuth node of a row."""
     return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a), MEASURED: row.measured[:, None]})
 
 
@@ -391,6 +392,7 @@ def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
 
 
 def _upright_numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the elevation node of a row."""
     return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a)})
 
 

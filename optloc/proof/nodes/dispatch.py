@@ -50,10 +50,12 @@ _Writer = Callable[[Node, int], str]
 
 
 def _call(field: str, arguments: str) -> _Writer:
+    """Return a writer of calls of a node's function, or of an empty text if the node has no such function."""
     return lambda node, code: "" if getattr(node, field) is None else f"{field}_{code}({arguments})"
 
 
 def _constant(field: str) -> _Writer:
+    """Return a writer of the value of a node's field."""
     return lambda node, code: repr(getattr(node, field))
 
 

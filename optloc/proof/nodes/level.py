@@ -153,7 +153,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
     """Bound the second derivatives of a geodetic height over a box (see `optloc.proof.nodes.node`).
 
     The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian
-    and prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2. This is the sum of ``3 p q^2`` with
+    and prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2. The bound covers ``3 p q^2`` with
     ``p^2 + q^2 = 1`` (1.155), for the turning normal and the stretching tangents, and ``3/2 e^2 (1 + e^2)`` (0.01),
     for curvature that changes with latitude.
     """
@@ -202,6 +202,7 @@ def height_numbers(problem: Problem) -> Array:
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (1, n) of the height node of a row."""
     return height_numbers(row.problem)
 
 

@@ -88,6 +88,7 @@ def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvatu
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the node of a row: the station's position."""
     return row.place(row.a)
 
 

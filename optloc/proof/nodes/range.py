@@ -242,6 +242,7 @@ def curve_difference(
 
 @compiled
 def _size(data: Array, reach: float) -> float:
+    """Return the size of the terms of a range, metres, which limits its accuracy."""
     return float(reach + (abs(data[0]) + abs(data[1]) + abs(data[2])))
 
 
@@ -252,6 +253,7 @@ def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, 
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the range node of a row: the station's position."""
     return row.place(row.a)
 
 

@@ -97,6 +97,7 @@ def _size(data: Array, reach: float) -> float:
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the range-rate node of a row."""
     # For a fixed target, the relative velocity is the reversed velocity of the station.
     return lay_out({STATION: row.place(row.a), VELOCITY: -row.velocity(row.a)})
 

@@ -172,6 +172,7 @@ def _square_bend(sense: Array, sense_b: Array) -> Symmetric:
 
 @compiled
 def _square_entry(sense: Array, sense_b: Array, k: int, m: int) -> float:
+    """Return entry (k, m) of the Hessian of ``|line|^2 - |line_b|^2``."""
     entry = 0.0
     for i in range(3):
         entry += sense[i, k] * sense[i, m] - sense_b[i, k] * sense_b[i, m]
@@ -250,6 +251,7 @@ def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, 
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the ratio node of a row: the positions of both stations."""
     return lay_out({STATION: row.place(row.a), STATION_B: row.place(row.b)})
 
 

@@ -304,6 +304,7 @@ def _ended(
 
 @compiled
 def _product(f: Jet, g: Jet) -> Jet:
+    """Return bounds of a product of two functions, from bounds of the functions and of their derivatives."""
     return (
         f[0] * g[0],
         f[1] * g[0] + f[0] * g[1],

@@ -279,6 +279,7 @@ class _System:
     def of(
         cls, problem: Problem, present: Array, made: CostColumns, others: OtherRows, value: Array, prior: Any
     ) -> _System:
+        """Return the whitened rows of one problem; `present` (m,) marks the rows to use."""
         from scipy import sparse  # imported with the first long run: problems of one epoch do not need it
 
         size, white = len(made.kinds), _whitening(problem, present)

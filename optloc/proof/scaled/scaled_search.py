@@ -321,6 +321,7 @@ def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
 
 @compiled
 def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+    """Return the result of `optloc.proof.level_search.bound_row` for a cost with unknown factors."""
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
     end_at_infinity(box, space.atlas.dimension - 1, infinity(space.atlas, piece) if space.far else -inf)
@@ -377,6 +378,7 @@ def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
 
 @compiled
 def _descend_near(work: ScaledSearchWorkspace, chart: LocalAxes) -> float:
+    """Return the result of `optloc.proof.level_search.descend_near` for a cost with unknown factors."""
     return descend_scaled(work.scaled, chart, work.tables)
 
 
@@ -391,11 +393,13 @@ def _set_rival(
     eps: float,
     rho: float,
 ) -> bool:
+    """Return the result of `optloc.proof.level_search.set_rival` for a cost with unknown factors."""
     return set_scaled_minimum(work.scaled, work.tables, atlas, chart, i, x, value, eps, rho)
 
 
 @compiled
 def _cost_set(work: ScaledSearchWorkspace, atlas: Atlas) -> float:
+    """Return the result of `optloc.proof.level_search.cost_set` for a cost with unknown factors."""
     bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
     if work.scaled.free and not work.scaled.lift.any():  # the columns of factors vanish at infinity
         return float(cost_at(work.rest.K, work.rest.w, work.box.nodes))
