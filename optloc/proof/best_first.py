@@ -162,11 +162,11 @@ def _is_due(lows: int, low: bool, boxes: int) -> bool:
 def search_minima(
     cost: Cost, box: Box, near: Box, x: Array, aim: SearchGoal, region: Array, budget: int
 ) -> tuple[int, int]:
-    """Search for minima all around a surface, over all positions, or between corners.
+    """Return the number of known minima and the number of boxes of a search for minima.
 
-    If the cost stays finite at infinity, all positions are searched. Otherwise the corners come from an enclosure of
-    the positions that cost less than x (D,), or from the region (2, D) if there is no enclosure. The result is the
-    number of known minima and the number of boxes.
+    On a surface, the search goes all around it. Otherwise, if the cost stays finite at infinity, all positions are
+    searched. In other cases the search is between corners. The corners come from an enclosure of the positions that
+    cost less than x (D,), or from the region (2, D) if there is no enclosure.
     """
     around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
     level, d, bent = cost_at(cost.K, cost.w, box.nodes) + aim.gap, x.shape[0], aim.surface.shape[0] > 0

@@ -36,7 +36,7 @@ _ULP = 2.0**-52
 # of these.
 _WIDER, _SHIFT = 1e-12, 1e-15
 # Coordinate descents towards the least-squares point of a box. Any point gives a valid bound. Over 8 fixes by range
-# differences one descent took 6 % more boxes of an atlas than three descents, and ten descents took 0.6 % fewer.
+# differences, one descent took 6 % more boxes of an atlas than three. Ten descents took 0.6 % fewer.
 _SWEEPS = 3
 # A node that has a bound on one side only must pull the direction v the right way. This share of |v| is the margin for
 # rounding.
@@ -123,9 +123,9 @@ def cost_at(K: Array, w: Array, nodes: Array) -> float:
 def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Array, rows: Array) -> float:
     """Return a lower bound of ``|K phi - w|`` over a box; a negative result means that no bound is known.
 
-    For any direction v, the minimum of ``v.(K phi - w)`` over the box is at least its value at the middle of the
-    remainders, less the greatest change by the box and by the remainders. The function takes as v the shortest
-    residual of the linear part (box-constrained least squares).
+    For any direction v, ``v.(K phi - w)`` is at least its value at the middle of the remainders, less its greatest
+    change over the box and the remainders. The function takes as v the shortest residual of the linear part
+    (box-constrained least squares).
 
     Parameters
     ----------
@@ -430,7 +430,7 @@ def _steepness(rows: Array, m: int) -> float:
 # The boxes still to be searched are a stack: the deepest box comes first, so that the stack stays short.
 
 # Columns of the stack (capacity, DEPTH): centre, half-widths, lower bound of the residual over the parent box, and the
-# piece of the atlas that contains the box (0 in search coordinates around a fix).
+# piece of the atlas. The piece is 0 in search coordinates around a fix.
 CENTRE, HALF, LEAST, PIECE, DEPTH = 0, 3, 6, 7, 8
 
 
@@ -515,10 +515,10 @@ _BALANCED = 1e-12
 # Half-width of the cube, in half-sizes of the station array. The margin keeps stations off the faces of the cube,
 # where the scaled line to a station would vanish.
 _REACHES = 1.25
-# If the fix is closer than this to the middle of the stations, the centre of the cube moves by `_ASIDE` (both in
-# half-sizes of the station array). Convex boxes around a fix, and boxes of low cost, end before they reach a centre
-# that is a fifth of the array away. The direction of the move is oblique: on the line from the centre through the fix
-# to a station, the difference of both ranges has no slope.
+# Both in half-sizes of the station array: if the fix is closer than `_NEAR_CENTRE` to the middle of the stations, the
+# centre of the cube moves by `_ASIDE`. Convex boxes around a fix, and boxes of low cost, end before they reach a
+# centre that is a fifth of the array away. The direction of the move is oblique: on the line from the centre through
+# the fix to a station, the difference of both ranges has no slope.
 _NEAR_CENTRE, _ASIDE = 0.1, (0.21, 0.13, 0.17)
 
 

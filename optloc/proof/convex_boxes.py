@@ -100,7 +100,7 @@ def known_minima(
             if not is_convex(cost, chart, box, 0.0) or is_elsewhere(chart, box, others[p - 1]):
                 continue
             sums = box.sums
-            # If the Hessian exceeds a margin, the minimum is within slope / margin of any point, and the cost at the
+            # If the Hessian exceeds a margin, the minimum is within slope / margin of any point. The cost at the
             # minimum is lower by at most slope^2 / margin.
             margin = _POLISHED * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
             least = cost_at(cost.K, cost.w, box.nodes) - margin / (_POLISHED * _POLISHED)
@@ -182,9 +182,9 @@ _WIDEST, _SHARE = 1e4, 0.9
 # standard deviations. Outside, the cost is high enough for boxes along the axes of space.
 _WIDER, _WIDE = 3.0, 3.0
 # The same for a proof, standard deviations. A valley is narrow, oblique to the faces, and longer than its curvature at
-# the minimum suggests. Squared rows quickly contract a box that is too wide. Over 2 000 fixes of each of ten layouts
-# 30 took as many boxes as 100, and proved up to 5 % more of the fixes on flat ground unique; over 100 fixes outside 12
-# took a sixth more boxes.
+# the minimum suggests. Squared rows quickly contract a box that is too wide. Over 2 000 fixes of each of ten layouts,
+# 30 took as many boxes as 100, and proved up to 5 % more of the fixes on flat ground unique. Over 100 fixes outside
+# the array, 12 took a sixth more boxes.
 _VALLEY = 30.0
 # Half-widths of the first convex box to test, standard deviations, and the factor by which the box and its sides grow.
 # A finer search takes as long as the boxes that it saves, or longer.
@@ -288,7 +288,7 @@ def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
 
 # Standard deviations: a minimum nearer to infinity than this gets axes of which only the last changes v, so that a box
 # can reach infinity. Other minima get principal axes, of which only one is long if the rows determine little. Over 100
-# fixes of five stations outside 12 took a tenth fewer boxes than 5, and over 120 on flat ground a tenth more.
+# fixes outside five stations, 12 took a tenth fewer boxes than 5. Over 120 fixes on flat ground, 12 took a tenth more.
 _REMOTE = 5.0
 # Least pivot as a share of the diagonal: smaller pivots are rounding.
 _PIVOT = 1e-14
@@ -296,7 +296,7 @@ _PIVOT = 1e-14
 
 @compiled
 def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
-    """Write axes of minimum i in its home coordinates, in standard deviations; return False if there are none."""
+    """Write axes of minimum i in its home coordinates, in standard deviations; return False if they do not exist."""
     minima, d = atlas.minima, atlas.dimension
     axes, back = minima.axes[i], minima.back[i]
     axes[:], back[:] = 0.0, 0.0
@@ -375,7 +375,7 @@ def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: flo
 
 @compiled
 def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float) -> bool:
-    """Write half-widths of a box around minimum i on which the cost is convex; return False if there is none.
+    """Write half-widths of a box around minimum i on which the cost is convex; return False if none is found.
 
     A cube shrinks or doubles, then each side grows separately, all within the hull (3,).
     """

@@ -202,8 +202,8 @@ def _clip(cost: Cost, box: Box, longest: float) -> int:
 
     With J_k the derivative of the residual along side k, and dq the remainders minus the middles of their intervals,
     each point of the box obeys ``J_k.residual = J_k.middle + |J_k|^2 s_k + sum_m J_k.J_m s_m + J_k.K dq``. Unlike
-    `optloc.proof.box.shrink`, this needs no inverse, so it works if the rows do not determine a position, whatever the
-    rounding. Over 18 fixes of all shapes both together left no fewer cells.
+    `optloc.proof.box.shrink`, this needs no inverse. So it works with any rounding, even if the rows do not determine
+    a position. Over 18 fixes of all shapes, both contractors together left no fewer cells.
     """
     rows, nodes, half = box.rows, box.nodes, box.half
     uncut(half, box.cut)
@@ -288,7 +288,7 @@ def _is_bent(cost: Cost, box: Box, dimension: int) -> bool:
 
 @compiled
 def _side(cost: Cost, space: Space, box: Box, piece: int) -> int:
-    """Return the side to halve: the steepest one, or if curvature dominates, the one that reduces remainders most."""
+    """Return the side to halve: the steepest side, or if curvature dominates, the best side to reduce remainders."""
     dimension = space.atlas.dimension
     side = steepest_side(box.half, box.rows, dimension)
     if _is_bent(cost, box, dimension):

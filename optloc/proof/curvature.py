@@ -365,7 +365,7 @@ def has_no_infimum(
 
 @compiled
 def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
-    """Return the side along which the unknown part of the Hessian changes the slope most; -1 if there is none.
+    """Return the side along which the unknown part of the Hessian changes the slope most, or -1 without any.
 
     Over 70 fixes that took many boxes, halving this side took an eighth fewer boxes than halving the steepest side.
     """

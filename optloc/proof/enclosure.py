@@ -97,9 +97,9 @@ SLACK = 1e-6
 _PIVOT, _INVERSE, _WIDER = 1e-9, 1e-7, 1e-9
 # Unit in the last place of a double at 1.
 _ULP = 2.0**-52
-# Columns of a table of nodes: the error at the fix, and the greatest change of the node from there. Then the squared
-# row, zero for nodes without one: coefficients of the error (3), of the position and one more unknown (4), the
-# weighted coefficients (4), the left inverse (4), and the weight in a sum of rows.
+# Columns of a table of nodes: the error at the fix, and the greatest change of the node from there. The other columns
+# are the squared row, zero for nodes without a squared row: coefficients of the error (3), coefficients of the
+# position and one more unknown (4), weighted coefficients (4), the left inverse (4), and the weight in a sum of rows.
 ERROR, SWING, FIRST, SECOND, THIRD, ROW, WEIGHTED, LEFT, WEIGHT, TIE_WIDTH = 0, 1, 2, 3, 4, 5, 9, 13, 17, 18
 
 
@@ -195,7 +195,7 @@ def _rows(
 
 @inlined
 def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Array, upper: Array) -> bool:
-    """Write the left inverse of the rows that has the least errors at the fix; return False if there is none."""
+    """Write the left inverse of the rows that has the least errors at the fix; return False if it does not exist."""
     normal = np.zeros((4, 4))
     for j in member:
         t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0

@@ -93,9 +93,9 @@ from optloc.proof.squares import Squares, bend_of, clip_to_squares, squares_of
 # Greatest number of contractions of a box by its squared rows; they end when one removes less than half. A whole face
 # of the cube needs three.
 _LOOKS = 8
-# If ranges change the residual by the remainder of the distance to the centre, squared and relative to the level, by
-# more than this, the squared rows contract the box. Over 100 fixes of five stations a ninth of this value took 4 %
-# fewer boxes for twice as many contractions, and ten times this value took 8 % more boxes.
+# Squared rows contract a box only if the remainder of ranges changes the squared residual by more than this many
+# levels. Over 100 fixes of five stations, a ninth of this value took 4 % fewer boxes, but twice the contractions. Ten
+# times this value took 8 % more boxes.
 _BENT = 9.0
 
 
@@ -265,12 +265,12 @@ search_everywhere = with_constants(
 )
 
 
-# A further verdict beside the verdicts of `optloc.proof.near`: the cost at infinity is within the gap.
+# A verdict in addition to the verdicts of `optloc.proof.near`: the cost at infinity is within the gap.
 UNBOUNDED = 8
-# Greatest size of an enclosure to search, as a multiple of the convex box around the fix, for fixes between the
-# stations and for other fixes; and the number of boxes after which the atlas replaces the enclosure. An enclosure of
-# six times the size takes about sixteen boxes, like an atlas of a fix outside. Of enclosures of fifty times the size,
-# few need less than a hundred boxes.
+# Greatest size of an enclosure to search, as a multiple of the convex box around the fix: between the stations, and
+# outside. The third number is the number of boxes after which the atlas replaces the enclosure. An enclosure of six
+# times the size takes about sixteen boxes, like an atlas of a fix outside. Of enclosures of fifty times the size, few
+# need less than a hundred boxes.
 _REACH, _REACH_OUTSIDE, _SOON = 50.0, 6.0, 100
 # Distance, relative to the distance from the fix, within which two minima are the same: the accuracy of a descent.
 _CLOSE = 1e-3
@@ -290,9 +290,9 @@ def prove_everywhere(
 ) -> tuple[int, int, float, float, int]:
     """Prove that no position costs less than a fix, and that no other minimum has a gap below the largest provable gap.
 
-    The claim is for all positions, to infinity. If there is an enclosure, it is searched first. If there is none, or
-    its search does not end soon, and the cost stays finite at infinity, the atlas of all space is searched. In terms
-    of inverse ranges a long valley is straight, and the cost is convex on wider boxes.
+    The claim is for all positions, to infinity. If there is an enclosure, it is searched first. If its search does not
+    end soon, or there is no enclosure, the atlas of all space is searched. The atlas needs a cost that stays finite at
+    infinity. In terms of inverse ranges a long valley is straight, and the cost is convex on wider boxes.
 
     Parameters
     ----------

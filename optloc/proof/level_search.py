@@ -1,9 +1,10 @@
 """The search of boxes for minima below a list of cost levels: one loop for costs with and without unknown scales.
 
-A box is finished if its cost is at least the first level, or if it contains no minimum because its gradient or
-curvature has one sign. A least cost over all positions is then attained elsewhere, if at all. Only the remaining part
-of a box is searched again. Around known and found minima, boxes follow the principal axes. A box whose cost exceeds a
-lower level is postponed until the lower level is shown, so that one search shows as much as the budget allows.
+A box is finished if its cost is at least the first level. It is also finished if it contains no minimum, because a
+component of the gradient or the curvature has a fixed sign: the least cost over all positions is then attained
+elsewhere, if at all. Only the remaining part of a box is searched again. Around known and found minima, boxes follow
+the principal axes. A box whose cost exceeds a lower level is postponed until the lower level is shown. So one search
+shows as much as the budget allows.
 """
 
 from __future__ import annotations
@@ -227,7 +228,7 @@ def _at_infinity(work: Any, atlas: Atlas, piece: int) -> float:
 
 @compiled
 def _last_above_zero(levels: Array) -> int:
-    """Return the index of the last level above zero, or -1 if there is none."""
+    """Return the index of the last level above zero, or -1 without such a level."""
     last: int = levels.shape[0] - 1
     while last >= 0 and levels[last] <= 0.0:
         last -= 1

@@ -222,11 +222,11 @@ def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array,
 
 @inlined
 def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, rows: Array, inside: bool) -> int:
-    """Return the coordinate across which to halve a box: the one that shrinks the remainders in the bound most.
+    """Return the coordinate across which halving a box reduces the remainders in its bound most.
 
     The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it. Its
-    weight is the pull ``|K_j.v|`` on the bound. If ranges have no part in the bound, or the centre is below the level
-    (`inside`), so that no bound can suffice, the widest side is halved.
+    weight is the pull ``|K_j.v|`` on the bound. If the centre is below the level (`inside`), no bound suffices. In
+    this case, and if ranges have no part in the bound, the result is the widest side.
     """
     if inside:
         return widest(half)

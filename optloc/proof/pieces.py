@@ -25,7 +25,7 @@ _TINY, _TINY_AROUND = 1e-5, 1e-3
 # Points within this many standard deviations of a minimum count as this minimum: a descent ends so close to it.
 _SAME = 1e-3
 # If contraction leaves less than this share of a box, the box is bounded again before it is halved. Over 16 fixes by
-# range differences a half took 2 % fewer boxes than a quarter or four fifths, and 5 % fewer than no second bound.
+# range differences, a half took 2 % fewer boxes than a quarter or four fifths. It took 5 % fewer than no second bound.
 SHRUNK = 0.5
 _WITHIN = 1e-9  # as in `optloc.proof.atlas.within`
 _BEYOND = 1e-12  # a thousand times the rounding of a sum of two numbers

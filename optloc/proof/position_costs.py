@@ -333,9 +333,9 @@ def position_costs(problem: Problem) -> PositionCosts:
     """Return the costs of a flat batch of problems over the position.
 
     Unknown emission times and offsets without a prior are projected out. Offsets, drifts and isotropic station errors
-    with Gaussian priors enlarge the covariance. Both are exact, because these unknowns enter the rows linearly. A
-    station error does so because, of all station positions with a given range, the one nearest to the surveyed
-    position is on the line to the target.
+    with Gaussian priors enlarge the covariance. Both are exact, because these unknowns enter the rows linearly. Among
+    all station positions with a given range, the nearest to the surveyed position is on the line to the target. So a
+    station error enters linearly, too.
 
     Parameters
     ----------
@@ -419,7 +419,7 @@ class Affine(NamedTuple):
         Orthonormal columns onto which measurements are folded (`compress`); None if they are not folded.
     place, first, gain : int array (e,), array (e,), array (e, m)
         Indices of the node numbers that change with z, their values for z = 0, and their slopes. Each angle or ratio
-        has one; ranges and rates have none.
+        has one such number; ranges and rates have none.
     """
 
     kinds: Array

@@ -1,4 +1,4 @@
-"""Scope of the proof: the targets, kinds of rows, biases and constraints that it covers, and what counts as a run."""
+"""Scope of the proof: targets, kinds of rows, biases and constraints that it covers, and the definition of a run."""
 
 from __future__ import annotations
 

@@ -146,7 +146,8 @@ class Box(NamedTuple):
     line : array (6,)
         Working memory.
     nodes, rows, curves, sums : array (J, NODE_WIDTH), (q, ROW_WIDTH), (J, CURVE_WIDTH), (SUMS,)
-        Tables, see `optloc.proof.box`.
+        Tables, see `optloc.proof.nodes.node` (nodes, curves), `optloc.proof.box` (rows) and `optloc.proof.curvature`
+        (sums).
     solve : array (3, 3)
         Working memory.
     cut : array (6,)
@@ -482,10 +483,10 @@ def blur_at(cost: Cost, chart: LocalAxes, box: Box) -> float:
     return noise
 
 
-# A cost that is lower than the cost f of a fix counts as equal within 8 e sqrt(f) + 24 e^2, with e the rounding of a
-# residual. Each of two costs has an error of 2 e sqrt(f) + e^2, and half of the tolerance is for them. A slope of the
-# cost has an error of e along each of three axes. 24 e^2 makes this an eighth of the curvature, or a quarter if half
-# is left.
+# Tolerance of equal costs: 8 e sqrt(f) + 24 e^2, with f the cost of a fix and e the rounding of a residual. Each of
+# two costs has an error of 2 e sqrt(f) + e^2, and half of the tolerance is for them. A slope of the cost has an error
+# of e along each of three axes. 24 e^2 makes this an eighth of the curvature, or a quarter if half of the tolerance is
+# left.
 _COSTS, _SLOPES = 8.0, 24.0
 COARSEST = 1.0
 """Greatest error of costs for a useful proof: a ninth of the gap below which two minima count as ambiguous."""

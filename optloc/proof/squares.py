@@ -6,9 +6,8 @@ v, in half sides of the cube, the error obeys
     (q_j - q_p - v z_j) (q_j + q_p + v z_j) / v = N_j - N_p - 2 z_j q_p - v z_j^2,
 
 with ``q_j = |p - v a_j|`` and the linear function ``N_j = -2 a_j.p + v |a_j|^2``. So an error is the right side
-divided by a sum of two ranges. On the right side only q_p is not linear over a box, whereas in the rows themselves
-each range is not linear. Any station of a group can be the reference. The module takes the station whose range is
-closest to linear.
+divided by a sum of two ranges. On the right side only q_p is not linear over a box. In the rows themselves, no range
+is linear. Any station of a group can be the reference. The module takes the station whose range is closest to linear.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Squares(NamedTuple):
     floor : float
         Sizes of the terms of residuals, times their weights.
     lack : float
-        Greatest difference between a residual and the residual of the squared rows by the rounding of `late`.
+        Greatest error of a residual of the squared rows by the rounding of `late`.
     steep : float
         Greatest change of a residual per unit change of the scaled range of a reference.
     lines : array (J, LINE_WIDTH)
@@ -172,7 +171,7 @@ def _set_spread(own: Array, R: Array, spread: Array) -> None:
 
 @compiled
 def bend_of(atlas: Atlas, squares: Squares, half: Array) -> float:
-    """Return how much the remainder of the distance to the cube's centre changes a residual over a box, at most."""
+    """Return the greatest change of a residual over a box by the remainder of the distance to the cube's centre."""
     return float(range_form(atlas.point, atlas.slant, triple(half, 0))[3] * squares.steep)
 
 

@@ -219,8 +219,8 @@ def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
 @compiled
 def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> None:
     """Contract corners (3,) of search coordinates to this piece of the surface; set the third coordinate to 0."""
-    # For a point that is farthest along the third axis, each other coordinate is at most sqrt(1/2) of its distance,
-    # because the squares sum to the squared distance.
+    # A point of this piece is farthest along the third axis. So each other coordinate is at most sqrt(1/2) of its
+    # distance from the centre: the squares sum to the squared distance.
     most = sqrt(0.5) * (WGS84_A + abs(surface[LEVEL])) * (1.0 + 1e-9)
     for k in range(2):
         unit, away = triple(surface, FIRST if k == 0 else SECOND), 0.0

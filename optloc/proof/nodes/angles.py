@@ -34,8 +34,8 @@ from optloc.proof.nodes.node import (
 
 # Azimuths.
 
-# Numbers: the station, its axes (rows), the wrapped measured angle to which the node is relative, and a mark that is
-# not 0 if no other node is in the row.
+# Numbers: the station, its axes (rows), and the wrapped measured angle to which the node is relative. The last number
+# is not 0 if no other node is in the row.
 STATION, AXES, MEASURED, ALONE, _WIDTH = 0, 6, 15, 16, 17
 
 # Rounding of an angle as a share of its argument: a few units in the last place.
@@ -362,8 +362,8 @@ def _frame_turn(
 def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
     """Write the unit vector v across the sight and the horizontal: ``|v.(x' - x)| <= r (sin e + 1 - cos a)``.
 
-    Here r is the distance, e the greatest change of the elevation, and a the greatest change of the azimuth from the
-    same station, below a quarter turn.
+    Here r is the distance, and e is the greatest change of the elevation. The greatest change of the azimuth from the
+    same station is a, below a quarter turn.
     """
     turn = _azimuth_beside(kinds, data, swing, j)
     p, q, r = sight(data[j], x)
@@ -379,7 +379,7 @@ def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row:
 
 @compiled
 def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
-    """Return the greatest change of the azimuth from the station of elevation j; pi if there is no such azimuth."""
+    """Return the greatest change of the azimuth from the station of elevation j; pi without this azimuth."""
     least = pi
     for m in range(kinds.shape[0]):
         if kinds[m] == AZIMUTH:

@@ -82,8 +82,8 @@ def _question(name: str, nodes: list[Node]) -> str:
 
 
 # Loops over all nodes except ranges in search coordinates around a fix, and over all nodes over a piece of an atlas.
-# Each loop contains the cases as text. A separate function for the cases would take seven arrays for each node, and
-# passing an array counts references, which takes half as long as the bound of an angle.
+# Each loop contains the cases as text. A separate function for the cases would take seven arrays for each node.
+# Passing arrays counts references, which takes half as long as the bound of an angle.
 
 _LOOPS = {
     "bound_others": """

@@ -2,7 +2,7 @@
 
 Linear forms (coordinates, planes, priors) are exact. A height is the distance to the ellipsoid, so it curves like the
 ranges to the centres of two balls. At each of its points, the ellipsoid contains the tangent ball of its least radius
-of curvature b^2/a, and is inside the tangent ball of its greatest radius of curvature a^2/b (Blaschke's rolling
+of curvature b^2/a. It is inside the tangent ball of its greatest radius of curvature a^2/b (Blaschke's rolling
 theorem). Above the ellipsoid the height is convex, and its Hessian is between 0 and 1/(b^2/a + height) across the
 normal.
 """

@@ -4,9 +4,8 @@ Residuals are ``K phi(x) - w``, whitened, with one column for each node phi_j. E
 folder with one `Node`; `optloc.proof.nodes.dispatch` lists them. A measurement kind names its nodes in its
 `optloc.models.Model`.
 
-All vectors here have three numbers. In the plane the third number of a point, of a line and of every axis is 0,
-`sense` has a column and a row of zeros, and the third half-width is 0, so that nothing depends on the third search
-coordinate.
+All vectors here have three numbers. In the plane the third number of a point, of a line and of every axis is 0, and so
+is the third half-width. `sense` has a column and a row of zeros. So nothing depends on the third search coordinate.
 
 Over a box (centre c, half-widths h in search coordinates s, x = c + T s) a node is bounded by two functions of
 
@@ -18,9 +17,9 @@ Over a box (centre c, half-widths h in search coordinates s, x = c + T s) a node
 (nodes of two points also have ``line_b, sense_b`` of the second point, data[3:6], after ``line, sense``):
 
 ``bound(data, line, sense, half, slope) -> (value, low, high)``
-    returns the value at the centre, and an interval [low, high] of the remainder ``phi(s) - value - slope.s`` for all
-    |s_k| <= half_k; writes the gradient with respect to s into slope (3,). Without a sharp bound, the slope is 0 and
-    the interval is wide; an end may be infinite.
+    returns the value at the centre, and an interval [low, high]. The interval contains the remainder
+    ``phi(s) - value - slope.s`` for all |s_k| <= half_k. Writes the gradient with respect to s into slope (3,).
+    Without a sharp bound, the slope is 0 and the interval is wide; an end may be infinite.
 ``curve(data, line, sense, half, curvature, turn) -> chi``
     writes the Hessian with respect to s at the centre into curvature (3, 3), and a bound of the change of each
     component of the gradient over the box into turn (3,). Returns a bound of the spectral norm of the change of the
@@ -146,12 +145,12 @@ class Node:
         of the sizes of the coordinates. None: 1, as for angles and ratios.
     ball : callable, optional
         ``(data, least, most) -> (x, y, z, radius)``: a ball that contains all points at which the node is in an
-        interval; infinite radius if there is none. None: there never is a ball.
+        interval; infinite radius without a ball. None: the node has no balls.
     ray : callable, optional
         ``(kinds, data, swing, j, x, row) -> (width, far)`` for node j, which is within `swing` (J,) of its value at a
         fix x. Writes a unit vector into row (3,). Points at distance r from the station are within ``r width`` of the
-        fix along this vector, and `far` is the distance of the fix. A negative width means no bound. None: there never
-        is a bound.
+        fix along this vector, and `far` is the distance of the fix. A negative width means no bound. None: the node
+        has no such bounds.
     of_station : bool
         Whether the node depends on one station and epoch only, so that all rows with this node share it.
     counts_from_measured : bool

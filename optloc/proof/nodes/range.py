@@ -116,7 +116,7 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
     nodes : array (J, NODE_WIDTH)
         Filled by `bound_ranges`.
     curves : array (J, CURVE_WIDTH)
-        Rows of ranges are written, see `optloc.proof.box`.
+        Rows of ranges are written, see `optloc.proof.nodes.node`.
     """
     h0, h1, h2 = half[0], half[1], half[2]
     m00, m01, m02, m11, m12, m22 = gram[0, 0], gram[0, 1], gram[0, 2], gram[1, 1], gram[1, 2], gram[2, 2]

@@ -41,9 +41,9 @@ def bound_ratio(
     """Bound a ratio of ranges over a box (see `optloc.proof.nodes.node`).
 
     There are two quotients. With ``N = r_a^2 - r_b^2`` (affine in the position) and S = r_a + r_b, the first is delta
-    = N/S = r_a - r_b. The second is phi = 1 + delta/r_b. With g the slope of a quotient phi = N/S, its remainder is
-    ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'``, where S' = S + u.s + q_S in the box. Only the enclosures of q_N and
-    q_S are inexact.
+    = N/S = r_a - r_b. The second is phi = 1 + delta/r_b. The remainder of a quotient phi = N/S with slope g is
+    ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'``. Here q are remainders, u is the slope of S, and S' = S + u.s + q_S.
+    Only the enclosures of q_N and q_S are inexact.
 
     If the box may contain station b, the ratio has no upper bound.
     """

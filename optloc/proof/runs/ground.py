@@ -213,7 +213,7 @@ def bends_of(ground: Ground, state: Array, half: Array) -> tuple[bool, float, fl
     """Return whether the positions of a box of states are bounded, and bounds of their derivatives by (q, w).
 
     The bounds are of the first three derivatives: per metre, metre^2 and metre^3. All functions are bounded along
-    lines of (q, w), in metres: a bound of the k-th derivative along each line bounds the derivative of the function.
+    lines of (q, w), in metres. A bound of the k-th derivative along each line bounds the derivative of the function.
     With u the normal at the start p, ``u.p' = 0`` and ``u.w = 0`` determine p and w, and the sphere is
     ``Y = p + S w - D u``. The position is ``F = Y + G n``, with n the normal at Y and G the remaining height. In
     ``Y'' + G'' n`` and ``Y''' + G''' n`` the second term cancels the part of the first along n.

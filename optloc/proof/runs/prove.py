@@ -362,7 +362,7 @@ def _prove_near(
 def _beside(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables, corners: Array, own: bool
 ) -> Space:
-    """Return search coordinates with their known minima, the fix (`own`) first; no minima if the fix is none."""
+    """Return search coordinates with their known minima, the fix (`own`) first; empty if the fix is no minimum."""
     others, known, place = task.beside.points, zero(), np.empty(task.x.shape[0])
     room = np.zeros((2, 1 + others.shape[0], 3))
     space = Space(False, atlas, chart, room[0], room[1])

@@ -1,10 +1,10 @@
 """Bounds over a box for hundreds of rows, in a time that is proportional to the number of rows.
 
 Each row of a long run depends on few nodes. All rows share a few unknowns that enter linearly, such as offsets and
-drifts. With ``e = S phi - w`` (S sparse, whitened) and Q an orthonormal basis of the directions of these unknowns, the
-cost is ``f = |P e|^2``, ``P = 1 - Q Q'``. The dense rows P S are never computed: each unit vector v with ``Q'v = 0``
-gives the bound ``|P e| >= v.e``, and bounds of v.e over a box need one pass over the entries of S. Second derivatives
-are summed over all nodes before they are bounded, because they cancel in a long run.
+drifts. The residual without them is ``e = S phi - w`` (S sparse, whitened). With Q an orthonormal basis of their
+directions, the cost is ``f = |P e|^2``, ``P = 1 - Q Q'``. The dense rows P S are never computed. Each unit vector v
+with ``Q'v = 0`` gives the bound ``|P e| >= v.e``. Bounds of v.e over a box need one pass over the entries of S. Second
+derivatives are summed over all nodes before they are bounded, because they cancel in a long run.
 """
 
 from __future__ import annotations
@@ -328,7 +328,7 @@ def sum_up_rows(
 
 @compiled
 def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None:
-    """Write the part of the Hessian's change that is linear in s: third derivatives without those of the nodes."""
+    """Write the part of the Hessian's change that is linear in s; the nodes' third derivatives are not included."""
     third = np.zeros((3, 6))  # entry (l, m) along k: sum_j pull_jk N_jlm
     for j in range(curves.shape[0]):
         for k in range(3):

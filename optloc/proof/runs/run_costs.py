@@ -43,8 +43,8 @@ from optloc.proof.search_space import (
 
 # From a problem to all its rows, and to the rows of a few epochs.
 
-# Nodes of the few rows. In runs of five stations at 200 and 600 epochs, with a tenth of them a box took as much time
-# as the bounds with all rows that it saved; with three times as many, no fewer of these bounds were needed.
+# Nodes of the few rows, tested in runs of five stations at 200 and 600 epochs. A tenth of all nodes took as much time
+# for a box as the bounds with all rows that it saved. Three times this number did not save more of these bounds.
 _LOOK = 60
 
 
@@ -197,7 +197,7 @@ def _course_cost(problem: Problem) -> tuple[tuple[ConstantVelocityCost, Constant
     rise = np.zeros(len(made.kinds))
     rise[made.column] = _rise(problem)[problem.epoch[made.row]]
     prior, times = _state_prior(problem, made, max(float(np.ptp(since)), 1.0))
-    # a prior applies to the state itself, whatever height is reported at that time
+    # a prior applies to the state itself, at any reported height
     when = np.stack([np.concatenate([when, times]), np.concatenate([rise, np.zeros(len(times))])], axis=1)
     parts = [usable[0], usable[0] & _few(problem, len(when))]
     systems = [_System.of(problem, part, made, others, value, prior) for part in parts]

@@ -210,7 +210,7 @@ def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) ->
 
 @compiled
 def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: float) -> tuple[float, float]:
-    """Return the cost at the centre of a box, and a lower bound of the residual over it, negative if there is none."""
+    """Return the cost at the centre of a box, and a lower bound of the residual over it, negative without a bound."""
     box, sheet, rows = tables.box, tables.sheet, run.rows
     if not set_nodes(space, run.cost, box):
         return inf, -1.0

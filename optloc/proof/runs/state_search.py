@@ -283,7 +283,7 @@ def _linearise(search: Search, table: StateTable) -> float:
 
 @compiled
 def _step(table: StateTable, damping: float) -> float:
-    """Write a damped Gauss-Newton step; return its squared length in standard deviations, negative if there is none."""
+    """Write a damped Gauss-Newton step; return its squared length in standard deviations, or -1 without a step."""
     n, matrix, lines = table.at.shape[0], table.solve, table.lines
     for m in range(n):
         table.slope[m] = 0.0

@@ -1,9 +1,9 @@
 """A target in uniform motion: bounds of a cost over boxes of positions and velocities.
 
 The rows are the rows of a run. For a box of states, the target's positions at the time t of an epoch are in a box of
-space, over which the nodes of this epoch are bounded. In the plane these positions are ``p + t v``; over ground, see
-`optloc.proof.runs.ground`. Slopes and Hessians with respect to the state follow by the chain rule, and are summed over
-all nodes before they are bounded. Search coordinates are the principal axes of the cost at the fix.
+space. The nodes of this epoch are bounded over this box. In the plane these positions are ``p + t v``; over ground,
+see `optloc.proof.runs.ground`. Slopes and Hessians with respect to the state follow by the chain rule, and are summed
+over all nodes before they are bounded. Search coordinates are the principal axes of the cost at the fix.
 """
 
 from __future__ import annotations

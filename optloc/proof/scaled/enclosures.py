@@ -112,7 +112,7 @@ def _without_factors(scaled: Scaled) -> Cost:
 
 @compiled
 def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box around all positions whose cost is below a level; return False if there is none."""
+    """Write the corners of a box around all positions whose cost is below a level; return False without a box."""
     q, J = cost.K.shape
     if q == 0 or J == 0:
         return False
@@ -186,7 +186,7 @@ def _meet_balls(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: A
 
 @compiled
 def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box around stations with two waves of one emission time; return False if there are none.
+    """Write the corners of a box around stations with two waves of one emission time; return False without any.
 
     The difference of both arrivals is the range times the difference of the factors. The null space of K'K is the
     vector of ones, and differences of nodes do not depend on it. So a multiple of its square is added, which makes K'K

@@ -47,8 +47,8 @@ from optloc.proof.search_space import (
 from optloc.proof.space import Space, floor_of, in_atlas
 
 # Greatest number of nodes of a moving target that count for the budget of boxes. Of 30 scenes in space with 200 m of
-# noise 9 were open after the 3 500 boxes of all 35 nodes, 4 after the 10 800 boxes of 20 nodes (0.6 s), and 3 after 30
-# 000.
+# noise, 9 were open after the 3 500 boxes of all 35 nodes. After the 10 800 boxes of 20 nodes (0.6 s) 4 were open, and
+# after 30 000 boxes 3.
 _MOST_COUNTED = 20
 
 
