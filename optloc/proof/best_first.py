@@ -385,21 +385,21 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
         with np.errstate(all="ignore"):  # plain Python would warn of values without a bound
             points[i], boxes[i] = _minima_of(costs.take(slice(i, i + 1)), places.take(i), gap, budget, most)
 
-    asked = list(range(n))
+    pending = list(range(n))
     if n <= FEW and len(costs.kinds) <= SMALL and not ready(present_in):
         # As in proofs of few fixes: most searches need few boxes, and loading compiled code takes longer.
         first = min(budget, FIRST_BOXES // n)
         with plain():
-            for i in asked:
+            for i in pending:
                 search(i, first)
-        asked = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
+        pending = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
     if enabled() and usable(search_minima, n):
-        mapped(lambda i: search(i, budget), asked)
+        mapped(lambda i: search(i, budget), pending)
         return points, boxes
     # Plain Python holds the interpreter lock, so threads would wait for each other.
-    few = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(asked), 1))) if enabled() else budget
+    few = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(pending), 1))) if enabled() else budget
     with plain():
-        for i in asked:
+        for i in pending:
             search(i, few)
     return points, boxes
 

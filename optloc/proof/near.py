@@ -178,7 +178,7 @@ def branch(
                 continue
             if here < aim.level and not is_empty(cut):
                 low_points += 1
-                # Often at first, then rarely; and in each box that contains at most one minimum.
+                # Descend often at first, then rarely; and from each box that contains at most one minimum.
                 seldom = low_points & (low_points - 1) == 0
                 if seldom or convex(shapes, A, half, nodes, curves, sums, 0.0):
                     outcome = _follow(cost, chart, box, minima, sides, aim)

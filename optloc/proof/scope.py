@@ -48,7 +48,7 @@ def _reasons(problem: Problem) -> Iterator[str]:
     if motion.known is not None or not problem.layout.shares("position"):
         yield "the rows do not share one position"
     if motion.order > 0:
-        yield from _beyond_courses(problem)
+        yield from _beyond_motion(problem)
     yield from _beyond_rows(problem)
     yield from _beyond_biases(problem)
     if is_scaled(problem) and not is_moment(problem):
@@ -64,13 +64,13 @@ def _reasons(problem: Problem) -> Iterator[str]:
             yield f"the prior on {name} is not covered"
 
 
-def _beyond_courses(problem: Problem) -> Iterator[str]:
+def _beyond_motion(problem: Problem) -> Iterator[str]:
     """Yield the reasons against a moving target: a node at an epoch must depend on the position at that epoch."""
     motion = problem.motions[0]
     if motion.order > 1:
         yield "the target accelerates, but the proof covers fixed targets and uniform motion"
     if is_moment(problem):
-        yield from _beyond_moments(problem)
+        yield from _beyond_velocity_at_epoch(problem)
         return
     if problem.epochs < 2:
         yield "the target moves, and the proof then needs several epochs"
@@ -91,7 +91,7 @@ def is_moment(problem: Problem) -> bool:
     return any(MODELS[rows.kind].velocity for rows in problem.rows)
 
 
-def _beyond_moments(problem: Problem) -> Iterator[str]:
+def _beyond_velocity_at_epoch(problem: Problem) -> Iterator[str]:
     """Yield the reasons against rates of one epoch: the proof needs rates that are linear in the velocity."""
     motion = problem.motions[0]
     if motion.over != "space" or motion.rise is not None:
@@ -155,7 +155,7 @@ def crowded(problem: Problem) -> str:
 def _nodes(problem: Problem) -> int:
     """Return the number of different ranges, rates, angles, ratios and heights in the rows."""
     moving, own = own_epochs(problem) > 1, 0
-    found: set[tuple[bool, int, int]] = set()
+    shared: set[tuple[bool, int, int]] = set()
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.signs is None:
@@ -163,8 +163,8 @@ def _nodes(problem: Problem) -> int:
             continue
         when = rows.epoch if moving else np.zeros_like(rows.epoch)
         for index in (rows.a, rows.b)[: model.stations]:
-            found.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
-    return own + len(found)
+            shared.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
+    return own + len(shared)
 
 
 def _beyond_biases(problem: Problem) -> Iterator[str]:
@@ -229,14 +229,14 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
     # target.
     if not problem.stations.isotropic:
         yield "the station errors differ from axis to axis"
-    if problem.stations.unknown_for == "run" and _move(problem):
+    if problem.stations.unknown_for == "run" and _stations_move(problem):
         yield "station errors last the whole run while stations move; the proof covers one line of sight for each"
     bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
     if bent:
         yield f"station errors change {bent[0]} rows by amounts that depend on the position"
 
 
-def _move(problem: Problem) -> bool:
+def _stations_move(problem: Problem) -> bool:
     """Return whether a station of rows of several epochs has different positions at these epochs."""
     place = problem.stations.position
     if place.shape[-3] < 2:

@@ -59,7 +59,7 @@ def _constant(field: str) -> _Writer:
     return lambda node, code: repr(getattr(node, field))
 
 
-_QUESTIONS: dict[str, tuple[str, _Writer, str]] = {
+_PROPERTIES: dict[str, tuple[str, _Writer, str]] = {
     "size_of": ("kind, data, reach", _call("size", "data, reach"), "1.0"),
     "ball_of": ("kind, data, least, most", _call("ball", "data, least, most"), "0.0, 0.0, 0.0, inf"),
     "ray_of": ("kind, kinds, data, swing, j, x, row", _call("ray", "kinds, data, swing, j, x, row"), "-1.0, 0.0"),
@@ -70,15 +70,15 @@ _QUESTIONS: dict[str, tuple[str, _Writer, str]] = {
 }
 
 
-def _question(name: str, nodes: list[Node]) -> str:
+def _property_source(name: str, nodes: list[Node]) -> str:
     """Return the source of a function that returns one property of a node."""
-    arguments, answer, others = _QUESTIONS[name]
+    arguments, write, default = _PROPERTIES[name]
     lines = [f"def {name}({arguments}):"]
     for code, node in enumerate(nodes):
-        said = answer(node, code)
-        if said and said != others:
-            lines.append(f"    if kind == {code}:\n        return {said}")
-    return "\n".join([*lines, f"    return {others}", ""])
+        expression = write(node, code)
+        if expression and expression != default:
+            lines.append(f"    if kind == {code}:\n        return {expression}")
+    return "\n".join([*lines, f"    return {default}", ""])
 
 
 # Loops over all nodes except ranges in search coordinates around a fix, and over all nodes over a piece of an atlas.
@@ -206,7 +206,9 @@ def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
 
 def text_of(name: str, nodes: list[Node]) -> str:
     """Return the source of a function that chooses by the codes of nodes."""
-    return _question(name, nodes) if name in _QUESTIONS else _LOOPS[name].format(cases="\n".join(_cases(name, nodes)))
+    if name in _PROPERTIES:
+        return _property_source(name, nodes)
+    return _LOOPS[name].format(cases="\n".join(_cases(name, nodes)))
 
 
 _KERNELS = ("bound", "curve", "size", "ball", "ray")
@@ -223,7 +225,7 @@ def _kernels(node: Node) -> Iterator[tuple[str, Any]]:
     yield from ((name, getattr(node, name)) for name in _KERNELS if getattr(node, name) is not None)
 
 
-def _written(name: str, nodes: list[Node]) -> Callable[..., Any]:
+def _generated(name: str, nodes: list[Node]) -> Callable[..., Any]:
     """Return a generated function with the name of this file, because stored compiled code belongs to a file."""
     space: dict[str, Any] = {
         "__name__": __name__,
@@ -237,17 +239,17 @@ def _written(name: str, nodes: list[Node]) -> Callable[..., Any]:
     return made
 
 
-bound_others = compiled(_written("bound_others", NODES))
-curve_others = compiled(_written("curve_others", NODES))
-bound_pieces = compiled(_written("bound_pieces", NODES))
-curve_pieces = compiled(_written("curve_pieces", NODES))
-size_of = compiled(_written("size_of", NODES))
-ball_of = compiled(_written("ball_of", NODES))
-ray_of = compiled(_written("ray_of", NODES))
-has_ray = inlined(_written("has_ray", NODES))
-shape_of = inlined(_written("shape_of", NODES))
-infinity_of = inlined(_written("infinity_of", NODES))
-points_of = inlined(_written("points_of", NODES))
+bound_others = compiled(_generated("bound_others", NODES))
+curve_others = compiled(_generated("curve_others", NODES))
+bound_pieces = compiled(_generated("bound_pieces", NODES))
+curve_pieces = compiled(_generated("curve_pieces", NODES))
+size_of = compiled(_generated("size_of", NODES))
+ball_of = compiled(_generated("ball_of", NODES))
+ray_of = compiled(_generated("ray_of", NODES))
+has_ray = inlined(_generated("has_ray", NODES))
+shape_of = inlined(_generated("shape_of", NODES))
+infinity_of = inlined(_generated("infinity_of", NODES))
+points_of = inlined(_generated("points_of", NODES))
 
 # Nodes of users.
 
@@ -256,18 +258,18 @@ _LOCK = Lock()
 
 def code_of(node: str | Node) -> int:
     """Return the code of a node; add a new node to the table and to all chains."""
-    found = named(node)
+    entry = named(node)
     with _LOCK:
-        if found not in _CODES:
-            _CODES[found] = len(NODES)
-            NODES.append(found)
-            _renew()
-        return _CODES[found]
+        if entry not in _CODES:
+            _CODES[entry] = len(NODES)
+            NODES.append(entry)
+            _regenerate()
+        return _CODES[entry]
 
 
-def _renew() -> None:
+def _regenerate() -> None:
     """Generate the chains again, for all nodes."""
-    replace({globals()[name]: _written(name, NODES) for name in (*_LOOPS, *_QUESTIONS)})
+    replace({globals()[name]: _generated(name, NODES) for name in (*_LOOPS, *_PROPERTIES)})
 
 
 def width(kinds: Iterable[int]) -> int:

@@ -138,9 +138,9 @@ def _run_cost(problem: Problem) -> tuple[RunCost, float]:
     kinds = np.array(made.kinds)
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
     prior = _rows_at(priors, len(kinds))
-    whole = _System.of(problem, usable[0], made, others, value, prior)
+    whole = _WhitenedRows.of(problem, usable[0], made, others, value, prior)
     data = whole.marked(kinds, made.numbers[:1])
-    few = _System.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, prior)
+    few = _WhitenedRows.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, prior)
     used = np.bincount(few.nodes.indices, minlength=len(kinds)) > 0
     dense = project_out(few.unknowns, np.column_stack([few.nodes[:, used].toarray(), few.measured]))
     present = (dense != 0.0).any(1)
@@ -200,7 +200,7 @@ def _course_cost(problem: Problem) -> tuple[tuple[ConstantVelocityCost, Constant
     # a prior applies to the state itself, at any reported height
     when = np.stack([np.concatenate([when, times]), np.concatenate([rise, np.zeros(len(times))])], axis=1)
     parts = [usable[0], usable[0] & _few(problem, len(when))]
-    systems = [_System.of(problem, part, made, others, value, prior) for part in parts]
+    systems = [_WhitenedRows.of(problem, part, made, others, value, prior) for part in parts]
     courses = [_course(problem, system, made, when) for system in systems]
     return (courses[0], courses[1]), float(turned_level(problem, others, known)[0])
 
@@ -237,7 +237,7 @@ def _state_prior(problem: Problem, made: CostColumns, span: float) -> tuple[Any,
     return sparse.csr_array(entries, shape=(count, len(made.kinds))), times
 
 
-def _course(problem: Problem, system: _System, made: CostColumns, when: Array) -> ConstantVelocityCost:
+def _course(problem: Problem, system: _WhitenedRows, made: CostColumns, when: Array) -> ConstantVelocityCost:
     """Return whitened rows as a cost over the nodes that they use; `when` (J, 2) has the nodes' times and heights."""
     used = np.flatnonzero(np.bincount(system.nodes.indices, minlength=len(when)))
     order = used[np.lexsort((when[used, 1], when[used, 0]))]
@@ -268,7 +268,7 @@ def _few(problem: Problem, nodes: int) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _System:
+class _WhitenedRows:
     """Whitened rows over nodes (sparse) and over other unknowns, with rows of priors, and the measurements (q,)."""
 
     nodes: Any
@@ -278,7 +278,7 @@ class _System:
     @classmethod
     def of(
         cls, problem: Problem, present: Array, made: CostColumns, others: OtherRows, value: Array, prior: Any
-    ) -> _System:
+    ) -> _WhitenedRows:
         """Return the whitened rows of one problem; `present` (m,) marks the rows to use."""
         from scipy import sparse  # imported with the first long run: problems of one epoch do not need it
 
