@@ -281,8 +281,9 @@ def shrink(
     """Contract a box to the part in which the residual may be shorter than rho.
 
     Let Z be nearly the inverse of J'J, ``Y = Z J'`` and ``E = Y J - 1``, and dq the remainders minus the middles of
-    their intervals. Each point of the box obeys ``s = Y (residual) - Y (middle) - Y K dq - E s``. So coordinate k
-    differs from coordinate k of -Y middle by at most ``rho |Y_k| + sum_j |Y_k K_j| (high_j - low_j)/2 + |E_k| half``.
+    their intervals. Each point of the box obeys ``s = Y (residual) - Y (middle) - Y K dq - E s``. This bounds the
+    distance of coordinate k from coordinate k of -Y middle by
+    ``rho |Y_k| + sum_j |Y_k K_j| (high_j - low_j)/2 + |E_k| half``.
 
     Parameters
     ----------

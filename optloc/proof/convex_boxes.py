@@ -27,7 +27,7 @@ _POLISHED = 100.0
 
 @inlined
 def set_convex(cost: Cost, chart: LocalAxes, box: Box, hull: Array, margin: float) -> bool:
-    """Enlarge a box around its centre as far as the cost is proven convex on it; return False if no such box is found.
+    """Enlarge a box around its centre as far as the cost is proven convex on it; return False without a convex box.
 
     In most cases the cost is convex over the whole hull. Otherwise the hull is scaled down.
 

@@ -200,8 +200,8 @@ def _look(cost: Cost, space: Space, box: Box, front: Array, i: int, level: float
 def _clip(cost: Cost, box: Box, longest: float) -> int:
     """Contract a box, side by side, to where the residual may be shorter than `longest`; return the result of the test.
 
-    With J_k the derivative of the residual along side k, and dq the remainders minus the middles of their intervals,
-    each point of the box obeys ``J_k.residual = J_k.middle + |J_k|^2 s_k + sum_m J_k.J_m s_m + J_k.K dq``. Unlike
+    Let J_k be the derivative of the residual along side k, and dq the remainders minus the middles of their intervals.
+    Each point of the box obeys ``J_k.residual = J_k.middle + |J_k|^2 s_k + sum_m J_k.J_m s_m + J_k.K dq``. Unlike
     `optloc.proof.box.shrink`, this needs no inverse. So it works with any rounding, even if the rows do not determine
     a position. Over 18 fixes of all shapes, both contractors together left no fewer cells.
     """

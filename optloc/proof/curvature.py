@@ -155,10 +155,10 @@ def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> 
 def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, margin: float) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` times the identity over the whole box.
 
-    H = Phi'A Phi + sum_j g_j N_j. With B = A Phi and E the changes of the gradients, the first part changes by at
-    least ``-(B'E + E'B)``, because the term ``dPhi'A dPhi`` is positive. A node whose Hessian is positive semidefinite
-    counts with its least force. Changes that are bounded by entries only are subtracted from the diagonal, row by row
-    (Gershgorin).
+    The Hessian is H = Phi'A Phi + sum_j g_j N_j. With B = A Phi and E the changes of the gradients, the first part
+    changes by at least ``-(B'E + E'B)``: the term ``dPhi'A dPhi`` is positive. A node whose Hessian is positive
+    semidefinite counts with its least force. Changes that are bounded by entries only are subtracted from the
+    diagonal, row by row (Gershgorin).
 
     Parameters
     ----------
@@ -244,8 +244,8 @@ def clip_to_minima(A: Array, half: Array, nodes: Array, curves: Array, sums: Arr
     """Contract a box to the part in which the gradient of f may vanish; return whether the box may contain a minimum.
 
     This is an interval Newton method. The gradient at c + s is ``g + H s``, with H the mean of the Hessian between
-    centre and s. Bounds of the change over t times the box are at most t times the bounds over the box
-    (`optloc.proof.nodes.node`), so the mean changes by half of them. With Y the inverse of the Hessian at the centre,
+    centre and s. Over t times the box, bounds of the change are at most t times the bounds over the box
+    (`optloc.proof.nodes.node`). So the mean changes by half of them. With Y the inverse of the Hessian at the centre,
     a zero of the gradient obeys ``s = -Y g - (Y H - 1) s``.
 
     Parameters

@@ -228,8 +228,8 @@ def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: f
     """Return whether the error of the left inverse is negligible against the widths of an enclosure.
 
     Let E = (left inverse) (rows) - 1 in search coordinates and the last unknown. Differences y to the fix obey
-    ``|y_k| <= b_k + sum_m |E_km y_m|``, where b_k are the bounds without E. If these terms are below a small share of
-    the widths at y = b, then no y exceeds the widths by more than this share.
+    ``|y_k| <= b_k + sum_m |E_km y_m|``, where b_k are the bounds without E. At y = b these terms may be below a small
+    share of the widths. Then no y exceeds the widths by more than this share.
 
     Parameters
     ----------

@@ -254,7 +254,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
 
 @compiled
 def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int) -> int:
-    """Move a box onto a surface, and bound its nodes; return -1, or the size of the stack if the box is finished.
+    """Move a box onto a surface, and bound its nodes; return -1, or the stack's size if it is dropped or halved.
 
     A box that belongs to another piece of the surface is dropped. A box over which the surface is no graph is halved
     across its longer side.

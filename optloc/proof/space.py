@@ -99,7 +99,7 @@ def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
 
 @inlined
 def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array, size: int) -> int:
-    """Bound the nodes of a cost over a box from the stack; return -1, or the size of the stack if the box is finished.
+    """Bound the nodes of a cost over a box from the stack; return -1, or the stack's size if it is dropped or halved.
 
     A box around a known minimum is dropped, and so is a box that belongs to another piece of a surface. A box over
     which the surface is no graph is halved.

@@ -50,7 +50,7 @@ _Writer = Callable[[Node, int], str]
 
 
 def _call(field: str, arguments: str) -> _Writer:
-    """Return a writer of calls of a node's function, or of an empty text if the node has no such function."""
+    """Return a writer of calls of a node's function, or of an empty text for nodes without the function."""
     return lambda node, code: "" if getattr(node, field) is None else f"{field}_{code}({arguments})"
 
 

@@ -150,7 +150,7 @@ class Node:
         ``(kinds, data, swing, j, x, row) -> (width, far)`` for node j, which is within `swing` (J,) of its value at a
         fix x. Writes a unit vector into row (3,). Points at distance r from the station are within ``r width`` of the
         fix along this vector, and `far` is the distance of the fix. A negative width means no bound. None: the node
-        has no such bounds.
+        has no bounds of this kind.
     of_station : bool
         Whether the node depends on one station and epoch only, so that all rows with this node share it.
     counts_from_measured : bool

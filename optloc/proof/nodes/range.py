@@ -54,7 +54,7 @@ RangeBend = tuple[Symmetric, Triple, float, float]
 def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, nodes: Array) -> int:
     """Bound all ranges over a box; return the number of other nodes.
 
-    With u the direction of the line v, a = r + u.d and b = |d - u u.d|, the remainder is ``sqrt(a^2 + b^2) - a``. It
+    Let u be the direction of the line v, a = r + u.d and b = |d - u u.d|. The remainder is ``sqrt(a^2 + b^2) - a``. It
     decreases with a (of either sign) and increases with b. So it is at most its value at the least a and the greatest
     b.
 
@@ -144,10 +144,10 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
         curves[j, TURN0], curves[j, TURN1], curves[j, TURN2], curves[j, CHI] = e0, e1, e2, chi
 
 
-# Behaviour at infinity. If the coefficients of ranges sum to zero in each row, the distance to the centre of the cube
-# of an atlas can be subtracted from each range. The result,
+# Behaviour at infinity. An atlas needs rows in which the coefficients of ranges sum to zero. Then the distance to the
+# centre of its cube can be subtracted from each range. The result,
 #
-#     R (|p - v a| - |p|) / v = R (-2 a.p + v |a|^2) / (|p - v a| + |p|),
+# R (|p - v a| - |p|) / v = R (-2 a.p + v |a|^2) / (|p - v a| + |p|),
 #
 # stays finite and smooth at infinity.
 

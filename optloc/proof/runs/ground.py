@@ -214,7 +214,7 @@ def bends_of(ground: Ground, state: Array, half: Array) -> tuple[bool, float, fl
 
     The bounds are of the first three derivatives: per metre, metre^2 and metre^3. All functions are bounded along
     lines of (q, w), in metres. A bound of the k-th derivative along each line bounds the derivative of the function.
-    With u the normal at the start p, ``u.p' = 0`` and ``u.w = 0`` determine p and w, and the sphere is
+    Let u be the normal at the start p. Then ``u.p' = 0`` and ``u.w = 0`` determine p and w, and the sphere is
     ``Y = p + S w - D u``. The position is ``F = Y + G n``, with n the normal at Y and G the remaining height. In
     ``Y'' + G'' n`` and ``Y''' + G''' n`` the second term cancels the part of the first along n.
 
@@ -251,8 +251,9 @@ def bends_of(ground: Ground, state: Array, half: Array) -> tuple[bool, float, fl
 def errors_of(third: float) -> tuple[float, float]:
     """Return bounds of the errors of slopes and second derivatives, as norms over (q, w), from the third derivatives.
 
-    A first difference has an error of ``b3 h^2 / 6``, a second difference along one number ``b3 h / 3``, and along two
-    numbers ``(2 2^1.5 + 4) b3 h / 12``. Four orthogonal numbers double the first error, and quadruple the others.
+    A first difference has an error of ``b3 h^2 / 6``. The error of a second difference is ``b3 h / 3`` along one
+    number, and ``(2 2^1.5 + 4) b3 h / 12`` along two. Four orthogonal numbers double the first error, and quadruple
+    the others.
     """
     first = 2.0 * (third * _STEP * _STEP / 6.0 + _ROUNDED / _STEP)
     return first, 4.0 * (0.6 * third * _STEP + 4.0 * _ROUNDED / (_STEP * _STEP))

@@ -94,7 +94,7 @@ def _convex_sides(
 ) -> bool:
     """Write half-widths (3,), at most the hull, of a box around a position on which the cost is convex.
 
-    Return False if no such box is found.
+    Return False without a convex box.
     """
     box, share, floor = tables.box, _WIDEST, floor_of(space, run.cost)
     for _ in range(_TRIALS):

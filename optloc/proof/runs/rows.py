@@ -278,7 +278,7 @@ def sum_up_rows(
 ) -> float:
     """Write sums (SUMS,) of a box, and bounds of the Hessian's change; return a bound of the norm of the rest.
 
-    Along s the Jacobian changes by ``P S (N s + r)`` with ``|r| <= chi |s| / 2``, and forces change by
+    Along s the Jacobian changes by ``P S (N s + r)`` with ``|r| <= chi |s| / 2``. Forces change by
     ``S'P S (Phi s + q)`` with q the remainders. The part that is linear in s is summed over the nodes, entry by entry,
     before it is bounded. The bounds of the change are in sums[C00:].
 

@@ -94,7 +94,8 @@ _WORTH = 4.0
 _NEAR, _TINY = 100.0, 1e-5
 # Boxes on the stack: pieces, slabs around known minima, and one for each halving of the deepest box.
 CAPACITY = 4096
-# Greatest ratio of bounds with few rows to bounds with all rows: few rows take a twentieth of the time.
+# Greatest number of bounds with few rows, as a multiple of the budget for all rows: few rows take a twentieth of the
+# time.
 _LOOKS = 10
 
 
@@ -124,7 +125,7 @@ def search_run(
     aim : Goal
         The conditions to show for each box.
     budget : int
-        Greatest number of boxes with all rows; with few rows, `_LOOKS` times as many boxes are allowed.
+        Greatest number of boxes with all rows; with few rows, `_LOOKS` times this number is allowed.
     found : array (D,)
         Written: the point of the outcomes CHEAPER and ANOTHER.
 
@@ -229,7 +230,7 @@ def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: f
 
 # Greatest number of steps, and the length of the last step, standard deviations.
 _STEPS, _CLOSE = 40, 1e-3
-# Greatest coordinate of a descent outside its piece of an atlas: other boxes descend beyond it.
+# Greatest coordinate of a descent in an atlas, whose pieces end at 1. Beyond it, boxes of other pieces descend.
 _ASIDE = 1.5
 
 

@@ -44,7 +44,8 @@ from optloc.proof.search_space import COARSEST, equal_within
 # The search.
 
 # As in `optloc.proof.runs.search`: levels below which boxes are bounded with all rows, and below which derivatives
-# exclude minima; boxes on the stack; and the greatest ratio of bounds with few rows to bounds with all rows.
+# exclude minima; boxes on the stack; and the greatest number of bounds with few rows, as a multiple of the budget for
+# all rows.
 _WORTH, _NEAR, _CAPACITY, _LOOKS = 4.0, 100.0, 4096, 10
 # Each side also counts with this share of the steepest side's change.
 _ALIKE = 0.1
@@ -90,7 +91,7 @@ def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: i
     aim : Goal
         The conditions to show for each box.
     budget : int
-        Greatest number of boxes with all rows; with few rows, `_LOOKS` times as many boxes are allowed.
+        Greatest number of boxes with all rows; with few rows, `_LOOKS` times this number is allowed.
     found : array (n,)
         Written: the state of the outcomes CHEAPER and ANOTHER.
 

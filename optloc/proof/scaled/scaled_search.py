@@ -252,7 +252,7 @@ def _grow(
     margin: float,
     sides: Array,
 ) -> bool:
-    """Write the sides of a convex box around a minimum; return False if no such box is found."""
+    """Write the sides of a convex box around a minimum; return False without a convex box."""
     size = _FIRST
     while not _convex(scaled, tables, space, piece, at, np.minimum(hull, size), rho, margin):
         size *= 0.5
