@@ -80,10 +80,7 @@ class CostColumns:
     def split(self, group: Array) -> tuple[CostColumns, Array]:
         """Return a copy in which only rows of one group share nodes, and the group of each node (J,).
 
-        Parameters
-        ----------
-        group : int array (m,)
-            Group of each row.
+        `group` (m,) has the group of each row.
         """
         out, new = CostColumns(self.problem), dict[tuple[int, int], int]()
         for row, column, coefficient in zip(self.row, self.column, self.coefficient, strict=True):
@@ -140,14 +137,9 @@ def stack_numbers(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
 
 
 def columns_of(problem: Problem, observed: Array) -> CostColumns:
-    """Return the nodes that sum to the rows of a flat batch of problems.
+    """Return the nodes that sum to the rows of a flat batch of N problems within the scope of the proof.
 
-    Parameters
-    ----------
-    problem : Problem
-        N problems within the scope of the proof.
-    observed : array (N, m)
-        Measurements minus all known additions; azimuth nodes are relative to them.
+    `observed` (N, m) has the measurements minus all known additions; azimuth nodes are relative to them.
     """
     made = CostColumns(problem)
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -206,12 +198,7 @@ def roots(precision: Array) -> Array:
 def compress(K: Array, w: Array) -> tuple[Array, Array]:
     """Return rows with the same sum of squares ``|K phi - w|^2`` for every phi; at most one more than nodes.
 
-    Parameters
-    ----------
-    K : array (B, q, J)
-        Whitened rows over the nodes, B = 1 or N.
-    w : array (N, q)
-        Whitened measurements.
+    K (B, q, J) are whitened rows over the nodes, with B = 1 or N, and w (N, q) are whitened measurements.
     """
     q, nodes = K.shape[-2:]
     if q <= nodes + 1:
@@ -234,24 +221,12 @@ def _fold(basis: Array, w: Array) -> Array:
 
 
 def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
-    """Return the numbers of the nodes with a mark on nodes that share no row and have their least cost at zero.
+    """Return the numbers (B, J, width) of the nodes, with a mark on nodes that are alone in their rows.
 
-    The cost of such a node is a function of one number, so that the absolute value of the node may replace it.
-
-    Parameters
-    ----------
-    kinds : int array (J,)
-        Codes of the nodes.
-    data : array (B, J, width)
-        Numbers of the nodes; B is N, or 1 if all problems share them.
-    K : array (B, q, J)
-        Whitened rows.
-    w : array (N, q)
-        Whitened measurements.
-
-    Returns
-    -------
-    array (B, J, width)
+    A node gets the mark if it shares no row with other nodes and its least cost is at zero. Its cost is then a
+    function of one number, so that the absolute value of the node may replace it. `kinds` (J,) and `data` (B, J,
+    width) are codes and numbers of the nodes, and K (B, q, J) and w (N, q) are whitened rows and measurements. B is N,
+    or 1 if all problems share.
     """
     if not any(NODES[kind].mark for kind in kinds):
         return data
@@ -265,16 +240,10 @@ def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
 
 
 def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Array, w: Array) -> Array:
-    """Return the numbers of nodes with a mark on nodes that share no row, see `mark_alone`.
+    """Return the numbers of nodes with a mark on nodes that are alone in their rows, see `mark_alone`.
 
-    Parameters
-    ----------
-    kinds, data, w : arrays
-        As in `mark_alone`.
-    alone, size : array (B, J)
-        Whether no other node and no other unknown is in a node's rows; lengths of the columns of K.
-    force : array (N, J)
-        ``K'w``.
+    `alone` (B, J) is true for nodes that share no row with another node or unknown, and `size` (B, J) has the lengths
+    of the columns of K. `force` (N, J) is ``K'w``.
     """
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
     out = np.array(data)
@@ -350,12 +319,8 @@ def position_costs(problem: Problem) -> PositionCosts:
 def costs_of_groups(problem: Problem, group: Array) -> tuple[PositionCosts, Array]:
     """Return costs like `position_costs` with separate nodes for each group of rows, and the groups (J,) of the nodes.
 
-    Parameters
-    ----------
-    problem : Problem
-        N problems whose rows are sums of ranges and logarithms of ranges.
-    group : int array (m,)
-        Group of each row; -1 for rows without a factor, such as priors.
+    The rows must be sums of ranges and of logarithms of ranges. `group` (m,) has the group of each row, and -1 for
+    rows without a factor, such as priors.
     """
     kinds, numbers, K, w, level, own = _rows_of(problem, group)
     K, w = compress(K, w)
@@ -452,10 +417,7 @@ class Affine(NamedTuple):
 def affine_costs(problem: Problem) -> Affine | None:
     """Return the cost of a problem as an affine function of its measurements, or None if it is not affine.
 
-    Parameters
-    ----------
-    problem : Problem
-        Without batch axes, and within the scope of the proof; its measurements are ignored.
+    The problem has no batch axes and is within the scope of the proof. Its measurements are ignored.
     """
     # an affine map is determined by its values at zero and at the unit vectors
     probes = np.concatenate([np.zeros((1, problem.count)), np.eye(problem.count)])

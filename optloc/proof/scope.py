@@ -29,13 +29,7 @@ MOST_FACTORS = 3
 
 
 def unsupported(problem: Problem) -> str:
-    """Return the first reason why the proof does not cover a problem, or an empty string if it does.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of problems.
-    """
+    """Return the first reason why the proof does not cover a flat batch of problems, or "" if it covers them."""
     return next(_reasons(problem), "")
 
 

@@ -147,7 +147,7 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
 # Behaviour at infinity. An atlas needs rows in which the coefficients of ranges sum to zero. Then the distance to the
 # centre of its cube can be subtracted from each range. The result,
 #
-# R (|p - v a| - |p|) / v = R (-2 a.p + v |a|^2) / (|p - v a| + |p|),
+#     R (|p - v a| - |p|) / v = R (-2 a.p + v |a|^2) / (|p - v a| + |p|),
 #
 # stays finite and smooth at infinity.
 
