@@ -523,7 +523,7 @@ def position_prior(problem: Problem, made: CostColumns) -> list[int]:
 
 
 def _with_rows_of(nodes: list[int], K: Array, w: Array) -> tuple[Array, Array]:
-    """Return the rows with one more row, of measured value zero, for each of the last nodes."""
+    """Return the rows with one more row for each of the last nodes, which has a measured value of zero."""
     if not nodes:
         return K, w
     own = np.zeros((len(K), len(nodes), K.shape[2] + len(nodes)))

@@ -88,7 +88,7 @@ class Runs:
 
     @property
     def dense(self) -> float:
-        """Return the number of nodes of dense rows with which a box would use as much of a budget of boxes.
+        """Return the number of dense nodes that a box of this run counts as in the budget of boxes.
 
         Long runs take fewer boxes than short ones, so the number grows only with a root of the time for a box.
         """
@@ -171,7 +171,7 @@ class CourseCosts:
 
     @property
     def dense(self) -> float:
-        """Return the number of nodes of dense rows with which a box would use as much of a budget of boxes."""
+        """Return the number of dense nodes that a box of these costs counts as in the budget of boxes."""
         return float(_DENSE)
 
     def take(self, items: Array | slice) -> CourseCosts:

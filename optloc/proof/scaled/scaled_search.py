@@ -365,7 +365,7 @@ def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho
 
 @inlined
 def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
-    """Contract a box whose factors have no bound by the rows without factors; return the same as `side_of_rest`."""
+    """Contract a box whose factors have no bound by the rows without factors; return the result of `side_of_rest`."""
     rest, box = work.rest, work.box
     uncut(box.half, box.cut)
     if rest.w.shape[0] == 0:
