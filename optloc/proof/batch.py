@@ -37,9 +37,9 @@ class ProofRequest(NamedTuple):
     x : array (n, d)
         Positions of the fixes, metres.
     others : array (n, P, d)
-        Other known minima, finite ones first, metres.
+        Other known minima, metres; finite minima first.
     known, hidden : int array (n,)
-        Number of other known minima; number of these, the last ones, that do not count although they may cost less.
+        Number of other known minima. Of these, the last `hidden` minima do not count, although they may cost less.
     gaps : array (n, G)
         Accepted gaps to other minima, in descending order. A gap of 0 proves the value alone, and may be repeated.
     eps : array (n,)
@@ -91,7 +91,7 @@ class ProofResult(NamedTuple):
     rivals : array (n, RIVALS, d)
         The first of these minima, metres.
     found : array (n, d)
-        Better or other points, metres; NaN if there is none.
+        Better or other points, metres; NaN for other verdicts.
     """
 
     verdict: Array

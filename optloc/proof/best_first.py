@@ -368,7 +368,7 @@ def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: i
     budget : int
         Greatest number of boxes for each cost.
     most : int
-        Number of minima to keep for each cost, the cheapest ones.
+        Number of minima to keep for each cost; the cheapest are kept.
 
     Returns
     -------

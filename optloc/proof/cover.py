@@ -95,7 +95,7 @@ def cover(
     Returns
     -------
     count, inside : int
-        Number of boxes that contain the region, and number of boxes, the first ones, inside it; -1 if none is found.
+        Number of boxes that contain the region, -1 without boxes; the first `inside` of them are inside the region.
     level : float
         The highest cost of the region.
     """

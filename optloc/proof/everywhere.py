@@ -311,7 +311,7 @@ def prove_everywhere(
     boxes : int
         Number of boxes searched.
     bound : float
-        A certified lower bound of f over all positions; -inf if there is none.
+        A certified lower bound of f over all positions; -inf without a bound.
     gap : float
         The proven gap; if no gap is proven, the smallest gap that was tried.
     met : int

@@ -85,7 +85,7 @@ class Goal(NamedTuple):
         Whether a box without a stationary point is finished. This holds if the search as a whole has no open boundary.
         Otherwise such a box also needs a cost of at least `value`.
     free : int
-        Number of known minima, the first ones, that are the fix or hidden: points in their boxes do not count.
+        The first `free` known minima are the fix or hidden: points in their boxes do not count.
     own : int
         Number of these that are the fix: 1, or 0 on another piece of a surface.
     """
@@ -127,7 +127,7 @@ def branch(
     boxes : int
         Number of boxes searched.
     bound : float
-        A lower bound of f in the remaining boxes; infinite if there are none.
+        A lower bound of f in the remaining boxes; infinite without remaining boxes.
     """
     # Arrays as local variables: passing a record on counts references to all its arrays, for each box.
     kinds, data, K, w, A = cost.kinds, cost.data, cost.K, cost.w, cost.A
@@ -344,8 +344,8 @@ def prove(
     boxes : int
         Number of boxes searched.
     bound : float
-        A certified lower bound of f over the region or over all positions; -inf if there is none. For a proven value
-        it is below the cost of the fix by the final eps.
+        A certified lower bound of f over the region or over all positions; -inf without a bound. For a proven value it
+        is below the cost of the fix by the final eps.
     """
     # The units are standard deviations of the fix, so that boxes are about as wide as the cost requires in each
     # direction.

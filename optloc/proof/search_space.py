@@ -84,8 +84,7 @@ class KnownMinima(NamedTuple):
     points : array (P, D)
         Other minima, polished, metres. Boxes around them without a second minimum are excluded from the search.
     hidden : int
-        Number of minima, the last ones, that do not count although they may cost less; points near them do not count
-        either.
+        The last `hidden` minima do not count, although they may cost less. Points near them do not count either.
     planes : array (e, 3)
         Normals of planes through the fix to which the claim is limited.
     surface : array (0,) or (SURFACE_WIDTH,)
