@@ -1,1 +1,1 @@
-"""Proofs that no position costs less: enclosure, convex box, branch and bound."""
+"""Proofs that no position costs less than a fix: enclosure, convex box, branch and bound."""

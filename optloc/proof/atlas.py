@@ -1,14 +1,15 @@
-"""An atlas of all positions: around known minima, inside a cube, and outside it to infinity, as boxes of finite size.
+"""An atlas of all positions as boxes of finite size: around known minima, inside a cube, and outside it to infinity.
 
-A position is ``x = m + R p / v``, with m the centre and R half the side of a cube that holds all stations:
+A position is ``x = m + R p / v``, with m the centre and R half the side of a cube that contains all stations:
 
-- piece k < 2 D, a face of the cube: p on the surface of the unit cube, v in (0, 1]; v = 0 is infinity. The coordinates
-  are those of p on the face, then v: the inverse-range chart;
-- piece 2 D, inside the cube: v = 1, the coordinates are those of p;
-- piece 2 D + 1 + i, around the known minimum i, the fix first: the coordinates are axes s of the minimum in those u of
-  the piece above where it lies, its home: ``u = start + axes s``. On a face v changes along the last one alone.
+- piece k < 2 D, a face of the cube: p is on the surface of the unit cube, and v in (0, 1]; v = 0 is infinity. The
+  coordinates are the coordinates of p on the face, then v (inverse range);
+- piece 2 D, inside the cube: v = 1, and the coordinates are the components of p;
+- piece 2 D + 1 + i, around the known minimum i, the fix first. Its home is the face, or the inside, that contains the
+  minimum. Home coordinates u and coordinates s of the piece are related by ``u = start + axes s``. On a face, v
+  changes along the last axis only.
 
-The line to a station at ``m + R a`` is, but for the factor R/v, ``p - v a``.
+The line to a station at ``m + R a`` is ``p - v a``, times R/v.
 """
 
 from __future__ import annotations
@@ -29,13 +30,14 @@ class AtlasMinima(NamedTuple):
     Parameters
     ----------
     home : int array (P,)
-        The face or inside on which each lies.
+        The piece that contains each minimum: a face or the inside.
     start, axes, back : array (P, 3), (P, 3, 3), (P, 3, 3)
-        Coordinates ``u = start + axes s`` there, and the inverse of the axes.
+        Home coordinates ``u = start + axes s``, and the inverse of the axes.
     sides : array (P, 3)
-        Half-widths of boxes in s where the cost is convex.
+        Half-widths in s of boxes in which the cost is convex.
     core : array (P, 2, 3)
-        Corners of wider boxes in s, searched along the axes; to infinity where the last number of the first is -inf.
+        Corners of wider boxes in s, which are searched along the axes. If the last number of the first corner is -inf,
+        the box reaches infinity.
     """
 
     home: Array
@@ -47,14 +49,14 @@ class AtlasMinima(NamedTuple):
 
 
 class Atlas(NamedTuple):
-    """Pieces of space, and working memory for one box.
+    """The pieces of space, and working memory for one box.
 
     Parameters
     ----------
     middle : array (3,)
         Centre of the cube, metres.
     radius : float
-        Half its side; all stations lie inside.
+        Half the side of the cube, metres; all stations are inside.
     dimension : int
         2 or 3.
     minima : AtlasMinima
@@ -64,7 +66,8 @@ class Atlas(NamedTuple):
     scale : array (4,)
         v at the centre of a box, then its derivative.
     place, linear : array (4,), (3, 3)
-        The home of the piece (itself but around minima), then coordinates there of the centre, and their derivative.
+        The home of the piece, then the home coordinates of the centre, and their derivative. A face and the inside are
+        their own home.
     away, away_b, sense, sense_b : arrays
         Scaled lines to a node's stations, and their derivatives.
     bend : array (3, 3)
@@ -89,7 +92,7 @@ class Atlas(NamedTuple):
 
 @compiled
 def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
-    """Return the pieces around a cube, centre `middle` (3,) and half-width `radius`, with room for `count` minima."""
+    """Return the pieces around a cube, centre `middle` (3,) and half-width `radius`, with space for `count` minima."""
     minima = AtlasMinima(
         np.zeros(count, dtype=np.int64),
         np.zeros((count, 3)),
@@ -104,7 +107,7 @@ def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
 @compiled
 def with_minima(middle: Array, radius: float, dimension: int, minima: AtlasMinima) -> Atlas:
     """Return the pieces around a cube and around known minima."""
-    # One array for all vectors and one for all matrices: an atlas is made for every fix.
+    # One array for all vectors and one for all matrices: each fix needs an atlas, and allocations take time.
     vectors, matrices = np.zeros((3, 3)), np.zeros((5, 3, 3))
     return Atlas(
         middle,
@@ -126,7 +129,7 @@ def with_minima(middle: Array, radius: float, dimension: int, minima: AtlasMinim
 
 @compiled
 def first_minima(minima: AtlasMinima, count: int) -> AtlasMinima:
-    """Return the first minima."""
+    """Return views of the first `count` minima."""
     return AtlasMinima(
         minima.home[:count],
         minima.start[:count],
@@ -139,7 +142,7 @@ def first_minima(minima: AtlasMinima, count: int) -> AtlasMinima:
 
 @compiled
 def with_room_for_minimum(atlas: Atlas) -> Atlas:
-    """Return the same pieces with room for one more known minimum, the last."""
+    """Return the same pieces with space for one more known minimum, in the last place."""
     before, count = atlas.minima, atlas.minima.home.shape[0]
     wider = atlas_of(atlas.middle, atlas.radius, atlas.dimension, count + 1)
     minima = wider.minima
@@ -155,21 +158,21 @@ def with_room_for_minimum(atlas: Atlas) -> Atlas:
 
 @compiled
 def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
-    """Write point and scale at the centre of a box, and their derivatives.
+    """Write p and v at the centre of a box, and their derivatives, into the working memory of the atlas.
 
     Parameters
     ----------
     atlas : Atlas
         Its working memory is written.
     piece : int
-        Which piece; the faces 2 k and 2 k + 1 have p_k = -1 and 1.
+        Number of the piece; the faces 2 k and 2 k + 1 have p_k = -1 and 1.
     at : array (3,)
-        Centre in the coordinates of the piece.
+        Centre of the box in the coordinates of the piece.
     """
     d, place, linear = atlas.dimension, atlas.place, atlas.linear
     around = piece - 2 * d - 1
-    # All below is in the coordinates of the home; around a minimum these turn with its axes. Entry by entry: slices of
-    # arrays cost more than all else here.
+    # All below is in home coordinates. Around a minimum they follow from the axes of the minimum. The loops handle
+    # single entries: slices of arrays would take more time than all other statements here.
     place[0] = piece if around < 0 else atlas.minima.home[around]
     for k in range(3):
         for m in range(3):
@@ -188,12 +191,12 @@ def _set_home(atlas: Atlas, home: int) -> None:
     d, place, linear, scale, slant = atlas.dimension, atlas.place, atlas.linear, atlas.scale, atlas.slant
     column = 0
     for k in range(d):
-        level = k == home // 2  # the coordinate that is level all over a face
+        level = k == home // 2  # the coordinate that is constant on a face
         atlas.point[k] = (1.0 if home % 2 else -1.0) if level else place[1 + column]
         for m in range(3):
             slant[k, m] = 0.0 if level else linear[column, m]
         column += 0 if level else 1
-    # Inside the cube v is 1 and does not change; on a face it is the last coordinate.
+    # Inside the cube v is constant 1; on a face v is the last coordinate.
     face = home < 2 * d
     scale[0] = place[d] if face else 1.0
     for m in range(3):
@@ -202,7 +205,7 @@ def _set_home(atlas: Atlas, home: int) -> None:
 
 @compiled
 def piece_of(atlas: Atlas, x: Array, u: Array) -> int:
-    """Return the face or inside on which a position x (D,) lies, and write its coordinates there into u (3,)."""
+    """Return the home of a position x (D,), metres: a face or the inside; write its coordinates there into u (3,)."""
     d, most, home = atlas.dimension, 1.0, 2 * atlas.dimension
     for k in range(d):
         p = (x[k] - atlas.middle[k]) / atlas.radius
@@ -214,12 +217,12 @@ def piece_of(atlas: Atlas, x: Array, u: Array) -> int:
 
 @compiled
 def coordinates_on(atlas: Atlas, home: int, x: Array, u: Array) -> bool:
-    """Write the coordinates u (3,) of a position x (D,) on a face or inside; return False where it has none there."""
+    """Write the coordinates u (3,) of a position x (D,) on a face or inside; return False if x has none there."""
     d, v, column = atlas.dimension, 1.0, 0
     u[:] = 0.0
     if home < 2 * d:
         out = (x[home // 2] - atlas.middle[home // 2]) / atlas.radius * (1.0 if home % 2 else -1.0)
-        if not out > 0.0:  # on the other side of the cube, or level with its centre: no scale brings it here
+        if not out > 0.0:  # on the other side of the cube, or level with its centre: no positive v exists
             return False
         v = 1.0 / out
         u[d - 1] = v
@@ -232,20 +235,21 @@ def coordinates_on(atlas: Atlas, home: int, x: Array, u: Array) -> bool:
 
 @compiled
 def write_position(atlas: Atlas, x: Array) -> None:
-    """Write the position x (D,) of the centre that `set_centre` has set; v must not be zero."""
+    """Write the position x (D,), metres, of the centre that `set_centre` has set; v must not be zero."""
     for k in range(atlas.dimension):
         x[k] = atlas.middle[k] + atlas.radius * atlas.point[k] / atlas.scale[0]
 
 
-# What a few sums and products round, relative to their sizes, and a thousand times that; and a thousand times more.
+# A thousand times the relative rounding of a few sums and products; and a factor that is a thousand times as far from
+# 1.
 _BEYOND, _OUTWARDS = 1e-12, 1.0 + 1e-9
-# Roundings of a coordinate of a piece around a minimum, three products and sums: of what is about 1 in size.
+# Rounding of a coordinate of a piece around a minimum: three products and sums of numbers of a size of about 1.
 _PLACED = 8.0 * 2.0**-52
 
 
 @compiled
 def widen_around(atlas: Atlas, i: int, half: Array) -> None:
-    """Widen a box of the piece around minimum i by how far rounding may have moved its centre."""
+    """Widen a box of the piece around minimum i by the rounding of its centre."""
     for k in range(atlas.dimension):
         for m in range(atlas.dimension):
             half[k] += _PLACED * abs(atlas.minima.back[i, k, m])
@@ -253,9 +257,9 @@ def widen_around(atlas: Atlas, i: int, half: Array) -> None:
 
 @compiled
 def infinity_coordinate(atlas: Atlas, piece: int) -> float:
-    """Return the last coordinate of infinity in a piece, -inf where it is not reached along that alone.
+    """Return the last coordinate of infinity in a piece, or -inf if the last coordinate alone does not reach infinity.
 
-    Around a minimum a little beyond, where v rounds to zero.
+    Around a minimum the result is slightly beyond infinity, where v rounds to zero.
     """
     d, around = atlas.dimension, piece - 2 * atlas.dimension - 1
     if around < 0 or atlas.minima.home[around] == 2 * d:
@@ -268,7 +272,7 @@ def infinity_coordinate(atlas: Atlas, piece: int) -> float:
 
 @compiled
 def is_near_minimum(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
-    """Return whether a box around the centre set lies inside the convex box of minimum i, and whether in its core."""
+    """Return whether the current box is inside the convex box of minimum i, and whether it is inside its core."""
     minima, d = atlas.minima, atlas.dimension
     if minima.home[i] != atlas.place[0]:
         return _within_from_another(atlas, half, i), False
@@ -284,7 +288,8 @@ def is_near_minimum(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
             for c in range(d):
                 slope += minima.back[i, k, c] * atlas.linear[c, m]
             reach += abs(slope) * half[m]
-        # Inwards by more than the rounding of the inverse axes: a box left out must be one that was looked at.
+        # The ends are moved outwards by more than the rounding of the inverse axes: only a box that is surely inside
+        # is left out.
         low, high = (away - reach) * _OUTWARDS, (away + reach) * _OUTWARDS
         convex = convex and max(high, -low) <= minima.sides[i, k]
         core = core and high <= minima.core[i, 1, k] and low >= minima.core[i, 0, k]
@@ -293,10 +298,10 @@ def is_near_minimum(atlas: Atlas, half: Array, i: int) -> tuple[bool, bool]:
 
 @compiled
 def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
-    """Return whether a box around the centre set lies inside the convex box of a minimum whose home is another.
+    """Return whether a box around the current centre is inside the convex box of a minimum that has another home.
 
-    Sums of coordinates there are quotients N/D of linear functions of the box's coordinates. From their value q at the
-    centre they differ by ``(dN - q dD) / D'``.
+    Sums of its home coordinates are quotients N/D of linear functions of the box's coordinates. Their difference from
+    the value q at the centre is ``(dN - q dD) / D'``.
     """
     minima, d, home = atlas.minima, atlas.dimension, int(atlas.minima.home[i])
     level, face = home // 2, home < 2 * d
@@ -329,7 +334,7 @@ def _within_from_another(atlas: Atlas, half: Array, i: int) -> bool:
 
 @inlined
 def _column(m: int, level: int, face: bool, d: int) -> int:
-    """Return the coordinate of p for coordinate m of a home, -1 for v; a face leaves out its level coordinate."""
+    """Return the component of p for coordinate m of a home, or -1 for v; a face omits its constant component."""
     if not face:
         return m
     if m == d - 1:
@@ -338,20 +343,22 @@ def _column(m: int, level: int, face: bool, d: int) -> int:
 
 
 class AtlasFrame(NamedTuple):
-    """Where a box lies, in numbers alone: machine code counts references to every array that it hands on.
+    """Position of a box as plain numbers.
+
+    Compiled code counts references to each array that it passes on, which takes time.
 
     Parameters
     ----------
     middle : triple
         Centre of the cube, metres.
     radius : float
-        Half its side.
+        Half the side of the cube, metres.
     space : bool
         Whether there are three dimensions.
     point, slant : triple, three triples
         p at the centre of the box, and the rows of its derivative.
     scale, rise : float, triple
-        v there, and its derivative.
+        v at the centre of the box, and its derivative.
     """
 
     middle: Triple
@@ -365,7 +372,7 @@ class AtlasFrame(NamedTuple):
 
 @inlined
 def frame_of(atlas: Atlas) -> AtlasFrame:
-    """Return where the centre that `set_centre` has set lies."""
+    """Return the position of the centre that `set_centre` has set, as plain numbers."""
     slant = (triple_at(atlas.slant[0], 0), triple_at(atlas.slant[1], 0), triple_at(atlas.slant[2], 0))
     point, rise = triple_at(atlas.point, 0), triple_at(atlas.scale, 1)
     return AtlasFrame(
@@ -375,21 +382,22 @@ def frame_of(atlas: Atlas) -> AtlasFrame:
 
 @compiled
 def contract_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, half: Array, cut: Array) -> None:
-    """Clip a box around the centre set to what lies between corners in search coordinates around a fix.
+    """Contract a box around the current centre to the part between corners in search coordinates around a fix.
 
-    With b a row of `back` a position x has the coordinate ``b.(x - origin)``, and v times it is linear in the
-    coordinates of the piece: ``b.(R p + (m - origin) v)``. So is v times an end, with which it is compared: v >= 0.
+    With b a row of `back`, a position x has the coordinate ``b.(x - origin)``. Times v, this is linear in the
+    coordinates of the piece: ``b.(R p + (m - origin) v)``. An end times v is linear as well, so both are compared
+    times v >= 0.
 
     Parameters
     ----------
     atlas : Atlas
-        The centre is set.
+        Its current centre is set.
     origin, back : array (3,), (3, 3)
-        The fix, and the derivative of the search coordinates with respect to the position.
+        The fix, metres, and the derivative of the search coordinates with respect to the position.
     corners : array (2, 3)
         Least and greatest search coordinates.
     half, cut : array (3,), (6,)
-        Half-widths of the box, and ends of what is left of it, clipped.
+        Half-widths of the box, and ends of its remaining part, contracted in place.
     """
     frame, h = frame_of(atlas), triple_at(half, 0)
     s0, s1, s2 = frame.slant
@@ -397,7 +405,8 @@ def contract_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array
     apart, most = (m0 - origin[0], m1 - origin[1], m2 - origin[2]), abs(frame.scale) + reach(frame.rise, h)
     for k in range(3):
         b = triple_at(back[k], 0)
-        # v times the coordinate: at the centre, its derivative, and what both round relative to.
+        # v times the coordinate: its value at the centre, its derivative, and the sizes that its rounding is relative
+        # to.
         away = inner_product(b, apart)
         middle = frame.radius * inner_product(b, frame.point) + away * frame.scale
         slant = sum_of_forms(1.0, sum_of_forms(b[0], s0, b[1], s1), b[2], s2)
@@ -408,8 +417,8 @@ def contract_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array
         for side in range(2):
             sign, end = (-1.0, corners[0, k]) if side == 0 else (1.0, corners[1, k])
             slope = sum_of_forms(sign, steep, -sign * end, frame.rise)
-            # How far the coordinate is beyond the end, times v, must not be positive: from the lowest corner of the box
-            # there is so much room.
+            # The distance of the coordinate beyond the end, times v, must not be positive. `room` is the greatest
+            # allowed rise from the lowest corner of the box.
             room = reach(slope, h) - sign * (middle - end * frame.scale) + _BEYOND * (blur + abs(end) * most)
             if room < 0.0:
                 cut[0], cut[3] = 1.0, -1.0
@@ -426,7 +435,7 @@ def contract_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array
 
 @inlined
 def _station(frame: AtlasFrame, data: Array, first: int) -> Triple:
-    """Return the station a at data[first:first + 3] in the units of the cube."""
+    """Return the station a at data[first:first + 3], relative to the centre and in half sides of the cube."""
     m0, m1, m2 = frame.middle
     per = 1.0 / frame.radius
     third = (data[first + 2] - m2) * per if frame.space else 0.0
@@ -446,7 +455,7 @@ def set_line(frame: AtlasFrame, data: Array, first: int, away: Array, sense: Arr
 
 @inlined
 def scaled_station(frame: AtlasFrame, data: Array) -> tuple[float, float, Triple]:
-    """Return ``|a|`` of a station a, and ``N = -2 a.p + v |a|^2`` with its gradient, a constant."""
+    """Return ``|a|`` of a station a, and ``N = -2 a.p + v |a|^2`` with its constant gradient."""
     a = _station(frame, data, 0)
     squared = inner_product(a, a)
     s0, s1, s2 = frame.slant

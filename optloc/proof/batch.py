@@ -1,4 +1,4 @@
-"""Proofs of many fixes: a compiled loop over a stretch of a batch, called from plain threads."""
+"""Proofs of many fixes: a compiled loop over a part of a batch, called from Python threads."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from optloc.proof.local_search import OPEN, prove_locally
 from optloc.proof.position_costs import PositionCosts
 from optloc.proof.search_space import LINES, Cost, KnownMinima, accuracy_floor, cost_of, empty_box, set_geometry
 
-# Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
-# what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
+# Fewest and most fixes for one call of compiled code: a call takes as long as one or two fixes. Threads share a batch
+# in such parts, and each thread should get several of them (about `_PARTS` in all).
 _STRETCH, _PARTS = (16, 512), 32
-# Few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second. Where there is
-# no machine code that could go on, they get so many more: about three seconds.
+# A few proofs with at most `SMALL` nodes begin in plain Python, with `FIRST_BOXES` boxes in all: about half a second.
+# If no compiled code is available to continue, they get `PLAIN_BOXES` boxes: about three seconds.
 SMALL, FIRST_BOXES, PLAIN_BOXES = 24, 400, 2000
-# Other minima that a proof goes on beside when it meets them; with more it begins anew.
+# Number of other minima that a proof can add during its search; with more, the proof begins again.
 RIVALS = 4
-# Fewest boxes that each of them gets: most proofs inside a network end with the first.
+# Fewest boxes for each fix: most proofs inside a network need only the first box.
 _AT_LEAST = 5
 
 
 class ProofRequest(NamedTuple):
-    """What is to be proven of each of n fixes.
+    """Requests for proofs of n fixes.
 
     Parameters
     ----------
     x : array (n, d)
-        Positions of the fixes.
+        Positions of the fixes, metres.
     others : array (n, P, d)
-        Other known minima, the finite ones first.
+        Other known minima, metres; finite minima first.
     known, hidden : int array (n,)
-        How many of them are there, and how many of these, the last ones, do not count though they may cost less.
+        Number of other known minima. Of these, the last `hidden` minima do not count, although they may cost less.
     gaps : array (n, G)
-        Gaps to other minima that will do, falling to 0 for the value alone, which may stand there more than once.
+        Accepted gaps to other minima, in descending order. A gap of 0 proves the value alone, and may be repeated.
     eps : array (n,)
-        How far below the cost of the fix still counts as equal.
+        A cost that is lower than the cost of the fix by at most eps counts as equal.
     region : array (n, 2, d)
-        Corners of the regions; NaN for all positions.
+        Corners of the regions, metres; NaN for all positions.
     fallback : array (n, 2, d)
-        Corners of the regions to take where all positions cannot be bounded; NaN for none.
+        Corners of the regions to prove if not all positions can be bounded, metres; NaN for none.
     budget : int array (n,)
-        How many boxes each may take.
+        Greatest number of boxes for each fix.
     planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
         Planes or a surface to which the claims are limited, see `optloc.proof.search_space.KnownMinima`.
     """
@@ -67,31 +67,31 @@ class ProofRequest(NamedTuple):
     surface: Array
 
     def take(self, index: Array | slice) -> ProofRequest:
-        """Return what is asked of some of the fixes."""
+        """Return the requests of some of the fixes."""
         return ProofRequest(*(array[index] for array in self))
 
 
 class ProofResult(NamedTuple):
-    """What became of each of n proofs.
+    """Results of n proofs.
 
     Parameters
     ----------
     verdict : int array (n,)
-        As `optloc.proof.local_search.prove_locally` or `optloc.proof.global_search.prove_globally` returns it.
+        Code from `optloc.proof.local_search.prove_locally` or `optloc.proof.global_search.prove_globally`.
     boxes : int array (n,)
-        Boxes looked at.
+        Number of boxes searched.
     bound : array (n,)
         Certified lower bounds of the cost.
     everywhere : bool array (n,)
-        Whether the claim is for all positions, not for the region asked for or the fallback.
+        Whether the claim is for all positions, rather than for the requested region or the fallback.
     gap : array (n,)
-        The gap that is proven, or where none is the smallest that was tried.
+        The proven gap; if no gap is proven, the smallest gap that was tried.
     met : int array (n,)
-        How many other minima were met on the way, beside which the claim holds.
+        Number of other minima that the search found; the claim excepts them.
     rivals : array (n, RIVALS, d)
-        These, the first of them.
+        The first of these minima, metres.
     found : array (n, d)
-        Better or other points; NaN where there is none.
+        Better or other points, metres; NaN for other verdicts.
     """
 
     verdict: Array
@@ -104,21 +104,21 @@ class ProofResult(NamedTuple):
     found: Array
 
     def take(self, index: Array | slice) -> ProofResult:
-        """Return what became of some of the proofs."""
+        """Return the results of some of the proofs."""
         return ProofResult(*(array[index] for array in self))
 
 
 def prove_all(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
-    """Return the outcome of the proofs of n fixes of n problems, by their costs.
+    """Return the results of the proofs of n fixes of n problems, from their costs.
 
-    The first few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
+    The first few proofs begin in plain Python: most proofs need few boxes, and loading compiled code takes longer.
     """
     n = len(asked.x)
     if worth_loading(_loop, n) or (len(costs.kinds) > SMALL and may_use_code(_loop, n)):
         return _prove(costs, asked)
     parts = []
     for first in range(0, n, FEW):
-        # Where machine code is made meanwhile, it goes on with the rest.
+        # If compiled code becomes available meanwhile, it continues with the rest.
         last = n if first > 0 and may_use_code(_loop, n) else min(first + FEW, n)
         some = slice(first, last)
         parts.append((_prove if last - first > FEW else _prove_few)(costs.take(some), asked.take(some)))
@@ -128,11 +128,11 @@ def prove_all(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
 
 
 def _prove_few(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
-    """Return the outcome of a few proofs, begun in plain Python; who needs more begins anew in machine code."""
+    """Return the results of a few proofs that begin in plain Python; proofs that need more boxes begin again."""
     n = len(asked.x)
     few = max(_AT_LEAST, FIRST_BOXES // max(n, 1))
     out = _prove_plainly(costs, asked, few)
-    # With more boxes a larger gap may be proven than with few, and minima may be met: only who has some left is done.
+    # More boxes may prove a larger gap and find minima. So a proof is complete only if it used less than its share.
     short = np.flatnonzero((out.boxes >= few) & (asked.budget > few))
     if len(short) and enabled():
         costs, asked = costs.take(short), asked.take(short)
@@ -144,17 +144,18 @@ def _prove_few(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
 
 
 def _prove_plainly(costs: PositionCosts, asked: ProofRequest, boxes: int) -> ProofResult:
+    """Return the results of proofs in plain Python, with at most `boxes` boxes for each fix."""
     with plain():
         return _prove(costs, asked._replace(budget=np.minimum(asked.budget, boxes)))
 
 
 def lacks_code(count: int) -> bool:
-    """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
+    """Return whether proofs of `count` fixes ended early because their compiled code is not yet available."""
     return enabled() and not may_use_code(_loop, count)
 
 
 def empty_answer(n: int, d: int) -> ProofResult:
-    """Return what n proofs in d dimensions write into."""
+    """Return result arrays for n proofs in d dimensions."""
     return ProofResult(
         verdict=np.zeros(n, dtype=np.int64),
         boxes=np.zeros(n, dtype=np.int64),
@@ -170,13 +171,14 @@ def empty_answer(n: int, d: int) -> ProofResult:
 def without_rivals(
     verdict: Array, boxes: Array, bound: Array, everywhere: Array, asked: ProofRequest, found: Array
 ) -> ProofResult:
-    """Return the outcome of proofs that try the first gap alone, and begin anew beside every minimum that they meet."""
+    """Return the results of proofs that try the first gap only, and begin again after each minimum that they find."""
     n, d = found.shape
     none = np.zeros(n, dtype=np.int64)
     return ProofResult(verdict, boxes, bound, everywhere, asked.gaps[:, 0], none, np.full((n, 0, d), np.nan), found)
 
 
 def _prove(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
+    """Return the results of all proofs, by compiled code in several threads or by plain Python."""
     n, d = asked.x.shape
     out = empty_answer(n, d)
     costs, asked = (
@@ -187,55 +189,55 @@ def _prove(costs: PositionCosts, asked: ProofRequest) -> ProofResult:
 
     def stretch(first: int) -> None:
         part = slice(first, min(first + length, n))
-        with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
+        with np.errstate(all="ignore"):  # plain Python would warn of values without a bound
             _loop(costs.take(part), asked.take(part), out.take(part))
 
     if enabled():
         map_on_threads(stretch, range(0, n, length))
         return out
-    for first in range(0, n, length):  # plain Python holds the interpreter: threads would wait for each other
+    for first in range(0, n, length):  # plain Python holds the interpreter lock, so threads would wait for each other
         stretch(first)
     return out
 
 
 def prove_here(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
-    """Write what becomes of proofs to arrays, by machine code in the calling thread; see `prove_all`.
+    """Write the results of proofs to arrays, by compiled code in the calling thread; see `prove_all`.
 
-    All arrays are writable and in C order: nothing is looked at, copied or shared out.
+    All arrays must be writable and in C order: they are not checked, copied or distributed to threads.
     """
     _loop(costs, asked, out)
 
 
 def is_code_loaded() -> bool:
-    """Return whether the machine code of proofs has been used in this process."""
+    """Return whether the compiled code of proofs has been used in this process."""
     return is_in_use(_loop)
 
 
 def costs_at(costs: PositionCosts, x: Array) -> tuple[Array, Array]:
-    """Return costs (n, P) at positions x (n, P, d), and what rounding may have made of their residuals (n, P)."""
+    """Return costs (n, P) at positions x (n, P, d), and bounds of the rounding of their residuals (n, P)."""
     out = np.zeros((2, *x.shape[:2]))
     if worth_loading(_evaluate, len(x)):
         _evaluate(PositionCosts(*(plainly(array) for array in costs)), plainly(x), out)
         return out[0], out[1]
-    with plain(), np.errstate(all="ignore"):  # as few proofs are: machine code takes longer to load
+    with plain(), np.errstate(all="ignore"):  # as for few proofs: loading compiled code takes longer
         _evaluate(costs, x, out)
     return out[0], out[1]
 
 
 def cost_here(costs: PositionCosts, x: Array, out: Array) -> None:
-    """Write costs and their rounding at positions x (n, P, d) to (2, n, P), by machine code; see `prove_here`."""
+    """Write costs and their rounding at positions x (n, P, d) to (2, n, P), by compiled code; see `prove_here`."""
     _evaluate(costs, x, out)
 
 
 def plainly(array: Array) -> Array:
-    """Return an array in one form for all calls: machine code is made anew for read-only or strided arrays."""
+    """Return a writable C-ordered array: read-only or strided arrays would need other compiled code."""
     return np.require(array, requirements=["C", "W"])
 
 
 @compiled
 def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
-    """Prove what is asked of each fix, and write what became of it."""
-    # Taken out of the records once: every look into one counts the references of an array.
+    """Prove the request of each fix, and write its result."""
+    # Local variables for all arrays: each access to a field of a record counts references.
     kinds, data, K, w = costs.kinds, costs.data, costs.K, costs.w
     fixes, others, known, steps, tolerances = asked.x, asked.others, asked.known, asked.gaps, asked.eps
     regions, fallbacks, budgets = asked.region, asked.fallback, asked.budget
@@ -249,7 +251,7 @@ def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
         if i == 0 or len(K) > 1:
             set_geometry(kinds, rows, A, weight, groups)
         cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, w[i], A, weight, groups), box
-        # Rows that are absent in this problem alone: the tables of the batch are too wide for it.
+        # If rows are absent in this problem only, the tables of the batch are too wide for it.
         if (weight == 0.0).any():
             cost = without_unused_nodes(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
@@ -278,7 +280,7 @@ def _loop(costs: PositionCosts, asked: ProofRequest, out: ProofResult) -> None:
 
 @compiled
 def without_unused_nodes(cost: Cost) -> Cost:
-    """Return a cost without nodes that no row has: time goes with the square of the nodes."""
+    """Return a cost without the nodes that no row uses: the time of a proof grows with the square of the nodes."""
     K, w = cost.K, cost.w
     nodes, rows = np.empty(K.shape[1], dtype=np.int64), np.empty(K.shape[0], dtype=np.int64)
     J = q = 0
@@ -300,7 +302,7 @@ def without_unused_nodes(cost: Cost) -> Cost:
 
 @compiled
 def _evaluate(costs: PositionCosts, x: Array, out: Array) -> None:
-    """Write costs, and lengths of the rounding of their residuals."""
+    """Write costs, and bounds of the rounding of residuals, as lengths."""
     J, q = costs.K.shape[2], costs.K.shape[1]
     box, weight, axes, origin = empty_box(q, J), np.empty(J), np.eye(3), np.zeros(3)
     for k in range(x.shape[2], 3):

@@ -1,8 +1,8 @@
-"""Starts by branch and bound: the minima of a cost from nothing, the boxes of least bound first.
+"""Starts by branch and bound: a search for the minima of a cost without any candidate, boxes of least bound first.
 
-What a proof can bound it can start: the centres of promising boxes descend to minima, and boxes that cost more than the
-best by a gap are dropped. When none is left, or the budget is spent, every minimum within the gap that was met is
-listed. Nothing is claimed of them: that is the proof's part, which begins at the best.
+The centres of promising boxes descend to minima, and boxes that cost more than the best minimum by a gap are dropped.
+The search ends when no box is left or the budget is spent, and lists all minima that it met within the gap. The search
+proves nothing about them. The proof begins afterwards, at the best minimum.
 """
 
 from __future__ import annotations
@@ -55,41 +55,41 @@ from optloc.proof.search_space import (
 from optloc.proof.space import Space, bound_or_halve, floor_of, place_of
 from optloc.proof.surface import SIDES, reach_of_piece
 
-# Standard deviations within which two minima are one: descents end a thousandth of one from their minimum.
+# Standard deviations within which two minima count as one. Descents end within a thousandth of a standard deviation.
 _SAME = 0.1
-# Rounds of a descent, each in the axes of where the one before ended. Two where a minimum is near; along the sphere of
-# a sharp range, a thousand times as long as it is thick, up to fifteen.
+# Rounds of a descent; each round uses the axes of the point where the round before ended. Near a minimum two rounds
+# suffice. Along the sphere of a sharp range, a thousand times as long as it is thick, a descent takes up to fifteen.
 _ROUNDS = 16
-# Standard deviations: a round that ends so near to where it began has nothing left to find.
+# Standard deviations: a round that moves the point by less than this has converged.
 _STILL = 1e-3
-# Distance, reaches of the stations, beyond which a descent has run away.
+# Distance beyond which a descent counts as diverged, in half-widths of the cube around the stations.
 _AWAY = 1e5
-# The test for stationary points is made where the cost at the centre is within so many levels; boxes at infinity are
-# not split below a size. Both as in `optloc.proof.global_search`, and only a matter of time.
+# The test for stationary points runs if the cost at the centre is at most this many levels. Boxes at infinity below
+# the size `_TINY` are not split. Both are as in `optloc.proof.global_search`, and affect the run time only.
 _NEAR, _TINY = 100.0, 1e-5
-# How far the cost may fall below that of a minimum in its convex box: what its polish leaves.
+# Greatest fall of the cost below the cost of a minimum within its convex box: the remaining error of polishing.
 _POLISHED = 1e-6
-# A centre that costs less than this share of the cheapest before is promising.
+# A centre is promising if it costs less than this share of the cheapest centre before.
 _HALF = 0.5
-# Boxes for a first look at each side of the Earth: enough for a good minimum, which spares most of the others.
+# Boxes of a first search on each side of the Earth: enough for a good minimum, whose cost excludes most other boxes.
 _LOOK = 32
 
 
 class SearchGoal(NamedTuple):
-    """What is looked for.
+    """Goal of a search for minima, and the minima that it finds.
 
     Parameters
     ----------
     planes, surface : array (e, 3), (0,) or (SURFACE_WIDTH,)
-        To which the minima are limited, see `optloc.proof.search_space.KnownMinima`.
+        Planes or a surface that contain the minima, see `optloc.proof.search_space.KnownMinima`.
     gap : float
-        By how much a minimum may cost more than the best.
+        Greatest cost of a minimum above the best one.
     reach : float
-        Metres beyond which a descent has run away.
+        Coordinate, metres, beyond which a descent counts as diverged.
     points : array (P, D)
-        Written: minima.
+        Written: minima, metres.
     costs : array (P,)
-        Written: what they cost.
+        Written: costs of the minima.
     """
 
     planes: Array
@@ -102,12 +102,13 @@ class SearchGoal(NamedTuple):
 
 @compiled
 def _add(cost: Cost, near: Box, aim: SearchGoal, x: Array, count: int, level: float) -> int:
-    """Descend from a place (D,) to a minimum; return how many are known with it, one more if it is new.
+    """Descend from a position (D,) to a minimum, and list it if it is new; return the number of known minima.
 
-    `x` is the minimum afterwards; what costs more than a level is none of interest.
+    `x` is overwritten by the end of the descent. A minimum that costs `level` or more is not added.
     """
     D, value, arrived = x.shape[0], inf, 0
-    # Until it has arrived twice: in the axes of a place beside, and in those of the minimum, where a sigma is one.
+    # Until two rounds have converged: one in the axes of a nearby point, one in the axes of the minimum, in which the
+    # unit is a standard deviation.
     for _ in range(_ROUNDS):
         chart, _ = chart_on(cost, x, near, aim.planes, aim.surface)
         near.at[:] = 0.0
@@ -116,7 +117,7 @@ def _add(cost: Cost, near: Box, aim: SearchGoal, x: Array, count: int, level: fl
             x[k] = near.centre[k]
         arrived = arrived + 1 if value < inf else 0
         if max(abs(near.at[0]), abs(near.at[1]), abs(near.at[2])) < _STILL:
-            # At the minimum of a sharp cost its rounding hides whether a step still falls.
+            # At the minimum of a sharp cost, rounding hides whether a step still reduces the cost.
             value, arrived = cost_at(cost.K, cost.w, near.nodes), 2
         if arrived == 2 or (arrived == 1 and not value < level):
             break
@@ -144,7 +145,7 @@ def _add(cost: Cost, near: Box, aim: SearchGoal, x: Array, count: int, level: fl
 
 @compiled
 def _least(aim: SearchGoal, count: int) -> float:
-    """Return the cost of the best minimum."""
+    """Return the cost of the best of the first `count` minima."""
     best = inf
     for p in range(count):
         best = min(best, aim.costs[p])
@@ -153,7 +154,7 @@ def _least(aim: SearchGoal, count: int) -> float:
 
 @compiled
 def _is_due(lows: int, low: bool, boxes: int) -> bool:
-    """Return whether a centre descends: the first, second, fourth, eighth ... that is low, and of all."""
+    """Return whether a centre descends: number 1, 2, 4, 8 and so on of the low centres, or of all centres."""
     return bool((low and lows & (lows - 1) == 0) or boxes & (boxes - 1) == 0)
 
 
@@ -161,11 +162,11 @@ def _is_due(lows: int, low: bool, boxes: int) -> bool:
 def search_minima(
     cost: Cost, box: Box, near: Box, x: Array, aim: SearchGoal, region: Array, budget: int
 ) -> tuple[int, int]:
-    """Look for minima: all around a surface, over all positions, or between corners.
+    """Return the number of known minima and the number of boxes of a search for minima.
 
-    All positions are searched where the cost stays finite at infinity. Otherwise the corners are an enclosure of the
-    positions that cost less than x (D,), or without one the region (2, D). Returns the number of minima that are
-    known, and the number of boxes.
+    On a surface, the search goes all around it. Otherwise, if the cost stays finite at infinity, all positions are
+    searched. In other cases the search is between corners. The corners come from an enclosure of the positions that
+    cost less than x (D,), or from the region (2, D) if there is no enclosure.
     """
     around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
     level, d, bent = cost_at(cost.K, cost.w, box.nodes) + aim.gap, x.shape[0], aim.surface.shape[0] > 0
@@ -206,7 +207,7 @@ def _search(
     budget: int,
     count: int,
 ) -> tuple[int, int]:
-    """Look for minima in the boxes of a stack; return the number of minima that are known, and the number of boxes."""
+    """Search the boxes of a stack for minima; return the number of known minima, and the number of boxes."""
     at, boxes, lows, cheapest, floor = np.empty(aim.points.shape[1]), zero(), zero(), inf, floor_of(space, cost)
     queue = [(0.0, i) for i in range(size)]
     while len(queue) > 0 and boxes < budget:
@@ -250,7 +251,7 @@ def _split(
     low: float,
     piece: int,
 ) -> int:
-    """Push the halves of the part of a box between the ends of its cut; return the size of the stack."""
+    """Push the halves of the remaining part of a box; return the size of the stack."""
     if not cut_out(box.cut, box.at, box.half) > 0.0:
         return size
     exact = space.far and piece <= 2 * space.atlas.dimension
@@ -260,17 +261,17 @@ def _split(
 
 @compiled
 def _queue_up(queue: list[tuple[float, int]], low: float, first: int, last: int) -> None:
-    """Put boxes of a stack into the queue by their bound."""
+    """Put boxes of a stack into the queue, ordered by their bound."""
     for i in range(first, last):
         heappush(queue, (low, i))
 
 
 @inlined
 def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: float) -> tuple[float, float, int]:
-    """Return the bound of the cost over a box whose nodes are bounded, the cost at its centre, and the side to halve.
+    """Return the bound of the cost over a box with bounded nodes, the cost at its centre, and the side to halve.
 
-    The side is -1 where the box holds no minimum below a level. Otherwise the ends of the part that may hold one are
-    written.
+    The side is -1 if the box contains no minimum below a level. Otherwise the ends of the part that may contain a
+    minimum are written into ``box.cut``.
     """
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
@@ -283,7 +284,7 @@ def _look(cost: Cost, space: Space, box: Box, piece: int, level: float, floor: f
 
 @inlined
 def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here: float, floor: float) -> int:
-    """Return the side to halve of a box of the atlas, -1 where it holds no minimum; the box is not cut."""
+    """Return the side to halve of a box of the atlas, or -1 if it contains no minimum; the box is not contracted."""
     atlas, d = space.atlas, space.atlas.dimension
     touching = piece < 2 * d and box.at[d - 1] <= box.half[d - 1]
     if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
@@ -296,7 +297,7 @@ def _side_far(cost: Cost, space: Space, box: Box, piece: int, level: float, here
 
 @inlined
 def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
-    """Write the ends of the part of a box that may hold a minimum below a level; return the side to halve, or -1."""
+    """Write the ends of the part of a box that may contain a minimum below a level; return the side to halve, or -1."""
     chart = space.chart
     gram = box.gram if chart.surface.shape[0] > 0 else chart.gram
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
@@ -312,7 +313,7 @@ def _cut(cost: Cost, space: Space, box: Box, level: float, here: float) -> int:
 
 @compiled
 def _with_known(cost: Cost, space: Space, near: Box, aim: SearchGoal, corners: Array, count: int) -> Space:
-    """Return search coordinates with the minima that are known, and convex boxes around them."""
+    """Return search coordinates with the known minima, and convex boxes around them."""
     known = KnownMinima(aim.points[:count], 0, aim.planes, aim.surface)
     minima, sides, number, _ = known_minima(cost, space.chart, near, known, corners[0], corners[1], 0.0, -inf, False)
     return Space(False, space.atlas, space.chart, minima[:number], sides[:number])
@@ -320,7 +321,7 @@ def _with_known(cost: Cost, space: Space, near: Box, aim: SearchGoal, corners: A
 
 @compiled
 def _push_minimum(cost: Cost, space: Space, near: Box, x: Array, stack: Array, size: int) -> tuple[Space, int]:
-    """Return the atlas with one more minimum x (D,), and push boxes around it; the same if x is no minimum."""
+    """Return the atlas with one more minimum x (D,), and push boxes around it; the same atlas if x is no minimum."""
     known, atlas = space.atlas.minima.home.shape[0], with_room_for_minimum(space.atlas)
     if not set_minimum(cost, near, atlas, known, x, -inf, _POLISHED, inf):
         return space, size
@@ -330,16 +331,17 @@ def _push_minimum(cost: Cost, space: Space, near: Box, x: Array, stack: Array, s
 
 
 class FoundPlaces(NamedTuple):
-    """Where the minima of n costs are looked for.
+    """Where to search for the minima of n costs.
 
     Parameters
     ----------
     x : array (n, d)
-        A place each: on its planes or surface, and where nothing else encloses the cheap positions a rather good one.
+        One position for each cost, metres: on its planes or surface. If nothing encloses the positions of low cost,
+        this position should have a low cost.
     region : array (n, 2, d)
-        Corners of what is searched where nothing encloses them.
+        Corners of the region to search if nothing encloses the minima, metres.
     planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
-        To which the minima are limited, see `optloc.proof.search_space.KnownMinima`.
+        Planes or a surface that contain the minima, see `optloc.proof.search_space.KnownMinima`.
     """
 
     x: Array
@@ -348,62 +350,62 @@ class FoundPlaces(NamedTuple):
     surface: Array
 
     def take(self, i: int) -> FoundPlaces:
-        """Return the place of one of the costs, without the first axis."""
+        """Return the search data of cost i, without the first axis."""
         return FoundPlaces(*(array[i] for array in self))
 
 
 def find_minima(costs: PositionCosts, places: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, Array]:
-    """Return the minima of n costs that a best-first search meets, from nothing.
+    """Return the minima of n costs that a best-first search meets without any candidate.
 
     Parameters
     ----------
     costs : PositionCosts
         The costs.
     places : FoundPlaces
-        Where they are looked for.
+        Where to search.
     gap : float
-        By how much the cost of a minimum may exceed that of the best.
+        Greatest cost of a minimum above the best one.
     budget : int
-        How many boxes may be looked at for each.
+        Greatest number of boxes for each cost.
     most : int
-        How many minima are kept for each, the cheapest.
+        Number of minima to keep for each cost; the cheapest are kept.
 
     Returns
     -------
     points : array (n, most, d)
-        The minima by their cost, NaN behind the last.
+        The minima in order of cost, metres; NaN after the last one.
     boxes : int array (n,)
-        Boxes looked at; where they are fewer than the budget, none was left that bounds did not drop.
+        Number of boxes. If it is below the budget, bounds have excluded all other boxes.
     """
     n, d = places.x.shape
     points, boxes = np.full((n, most, d), np.nan), np.zeros(n, dtype=np.int64)
     costs, places = PositionCosts(*map(plainly, costs)), FoundPlaces(*map(plainly, places))
 
     def search(i: int, budget: int) -> None:
-        with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
+        with np.errstate(all="ignore"):  # plain Python would warn of values without a bound
             points[i], boxes[i] = _minima_of(costs.take(slice(i, i + 1)), places.take(i), gap, budget, most)
 
-    asked = list(range(n))
+    pending = list(range(n))
     if n <= FEW and len(costs.kinds) <= SMALL and not is_in_use(without_unused_nodes):
-        # As few proofs are: most need few boxes, and machine code takes longer to load.
+        # As in proofs of few fixes: most searches need few boxes, and loading compiled code takes longer.
         first = min(budget, FIRST_BOXES // n)
         with plain():
-            for i in asked:
+            for i in pending:
                 search(i, first)
-        asked = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
+        pending = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
     if enabled() and may_use_code(search_minima, n):
-        map_on_threads(lambda i: search(i, budget), asked)
+        map_on_threads(lambda i: search(i, budget), pending)
         return points, boxes
-    # Plain Python holds the interpreter: threads would wait for each other.
-    few = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(asked), 1))) if enabled() else budget
+    # Plain Python holds the interpreter lock, so threads would wait for each other.
+    few = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(pending), 1))) if enabled() else budget
     with plain():
-        for i in asked:
+        for i in pending:
             search(i, few)
     return points, boxes
 
 
 def _minima_of(costs: PositionCosts, place: FoundPlaces, gap: float, budget: int, most: int) -> tuple[Array, int]:
-    """Return the minima (most, d) of one cost, and the boxes that it took; places without their first axis."""
+    """Return the minima (most, d) of one cost, and the number of boxes; `place` has no first axis."""
     cost = without_unused_nodes(cost_of(costs.kinds, costs.data[0], costs.K[0], costs.w[0]))
     _, radius = station_cube(cost.kinds, cost.data, place.x)
     found, least = np.zeros((most, len(place.x))), np.full(most, inf)

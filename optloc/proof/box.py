@@ -1,4 +1,8 @@
-"""A box: all nodes bounded over it, the least length of the residual there, and the boxes that are left."""
+"""Bounds over a box: bounds of all nodes, a lower bound of the residual's length, and the stack of boxes to search.
+
+A node is one scalar function of the position that rows are made of, such as a range or an angle. Over a box each node
+is linear up to a remainder, and an interval encloses this remainder.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +29,20 @@ from optloc.proof.nodes.node import (
 )
 from optloc.proof.nodes.range import bound_ranges
 
-# Unit in the last place of a double at 1.
+# Each half-width grows by the rounding of its centre and corners: a share of the half-width, and a few units in the
+# last place of centre and corners.
 _ULP = 2.0**-52
 # A half-width covers the rounding of its centre and corners: relative to itself, and some units in the last place
 # of these.
 _WIDER, _SHIFT = 1e-12, 1e-15
-# Coordinate descents towards the least-squares point of a box; any point gives a valid bound. Over 8 fixes by range
-# differences one descent took 6 % more boxes of an atlas than three, and ten took 0.6 % fewer.
+# Coordinate descents towards the least-squares point of a box. Any point gives a valid bound. Over 8 fixes by range
+# differences, one descent took 6 % more boxes of an atlas than three. Ten descents took 0.6 % fewer.
 _SWEEPS = 3
-# Share of v that its pull on a node without an end keeps of the right sign, whatever is rounded.
+# A node that has a bound on one side only must pull the direction v the right way. This share of |v| is the margin for
+# rounding.
 _BEYOND = 1e-9
-# Columns of a table of rows over a box (q, ROW_WIDTH): residual in the middle of the remainders, Jacobian, direction v.
+# Columns of a table of rows over a box (q, ROW_WIDTH): the residual with each remainder at the middle of its interval,
+# the Jacobian, and the direction v.
 MIDDLE, J0, J1, J2, DIRECTION, ROW_WIDTH = range(6)
 
 
@@ -43,12 +50,12 @@ MIDDLE, J0, J1, J2, DIRECTION, ROW_WIDTH = range(6)
 def bound_nodes(
     kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, line: Array, nodes: Array
 ) -> None:
-    """Bound all nodes over a box in the near chart.
+    """Bound all nodes over a box in search coordinates around a fix.
 
     Parameters
     ----------
     kinds, data : array (J,), (J, width)
-        The nodes.
+        The nodes: their codes and their numbers.
     centre : array (3,)
         Centre of the box, metres.
     sense, gram : array (3, 3)
@@ -58,7 +65,7 @@ def bound_nodes(
     line : array (6,)
         Working memory.
     nodes : array (J, NODE_WIDTH)
-        Written.
+        Written: value, slope and interval of the remainder of each node.
     """
     others = bound_ranges(kinds, data, centre, sense, gram, half, nodes)
     if others:
@@ -67,9 +74,9 @@ def bound_nodes(
 
 @inlined
 def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
-    """Fill residuals (in the middle of the remainders) and Jacobian of the table of rows (q, ROW_WIDTH).
+    """Write residuals and Jacobian into the table of rows (q, ROW_WIDTH), each remainder at the middle of its interval.
 
-    A remainder that is bounded from one side counts with its bound.
+    A remainder with one finite bound counts with this bound.
     """
     for j in range(K.shape[1]):
         nodes[j, BETWEEN] = middle_of(nodes[j, LOW], nodes[j, HIGH])
@@ -86,7 +93,7 @@ def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
 
 @inlined
 def middle_of(low: float, high: float) -> float:
-    """Return the middle of an interval; of one that ends on one side alone its end, and 0 of one without ends."""
+    """Return the middle of an interval; its finite end if the other end is infinite; 0 if both are infinite."""
     middle = 0.5 * (low + high)
     if abs(middle) < inf:
         return middle
@@ -95,14 +102,14 @@ def middle_of(low: float, high: float) -> float:
 
 @inlined
 def size_within(low: float, high: float) -> float:
-    """Return the sizes of the finite ends of an interval, which limit its accuracy."""
+    """Return the sum of the sizes of the finite ends of an interval, which limits the accuracy of its middle."""
     size = abs(low) + abs(high)
     return size if size < inf else abs(middle_of(low, high))
 
 
 @inlined
 def cost_at(K: Array, w: Array, nodes: Array) -> float:
-    """Return f at the centre of a box whose table of nodes is filled."""
+    """Return the cost f at the centre of a box from its filled table of nodes."""
     total = 0.0
     for i in range(K.shape[0]):
         residual = -w[i]
@@ -114,10 +121,11 @@ def cost_at(K: Array, w: Array, nodes: Array) -> float:
 
 @inlined
 def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Array, rows: Array) -> float:
-    """Return a lower bound of ``|K phi - w|`` over a box, negative where it says nothing.
+    """Return a lower bound of ``|K phi - w|`` over a box; a negative result means that no bound is known.
 
-    For any v, ``v.(K phi - w)`` over the box is at least its value in the middle less what the box and the remainders
-    can change; v is the residual nearest to zero of the linear part (box-constrained least squares).
+    For any direction v, ``v.(K phi - w)`` is at least its value at the middle of the remainders, less its greatest
+    change over the box and the remainders. The function takes as v the shortest residual of the linear part
+    (box-constrained least squares).
 
     Parameters
     ----------
@@ -126,13 +134,13 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
     weight : array (J,)
         Lengths of the columns of K.
     floor : float
-        What else limits the accuracy of residuals: lengths of w and of the coordinates times their weights.
+        Further sizes that limit the accuracy of residuals: the length of w, and the coordinates times their weights.
     half : array (3,)
         Half-widths in search coordinates.
     nodes, rows : array (J, NODE_WIDTH), (q, ROW_WIDTH)
-        Filled tables; the direction v is written.
+        Filled tables of the box; the direction v is written into `rows`.
     """
-    # Whatever v is, the bound holds; how good it is depends on v alone.
+    # The bound is valid for each v. A better v gives a tighter bound.
     _nearest(half, rows)
     _absorb(K, weight, nodes, rows)
     length, reach, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -147,7 +155,8 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
         return -1.0
     reach -= abs(t0) * half[0] + abs(t1) * half[1] + abs(t2) * half[2]
     for j in range(K.shape[1]):
-        # The residual was taken in the middle of the remainders, so each counts with half its width.
+        # The residual was taken with each remainder at its middle, so a remainder changes it by at most half its
+        # width.
         radius = 0.5 * (nodes[j, HIGH] - nodes[j, LOW])
         if radius > 0.0:
             total = 0.0
@@ -162,13 +171,13 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
 
 @inlined
 def exceeds_level(low: float, level: float) -> bool:
-    """Return whether a cost is at least a level where the residual is at least `low` long: no cost is negative."""
+    """Return whether a residual of at least `low` implies a cost of at least `level`; costs are never negative."""
     return level <= 0.0 or (low > 0.0 and low * low >= level)
 
 
 @inlined
 def rounding_error(K: Array, weight: Array, floor: float, nodes: Array) -> float:
-    """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
+    """Return a bound of the rounding error of a residual, as a length; for the arguments see `least_residual`."""
     size = floor
     for j in range(K.shape[1]):
         size += weight[j] * (abs(nodes[j, PHI]) + size_within(nodes[j, LOW], nodes[j, HIGH]))
@@ -178,13 +187,13 @@ def rounding_error(K: Array, weight: Array, floor: float, nodes: Array) -> float
 @inlined
 def relative_rounding(K: Array) -> float:
     """Return the relative rounding error of sums over the nodes and rows of K (q, J)."""
-    # One rounding for each term of the sums, and 32 for those within a node and in the slopes.
+    # One rounding for each term of the sums, and 32 for the terms inside a node and in its slopes.
     return float((32 + K.shape[0] + K.shape[1]) * _ULP)
 
 
 @compiled
 def normal_of(rows: Array) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return J'J (00, 01, 02, 11, 12, 22) and J' middle."""
+    """Return the entries (00, 01, 02, 11, 12, 22) of J'J, and the vector J' middle (3 numbers)."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(rows.shape[0]):
         middle, j0, j1, j2 = rows[i, MIDDLE], rows[i, J0], rows[i, J1], rows[i, J2]
@@ -202,7 +211,7 @@ def normal_of(rows: Array) -> tuple[float, float, float, float, float, float, fl
 
 @compiled
 def clamp(s: float, half: float) -> float:
-    """Return the number nearest to s between -half and half."""
+    """Return the number between -half and half that is nearest to s."""
     if s > half:
         return half
     return max(s, -half)
@@ -210,7 +219,7 @@ def clamp(s: float, half: float) -> float:
 
 @inlined
 def _nearest(half: Array, rows: Array) -> None:
-    """Write the direction v = middle + J s with s nearly the least-squares solution inside the box."""
+    """Write the direction v = middle + J s, where s is nearly the least-squares solution inside the box."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
     d0, d1 = 1.0 / a00 if a00 > 0.0 else 0.0, 1.0 / a11 if a11 > 0.0 else 0.0
     d2 = 1.0 / a22 if a22 > 0.0 else 0.0
@@ -225,7 +234,10 @@ def _nearest(half: Array, rows: Array) -> None:
 
 @compiled
 def _absorb(K: Array, weight: Array, nodes: Array, rows: Array) -> None:
-    """Take off the direction v what nodes that are only enclosed may explain, as around a station of theirs."""
+    """Remove from the direction v the parts that nodes without slope can explain.
+
+    An example is a range over a box around its station.
+    """
     for _ in range(_SWEEPS):
         for j in range(K.shape[1]):
             radius = 0.5 * (nodes[j, HIGH] - nodes[j, LOW])
@@ -245,13 +257,13 @@ def _absorb(K: Array, weight: Array, nodes: Array, rows: Array) -> None:
 
 @compiled
 def _open_side(nodes: Array, j: int) -> float:
-    """Return 1 where a node may be greater by anything, -1 where it may be less, and 0 where it may be both."""
+    """Return 1 if a node has no upper bound, -1 if it has no lower bound, and 0 if it has neither or both."""
     return (1.0 if nodes[j, LOW] > -inf else 0.0) - (1.0 if nodes[j, HIGH] < inf else 0.0)
 
 
 @compiled
 def _move_beyond(K: Array, weight: float, rows: Array, pull: float, side: float) -> float:
-    """Return a step of a node towards the side without an end, after which it takes nothing off along v."""
+    """Return a step of a one-sided node towards its open side; after it the node only adds to the residual along v."""
     length = 0.0
     for i in range(K.shape[0]):
         length += rows[i, DIRECTION] * rows[i, DIRECTION]
@@ -259,18 +271,19 @@ def _move_beyond(K: Array, weight: float, rows: Array, pull: float, side: float)
     return side * max(move, 0.0)
 
 
-# Parts of a box that may be left out: where residuals are too long.
+# Contraction of a box: parts in which the residual is too long are cut off.
 
 
 @inlined
 def contract_box(
     K: Array, weight: Array, rho: float, half: Array, plane: bool, nodes: Array, rows: Array, cut: Array, solve: Array
 ) -> None:
-    """Clip a box to where the residual may be shorter than rho.
+    """Contract a box to the part in which the residual may be shorter than rho.
 
-    With ``Y = Z J'``, Z nearly the inverse of J'J, and ``E = Y J - 1`` every point of the box obeys
-    ``s = Y (residual) - Y (middle) - Y K dq - E s``, dq the remainders from their middle: each coordinate is within
-    ``rho |Y_k| + sum_j |Y_k K_j| (high_j - low_j)/2 + |E_k| half`` of that of -Y middle.
+    Let Z be nearly the inverse of J'J, ``Y = Z J'`` and ``E = Y J - 1``, and dq the remainders minus the middles of
+    their intervals. Each point of the box obeys ``s = Y (residual) - Y (middle) - Y K dq - E s``. This bounds the
+    distance of coordinate k from coordinate k of -Y middle by
+    ``rho |Y_k| + sum_j |Y_k K_j| (high_j - low_j)/2 + |E_k| half``.
 
     Parameters
     ----------
@@ -281,18 +294,18 @@ def contract_box(
     half : array (3,)
         Half-widths.
     plane : bool
-        Whether nothing depends on the third coordinate.
+        Whether no node depends on the third coordinate.
     nodes, rows : arrays
         Filled tables of the box.
     cut : array (6,)
-        Lower and upper ends of the box about its centre; clipped.
+        Lower and upper ends of the box relative to its centre; contracted in place.
     solve : array (3, 3)
         Working memory.
     """
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
-    if plane:  # nothing depends on the third coordinate: any pivot will do
+    if plane:  # no node depends on the third coordinate, so any positive pivot is valid
         a22 = a22 + 1.0
-    if half[1] == 0.0:  # nor on the second
+    if half[1] == 0.0:  # no node depends on the second coordinate either
         a11 = a11 + 1.0
     if not inverse(a00, a01, a02, a11, a12, a22, solve):
         return
@@ -312,7 +325,7 @@ def contract_box(
             r1 += abs(solve[1, 0] * p0 + solve[1, 1] * p1 + solve[1, 2] * p2) * radius
             r2 += abs(solve[2, 0] * p0 + solve[2, 1] * p1 + solve[2, 2] * p2) * radius
     l0, l1, l2, h0, h1, h2 = sqrt(a00), sqrt(a11), sqrt(a22), half[0], half[1], half[2]
-    # Products of Y with vectors of these lengths are off by so many of their digits, before they cancel.
+    # Products of Y with vectors of these lengths have this rounding error: terms are rounded before they cancel.
     slack = relative_rounding(K) * (size + sqrt(longest) + l0 * h0 + l1 * h1 + l2 * h2)
     for k in range(2 if plane else 3):
         y0, y1, y2 = solve[k, 0], solve[k, 1], solve[k, 2]
@@ -328,23 +341,23 @@ def contract_box(
 
 @inlined
 def reset_cut(half: Array, cut: Array) -> None:
-    """Write the ends of a whole box."""
+    """Write the ends of the whole box into `cut`."""
     for k in range(3):
         cut[k], cut[3 + k] = -half[k], half[k]
 
 
 @compiled
 def contract_coordinate(cut: Array, k: int, centre: float, reach: float) -> None:
-    """Clip coordinate k of a box to ``|s - centre| <= reach``, with some slack for rounding."""
+    """Contract coordinate k of a box to ``|s - centre| <= reach``, with slack for rounding."""
     reach += 1e-9 * (abs(centre) + reach)
-    if not reach < inf:  # NaN as well: where bounds are infinite nothing is known
+    if not reach < inf:  # NaN as well: with infinite bounds the coordinate is not restricted
         return
     cut[k], cut[3 + k] = max(cut[k], centre - reach), min(cut[3 + k], centre + reach)
 
 
 @inlined
 def share_left(cut: Array, half: Array) -> float:
-    """Return the share of the volume of a box that a cut leaves."""
+    """Return the share of a box's volume that remains between the ends of a cut."""
     share = 1.0
     for k in range(3):
         if cut[k] > cut[3 + k]:
@@ -356,7 +369,7 @@ def share_left(cut: Array, half: Array) -> float:
 
 @inlined
 def cut_out(cut: Array, at: Array, half: Array) -> float:
-    """Replace a box by its part between the ends of a cut; return the share of its volume that this is."""
+    """Replace a box by its part between the ends of a cut; return the share of the volume that remains."""
     share = 1.0
     for k in range(3):
         low, high, old = cut[k], cut[3 + k], half[k]
@@ -372,26 +385,27 @@ def cut_out(cut: Array, at: Array, half: Array) -> float:
 
 @compiled
 def is_empty(cut: Array) -> bool:
-    """Return whether nothing is left of a box."""
+    """Return whether the cut leaves no part of a box."""
     return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])
 
 
-# Share of the steepest side's change that counts for all sides alike: nodes that are only enclosed have no slope. Over
-# 8 fixes by range differences no share took 10 % more boxes.
+# Each side also gets this share of the steepest side's change, because nodes that are only enclosed have no slope.
+# Over 8 fixes by range differences a share of 0 took 10 % more boxes.
 _ALIKE = 0.1
 
 
 @compiled
 def steepest_side(half: Array, rows: Array, dimension: int) -> int:
-    """Return the side along which the residual changes most; a part of that change counts for all sides alike.
+    """Return the side along which the residual changes most.
 
-    Nodes that are only enclosed have no slope, and bend where they do.
+    Each side also counts with a share of the greatest change. Nodes that are only enclosed have no slope, although
+    they depend on the position.
     """
     steepest, best, k = 0.0, -1.0, 0
     for m in range(dimension):
         steepest = max(steepest, _steepness(rows, m))
     for m in range(dimension):
-        change = (_steepness(rows, m) + _ALIKE * steepest + 1e-300) * half[m]  # all flat: the widest side
+        change = (_steepness(rows, m) + _ALIKE * steepest + 1e-300) * half[m]  # if all slopes are zero, the widest side
         if change > best:
             best, k = change, m
     return k
@@ -399,7 +413,7 @@ def steepest_side(half: Array, rows: Array, dimension: int) -> int:
 
 @inlined
 def widest(half: Array) -> int:
-    """Return the widest side of a box."""
+    """Return the number of the widest side of a box."""
     if half[0] >= half[1] and half[0] >= half[2]:
         return 0
     return 1 if half[1] >= half[2] else 2
@@ -407,24 +421,26 @@ def widest(half: Array) -> int:
 
 @compiled
 def _steepness(rows: Array, m: int) -> float:
+    """Return the length of the derivative of the residual along side m."""
     total = 0.0
     for i in range(rows.shape[0]):
         total += rows[i, J0 + m] * rows[i, J0 + m]
     return sqrt(total)
 
 
-# The boxes still to be looked at: a stack, so that the deepest comes first and few are kept.
+# The boxes still to be searched are a stack: the deepest box comes first, so that the stack stays short.
 
-# Columns of the stack (capacity, DEPTH): centre, half-widths, the bound of the box that it came from, and the piece of
-# an atlas that it lies in (0 in the near chart).
+# Columns of the stack (capacity, DEPTH): centre, half-widths, lower bound of the residual over the parent box, and the
+# piece of the atlas. The piece is 0 in search coordinates around a fix.
 CENTRE, HALF, LEAST, PIECE, DEPTH = 0, 3, 6, 7, 8
 
 
 @compiled
 def push_around(stack: Array, size: int, low: Array, high: Array, hole: Array, piece: int) -> int:
-    """Push the box between two corners, less the box |s_k| <= hole_k around the origin; return the size of the stack.
+    """Push the box between two corners without the box |s_k| <= hole_k around the origin; return the size of the stack.
 
-    The hole is cut out along its faces: at most two slabs a dimension. Slabs overlap the hole by a rounding.
+    The hole is cut out along its faces, which leaves at most two slabs for each dimension. The slabs overlap the hole
+    by a rounding error.
     """
     low, high = low.copy(), high.copy()
     for k in range(3):
@@ -445,7 +461,7 @@ def push_around(stack: Array, size: int, low: Array, high: Array, hole: Array, p
 
 @compiled
 def pop(stack: Array, row: int, at: Array, half: Array) -> None:
-    """Write centre and half-widths of a box on the stack into `at` and `half`."""
+    """Copy centre and half-widths of the box at `row` of the stack into `at` and `half`."""
     for k in range(3):
         at[k], half[k] = stack[row, CENTRE + k], stack[row, HALF + k]
 
@@ -461,9 +477,9 @@ def push(stack: Array, size: int, at: Array, half: Array, low: float, piece: int
 
 @compiled
 def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: float, piece: int, exact: bool) -> int:
-    """Push the halves of a box, cut across side k; return the size of the stack.
+    """Push the two halves of a box that is cut across side k; return the size of the stack.
 
-    `exact` says that centres and half-widths are sums of powers of two, which halving does not round.
+    `exact`: centres and half-widths are sums of powers of two, so that halving does not round them.
     """
     for side in range(2):
         for m in range(3):
@@ -478,38 +494,41 @@ def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: fl
 
 @compiled
 def _wide(half: float, size: float) -> float:
-    """Return a half-width that covers the rounding of a centre and of a corner of this size."""
+    """Return a half-width, enlarged by the rounding of a centre and a corner of this size."""
     return half * (1.0 + _WIDER) + _SHIFT * size if half > 0.0 else 0.0
 
 
 @compiled
 def least_left(stack: Array, size: int) -> float:
-    """Return a lower bound of the cost in the boxes left."""
+    """Return a lower bound of the cost over all boxes that remain on the stack."""
     least = inf
     for i in range(size):
         low = stack[i, LEAST]
-        least = min(least, low * low if low > 0.0 else 0.0)  # NaN, too, says nothing
+        least = min(least, low * low if low > 0.0 else 0.0)  # NaN, too, gives no bound
     return least
 
 
-# Space as boxes: whether it may be taken to infinity, and the cube in its middle.
+# All of space as boxes: whether boxes may reach infinity, and the cube in the middle.
 
-# How little the coefficients of ranges in a row may sum to, relative to their sizes: zero but for whitening's rounding.
+# Sum of the coefficients of ranges in a row, relative to the sum of their sizes, below which the row counts as
+# balanced. Only the rounding of whitening keeps this sum from zero.
 _BALANCED = 1e-12
-# Half-width of the cube, reaches of the stations: with a margin, so that no station touches a face, where lines to it
-# would vanish.
+# Half-width of the cube, in half-sizes of the station array. The margin keeps stations off the faces of the cube,
+# where the scaled line to a station would vanish.
 _REACHES = 1.25
-# Reaches of the stations from their middle within which a fix moves the centre aside, and by how many. Convex boxes
-# around a fix, and boxes of low cost, end before they reach a centre that is a fifth of the array away. The direction
-# is oblique: on the line from the centre through the fix to a station, the difference of both ranges has no slope.
+# Both in half-sizes of the station array: if the fix is closer than `_NEAR_CENTRE` to the middle of the stations, the
+# centre of the cube moves by `_ASIDE`. Convex boxes around a fix, and boxes of low cost, end before they reach a
+# centre that is a fifth of the array away. The direction of the move is oblique: on the line from the centre through
+# the fix to a station, the difference of both ranges has no slope.
 _NEAR_CENTRE, _ASIDE = 0.1, (0.21, 0.13, 0.17)
 
 
 @compiled
 def reaches_infinity(kinds: Array, K: Array) -> bool:
-    """Return whether a cost stays finite at infinity, so that the chart holds.
+    """Return whether a cost stays finite at infinity, so that an atlas of all positions applies.
 
-    Linear forms, heights, and ranges that no other balances grow without end, and so do their logarithms.
+    Linear forms, heights, and ranges without a range of opposite sign grow without limit, and so do logarithms of
+    ranges.
 
     Parameters
     ----------
@@ -519,7 +538,7 @@ def reaches_infinity(kinds: Array, K: Array) -> bool:
         Whitened rows.
     """
     for j in range(kinds.shape[0]):
-        # Here and below ranges, the common case, spare the call: what they do at infinity is known.
+        # Here and below, ranges skip the call `infinity_of`: they are the common case, and their limit is known.
         if kinds[j] != RANGE and infinity_of(kinds[j]) == GROWS:
             return False
     for i in range(K.shape[0]):
@@ -538,15 +557,16 @@ def reaches_infinity(kinds: Array, K: Array) -> bool:
 
 @compiled
 def station_cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
-    """Return centre (3,) and half-width of a cube that holds all stations well.
+    """Return centre (3,) and half-width, metres, of a cube that contains all stations with a margin.
 
     Parameters
     ----------
     kinds, data : array (J,), (J, width)
         Nodes that have stations.
     x : array (D,)
-        The fix. If it is near the middle of the stations, the centre moves aside: the distance to the centre, which
-        is taken off ranges, has no derivative there. If all stations are in one place, its distance is the only length.
+        The fix, metres. If the fix is near the middle of the stations, the centre is moved: each range is counted from
+        the distance to the centre, which has no derivative at the centre. If all stations coincide, the distance of
+        the fix from them sets the size.
     """
     low, high = np.full(3, inf), np.full(3, -inf)
     for j in range(kinds.shape[0]):

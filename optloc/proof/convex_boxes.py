@@ -1,4 +1,4 @@
-"""Boxes around known minima on which the cost is convex: no second minimum fits in."""
+"""Boxes around known minima on which the cost is convex, so that they contain no second minimum."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from optloc.proof.search_space import HIDDEN_REACH, Box, Cost, KnownMinima, Loca
 
 # Around a fix, in its search coordinates.
 
-# What is left of a box that is not convex: a third of its volume. And how often it is made smaller: a hull of a billion
-# standard deviations comes down to half of one.
+# Factor of the half-widths of a box that is not convex, which leaves a third of its volume; and the greatest number of
+# such steps, which reduce a hull of a billion standard deviations to half of one.
 _LESS, _SHRINKS = 0.7, 60
-# Other minima must be known to a hundredth of a standard deviation: margin of convexity over slope.
+# Other minima must be known to a hundredth of a standard deviation: the ratio of convexity margin to slope.
 _POLISHED = 100.0
 
 
 @inlined
 def set_convex(cost: Cost, chart: LocalAxes, box: Box, hull: Array, margin: float) -> bool:
-    """Make a box around its centre as large as the cost is found convex on it; return False where it is on none.
+    """Enlarge a box around its centre as far as the cost is proven convex on it; return False without a convex box.
 
-    Convex over the whole hull in most cases; else the hull is shrunk as a whole.
+    In most cases the cost is convex over the whole hull. Otherwise the hull is scaled down.
 
     Parameters
     ----------
     cost, chart : Cost, LocalAxes
         The cost and its search coordinates.
     box : Box
-        Its centre `at` is a minimum; its half-widths are written.
+        The centre `at` is a minimum; the half-widths are written.
     hull : array (3,)
-        Half-widths beyond which there is nothing to gain.
+        Greatest useful half-widths.
     margin : float
-        By how much the Hessian of f/2 must exceed zero.
+        The Hessian of f/2 must exceed this.
     """
     size = 1.0
     for _ in range(_SHRINKS):
@@ -54,7 +54,7 @@ def set_convex(cost: Cost, chart: LocalAxes, box: Box, hull: Array, margin: floa
 
 @compiled
 def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
-    """Return whether a box lies inside the convex box (half-widths `sides`) of a known minimum."""
+    """Return whether a box is inside the convex box (half-widths `sides`) of a known minimum."""
     for p in range(minima.shape[0]):
         inside = True
         for k in range(3):
@@ -76,11 +76,12 @@ def known_minima(
     value: float,
     own: bool,
 ) -> tuple[Array, Array, int, int]:
-    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, two numbers.
+    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, two counts.
 
-    These are how many there are, 0 where the cost is not convex around the fix; and how many of them are the fix, which
-    comes first, or hidden. Points that are no minima are left out, and those whose box holds a point below `value`,
-    unless they are hidden; without the fix (`own`), those of another piece of a surface.
+    The first count is the number of minima, 0 if the cost is not convex around the fix. The second count is the number
+    of minima that are the fix, which comes first, or hidden. Points that are no minima are left out. A minimum whose
+    box contains a point below `value` is left out unless it is hidden. Without the fix (`own` is False), minima of
+    other pieces of a surface are left out too.
     """
     others = known.points
     count, free, size = 0, 0, 1 + others.shape[0]
@@ -99,8 +100,8 @@ def known_minima(
             if not is_convex(cost, chart, box, 0.0) or is_elsewhere(chart, box, others[p - 1]):
                 continue
             sums = box.sums
-            # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point, and the cost there
-            # is less by slope^2 / margin at most.
+            # If the Hessian exceeds a margin, the minimum is within slope / margin of any point. The cost at the
+            # minimum is lower by at most slope^2 / margin.
             margin = _POLISHED * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
             least = cost_at(cost.K, cost.w, box.nodes) - margin / (_POLISHED * _POLISHED)
             if not hidden and not least >= value:
@@ -110,7 +111,7 @@ def known_minima(
         if hidden:
             limit_half_widths(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
         if set_convex(cost, chart, box, hull, margin):
-            # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
+            # The box is reduced by the rounding of its centre. For the fix, the centre is the origin itself.
             shift[:] = 0.0
             if p > 0:
                 widen_by_rounding(chart, box.centre, shift)
@@ -123,14 +124,14 @@ def known_minima(
     return minima, sides, count, free
 
 
-# How far, metres, the point of a surface at the search coordinates of another may be from it: below an Earth's radius,
-# where its other side is, and above all rounding.
+# Greatest distance, metres, between a point and the surface point at its search coordinates. The limit is below an
+# Earth's radius, the distance of the other side, and above all rounding.
 _ASIDE = 1e5
 
 
 @inlined
 def is_elsewhere(chart: LocalAxes, box: Box, place_of: Array) -> bool:
-    """Return whether a point (D,) of a surface is not that at its own search coordinates, but behind it."""
+    """Return whether a point (D,) of a surface is on the other side of the Earth, behind its search coordinates."""
     apart = 0.0
     for m in range(place_of.shape[0]):
         apart = max(apart, abs(place_of[m] - box.centre[m]))
@@ -139,7 +140,7 @@ def is_elsewhere(chart: LocalAxes, box: Box, place_of: Array) -> bool:
 
 @compiled
 def limit_half_widths(sense: Array, hull: Array) -> None:
-    """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
+    """Reduce half-widths (3,) so that no coordinate is farther than `HIDDEN_REACH` metres from the centre."""
     share = 1.0
     for k in range(3):
         reach = 0.0
@@ -151,20 +152,20 @@ def limit_half_widths(sense: Array, hull: Array) -> None:
         hull[k] *= share
 
 
-# The cost over the pieces of an atlas: all nodes over a box, out to infinity, and the surroundings of known minima.
+# The cost over the pieces of an atlas: all nodes over a box, out to infinity, and the boxes around known minima.
 #
-# Angles and ratios are functions of the scaled line ``p - v a`` alone; ranges count less the distance to the centre of
-# the cube, which rows whose coefficients of ranges sum to zero do not feel.
+# Angles and ratios are functions of the scaled line ``p - v a`` alone. From each range the distance to the centre of
+# the cube is subtracted. This does not change rows whose coefficients of ranges sum to zero.
 
 
 @compiled
 def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes: measurements and the cube."""
+    """Return the sizes of measurements and of the cube in residuals, without the sizes of the nodes."""
     total = 0.0
     for i in range(cost.w.shape[0]):
         total += cost.w[i] * cost.w[i]
     total = sqrt(total)
-    # Lines are p - v a with |p| at most sqrt(3) and |a| below 1: their lengths, and sums of two, are below 4 reaches.
+    # Lines are p - v a with |p| <= sqrt(3) and |a| < 1. So their lengths, and sums of two lengths, are below 4 radii.
     size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
     for j in range(cost.kinds.shape[0]):
         own = size if infinity_of(cost.kinds[j]) == DIFFERENCE else 4.0 * size_of(cost.kinds[j], cost.data[j], 1.0)
@@ -172,45 +173,46 @@ def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
     return total
 
 
-# The surroundings of a known minimum in an atlas: its principal axes, and a box in which it is the only minimum.
+# Boxes around a known minimum in an atlas: principal axes, and a box in which it is the only minimum.
 
-# No convex box is looked for beyond this many standard deviations: a fix so well determined needs none wider. Nor
-# nearer to infinity than a tenth of the way, where its coordinates end.
+# Greatest half-width of convex boxes, standard deviations: a fix with such small deviations needs no wider box. And
+# the greatest share of the way to infinity, where the coordinates of the minimum end.
 _WIDEST, _SHARE = 1e4, 0.9
-# The box searched along the axes of a minimum: convex boxes, and standard deviations at least. Beyond it the cost is
-# high enough for boxes along the axes of space.
+# Half-widths of the box searched along the axes of a minimum: in units of the convex box, and at least this many
+# standard deviations. Outside, the cost is high enough for boxes along the axes of space.
 _WIDER, _WIDE = 3.0, 3.0
-# The same for a proof: a valley is narrow, oblique to the faces, and longer than its curvature at the minimum says.
-# What is too wide is clipped by squared rows at once. Over 2 000 fixes of each of ten layouts 30 took as many boxes as
-# 100, and proved up to 5 % more of the fixes on flat ground unique; over 100 outside 12 took a sixth more boxes.
+# The same for a proof, standard deviations. A valley is narrow, oblique to the faces, and longer than its curvature at
+# the minimum suggests. Squared rows quickly contract a box that is too wide. Over 2 000 fixes of each of ten layouts,
+# 30 took as many boxes as 100, and proved up to 5 % more of the fixes on flat ground unique. Over 100 fixes outside
+# the array, 12 took a sixth more boxes.
 _VALLEY = 30.0
-# Half-widths of the first convex box that is tried, standard deviations, and by what it and its sides are tried larger:
-# a finer search takes as long as the boxes that it spares, or longer.
+# Half-widths of the first convex box to test, standard deviations, and the factor by which the box and its sides grow.
+# A finer search takes as long as the boxes that it saves, or longer.
 _FIRST, _GROWTH = 3.0, 2.0
 
 
 @compiled
 def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: float, eps: float, limit: float) -> bool:
-    """Write a minimum and its surroundings into an atlas; return False where it is none, or costs too little.
+    """Write a minimum and the boxes around it into an atlas; return False if x is no minimum or costs too little.
 
     Parameters
     ----------
     cost : Cost
         The cost.
     box : Box
-        Tables to work with.
+        Working memory.
     atlas : Atlas
         Minimum i is written.
     i : int
-        Which.
+        Number of the minimum.
     x : array (D,)
-        Its position, polished.
+        Polished position of the minimum, metres.
     value : float
-        What it must cost at least: its surroundings are not searched.
+        Least allowed cost: the convex box is not searched.
     eps : float
-        How far the cost may fall below that of x in its convex box.
+        Greatest fall of the cost below the cost of x in the convex box.
     limit : float
-        How far, in metres, these may reach along any coordinate.
+        Greatest reach of the boxes along any coordinate, metres.
     """
     minima, d = atlas.minima, atlas.dimension
     minima.home[i] = piece_of(atlas, x, minima.start[i])
@@ -219,7 +221,7 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: flo
     _tables(cost, box, atlas, i, np.zeros(3))
     if not cost_at(cost.K, cost.w, box.nodes) >= value:
         return False
-    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
+    # On a box whose Hessian exceeds a margin, the cost falls below the cost of its centre by at most slope^2 / margin.
     margin, hull = 0.0, np.zeros(3)
     for k in range(3):
         slope = abs(box.sums[G0 + k]) + box.sums[NOISE0 + k]
@@ -235,9 +237,9 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: flo
 
 @compiled
 def widen_core(atlas: Atlas, i: int, limit: float) -> None:
-    """Let the box searched along the axes of minimum i hold the valley in which it lies, within a limit in metres.
+    """Widen the box searched along the axes of minimum i to contain its valley, within a limit in metres.
 
-    Where infinity is no farther than that, and the axes allow it, the box reaches there.
+    If infinity is no farther than the box, and the axes allow it, the box reaches infinity.
     """
     d, core, hull = atlas.dimension, atlas.minima.core[i], np.full(3, _VALLEY)
     end = infinity_coordinate(atlas, 2 * d + 1 + i)
@@ -254,9 +256,9 @@ def widen_core(atlas: Atlas, i: int, limit: float) -> None:
 
 @compiled
 def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Write half-widths (3,) around minimum i beyond which no convex box is looked for, within a limit in metres."""
+    """Write the greatest half-widths (3,) of convex boxes around minimum i, within a limit in metres."""
     minima, d = atlas.minima, atlas.dimension
-    # v falls along the last of the axes alone, or along all of them at once.
+    # v falls along the last axis only, or along all axes.
     ways = 1 if infinity_coordinate(atlas, 2 * d + 1 + i) > -inf else d
     for k in range(d):
         steep = abs(minima.axes[i, d - 1, k]) * ways if minima.home[i] < 2 * d else 0.0
@@ -267,9 +269,9 @@ def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
 
 @compiled
 def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
-    """Make half-widths (3,) around minimum i so small that no coordinate is farther than so many metres."""
+    """Reduce half-widths (3,) around minimum i so that no coordinate is farther than `limit` metres."""
     minima, d = atlas.minima, atlas.dimension
-    beside, out, scale = 0.0, 0.0, 1.0  # how far p and v change, and v
+    beside, out, scale = 0.0, 0.0, 1.0  # greatest changes of p and v, and v
     for k in range(d):
         reach = 0.0
         for m in range(d):
@@ -284,17 +286,17 @@ def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
         hull[k] *= min(share, 1.0)
 
 
-# Standard deviations: a minimum nearer to infinity has axes of which v changes along the last alone, so that a box of
-# them can reach there. Else principal axes, of which one alone is long where the rows say little. Over 100 fixes of
-# five stations outside 12 took a tenth fewer boxes than 5, and over 120 on flat ground a tenth more.
+# Standard deviations: a minimum nearer to infinity than this gets axes of which only the last changes v, so that a box
+# can reach infinity. Other minima get principal axes, of which only one is long if the rows determine little. Over 100
+# fixes outside five stations, 12 took a tenth fewer boxes than 5. Over 120 fixes on flat ground, 12 took a tenth more.
 _REMOTE = 5.0
-# Share of its diagonal that a pivot must exceed: below it is rounding.
+# Least pivot as a share of the diagonal: smaller pivots are rounding.
 _PIVOT = 1e-14
 
 
 @compiled
 def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
-    """Write axes of minimum i in the coordinates of its home, a standard deviation each; False where there are none."""
+    """Write axes of minimum i in its home coordinates, in standard deviations; return False if they do not exist."""
     minima, d = atlas.minima, atlas.dimension
     axes, back = minima.axes[i], minima.back[i]
     axes[:], back[:] = 0.0, 0.0
@@ -326,9 +328,9 @@ def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
 
 @compiled
 def _set_triangular(information: Array, d: int, axes: Array, back: Array) -> bool:
-    """Write the upper triangular R with ``R'R`` the information (d, d) into back, and its inverse into axes.
+    """Write the upper triangular R with ``R'R`` the information (d, d) into `back`, and the inverse into `axes`.
 
-    Returned is False where the information is singular.
+    Return False if the information is singular.
     """
     axes[:], back[:] = 0.0, 0.0
     for k in range(d):
@@ -365,21 +367,22 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
 
 @compiled
 def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
+    """Return whether the Hessian of f/2 exceeds `margin` over a box with half-widths (3,) around minimum i."""
     _tables(cost, box, atlas, i, half)
-    # Ranges are differences here, whose Hessians have no sign: the test must take them for any node.
+    # Here ranges are differences, whose Hessians have no fixed sign, so the test must treat them as any node.
     return is_convex_over_box(np.full_like(cost.kinds, ANY), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
 
 
 @compiled
 def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float) -> bool:
-    """Write half-widths of a box around minimum i on which the cost is convex; return False where there is none.
+    """Write half-widths of a box around minimum i on which the cost is convex; return False if none is found.
 
-    A cube that shrinks or doubles, then its sides one by one, none beyond the hull (3,).
+    A cube shrinks or doubles, then each side grows separately, all within the hull (3,).
     """
     sides, size = atlas.minima.sides[i], _FIRST
     trial = np.minimum(hull, size)
     while not _convex(cost, box, atlas, i, trial, margin):
-        # Where it is not even at the centre, or on a millionth of a standard deviation, no box holds the minimum.
+        # If the cost is not convex at the centre, or on a millionth of a standard deviation, no box is found.
         if (size == _FIRST and not _convex(cost, box, atlas, i, np.zeros(3), margin)) or size < 1e-6:
             return False
         size *= 0.5

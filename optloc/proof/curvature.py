@@ -1,4 +1,4 @@
-"""Second derivatives of the cost over a box: where it is convex, and where its gradient cannot vanish."""
+"""Second derivatives of the cost over a box: where the cost is convex, and where its gradient cannot vanish."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ from optloc.proof.nodes.range import curve_ranges
 DETERMINED = 1e-13
 """Share of the best information below which rows do not determine a coordinate.
 
-Its square root, a ratio of standard deviations of three million, is beyond what doubles can tell.
+The square root is a ratio of standard deviations of three million, the limit of double precision.
 """
 FAINT = 1e-6
-"""Share of the best information below which second derivatives may say more: stations that are nearly coplanar."""
+"""Share of the best information below which second derivatives may add some: stations are nearly coplanar."""
 
-# How often in turn each component of the gradient is looked at: a second time took 3 % of the boxes, a third none.
+# Passes over the components of the gradient: a second pass saved 3 % of the boxes, a third pass none.
 _SWEEPS = 2
-# Some units in the last place: what a sum of a few products is off by, relative to their sizes.
+# A few units in the last place: the rounding of a sum of a few products, relative to their sizes.
 _ROUNDING = 1e-15
-# A vector of sums (SUMS,): the Hessian of f/2 at the centre, entries H00 to H22 as of a node, its gradient; lengths of
-# the columns of the Jacobian, bounds of the rounding of these columns and of the gradient; and bounds of the change of
-# each entry of the Hessian.
+# A vector of sums (SUMS,): the Hessian of f/2 at the centre (entries H00 to H22 as in a node), and its gradient;
+# lengths of the columns of the Jacobian, and bounds of the rounding of these columns and of the gradient; and bounds
+# of the change of each entry of the Hessian.
 G0, G1, G2, LENGTH0, LENGTH1, LENGTH2, BLUR0, BLUR1, BLUR2, NOISE0, NOISE1, NOISE2 = range(6, 18)
 C00, C01, C02, C11, C12, C22, SUMS = range(18, 25)
 
@@ -71,29 +71,29 @@ def curve_nodes(
     nodes: Array,
     curves: Array,
 ) -> None:
-    """Fill the table of second derivatives (J, CURVE_WIDTH) over a box.
+    """Write the table of second derivatives (J, CURVE_WIDTH) over a box.
 
-    Arguments are those of `bound_nodes`, which ran before, and working memory `second` (3, 3).
+    `bound_nodes` must have run for the same box, and its arguments are the same. `second` (3, 3) is working memory.
     """
     curve_ranges(kinds, gram, half, nodes, curves)
     for j in range(kinds.shape[0]):
-        if kinds[j] != RANGE:  # ranges alone are the common case, and every array that is handed on costs
+        if kinds[j] != RANGE:  # only if there are other kinds than ranges: each array that a call passes on takes time
             curve_others(kinds, data, centre, sense, half, line, second, nodes, curves)
             break
 
 
 @compiled
 def sum_up(K: Array, w: Array, weight: Array, noise: float, nodes: Array, curves: Array, sums: Array) -> None:
-    """Fill forces and pulls of the table, and Hessian and gradient of f/2 at the centre of the box.
+    """Write forces and pulls into the table, and Hessian and gradient of f/2 at the centre of the box into the sums.
 
     Parameters
     ----------
     K, w, weight : array (q, J), (q,), (J,)
         Whitened rows, and the lengths of the columns of K.
     noise : float
-        The rounding of a residual, see `rounding`.
+        Bound of the rounding of a residual, see `rounding`.
     nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
-        Tables of the box.
+        Tables of the box; forces and pulls are written into `curves`.
     sums : array (SUMS,)
         Written.
     """
@@ -138,9 +138,9 @@ def sum_up(K: Array, w: Array, weight: Array, noise: float, nodes: Array, curves
 
 @inlined
 def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> tuple[float, float]:
-    """Return how far component j of K'(K phi - w) can fall and rise over the box; A = K'K (J, J).
+    """Return the greatest fall and rise of component j of K'(K phi - w) over the box; A = K'K (J, J).
 
-    What rounding may have made of it at the centre counts as change.
+    Rounding of the component at the centre counts as change.
     """
     spread = abs(curves[j, PULL0]) * half[0] + abs(curves[j, PULL1]) * half[1] + abs(curves[j, PULL2]) * half[2]
     fall, rise = -spread - curves[j, BLUR], spread + curves[j, BLUR]
@@ -155,11 +155,12 @@ def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> 
 def is_convex_over_box(
     kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, margin: float
 ) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` times the identity all over the box.
+    """Return whether the Hessian of f/2 exceeds `margin` times the identity over the whole box.
 
-    H = Phi'A Phi + sum_j g_j N_j. The first part changes by at least ``-(B'E + E'B)`` with B = A Phi and E the changes
-    of the gradients (a term ``dPhi'A dPhi`` is positive). A node whose Hessian is positive semidefinite counts with its
-    least force. What is bounded by entries only is taken off the diagonal, row by row (Gershgorin).
+    The Hessian is H = Phi'A Phi + sum_j g_j N_j. With B = A Phi and E the changes of the gradients, the first part
+    changes by at least ``-(B'E + E'B)``: the term ``dPhi'A dPhi`` is positive. A node whose Hessian is positive
+    semidefinite counts with its least force. Changes that are bounded by entries only are subtracted from the
+    diagonal, row by row (Gershgorin).
 
     Parameters
     ----------
@@ -168,29 +169,30 @@ def is_convex_over_box(
     A : array (J, J)
         ``K'K``.
     half, nodes, curves, sums : arrays
-        Of the box, filled by `bound_nodes`, `curve_nodes` and `sum_up`.
+        Tables of the box, filled by `bound_nodes`, `curve_nodes` and `sum_up`.
     margin : float
         In units of f/2 per squared search coordinate.
     """
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
     away = margin
-    # The rounding of J'J, taken off as changes are.
+    # The rounding of J'J is subtracted like changes.
     length, blur = sums[LENGTH0] + sums[LENGTH1] + sums[LENGTH2], sums[BLUR0] + sums[BLUR1] + sums[BLUR2]
     d0, d1 = sums[LENGTH0] * blur + sums[BLUR0] * length, sums[LENGTH1] * blur + sums[BLUR1] * length
     d2 = sums[LENGTH2] * blur + sums[BLUR2] * length
     for j in range(kinds.shape[0]):
         b0, b1, b2 = abs(curves[j, PULL0]), abs(curves[j, PULL1]), abs(curves[j, PULL2])
         e0, e1, e2 = curves[j, TURN0], curves[j, TURN1], curves[j, TURN2]
-        # Rows of |B|'E + E'|B|: Gershgorin takes them off the diagonal.
+        # Row sums of |B|'E + E'|B|, which Gershgorin's theorem subtracts from the diagonal.
         d0 += 2.0 * b0 * e0 + b0 * e1 + b1 * e0 + b0 * e2 + b2 * e0
         d1 += 2.0 * b1 * e1 + b0 * e1 + b1 * e0 + b1 * e2 + b2 * e1
         d2 += 2.0 * b2 * e2 + b0 * e2 + b2 * e0 + b1 * e2 + b2 * e1
-        shape = CONVEX if kinds[j] == RANGE else shape_of(kinds[j])  # the common case spares the call
+        shape = CONVEX if kinds[j] == RANGE else shape_of(kinds[j])  # ranges, the common case, skip the call
         if shape == FLAT:
             continue
         fall, rise = force_change(A, half, nodes, curves, j)
         if shape == CONVEX:
-            # A force times a positive semidefinite Hessian is least where the force is: no absolute values are lost.
+            # A force times a positive semidefinite Hessian is least for the least force, so no absolute values are
+            # needed.
             h0 += fall * curves[j, H00]
             h1 += fall * curves[j, H01]
             h2 += fall * curves[j, H02]
@@ -212,12 +214,12 @@ def is_convex_over_box(
 
 @compiled
 def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -> float:
-    """Write bounds of the change of each entry of the Hessian into sums[C00:]; return one of the rest's norm."""
+    """Write bounds of the change of the Hessian's entries into sums[C00:]; return a bound of the norm of the rest."""
     l0, l1, l2, u0, u1, u2 = sums[LENGTH0], sums[LENGTH1], sums[LENGTH2], sums[BLUR0], sums[BLUR1], sums[BLUR2]
-    # The rounding of J'J counts as change: twice, because only half of a change counts for the mean over a line.
+    # The rounding of J'J counts as change. It is doubled, because the mean over a line takes half of each change.
     sums[C00], sums[C01], sums[C02] = 4.0 * l0 * u0, 2.0 * (l0 * u1 + l1 * u0), 2.0 * (l0 * u2 + l2 * u0)
     sums[C11], sums[C12], sums[C22] = 4.0 * l1 * u1, 2.0 * (l1 * u2 + l2 * u1), 4.0 * l2 * u2
-    ball = 0.0  # what is known of a change by its norm alone
+    ball = 0.0  # the part of the change that is bounded by its norm only
     for j in range(A.shape[0]):
         fall, rise = force_change(A, half, nodes, curves, j)
         most = max(-fall, rise) + curves[j, BLUR]
@@ -243,18 +245,19 @@ def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -
 def contract_to_minima(
     A: Array, half: Array, nodes: Array, curves: Array, sums: Array, cut: Array, solve: Array
 ) -> bool:
-    """Clip a box to where the gradient of f may vanish; return whether it may hold a minimum.
+    """Contract a box to the part in which the gradient of f may vanish; return whether the box may contain a minimum.
 
-    Interval Newton: the gradient at c + s is ``g + H s``, H the mean of the Hessian between centre and s. Bounds of its
-    change over t times the box are at most t times those over the box (`optloc.proof.nodes.node`), so the mean changes
-    by half of them. With Y the inverse of the Hessian at the centre a zero obeys ``s = -Y g - (Y H - 1) s``.
+    This is an interval Newton method. The gradient at c + s is ``g + H s``, with H the mean of the Hessian between
+    centre and s. Over t times the box, bounds of the change are at most t times the bounds over the box
+    (`optloc.proof.nodes.node`). So the mean changes by half of them. With Y the inverse of the Hessian at the centre,
+    a zero of the gradient obeys ``s = -Y g - (Y H - 1) s``.
 
     Parameters
     ----------
     A, half, nodes, curves, sums : arrays
-        As of `convex`.
+        As in `convex`.
     cut : array (6,)
-        Lower and upper ends of the box about its centre; clipped.
+        Lower and upper ends of the box relative to its centre; contracted in place.
     solve : array (3, 3)
         Working memory.
     """
@@ -263,10 +266,10 @@ def contract_to_minima(
 
 @inlined
 def contract_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Array) -> None:
-    """Clip a box to where the gradient of f may vanish; `ball` and sums[C00:] bound the change of the Hessian."""
+    """Contract a box to the part in which the gradient may vanish; `ball` and sums[C00:] bound the Hessian's change."""
     if not ball < inf:
         return
-    # The share of the box that the mean reaches: half of the bounds of change, which grow with it at least linearly.
+    # The mean of the Hessian changes by half of the bounds of change, which grow with the box at least linearly.
     plane = half[2] == 0.0 and sums[H22] == 0.0
     a, b, c, d, e, f = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], 1.0 if plane else sums[H22]
     d = 1.0 if half[1] == 0.0 and d == 0.0 else d
@@ -283,12 +286,12 @@ def contract_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Ar
     for k in range(2 if plane else 3):
         y0, y1, y2 = solve[k, 0], solve[k, 1], solve[k, 2]
         step = y0 * sums[G0] + y1 * sums[G1] + y2 * sums[G2]
-        # What rounding leaves of Y H - 1 counts as change.
+        # The rounding of Y H - 1 counts as change.
         e0, e1, e2 = y0 * a + y1 * b + y2 * c, y0 * b + y1 * d + y2 * e, y0 * c + y1 * e + y2 * f
         e0, e1, e2 = e0 - (k == 0), e1 - (k == 1), e2 - (k == 2)
         reach = abs(e0) * h0 + abs(e1) * h1 + abs(e2) * h2 + abs(y0) * w0 + abs(y1) * w1 + abs(y2) * w2
         reach += sqrt(y0 * y0 + y1 * y1 + y2 * y2) * ball
-        # The rounding of the gradient, and of the products with it, whatever is left of their sum.
+        # The rounding of the gradient and of the products with it, even if they cancel in the sum.
         reach += abs(y0) * sums[NOISE0] + abs(y1) * sums[NOISE1] + abs(y2) * sums[NOISE2]
         g0, g1, g2 = abs(sums[G0]), abs(sums[G1]), abs(sums[G2])
         reach += _ROUNDING * (abs(y0) * g0 + abs(y1) * g1 + abs(y2) * g2)
@@ -297,17 +300,18 @@ def contract_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Ar
 
 @inlined
 def _clip_along(a: float, d: float, f: float, plane: bool, sums: Array, ball: float, cut: Array) -> bool:
-    """Clip each coordinate to where its own component of the gradient may vanish; return whether anything is left.
+    """Contract each coordinate to where the same component of the gradient may vanish; return whether any part remains.
 
-    Where the Hessian is nearly singular its inverse says nothing, but a steep coordinate is known. Arguments as of
-    `clip_newton`; a, d and f are the diagonal of the Hessian, `ball` is times half of the diagonal of the box.
+    If the Hessian is nearly singular, its inverse gives no bound, but a steep coordinate still gives one. Arguments
+    are as in `clip_newton`. a, d and f are the diagonal of the Hessian, and `ball` is multiplied by half of the
+    diagonal of the box.
     """
     for _ in range(_SWEEPS):
         for k in range(2 if plane else 3):
             own = a if k == 0 else (d if k == 1 else f)
             if not own > 0.0:
                 continue
-            # The rounding of the sum counts, whatever is left of it: its own slope may be little.
+            # The rounding of the sum counts even if the terms cancel, because the slope may be small.
             middle, wide = sums[G0 + k], ball + sums[NOISE0 + k] + _ROUNDING * abs(sums[G0 + k])
             for m in range(3):
                 at, far = symmetric_entry(k, m), max(abs(cut[m]), abs(cut[3 + m]))
@@ -325,10 +329,10 @@ def _clip_along(a: float, d: float, f: float, plane: bool, sums: Array, ball: fl
 def has_no_infimum(
     dimension: int, touching: bool, half: Array, sums: Array, ball: float, cut: Array, solve: Array
 ) -> bool:
-    """Return whether no infimum of the cost can lie in a box of an atlas.
+    """Return whether a box of an atlas cannot contain an infimum of the cost.
 
-    The gradient does not vanish, or the Hessian has a negative eigenvalue; and at infinity, an end of the box that is
-    none of space (`touching`), the cost falls inwards or changes along infinity.
+    This holds if the gradient does not vanish, or the Hessian has a negative eigenvalue. A box that reaches infinity
+    (`touching`) contains no infimum if the cost falls inwards or changes along infinity.
 
     Parameters
     ----------
@@ -341,7 +345,7 @@ def has_no_infimum(
     ball : float
         A bound of the norm of the rest of that change.
     cut : array (6,)
-        Ends of the part of the box that is asked about; clipped, but for a box that reaches infinity.
+        Ends of the part of the box to test; contracted unless the box reaches infinity.
     solve : array (3, 3)
         Working memory.
     """
@@ -356,7 +360,7 @@ def has_no_infimum(
         for m in range(3):
             at = symmetric_entry(k, m)
             change += (abs(sums[at]) + sums[C00 + at]) * half[m]
-        # Slack for the rounding of the sums, relative, and of the gradient itself.
+        # Slack for the relative rounding of the sums, and for the rounding of the gradient.
         slope, change = sums[G0 + k], change * (1.0 + 1e-6) + sums[NOISE0 + k]
         if -slope > change or (k < dimension - 1 and slope > change):
             return True
@@ -365,9 +369,9 @@ def has_no_infimum(
 
 @compiled
 def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
-    """Return the side of a box along which the slope changes most by what is not known of the Hessian; -1 for none.
+    """Return the side along which the unknown part of the Hessian changes the slope most, or -1 without any.
 
-    Over 70 fixes that took many boxes, halved there they took an eighth fewer than across the steepest side.
+    Over 70 fixes that took many boxes, halving this side took an eighth fewer boxes than halving the steepest side.
     """
     most, side = 0.0, -1
     for m in range(dimension):
@@ -382,8 +386,9 @@ def most_curved_side(half: Array, sums: Array, dimension: int) -> int:
 
 @compiled
 def is_concave_along(sums: Array, ball: float, hessian: Array) -> bool:
-    """Return whether the cost curves downwards along one direction all over a box, as around a saddle."""
-    # No eigenvalue is less than an entry of the diagonal less those beside it (Gershgorin): the common case.
+    """Return whether the cost has a direction of negative curvature over the whole box, as around a saddle."""
+    # No eigenvalue is less than a diagonal entry less the sizes of the other entries of its row (Gershgorin). This
+    # decides the common case.
     a, b, c = abs(sums[H01]), abs(sums[H02]), abs(sums[H12])
     least = min(sums[H00] - a - b, sums[H11] - a - c, sums[H22] - b - c)
     if least + ball >= 0.0 or positive(sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]):
@@ -409,7 +414,7 @@ def is_concave_along(sums: Array, ball: float, hessian: Array) -> bool:
 
 @compiled
 def least_diagonal(information: Array, dimension: int) -> float:
-    """Return the least entry of the diagonal of an information matrix."""
+    """Return the least diagonal entry of an information matrix."""
     least = inf
     for k in range(dimension):
         least = min(least, information[k, k])
@@ -418,16 +423,16 @@ def least_diagonal(information: Array, dimension: int) -> float:
 
 @compiled
 def bend_axes(sums: Array, axes: Array, information: Array, dimension: int) -> None:
-    """Take the second derivative of the cost along axes that the rows do not determine to first order.
+    """Replace the information along axes by the second derivative of the cost if this is larger.
 
-    On a plane of symmetry all first derivatives across it vanish.
+    The rows may not determine an axis to first order: across a plane of symmetry all first derivatives vanish.
 
     Parameters
     ----------
     sums : array (SUMS,)
-        With the Hessian of f/2.
+        Contains the Hessian of f/2.
     axes, information : array (3, 3)
-        Axes in columns, and the information along them on the diagonal; raised.
+        Axes in columns, and a matrix whose diagonal is the information along them; raised in place.
     dimension : int
         2 or 3.
     """
@@ -441,6 +446,6 @@ def bend_axes(sums: Array, axes: Array, information: Array, dimension: int) -> N
 
 @compiled
 def symmetric_entry(k: int, m: int) -> int:
-    """Return where entry (k, m) of a symmetric matrix stands among (00, 01, 02, 11, 12, 22)."""
+    """Return the index of entry (k, m) of a symmetric matrix in the list (00, 01, 02, 11, 12, 22)."""
     first, second = min(k, m), max(k, m)
     return second if first == 0 else first + second + 1

@@ -1,4 +1,4 @@
-"""Descents: which minimum a low point belongs to, by a few damped Newton steps."""
+"""Descents: damped Newton steps from a point of low cost to the minimum that it belongs to."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from optloc.proof.curvature import G0, G1, G2
 from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22
 from optloc.proof.search_space import Box, Cost, LocalAxes, curve_box, rounding_at_centre, value_at
 
-# Steps of a descent: damped Newton needs five to ten from a box near a minimum; beyond forty it creeps along a valley.
+# Greatest number of steps of a descent. From a box near a minimum, damped Newton needs five to ten; after forty it
+# moves slowly along a valley.
 _STEPS = 40
-# A step that gains so many standard deviations, squared, ends it: the next one, of Newton's, would be a millionth.
+# A step shorter than this, in standard deviations, ends a descent: the next Newton step would be a millionth.
 _CLOSE = 1e-3
-# Damping at first, its factors after a step that was good and one that was not, and from where on it grows again. Steps
-# that are damped by more than the last are no Newton steps, and do not end a descent.
+# First damping; its factors after a successful and an unsuccessful step; and the least damping after an unsuccessful
+# step. Steps with a damping above `_FREE` are no Newton steps, and do not end a descent.
 _DAMPING, _LESS, _MORE, _LEAST, _FREE = 1e-6, 0.1, 10.0, 1e-4, 1e-3
-# Rounding of sums of squares, relative and absolute; a step may raise the cost by it and by what residuals are rounded.
+# Rounding of sums of squares, relative and absolute. A step may raise the cost by this and by the rounding of
+# residuals.
 _SAME_COST = 1e-14
 
 
 @compiled
 def descend(cost: Cost, chart: LocalAxes, box: Box) -> float:
-    """Move the centre of a box to a minimum of the cost; return the cost there, or infinity where none is reached.
+    """Move the centre of a box to a minimum of the cost; return the cost there, or infinity if no minimum is reached.
 
-    The half-widths become zero, and the tables are those of the point. Newton's Hessian where it is positive definite,
-    that of Gauss and Newton elsewhere, damped after Levenberg and Marquardt. Lengths of steps are counted in standard
-    deviations, whatever the unit of the search coordinates is: away from the fix they are another.
+    The half-widths become zero, and the tables are filled for the point. If Newton's Hessian is positive definite, it
+    is used, else the Gauss-Newton one; both are damped (Levenberg-Marquardt). Lengths of steps are in standard
+    deviations at the point, because the unit of the search coordinates is a standard deviation at the fix only.
     """
     box.half[:] = 0.0
     start = box.at.copy()
@@ -62,15 +64,15 @@ def descend(cost: Cost, chart: LocalAxes, box: Box) -> float:
 
 @compiled
 def newton_step(box: Box, damping: float) -> float:
-    """Write the damped step into the first row of box.solve; return its squared length in standard deviations.
+    """Write the damped step into the first row of box.solve; return its squared length in squared standard deviations.
 
-    NaN where there is none.
+    The result is NaN if there is no step.
     """
     sums = box.sums
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
     second, third = h3 != 0.0, h5 != 0.0
     if not positive_along(h0, h1, h2, h3, h4, h5, second, third):
-        # Less the curvature of the nodes, Gauss and Newton's information is left, which always falls.
+        # Without the curvature of the nodes, the Gauss-Newton matrix remains, whose step always reduces the cost.
         for j in range(box.curves.shape[0]):
             force = box.curves[j, FORCE]
             h0 -= force * box.curves[j, H00]
@@ -85,7 +87,7 @@ def newton_step(box: Box, damping: float) -> float:
 
 @inlined
 def damped_step(box: Box, h0: float, h1: float, h2: float, h3: float, h4: float, h5: float, damping: float) -> float:
-    """Write the step of a Hessian (00, 01, 02, 11, 12, 22) as `newton_step` does; return its squared length, or NaN."""
+    """Write the step of a Hessian (00, 01, 02, 11, 12, 22) like `newton_step`; return its squared length, or NaN."""
     sums, solve, more = box.sums, box.solve, 1.0 + damping
     if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
         return float("nan")

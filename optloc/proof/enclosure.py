@@ -1,4 +1,8 @@
-"""A box around all points that cost less than a level, from the measurements alone."""
+"""Enclosures: a box around all points that cost less than a level, computed from the measurements alone.
+
+Each residual of such a point is bounded, so each node of the point is within an interval. Intervals of nodes give
+balls, ellipsoids, bounds of squared rows and bounds of directions. The box is the intersection of all of them.
+"""
 
 from __future__ import annotations
 
@@ -15,28 +19,28 @@ from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
 from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
 from optloc.proof.search_space import Box, Cost, LocalAxes
 
-# Balls that hold all points at which one node lies in an interval.
+# Balls and ellipsoids that contain all points at which one node is within an interval.
 
 
 @compiled
 def around_node(
     kind: int, data: Array, least: float, most: float, x: Array, back: Array, lower: Array, upper: Array
 ) -> None:
-    """Clip a box of search coordinates by all points at which a node lies between `least` and `most`.
+    """Contract a box of search coordinates to all points at which a node is between `least` and `most`.
 
     Parameters
     ----------
     kind, data : int, array (width,)
-        The node.
+        The node: its code and its numbers.
     least, most : float
-        Its interval.
+        The interval, in the node's unit.
     x, back : array (3,), (3, 3)
-        Origin of the search coordinates, and their derivative with respect to the position.
+        Origin of the search coordinates, metres, and their derivative with respect to the position.
     lower, upper : array (3,)
-        Corners of the box, clipped in place.
+        Corners of the box, contracted in place.
     """
     c0, c1, c2, radius = data[0], data[1], data[2], most
-    if kind != RANGE:  # whose ball it is: ranges are asked often enough to be spared the call
+    if kind != RANGE:  # ranges skip the call, because they are the common case
         c0, c1, c2, radius = ball_of(kind, data, least, most)
         if radius == inf:
             return
@@ -51,19 +55,19 @@ def around_node(
 
 @compiled
 def around_foci(one: Array, other: Array, most: float, x: Array, back: Array, lower: Array, upper: Array) -> None:
-    """Clip a box of search coordinates by all points whose distances from two places sum to `most` at most.
+    """Contract a box of search coordinates to all points whose distances from two foci sum to at most `most`.
 
-    They are an ellipsoid of revolution, with 2a the sum and c the vector from its centre to a focus. Along a row b of
-    `back` it reaches ``sqrt((a^2 - |c|^2) |b|^2 + (b.c)^2)`` from its centre.
+    These points fill an ellipsoid of revolution. The sum of distances is 2a, and c is the vector from the centre to a
+    focus. Along a row b of `back` the ellipsoid reaches ``sqrt((a^2 - |c|^2) |b|^2 + (b.c)^2)`` from its centre.
 
     Parameters
     ----------
     one, other : array (3,)
-        The places, metres.
+        The foci, metres.
     most : float
         The sum of distances, metres.
     x, back, lower, upper : arrays
-        As of `around_node`.
+        As in `around_node`.
     """
     half = np.empty((2, 3))
     middle, focus = half[0], half[1]
@@ -83,19 +87,19 @@ def around_foci(one: Array, other: Array, most: float, x: Array, back: Array, lo
         lower[k], upper[k] = max(lower[k], centre - reach), min(upper[k], centre + reach)
 
 
-# Squared rows of ranges: linear in the position and one more unknown, they bound both.
+# Squared rows of ranges are linear in the position and one more unknown, so they bound both.
 
-# A left inverse is exact to this share, and the slack of all bounds from an enclosure: nothing beside its widths, which
-# are standard deviations or more.
+# A left inverse is exact to this share. All bounds of an enclosure get this share as slack. It is small against the
+# widths of an enclosure, which are standard deviations or more.
 SLACK = 1e-6
-# Share of the diagonal that a pivot of normal equations must exceed, how far a left inverse may then be from one, and
-# what a ball and its centre are widened by: a weak geometry has no enclosure rather than a wrong one.
+# Least pivot of normal equations as a share of the diagonal; greatest error of a left inverse; and the share by which
+# a ball and its centre are widened. A weak geometry gets no enclosure, rather than a wrong one.
 _PIVOT, _INVERSE, _WIDER = 1e-9, 1e-7, 1e-9
 # Unit in the last place of a double at 1.
 _ULP = 2.0**-52
-# Columns of a table of nodes: error at the fix, and how far from there the node may be; of its squared row, zero where
-# it has none: coefficients of the error (3), of the position and one more unknown (4), the same weighted (4), the left
-# inverse of all (4), and the weight in a sum of rows.
+# Columns of a table of nodes: the error at the fix, and the greatest change of the node from there. The other columns
+# are the squared row, zero for nodes without a squared row: coefficients of the error (3), coefficients of the
+# position and one more unknown (4), weighted coefficients (4), the left inverse (4), and the weight in a sum of rows.
 ERROR, SWING, FIRST, SECOND, THIRD, ROW, WEIGHTED, LEFT, WEIGHT, TIE_WIDTH = 0, 1, 2, 3, 4, 5, 9, 13, 17, 18
 
 
@@ -115,15 +119,15 @@ def around_squares(
     lower: Array,
     upper: Array,
 ) -> None:
-    """Bound the search coordinates by the squared rows of a group.
+    """Contract the box of search coordinates by the squared rows of one group of nodes.
 
-    Squaring ``r_j = n_j r_p + z_j + e_j`` with n_j = +-1 leaves ``2 a_j.(x - s_p) + 2 z_j n_j r_p = const - phi_j``
-    with ``phi_j = e_j (2 z_j + 2 n_j r_p + e_j)``; without a reference the second unknown is |x - s_p|^2 and n_j = 0.
-    Differences to the fix bring the constants away. The last unknown is bounded first, because phi contains it.
+    Squaring ``r_j = n_j r_p + z_j + e_j`` with n_j = +-1 gives ``2 a_j.(x - s_p) + 2 z_j n_j r_p = const - phi_j``
+    with ``phi_j = e_j (2 z_j + 2 n_j r_p + e_j)``. Without a reference range, the second unknown is |x - s_p|^2 and
+    n_j = 0. Differences to the fix remove the constants. The last unknown is bounded first, because phi contains it.
     """
     count, ranges = _rows(kinds, data, nodes, sense, member, reference, tie, ties)
     for k in range(3):
-        count += int(lower[k] == upper[k] == 0.0)  # a coordinate that there is not needs no row
+        count += int(lower[k] == upper[k] == 0.0)  # a coordinate that does not exist needs no row
     if count < 3 + int(ranges) or not _left_inverse(A, member, ties, ranges, lower, upper):
         return
     near = nodes[reference, PHI] if reference >= 0 else 0.0
@@ -133,15 +137,15 @@ def around_squares(
             ties[j, WEIGHT] = ties[j, LEFT + 3]
         own, beta, alpha, square = _sums(R, member, ties, near, 0.0)
         alpha, beta = rho * alpha, rho * beta + rho * rho * square
-        last = abs(own) + beta  # how far the last unknown may be from its value at the fix
+        last = abs(own) + beta  # greatest distance of the last unknown from its value at the fix
         if reference >= 0:
-            if alpha >= 1.0:  # the errors can make up for any reference range
+            if alpha >= 1.0:  # the errors can compensate any reference range
                 return
             own, more = near + own, 1.0 / (1.0 - alpha)
             least, most = max(0.0, (own - beta) / (1.0 + alpha)), (own + beta) * more
             middle, spread = 0.5 * (least + most), 0.5 * (most - least) * (1.0 + SLACK)
             last = max(abs(least - near), abs(most - near))
-    bound = np.empty((3, 4))  # centre and reach of each coordinate, what of it goes with the last unknown, and its side
+    bound = np.empty((3, 4))  # of each coordinate: centre, reach, reach per change of the last unknown, greatest size
     for k in range(3):
         for j in member:
             ties[j, WEIGHT] = ties[j, LEFT + k]
@@ -159,14 +163,13 @@ def around_squares(
 def _rows(
     kinds: Array, data: Array, nodes: Array, sense: Array, member: Array, reference: int, tie: Array, ties: Array
 ) -> tuple[int, bool]:
-    """Write the squared rows: their coefficients in search coordinates, and those of their errors.
+    """Write the coefficients of the squared rows; return the number of rows, and whether any is a range.
 
-    An error e changes a row by ``e (first + second r_p + third e)``. Returned: how many rows there are, and whether any
-    is a range.
+    An error e changes a row by ``e (first + second r_p + third e)``.
     """
     origin, count, ranges = reference, 0, False
     for j in member:
-        ties[j, FIRST:] = 0.0  # the row among them
+        ties[j, FIRST:] = 0.0  # the coefficients of the row, too
         if kinds[j] == LINEAR:
             for k in range(3):
                 ties[j, ROW + k] = data[j, 3] * sense[0, k] + data[j, 4] * sense[1, k] + data[j, 5] * sense[2, k]
@@ -181,7 +184,7 @@ def _rows(
                     ties[j, ROW + k] += 2.0 * (data[j, m] - data[origin, m]) * sense[m, k]
             ties[j, ROW + 3] = 2.0 * apart * tie[j] if reference >= 0 else -1.0
             ties[j, FIRST], ties[j, SECOND], ties[j, THIRD] = 2.0 * apart, 2.0 * tie[j], 1.0
-            # For the left inverse: what a squared row is worth beside its range.
+            # Weight for the left inverse: the derivative of a range with respect to its square.
             ties[j, WEIGHT] = 0.5 / near if near > 0.0 else 1.0
             ranges = True
         else:
@@ -192,7 +195,7 @@ def _rows(
 
 @inlined
 def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Array, upper: Array) -> bool:
-    """Write the left inverse of the rows that is best for the errors at the fix; False where there is none."""
+    """Write the left inverse of the rows that has the least errors at the fix; return False if it does not exist."""
     normal = np.zeros((4, 4))
     for j in member:
         t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
@@ -222,20 +225,20 @@ def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Arr
 
 @inlined
 def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: float) -> bool:
-    """Return whether what the left inverse lacks of one is nothing beside the widths of an enclosure.
+    """Return whether the error of the left inverse is negligible against the widths of an enclosure.
 
-    With E = (left inverse) (rows) - 1 in search coordinates and the last unknown, differences y to the fix obey
-    ``|y_k| <= b_k + sum_m |E_km y_m|``, b_k the bounds without E. Where these terms are below a share of the widths at
-    y = b, no y is farther away than the widths and that share: it would be farther still by less than it is.
+    Let E = (left inverse) (rows) - 1 in search coordinates and the last unknown. Differences y to the fix obey
+    ``|y_k| <= b_k + sum_m |E_km y_m|``, where b_k are the bounds without E. At y = b these terms may be below a small
+    share of the widths. Then no y exceeds the widths by more than this share.
 
     Parameters
     ----------
     member, ties : arrays
-        As of `around_squares`.
+        As in `around_squares`.
     bound : array (3, 4)
-        Of each coordinate: centre, reach, reach over that of the last unknown, and greatest size.
+        Of each coordinate: centre, reach, reach per change of the last unknown, and greatest size.
     last, more : float
-        Greatest size of the last unknown, and how many times what is added to its bound it grows by.
+        Greatest size of the last unknown, and the factor by which an addition to its bound grows.
     """
     off, size = np.zeros((4, 4)), np.zeros((4, 4))
     for j in member:
@@ -246,7 +249,7 @@ def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: f
                 off[k, m] += ties[j, LEFT + k] * ties[j, ROW + m]
                 size[k, m] += abs(ties[j, LEFT + k] * ties[j, ROW + m])
     wide, good = 0.0, True
-    for k in range(3, -1, -1):  # the last unknown first: it moves the others
+    for k in range(3, -1, -1):  # the last unknown first, because the other bounds contain it
         extra = 0.0
         for m in range(4):
             most = bound[m, 3] if m < 3 else last
@@ -264,11 +267,11 @@ def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: f
 
 @inlined
 def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> tuple[float, float, float, float]:
-    """Return what the errors make of a weighted sum of squared rows.
+    """Return the value of a weighted sum of squared rows at the fix, and three numbers that bound its errors.
 
-    First its value at the fix. Then ``sqrt(m'R m)`` for weights times (first + middle second), and for weights times
-    second: rho times them bounds the part of the errors that is linear. Last the sum of ``|weight| third R_ii``: rho
-    squared times that bounds the part that is quadratic.
+    The second and third number are ``sqrt(m'R m)``, for weights times (first + middle second) and for weights times
+    second. Times rho, they bound the linear part of the errors. The last number is the sum of ``|weight| third R_ii``.
+    Times rho squared, it bounds the quadratic part.
     """
     value = linear = slope = square = 0.0
     for i in range(member.shape[0]):
@@ -293,28 +296,28 @@ def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> t
     return value, sqrt(max(linear, 0.0)), sqrt(max(slope, 0.0)), square
 
 
-# A box around all points that several stations see in directions close to those of the fix.
+# A box around all points that several stations see in nearly the same directions as the fix.
 
 
 @compiled
 def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, lower: Array, upper: Array) -> None:
-    """Clip a box of search coordinates by angles that differ little from those at the fix.
+    """Contract a box of search coordinates by angles that differ little from the angles of the fix.
 
-    With n the horizontal and v the other unit vector across the direction from a station to the fix, a point at
+    Let n be the horizontal unit vector across the direction from a station to the fix, and v the other one. A point at
     distance r whose azimuth and elevation differ by at most a and e obeys ``|n.(x - x^)| <= r sin a`` and
-    ``|v.(x - x^)| <= r (sin e + 1 - cos a)``. With r at most the fix's distance plus ``y = |x - x^|`` and a left
-    inverse of these rows, y is bounded first, then each coordinate.
+    ``|v.(x - x^)| <= r (sin e + 1 - cos a)``. The distance r is at most the distance of the fix plus ``y = |x - x^|``.
+    A left inverse of these rows bounds y first, then each coordinate.
 
     Parameters
     ----------
     kinds, data : array (J,), (J, width)
         The nodes.
     x, back : array (3,), (3, 3)
-        The fix, and the derivative of the search coordinates with respect to the position.
+        The fix, metres, and the derivative of the search coordinates with respect to the position.
     swing : array (J,)
-        How far each angle may be from its value at the fix, radians; infinite where it is not known.
+        Greatest difference of each angle from its value at the fix, radians; infinite if unknown.
     lower, upper : array (3,)
-        Corners of the box, clipped in place.
+        Corners of the box, contracted in place.
     """
     J = kinds.shape[0]
     rows, reach, far = np.empty((J, 3)), np.empty(J), np.empty(J)
@@ -326,7 +329,7 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
                 reach[count], far[count] = wide, away
                 count += 1
     gamma, off = np.empty((3, max(count, 1))), np.empty((3, 3))
-    # Along what the coordinates span: a position differs from the fix in no other way.
+    # Only along the axes that the search coordinates span: in other directions no position differs from the fix.
     axes, turned = np.zeros((3, 3)), np.zeros((3, 3))
     span = _span(back, axes, turned)
     for i in range(count):
@@ -343,13 +346,13 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
         size = sqrt(gamma[0, i] ** 2 + gamma[1, i] ** 2 + gamma[2, i] ** 2) * reach[i]
         steep += size
         most += size * far[i]
-    # The widths grow with y itself; where they outgrow it, y is not bounded.
+    # The widths grow with y. If they grow faster than y, then y has no bound.
     if not steep < 1.0 - 1e-9:
         return
     most /= 1.0 - steep
     for k in range(3):
         wide = 0.0
-        for m in range(3):  # what the left inverse lacks of one, times y
+        for m in range(3):  # the error of the left inverse, times y
             for c in range(3):
                 wide += abs(turned[k, c]) * off[c, m] * most
         for i in range(count):
@@ -361,9 +364,9 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
 
 @compiled
 def _span(back: Array, axes: Array, turned: Array) -> int:
-    """Write orthonormal axes (3, 3) of the rows of a matrix, and the matrix along them; return how many there are.
+    """Write orthonormal axes (3, 3) of the rows of a matrix, and the matrix along them; return the number of axes.
 
-    Rows of zeros are the last ones.
+    Rows of zeros must come last.
     """
     count = 0
     for k in range(3):
@@ -387,9 +390,9 @@ def _span(back: Array, axes: Array, turned: Array) -> int:
 
 @compiled
 def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, span: int, gamma: Array, off: Array) -> bool:
-    """Write the left inverse of rows weighted by their widths; False where they do not determine a position.
+    """Write the left inverse of rows weighted by their widths; return False if they do not determine a position.
 
-    How far it may be from one, entry by entry, goes into `off` (3, 3).
+    The bounds of its errors are written into `off` (3, 3), entry by entry.
     """
     solve, normal = np.empty((3, 3)), np.zeros((3, 3))
     for i in range(count):
@@ -413,7 +416,7 @@ def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, span: i
 
 @compiled
 def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bool:
-    """Write how far gamma times rows may be from one, entry by entry; return whether that is a small rounding."""
+    """Write bounds of |gamma rows - 1|, entry by entry; return whether all are as small as rounding."""
     off[:] = 0.0
     for k in range(span):
         for m in range(span):
@@ -431,20 +434,20 @@ def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bo
 def enclose(cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, upper: Array) -> bool:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
-    Within a group of nodes (`optloc.proof.groups.Groups`) errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
-    Ranges and linear forms are squared to equations linear in position and one more unknown; sums of two ranges give
-    ellipsoids, and other nodes balls of their own.
+    Within a group of nodes (`optloc.proof.groups.Groups`) errors obey ``|m.e| <= rho sqrt(m'R m)`` for each vector m.
+    Squares of ranges and linear forms give equations that are linear in the position and one more unknown. Sums of two
+    ranges give ellipsoids. Other nodes give balls.
 
     Parameters
     ----------
     cost, chart : Cost, LocalAxes
         The cost, and search coordinates around the fix.
     box : Box
-        Tables of the fix, of which the values of the nodes and the forces ``K'(K phi - w)`` are read.
+        Tables of the fix. The function reads the values of the nodes and the forces ``K'(K phi - w)``.
     rho : float
         Square root of the level.
     lower, upper : array (3,)
-        Written: corners in search coordinates, infinite where there is no bound.
+        Written: corners in search coordinates, infinite for coordinates without a bound.
 
     Returns
     -------
@@ -453,13 +456,13 @@ def enclose(cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, up
     """
     kinds, data, A, groups, nodes, curves = cost.kinds, cost.data, cost.A, cost.groups, box.nodes, box.curves
     x, sense, back = chart.origin, chart.sense, chart.back
-    # Longer by what rounding may have taken off the residuals.
+    # Rounding may have shortened the residuals, so the limit grows by as much.
     rho, first, rays = rho * (1.0 + SLACK) + SLACK + rounding_error(cost.K, cost.weight, chart.floor, nodes), 0, 0
     order, R, ties = groups.order, groups.R, np.empty((kinds.shape[0], TIE_WIDTH))
     for k in range(3):
         plane = sense[0, k] == 0.0 and sense[1, k] == 0.0 and sense[2, k] == 0.0
         lower[k], upper[k] = (0.0, 0.0) if plane else (-inf, inf)
-    ties[:, SWING] = inf  # until a group says how far
+    ties[:, SWING] = inf  # until a group gives a bound
     for number in range(kinds.shape[0]):
         count, reference = order[1, number], order[2, number]
         if count == 0:
@@ -467,7 +470,7 @@ def enclose(cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, up
         size = count if reference < 0 else count - 1
         own, member = R[first : first + size, first : first + size], order[0, first : first + size]
         first += count
-        if reference == LOOSE:  # its rows are too few to say anything of one node
+        if reference == LOOSE:  # its rows are too few to determine single nodes
             continue
         for i in range(size):
             j, error = member[i], 0.0

@@ -1,4 +1,4 @@
-"""The proof for all positions: an enclosure where there is one, else the atlas of all space."""
+"""The proof for all positions: first within an enclosure if there is one, else over the atlas of all space."""
 
 from __future__ import annotations
 
@@ -88,12 +88,14 @@ from optloc.proof.search_space import (
 from optloc.proof.space import Space, in_atlas
 from optloc.proof.squares import Squares, change_of_residual, clip_to_squares, squares_of
 
-# Branch and bound over all positions, for costs that nothing encloses.
+# Branch and bound over all positions, for costs without an enclosure.
 
-# How often in turn a box is clipped to its squared rows, while that takes off half: from all of a face three times do.
+# Greatest number of contractions of a box by its squared rows; they end when one removes less than half. A whole face
+# of the cube needs three.
 _LOOKS = 8
-# What ranges bend over a box, squared and over the level, from which on its squared rows are looked at. Over 100 fixes
-# of five stations a ninth took 4 % fewer boxes for twice as many looks, and ten times as much 8 % more.
+# Squared rows contract a box only if the remainder of ranges changes the squared residual by more than this many
+# levels. Over 100 fixes of five stations, a ninth of this value took 4 % fewer boxes, but twice the contractions. Ten
+# times this value took 8 % more boxes.
 _BENT = 9.0
 
 
@@ -105,14 +107,14 @@ class GlobalWorkspace(NamedTuple):
     cost : Cost
         The cost.
     corners : array (2, 3)
-        Corners in search coordinates around the fix beyond which the cost is at least the first level; NaN where none
-        are known.
+        Corners in search coordinates around the fix, outside which the cost is at least the first level; NaN if
+        unknown.
     squares : Squares
-        Squared rows, of which boxes are clipped.
+        Squared rows, which contract boxes.
     floor : float
-        The sizes that `optloc.proof.box.rounding_error` counts beside the nodes.
+        Sizes of measurements and coordinates for `optloc.proof.box.rounding_error`.
     box, near : Box
-        Tables for a box of the atlas, and for one around a position.
+        Tables for a box of the atlas, and for a box around a position.
     """
 
     cost: Cost
@@ -125,6 +127,7 @@ class GlobalWorkspace(NamedTuple):
 
 @compiled
 def _bound_row(work: GlobalWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+    """Return the result of `optloc.proof.level_search.bound_row` for a cost without unknown scales."""
     atlas, box, cost, piece = space.atlas, work.box, work.cost, int(stack[row, PIECE])
     if not _take(stack, row, atlas, space.chart, work.corners, box, piece):
         return inf, inf
@@ -136,7 +139,7 @@ def _bound_row(work: GlobalWorkspace, space: Space, stack: Array, row: int, leve
 
 @inlined
 def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
-    """Return a lower bound of the residual's length over a box whose centre is set; its tables are filled."""
+    """Return a lower bound of the residual's length over a box whose centre is set; fill the tables of the box."""
     bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
     return least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
@@ -144,6 +147,7 @@ def _bound(cost: Cost, atlas: Atlas, box: Box, floor: float) -> float:
 
 @inlined
 def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: float, sound: bool) -> int:
+    """Return the result of `optloc.proof.level_search.side_of_rest` for a cost without unknown scales."""
     cost, atlas, box = work.cost, space.atlas, work.box
     noise = rounding_error(cost.K, cost.weight, work.floor, box.nodes)
     reset_cut(box.half, box.cut)
@@ -151,7 +155,7 @@ def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: floa
     contract_box(cost.K, cost.weight, rho + noise, box.half, flat, box.nodes, box.rows, box.cut, box.solve)
     if is_empty(box.cut):
         return -1
-    # What that leaves little of is looked at anew, which is cheaper.
+    # If little of the box remains, the smaller box is bounded again, which takes less time than the tests below.
     if not sound or share_left(box.cut, box.half) <= SHRUNK:
         return int(steepest_side(box.half, box.rows, atlas.dimension))
     if _clips_away(cost, atlas, box, touching, noise):
@@ -162,9 +166,9 @@ def _side_of_rest(work: GlobalWorkspace, space: Space, touching: bool, rho: floa
 
 @inlined
 def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array, box: Box, piece: int) -> bool:
-    """Take a box off the stack and set its centre; return False where nothing of it is to be looked at.
+    """Take a box off the stack and set its centre; return False if no part of it needs a search.
 
-    What lies beyond the corners, if they are known, is left out.
+    If the corners are known, the part of the box outside them is cut off.
     """
     faces = 2 * atlas.dimension
     pop(stack, row, box.at, box.half)
@@ -187,7 +191,7 @@ def _take(stack: Array, row: int, atlas: Atlas, chart: LocalAxes, corners: Array
 
 @compiled
 def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box, piece: int) -> bool:
-    """Clip a box whose centre is set to its squared rows, again while that helps; return whether anything is left."""
+    """Contract a box with a set centre by its squared rows, as often as that helps; return whether any part remains."""
     if squares.groups == 0 or change_of_residual(atlas, squares, box.half) ** 2 <= _BENT * level:
         return True
     for _ in range(_LOOKS):
@@ -206,14 +210,14 @@ def _squeeze(cost: Cost, atlas: Atlas, squares: Squares, level: float, box: Box,
 
 @compiled
 def excludes_infimum(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
-    """Return whether no infimum of the cost can lie in a box whose nodes are bounded; `touching`: infinity is there."""
+    """Return whether a box with bounded nodes contains no infimum of the cost; `touching`: the box reaches infinity."""
     reset_cut(box.half, box.cut)
     return _clips_away(cost, atlas, box, touching, rounding_error(cost.K, cost.weight, floor, box.nodes))
 
 
 @inlined
 def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float) -> bool:
-    """Return the same as `leaves` of the part between the ends of ``box.cut``, clipped to where an infimum may lie."""
+    """Return the result of `leaves` for the part between the ends of ``box.cut``, which is contracted."""
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
@@ -222,6 +226,7 @@ def _clips_away(cost: Cost, atlas: Atlas, box: Box, touching: bool, noise: float
 
 @compiled
 def _descend_near(work: GlobalWorkspace, chart: LocalAxes) -> float:
+    """Return the result of `optloc.proof.level_search.descend_near` for a cost without unknown scales."""
     return descend(work.cost, chart, work.near)
 
 
@@ -236,11 +241,13 @@ def _set_rival(
     eps: float,
     _rho: float,
 ) -> bool:
+    """Return the result of `optloc.proof.level_search.set_rival` for a cost without unknown scales."""
     return set_minimum(work.cost, work.near, atlas, i, x, value, eps, inf)
 
 
 @compiled
 def _cost_set(work: GlobalWorkspace, atlas: Atlas) -> float:
+    """Return the result of `optloc.proof.level_search.cost_set` for a cost without unknown scales."""
     bound_pieces(atlas, work.cost.kinds, work.cost.data, work.box.half, work.box.nodes)
     return cost_at(work.cost.K, work.cost.w, work.box.nodes)
 
@@ -258,13 +265,14 @@ search_everywhere = specialise(
 )
 
 
-# A verdict beside those of `optloc.proof.local_search`: the cost at infinity is within the gap.
+# A verdict in addition to the verdicts of `optloc.proof.local_search`: the cost at infinity is within the gap.
 UNBOUNDED = 8
-# How many times as large as the convex box around the fix an enclosure may be for its search to be tried, of a fix
-# between the stations and of others, and boxes after which that is given up for the atlas. What is six times as large
-# takes some sixteen boxes, as an atlas of a fix outside does; of what is fifty times as large few end with a hundred.
+# Greatest size of an enclosure to search, as a multiple of the convex box around the fix: between the stations, and
+# outside. The third number is the number of boxes after which the atlas replaces the enclosure. An enclosure of six
+# times the size takes about sixteen boxes, like an atlas of a fix outside. Of enclosures of fifty times the size, few
+# need less than a hundred boxes.
 _REACH, _REACH_OUTSIDE, _SOON = 50.0, 6.0, 100
-# Distance, relative to that of the fix, within which two minima are the same: a descent's own accuracy.
+# Distance, relative to the distance from the fix, within which two minima are the same: the accuracy of a descent.
 _CLOSE = 1e-3
 
 
@@ -280,37 +288,38 @@ def prove_globally(
     rivals: Array,
     found: Array,
 ) -> tuple[int, int, float, float, int]:
-    """Prove that no position costs less than a fix, and that no other minimum has a gap below as much as can be shown.
+    """Prove that no position costs less than a fix, and that no other minimum has a gap below the largest provable gap.
 
-    The claim is for all positions, to infinity. Where something encloses the cheap ones, that is searched first; where
-    nothing does, or the search does not end soon, and the cost stays finite at infinity, the atlas of all space: along
-    inverse ranges a long valley is straight, and the cost convex on wider boxes.
+    The claim is for all positions, to infinity. If there is an enclosure, it is searched first. If its search does not
+    end soon, or there is no enclosure, the atlas of all space is searched. The atlas needs a cost that stays finite at
+    infinity. In terms of inverse ranges a long valley is straight, and the cost is convex on wider boxes.
 
     Parameters
     ----------
     cost, box, x, beside, eps, budget, found
-        As of `optloc.proof.local_search.prove_locally`.
+        As in `optloc.proof.local_search.prove_locally`.
     gaps : array (G,)
-        Gaps that will do, falling, the last 0 for the value alone. Only the atlas tries more than the first.
+        Accepted gaps in descending order; a last gap of 0 proves the value alone. Only the atlas tries more than the
+        first gap.
     rivals : array (F, D)
-        Written: minima within the first gap that were met, and beside which the claim holds.
+        Written: minima within the first gap that the search found; the claim excepts them.
 
     Returns
     -------
     verdict : int
-        As of `optloc.proof.local_search.prove_locally`. UNBOUNDED: the cost at infinity is below the cost of the fix
-        plus every gap.
+        As in `optloc.proof.local_search.prove_locally`. UNBOUNDED: the cost at infinity is below the cost of the fix
+        plus each gap.
     boxes : int
-        How many boxes were looked at.
+        Number of boxes searched.
     bound : float
-        A certified lower bound of f over all positions; -inf where there is none.
+        A certified lower bound of f over all positions; -inf without a bound.
     gap : float
-        The gap that is proven, or where none is the smallest that was tried.
+        The proven gap; if no gap is proven, the smallest gap that was tried.
     met : int
-        How many rivals there are.
+        Number of rivals.
     """
     nowhere, bound_to = np.full(x.shape[0], np.nan), beside.planes.shape[0] + beside.surface.shape[0] > 0
-    open_end = not bound_to and reaches_infinity(cost.kinds, cost.K)  # the atlas is of all space
+    open_end = not bound_to and reaches_infinity(cost.kinds, cost.K)  # the atlas covers space, no plane
     first, reach = (min(budget, _SOON), _reach_of(cost, x)) if open_end else (budget, inf)
     verdict, boxes, bound = prove_locally(
         cost, box, x, beside, gaps[0], eps, first, reach, nowhere, nowhere, False, found
@@ -324,7 +333,7 @@ def prove_globally(
 
 @compiled
 def _reach_of(cost: Cost, x: Array) -> float:
-    """Return how many times as large as a convex box an enclosure may be for its search to be tried."""
+    """Return the greatest size of an enclosure to search, as a multiple of the convex box around a fix x (D,)."""
     middle, radius = station_cube(cost.kinds, cost.data, x)
     between = True
     for k in range(x.shape[0]):
@@ -344,7 +353,7 @@ def prove_atlas(
     rivals: Array,
     found: Array,
 ) -> tuple[int, int, float, float, int]:
-    """Prove the same as `prove_everywhere` with the atlas alone, where `optloc.proof.box.reaches_infinity` holds."""
+    """Prove the same as `prove_everywhere` with the atlas alone; `optloc.proof.box.reaches_infinity` must hold."""
     chart, _ = chart_at(cost, x, box)
     least, corners, nowhere = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), np.full(x.shape[0], nan)
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
@@ -397,7 +406,7 @@ def verdict_of(
 
 @compiled
 def _listed(x: Array, others: Array, found: Array) -> bool:
-    """Return whether a minimum that was found is one of the others: around it no box along the axes of x is convex."""
+    """Return whether a found minimum is one of the others; around it no box along the axes of x is convex."""
     for p in range(others.shape[0]):
         apart = away = 0.0
         for k in range(x.shape[0]):

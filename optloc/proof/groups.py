@@ -1,4 +1,4 @@
-"""Groups of nodes that correlated rows tie to each other, solved for what the rows say of each node."""
+"""Groups of nodes that correlated rows connect: each group is solved for its single nodes."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from optloc.kernels.jit import compiled, zero
 from optloc.kernels.systems import invert
 from optloc.proof.nodes.node import RANGE
 
-# Nodes whose rows are tied to each other by less than this share count as independent: what the rounding of whitened
-# rows leaves of an entry of K'K that is zero.
+# Nodes count as independent if their coupling by rows is below this share. Rounding of whitened rows leaves such an
+# entry of K'K in place of zero.
 _APART = 1e-13
-# Share of its diagonal that a pivot of a group's rows must exceed, and how far ties may be from -1, 0 and 1: a group
-# whose covariance has lost more digits bounds nothing. Nor does one whose products may be off by more than `_BLURRED`,
-# half of the slack of an enclosure.
+# Least pivot of a group's rows as a share of the diagonal; greatest distance of tie factors from -1, 0 and 1; and
+# greatest error of products, half of the slack of an enclosure. A group whose covariance has lost more digits bounds
+# no node.
 _PIVOT, _TIED, _BLURRED = 1e-9, 1e-9, 5e-7
-# References of a group that needs none, and of one whose rows are too few.
+# References of a group that needs no reference, and of a group whose rows are too few.
 NONE, LOOSE = -1, -2
 
 
 class Groups(NamedTuple):
-    """Nodes in groups: rows say ``phi_j = n_j r_p + z_j + e_j`` of a node, r_p the reference range of its group.
+    """Nodes in groups: a node of a group is ``phi_j = n_j r_p + z_j + e_j``, with r_p the reference range of the group.
 
     Parameters
     ----------
     order : int array (3, J)
-        The nodes, group behind group, the reference last; sizes of the groups, ended by a zero; their references: a
-        node, NONE or LOOSE.
+        First row: the nodes, group after group, the reference last. Second row: sizes of the groups, then a zero.
+        Third row: references of the groups, a node, NONE or LOOSE.
     R : array (J, J)
-        Covariances of the errors e of each group but of its reference, in that order.
+        Covariances of the errors e of each group without its reference, in the same order.
     tie : array (J,)
-        Factors n_j by node: -1, 0 or 1.
+        Factors n_j of the nodes: -1, 0 or 1.
     """
 
     order: Array
@@ -43,13 +43,13 @@ class Groups(NamedTuple):
 
 @compiled
 def empty_groups(J: int) -> Groups:
-    """Return room for groups of J nodes."""
+    """Return uninitialised arrays for groups of J nodes."""
     return Groups(np.empty((3, J), np.int64), np.empty((J, J)), np.empty(J))
 
 
 @compiled
 def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
-    """Write the groups of nodes (codes `kinds`) whose rows have ``A = K'K`` (J, J)."""
+    """Write the groups of nodes with codes `kinds` (J,) and products of rows ``A = K'K`` (J, J)."""
     J, order = kinds.shape[0], groups.order
     first = number = zero()
     for j in range(J):
@@ -65,7 +65,7 @@ def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
 
 @compiled
 def _gather(A: Array, member: Array, first: int) -> int:
-    """Move the nodes that are tied to that at `first` behind it; return how many the group has."""
+    """Move the nodes that are coupled to the node at `first` directly behind it; return the size of the group."""
     seen, end = first, first + 1
     while seen < end:
         j = member[seen]
@@ -80,10 +80,10 @@ def _gather(A: Array, member: Array, first: int) -> int:
 
 @compiled
 def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Array, tie: Array) -> int:
-    """Solve the rows of a group for its nodes; return its reference, which is moved to the end."""
+    """Solve the rows of a group for its nodes; return the reference, which is moved to the end of the group."""
     if _ties(kinds, A, member, first, count, count, R, tie):
         return NONE
-    # The rows say differences only: any range may be the reference, the first one is.
+    # The rows determine differences only. Any range can be the reference; the first one is taken.
     for i in range(first, first + count):
         if kinds[member[i]] == RANGE:
             last, reference = first + count - 1, member[i]
@@ -94,9 +94,9 @@ def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Arr
 
 @compiled
 def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: int, R: Array, tie: Array) -> bool:
-    """Write the covariance of the errors, and how nodes follow the reference; False where rows say otherwise.
+    """Write the covariance of the errors, and the factors n_j; return False if the rows do not have this form.
 
-    Where the group has more nodes than the `size` that are solved for, the last is the reference.
+    If the group has more nodes than the `size` solved nodes, the last node is the reference.
     """
     own = R[first : first + size, first : first + size]
     for i in range(size):
@@ -104,7 +104,7 @@ def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: i
             own[i, j] = A[member[first + i], member[first + j]]
     if size == 0 or not invert(own, size, _PIVOT):
         return False
-    condition = 0.0  # at least the largest over the least eigenvalue of the rows scaled to one length
+    condition = 0.0  # at least the ratio of largest to least eigenvalue of the rows scaled to equal lengths
     for i in range(size):
         condition += A[member[first + i], member[first + i]] * own[i, i]
     if not (size + 2) * 2.0**-52 * size * condition <= _BLURRED:

@@ -1,10 +1,10 @@
-"""The search of boxes for minima that cost less than some levels: one loop for costs with unknown scales and without.
+"""The search of boxes for minima below a list of cost levels: one loop for costs with and without unknown scales.
 
-A box is done where the cost is at least the first level, or where it has no minimum, its gradient or its curvature
-being of one sign: the least cost over all positions, if it is attained, is attained elsewhere. What of a box can be
-neither is all that is looked at again. Around known minima boxes lie along their principal axes, and around those that
-are met as well. Boxes that cost more than a lower level wait until that is shown: so one tree tells how far the budget
-goes.
+A box is finished if its cost is at least the first level. It is also finished if it contains no minimum, because a
+component of the gradient or the curvature has a fixed sign: the least cost over all positions is then attained
+elsewhere, if at all. Only the remaining part of a box is searched again. Around known and found minima, boxes follow
+the principal axes. A box whose cost exceeds a lower level is postponed until the lower level is shown. So one search
+shows as much as the budget allows.
 """
 
 from __future__ import annotations
@@ -24,33 +24,35 @@ from optloc.proof.pieces import CAPACITY, SPARE, is_listed, is_tiny, push_core, 
 from optloc.proof.search_space import LocalAxes
 from optloc.proof.space import Space, in_atlas, place_of, set_place
 
-# The test for stationary points is made where the cost at the centre is within so many levels: elsewhere the box is too
-# large, or its bound will do when it is halved. Over 8 fixes by range differences one level took four times as many
-# boxes; a test everywhere took a quarter more time for the same. Over 500 fixes of five stations ten and a hundred
-# levels took the same time.
+# The test for stationary points runs if the cost at the centre is within this many levels. Elsewhere the box is too
+# large for the test, or its bound suffices after halving. Over 8 fixes by range differences one level took four times
+# as many boxes; a test everywhere took a quarter more time for the same. Over 500 fixes of five stations ten and a
+# hundred levels took the same time.
 _NEAR = 10.0
 
-# What differs between costs: kernels of these names take the places of these (`optloc.kernels.jit.specialise`).
+# Placeholders for the parts that differ between costs: kernels of these names replace them
+# (`optloc.kernels.jit.specialise`).
 
 
 @compiled
 def bound_row(work: Any, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
-    """Return a bound of the residual in a box of the stack, infinite where all costs exceed a level, and the cost."""
+    """Return a bound of the residual in a box of the stack, infinite if excluded, and the cost at its centre."""
     raise NotImplementedError
 
 
 @compiled
 def side_of_rest(work: Any, space: Space, touching: bool, rho: float, sound: bool) -> int:
-    """Return the side across which to halve what of a box may hold a residual shorter than rho; -1 for nothing of it.
+    """Return the side across which to halve a contracted box; -1 if no part of the box remains.
 
-    Nor may it be without a minimum, where that is `sound`. What is left are the ends of ``box.cut``.
+    The box is contracted to residuals shorter than rho, and if `sound`, to points that may be minima. The ends of the
+    remaining part are in ``box.cut``.
     """
     raise NotImplementedError
 
 
 @compiled
 def descend_near(work: Any, chart: LocalAxes) -> float:
-    """Move the box around a position to a minimum; return its cost, or infinity where none is reached."""
+    """Move the box around a position to a minimum; return its cost, or infinity if no minimum is reached."""
     raise NotImplementedError
 
 
@@ -58,13 +60,13 @@ def descend_near(work: Any, chart: LocalAxes) -> float:
 def set_rival(
     work: Any, atlas: Atlas, chart: LocalAxes, i: int, x: Array, value: float, eps: float, rho: float
 ) -> bool:
-    """Write a minimum and its surroundings into an atlas, see `optloc.proof.convex_boxes.set_minimum`."""
+    """Write a minimum and the boxes around it into an atlas, see `optloc.proof.convex_boxes.set_minimum`."""
     raise NotImplementedError
 
 
 @compiled
 def cost_set(work: Any, atlas: Atlas) -> float:
-    """Return the cost at the centre set, with tables of the box."""
+    """Return the cost at the current centre; the tables of the box are overwritten."""
     raise NotImplementedError
 
 
@@ -91,36 +93,36 @@ def search_levels(
     work : NamedTuple
         The cost, and working memory: `box`, and `near` for boxes around a position.
     space : Space
-        Where the boxes are: an atlas of all positions, or search coordinates around the fix.
+        Space of the boxes: an atlas of all positions, or search coordinates around the fix.
     stack, size : array (CAPACITY, DEPTH), int
         The boxes.
     levels : array (G,)
-        Costs to exceed, falling; a point that costs less than the last refutes the fix.
+        Costs to exceed, in descending order; a point that costs less than the last level refutes the fix.
     eps : float
-        How far the last is below the cost of the fix.
+        Cost of the fix minus the last level.
     whole : bool
-        Whether a box is done as well where it has no minimum; otherwise only if it costs at least the last level.
+        Whether a box without a minimum is finished. Otherwise such a box also needs a cost of at least the last level.
     budget : int
-        How many boxes may be looked at.
+        Greatest number of boxes.
     rivals : array (F, D)
-        Written: minima that cost less than the first level and were met.
+        Written: minima that cost less than the first level and were found.
     found : array (D,)
         Written: the point of the outcomes CHEAPER and ANOTHER.
 
     Returns
     -------
     outcome : int
-        CLEAR: no minimum beside those known and met costs less than a level. CHEAPER: `found` costs less than the
-        last. ANOTHER: `found` is a minimum that costs less than the first, and was not searched around. SPENT: boxes
-        are left. INFINITE: the cost at infinity is below the level.
+        CLEAR: no minimum other than known and found ones costs less than a level. CHEAPER: `found` costs less than the
+        last level. ANOTHER: `found` is a minimum that costs less than the first level, and no boxes were made around
+        it. SPENT: boxes are left. INFINITE: the cost at infinity is below the level.
     boxes : int
-        How many boxes were looked at.
+        Number of boxes searched.
     bound : float
         A lower bound of f: the last level, unless boxes are left.
     shown : int
-        Which of the levels is exceeded.
+        Index of the greatest level that is exceeded.
     met : int
-        How many rivals there are.
+        Number of rivals.
     """
     box, d, value = work.box, space.atlas.dimension, levels[-1]
     aside, waiting, boxes, lows, met = np.empty((CAPACITY, DEPTH)), zero(), 0, 0, zero()
@@ -128,7 +130,7 @@ def search_levels(
     if now < first:  # no cost is below zero
         return CLEAR, 0, value, first, met
     while True:
-        if size == 0:  # nothing below this level is left
+        if size == 0:  # no box below this level is left
             if now <= first:
                 return CLEAR, boxes, value, now, met
             now -= 1
@@ -146,13 +148,13 @@ def search_levels(
             place_of(space, box, found)
             return CHEAPER, boxes, 0.0, shown, met
         touching = touches_infinity(box, d - 1, infinity_coordinate(space.atlas, piece) if space.far else -inf)
-        # The test for minima is dear, and fails in large boxes: only where the cost is low it can spare splits.
+        # The test for minima takes long, and fails in large boxes. It saves halvings only if the cost is low.
         sound = (whole or exceeds_level(low, value)) and here < _NEAR * (level + 1.0)
         side = side_of_rest(work, space, touching, sqrt(max(level, 0.0)), sound)
         if side < 0:
             continue
         lows += int(here < level)
-        # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
+        # At low centre number 1, 2, 4, 8 and so on: minima are found early, with few descents in vain.
         if here < level and lows & (lows - 1) == 0:
             at, half, cut = box.at.copy(), box.half.copy(), box.cut.copy()
             met, size, space = _meet(work, space, levels, first, eps, stack, size, rivals, met, found)
@@ -181,9 +183,9 @@ def _meet(
     met: int,
     found: Array,
 ) -> tuple[int, int, Space]:
-    """Descend from the centre set; where that ends in another minimum, write it and push boxes around it.
+    """Descend from the current centre; if the descent ends in an unknown minimum, store it and push boxes around it.
 
-    Returns the number of rivals, -1 where one cannot be searched around; the size of the stack; the space.
+    Returns the number of rivals (-1 if no boxes can be made around the minimum), the size of the stack, and the space.
     """
     atlas, chart, near, d = space.atlas, space.chart, work.near, space.atlas.dimension
     place_of(space, work.box, found)
@@ -201,7 +203,7 @@ def _meet(
     if not space.far or met == rivals.shape[0]:
         return -1, size, space
     known, wider, value = atlas.minima.home.shape[0], with_room_for_minimum(atlas), levels[-1]
-    # As of those that are known all its convex box must cost at least what nothing may fall short of.
+    # As for known minima, the whole convex box must cost at least the last level, with a margin.
     slack, rho = max(0.5 * (least - value), 0.5 * eps), sqrt(max(levels[0], 0.0))
     if not set_rival(work, wider, chart, known, found, value + 0.5 * slack, 0.5 * slack, rho):
         return -1, size, space
@@ -213,7 +215,7 @@ def _meet(
 
 @compiled
 def _at_infinity(work: Any, atlas: Atlas, piece: int) -> float:
-    """Return the cost at infinity next to the centre of a box that reaches there; its tables are lost."""
+    """Return the cost at infinity next to the centre of a box that reaches infinity; its tables are overwritten."""
     at = work.box.at.copy()
     at[atlas.dimension - 1] = infinity_coordinate(atlas, piece)
     set_centre(atlas, piece, at)
@@ -221,12 +223,12 @@ def _at_infinity(work: Any, atlas: Atlas, piece: int) -> float:
     return cost_set(work, atlas)
 
 
-# Levels that costs are held against, and boxes that wait for a lower one.
+# Levels for costs, and boxes that are postponed to a lower level.
 
 
 @compiled
 def _last_above_zero(levels: Array) -> int:
-    """Return the last level above zero, -1 where none is."""
+    """Return the index of the last level above zero, or -1 without such a level."""
     last: int = levels.shape[0] - 1
     while last >= 0 and levels[last] <= 0.0:
         last -= 1
@@ -235,7 +237,7 @@ def _last_above_zero(levels: Array) -> int:
 
 @compiled
 def _first_below(levels: Array, first: int, ends: float) -> int:
-    """Return the first level from one on that a cost reaches, or how many there are where it reaches none."""
+    """Return the index of the first level, from `first` on, that a cost reaches, or the number of levels."""
     while first < levels.shape[0] and ends < levels[first]:
         first += 1
     return first
@@ -243,7 +245,7 @@ def _first_below(levels: Array, first: int, ends: float) -> int:
 
 @compiled
 def _take_back(stack: Array, aside: Array, waiting: int, level: float) -> tuple[int, int]:
-    """Move the boxes whose bound is below a level from aside to the stack; return how many there are on each."""
+    """Move the boxes whose bound is below a level from `aside` to the stack; return the numbers of boxes on both."""
     size, left = zero(), zero()
     for i in range(waiting):
         if aside[i, LEAST] * aside[i, LEAST] < level:

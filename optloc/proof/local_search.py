@@ -1,4 +1,4 @@
-"""Branch and bound around a fix: nothing costs less, and no other minimum costs nearly as little."""
+"""Branch and bound around a fix: no point costs less, and no other minimum has nearly the same cost."""
 
 from __future__ import annotations
 
@@ -61,33 +61,33 @@ from optloc.proof.search_space import (
 )
 from optloc.proof.surface import DATA, LEVEL, MIDDLE, SIDES, is_beyond, is_one_side, reach_of_piece
 
-# Branch and bound over boxes of the near chart.
+# Branch and bound over boxes in search coordinates around a fix.
 
-# What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
+# Outcomes of a search: all is shown, a cheaper point, another minimum below the level, budget spent, or a cost at
 # infinity below the level.
 CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
-# Boxes on the stack: a stack that goes deep first holds one box a halving, and 512 halvings no box survives.
+# Boxes on the stack: a depth-first stack has one box for each halving, and no box remains after 512 halvings.
 _CAPACITY = 512
 
 
 class Goal(NamedTuple):
-    """What is to be shown of every box.
+    """Conditions that a search shows for each box.
 
     Parameters
     ----------
     level : float
-        Cost from which on a box is done.
+        A box whose cost is at least this is finished.
     value : float
-        Cost that every point must be shown to have.
+        Cost that each point must be shown to have at least.
     better : float
-        Cost below which a point refutes the fix; above `value`, so that no sliver is left between the two.
+        A point below this cost refutes the fix. It is above `value`, so that no thin region remains between the two.
     whole : bool
-        Whether a box is done as well where the gradient cannot vanish, because the search as a whole leaves no way out;
-        otherwise only if its cost is at least `value`.
+        Whether a box without a stationary point is finished. This holds if the search as a whole has no open boundary.
+        Otherwise such a box also needs a cost of at least `value`.
     free : int
-        How many of the known minima, the fix first, are hidden or the fix: what their boxes hold does not count.
+        The first `free` known minima are the fix or hidden: points in their boxes do not count.
     own : int
-        How many of these are the fix: one, and none on another piece of a surface.
+        Number of these that are the fix: 1, or 0 on another piece of a surface.
     """
 
     level: float
@@ -102,37 +102,37 @@ class Goal(NamedTuple):
 def search_boxes(
     cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal, budget: int, stack: Array, size: int
 ) -> tuple[int, int, float]:
-    """Look at the boxes of a stack until none is left.
+    """Search the boxes of a stack until none is left or the outcome is decided.
 
     Parameters
     ----------
     cost, chart : Cost, LocalAxes
         The cost and its search coordinates.
     box : Box
-        Tables; holds the point of the outcomes CHEAPER and ANOTHER in the end.
+        Tables; after the outcomes CHEAPER and ANOTHER it contains the point.
     minima, sides : array (P, 3)
-        Known minima, and half-widths of boxes around them where the cost is convex.
+        Known minima, and half-widths of boxes around them in which the cost is convex.
     aim : Goal
-        What is to be shown.
+        The conditions to show.
     budget : int
-        How many boxes may be looked at.
+        Greatest number of boxes.
     stack, size : array (capacity, DEPTH), int
         The boxes (`optloc.proof.box`).
 
     Returns
     -------
     outcome : int
-        CLEAR: all is shown. CHEAPER: a point below `aim.better`. ANOTHER: a minimum below `aim.level`. SPENT: boxes are
-        left.
+        CLEAR: all is shown. CHEAPER: a point below `aim.better`. ANOTHER: a minimum below `aim.level`. SPENT: boxes
+        are left.
     boxes : int
-        How many boxes were looked at.
+        Number of boxes searched.
     bound : float
-        A lower bound of f in the boxes left; infinite if there are none.
+        A lower bound of f in the remaining boxes; infinite without remaining boxes.
     """
-    # Arrays by names of their own: to hand a record on counts references to all it holds, at every box.
+    # Arrays as local variables: passing a record on counts references to all its arrays, for each box.
     kinds, data, K, w, A = cost.kinds, cost.data, cost.K, cost.w, cost.A
     bent, shapes = chart.surface.shape[0] > 0, shapes_of(cost, chart)
-    gram = box.gram if bent else chart.gram  # a box on a surface has axes of its own
+    gram = box.gram if bent else chart.gram  # a box on a surface has other axes
     sense, at, half, centre, line = chart.sense, box.at, box.half, box.centre, box.line
     nodes, rows, curves, sums, solve, cut = box.nodes, box.rows, box.curves, box.sums, box.solve, box.cut
     weight, origin, floor, unique = cost.weight, chart.origin, chart.floor, aim.level > aim.value
@@ -155,13 +155,14 @@ def search_boxes(
             bound_nodes(kinds, data, centre, sense, gram, half, line, nodes)
         linearise_rows(K, w, nodes, rows)
         low = least_residual(K, weight, floor, half, nodes, rows)
-        # A length, where the level is a cost: below 1 the length is the larger, so it is squared.
+        # `low` is a length, and the level is a cost. Below 1 a length is larger than its square, so the length is
+        # squared.
         if exceeds_level(low, aim.level):
             continue
         here, noise = cost_at(K, w, nodes), rounding_error(K, weight, floor, nodes)
         if here < aim.better:
             return CHEAPER, boxes, 0.0
-        # What cannot hold a residual shorter than rho, and below what no minimum, is cut off from all sides.
+        # Parts with residuals longer than rho, and parts that contain no minimum, are cut off from all sides.
         reset_cut(half, cut)
         contract_box(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
         sound = aim.whole or exceeds_level(low, aim.value)
@@ -177,7 +178,7 @@ def search_boxes(
                 continue
             if here < aim.level and not is_empty(cut):
                 low_points += 1
-                # Early, then more and more seldom, and wherever a box holds one minimum at most.
+                # Descend often at first, then rarely; and from each box that contains at most one minimum.
                 seldom = low_points & (low_points - 1) == 0
                 if seldom or is_convex_over_box(shapes, A, half, nodes, curves, sums, 0.0):
                     outcome = _follow(cost, chart, box, minima, sides, aim)
@@ -190,10 +191,11 @@ def search_boxes(
 
 @inlined
 def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, enough: bool) -> bool:
-    """Return whether a box lies where nothing is left to show.
+    """Return whether a box is inside the convex box of a known minimum for which no condition is open.
 
-    In the convex box of a known minimum there is no second, but a lower point there may be: `enough` says where any of
-    them will do. The box of the fix holds nothing cheaper where no way leads out of the search.
+    The convex box of a known minimum contains no second minimum, but it may contain a point of lower cost. `enough`:
+    any known minimum finishes the box. If the search has no open boundary, the box of the fix contains nothing
+    cheaper.
     """
     first = 0 if aim.whole else aim.own
     if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
@@ -203,9 +205,9 @@ def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Goal, eno
 
 @compiled
 def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array, aim: Goal) -> int:
-    """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER if it is not known, or CLEAR.
+    """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER for an unknown minimum, or CLEAR.
 
-    The box is the minimum afterwards, or where all is clear what it was, but for its tables.
+    Afterwards the box is the minimum. After CLEAR, centre and half-widths are restored, but not the tables.
     """
     at, half = box.at.copy(), box.half.copy()
     least = descend(cost, chart, box)
@@ -220,11 +222,11 @@ def _follow(cost: Cost, chart: LocalAxes, box: Box, minima: Array, sides: Array,
 
 @inlined
 def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, rows: Array, inside: bool) -> int:
-    """Return the coordinate across which to cut a box: where the remainders that matter shrink most.
+    """Return the coordinate across which halving a box reduces the remainders in its bound most.
 
-    The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it; it
-    matters with its pull ``|K_j.v|`` on the bound. Where ranges have no part in the bound, and where no bound can do,
-    because the centre lies below the level (`inside`), the widest side is cut.
+    The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it. Its
+    weight is the pull ``|K_j.v|`` on the bound. If the centre is below the level (`inside`), no bound suffices. In
+    this case, and if ranges have no part in the bound, the result is the widest side.
     """
     if inside:
         return widest(half)
@@ -240,7 +242,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
             c = abs(gram[1, 2] * h1 * h2 - e1 * e2)
             x, y = gram[0, 0] * h0 * h0 - e0 * e0 + a + b, gram[1, 1] * h1 * h1 - e1 * e1 + a + c
             z = gram[2, 2] * h2 * h2 - e2 * e2 + b + c
-            pull = abs(pull) * wide / (x + y + z + 1e-300)  # no width at all: not 0 / 0
+            pull = abs(pull) * wide / (x + y + z + 1e-300)  # avoids 0 / 0 for a box without width
             t0 += pull * x
             t1 += pull * y
             t2 += pull * z
@@ -252,9 +254,10 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
 
 @compiled
 def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int) -> int:
-    """Lay a box on a surface, and bound its nodes; return -1, or the size of the stack where that is another box's.
+    """Move a box onto a surface, and bound its nodes; return -1, or the stack's size if it is dropped or halved.
 
-    A box of another piece of the surface is dropped, one over which it is no graph is halved across its longer side.
+    A box that belongs to another piece of the surface is dropped. A box over which the surface is no graph is halved
+    across its longer side.
     """
     half, sense = box.half, chart.sense
     if is_beyond(chart.surface, box.centre, sense, half):
@@ -268,20 +271,20 @@ def lay_or_halve(cost: Cost, chart: LocalAxes, box: Box, stack: Array, size: int
 
 # The proof.
 
-# Half-width from which on an enclosure is none: its products would overflow.
+# Half-width above which a box does not count as an enclosure: its products would overflow.
 _ENDLESS = 1e300
-# Corners of what is searched are moved out by this share, for the rounding of the enclosure.
+# Corners of the region to search are moved outwards by this share, for the rounding of the enclosure.
 _OUTWARDS = 1e-9
 
-# A level this far below the cost of a place: the place need be no minimum. Rounding is far less.
+# If the level is this far below the cost of a position, the position need not be a minimum. Rounding is far less.
 _MUCH = 1.0
-# Share of a cost that counts as equal (`optloc.solvers.policy.equal_cost`).
+# Share of a cost within which costs count as equal (`optloc.solvers.policy.equal_cost`).
 _EQUAL = 1e-6
 
 # Verdicts of a proof.
 UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
 COARSE = 9
-"""A verdict beside these: the rounding of residuals exceeds the stated noise by so much that no two costs differ."""
+"""A further verdict: the rounding of residuals exceeds the stated noise so far that costs cannot be compared."""
 
 
 @compiled
@@ -304,46 +307,48 @@ def prove_locally(
     Parameters
     ----------
     cost : Cost
-        The cost; unknowns other than the position have been projected out.
+        The cost of the position; other unknowns have been projected out.
     box : Box
-        Tables to work with, see `optloc.proof.search_space.empty_box`.
+        Working memory, see `optloc.proof.search_space.empty_box`.
     x : array (D,)
-        The fix, polished.
+        The polished fix, metres.
     known : KnownMinima
-        Other minima that are known, and planes or a surface to which the claim is limited.
+        Other known minima, and planes or a surface to which the claim is limited.
     kappa : float
         Gap to prove; 0 proves the value alone.
     eps : float
-        How far below the cost of the fix still counts as equal, 1e-6 (1 + f) or so; where the rounding of residuals
-        makes more of it, that counts (`optloc.proof.search_space.equal_within`).
+        A cost that is lower than the cost of the fix by at most eps counts as equal; usually about 1e-6 (1 + f). If
+        the rounding of residuals needs more, eps is raised (`optloc.proof.search_space.equal_within`).
     budget : int
-        How many boxes may be looked at.
+        Greatest number of boxes.
     reach : float
-        How many times as large as the convex box around the fix what is searched may be; beyond, no box is looked at.
+        Greatest size of the region to search, as a multiple of the convex box around the fix. If the region is larger,
+        no box is searched.
     lower, upper : array (D,)
-        Corners of the region to search, in the frame of x; NaN in lower[0] asks for an enclosure of all points that
-        cost less than f(x) + kappa, which makes the claim a global one.
+        Corners of the region to search, in the frame of x, metres. If lower[0] is NaN, the function searches an
+        enclosure of all points that cost less than f(x) + kappa, so that the claim holds for all positions.
     closed : bool
-        With a region: whether points outside it are dealt with elsewhere, so that a place where the gradient cannot
-        vanish need not be bounded. False: the claim is for the region alone.
+        For a region: whether another proof covers the points outside. If so, a box without a stationary point needs no
+        bound. If not, the claim is for the region alone.
     found : array (D,)
-        Written: the better or other point (verdicts BETTER and OTHER).
+        Written: the better or other point (verdicts BETTER and OTHER), metres.
 
     Returns
     -------
     verdict : int
-        UNIQUE: the value is proven, and no other minimum (beside `others`) has a gap below kappa. VALUE: kappa is 0 and
-        the value is proven. BETTER: `found` costs less. OTHER: `found` is close to another minimum whose gap is below
-        kappa. BUDGET: boxes are left. OPEN: there is no enclosure. STATIONARY: the fix is no strict minimum, or not
+        UNIQUE: the value is proven, and no unknown minimum has a gap below kappa. VALUE: kappa is 0, and the value is
+        proven. BETTER: `found` costs less. OTHER: `found` is close to another minimum whose gap is below kappa.
+        BUDGET: boxes are left. OPEN: there is no enclosure. STATIONARY: the fix is no strict minimum, or is not
         polished enough. SINGULAR: the rows do not determine a position near the fix. COARSE: the noise is finer than
         rounding.
     boxes : int
-        How many boxes were looked at.
+        Number of boxes searched.
     bound : float
-        A certified lower bound of f over the region or over all positions; -inf where there is none. Of a proven value
-        it is below the cost of the fix by what counts as equal.
+        A certified lower bound of f over the region or over all positions; -inf without a bound. For a proven value it
+        is below the cost of the fix by the final eps.
     """
-    # Standard deviations of the fix as units: boxes are then about as wide as the cost needs in every direction.
+    # The units are standard deviations of the fix, so that boxes are about as wide as the cost requires in each
+    # direction.
     chart, good = chart_on(cost, x, box, known.planes, known.surface)
     if not good:
         return SINGULAR, 0, -inf
@@ -360,12 +365,12 @@ def prove_locally(
         there, noise = _laid(cost, chart, box)
         slope = (box.sums[G0], box.sums[G1], 0.0)
     eps = equal_within(eps, least, noise)
-    # A fix is off its surface by a rounding: half of eps is for what that costs.
+    # A fix is off its surface by rounding; half of eps is allowed for the change of cost.
     if not abs(there - least) <= 0.5 * eps:
         return STATIONARY, 0, -inf
     if not eps <= most:
         return COARSE, 0, -inf
-    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
+    # On a box whose Hessian exceeds a margin, the cost falls below the cost of its centre by at most slope^2 / margin.
     margin = steepness(slope, noise) / (0.5 * eps if bent else eps)
     minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
     if count == 0 and not (kappa <= 0.0 and eps > _MUCH and _holds_origin(low, high)):
@@ -373,8 +378,9 @@ def prove_locally(
     if count and not _extent(low, high, sides[0]) <= reach:
         return BUDGET, 0, -inf
     own, free, hole = (1, free, sides[0]) if count else (0, 0, np.zeros(3))
-    count = free if kappa <= 0.0 else count  # the value alone: boxes of other minima are bounded as all others are
-    # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
+    count = free if kappa <= 0.0 else count  # for the value alone, boxes of other minima are bounded like all others
+    # Hidden minima leave an open boundary: where the position becomes visible, the cost may be least and still have a
+    # slope.
     better, whole = _refuting(least, eps, noise), (closed or isnan(lower[0])) and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
     aim, stack = Goal(level, least - eps, better, whole, free, own), np.empty((_CAPACITY, DEPTH))
@@ -384,7 +390,7 @@ def prove_locally(
         outcome, boxes = _search_sides(cost, chart, box, known, aim, budget, boxes, stack)
     if outcome == CLEAR:
         return UNIQUE if kappa > 0.0 else VALUE, boxes, least - eps
-    if outcome == SPENT:  # of other sides nothing is known
+    if outcome == SPENT:  # other sides have no bound
         return BUDGET, boxes, min(bound, least - eps) if alone else -inf
     for k in range(x.shape[0]):
         found[k] = box.centre[k]
@@ -393,10 +399,11 @@ def prove_locally(
 
 @inlined
 def _refuting(least: float, eps: float, noise: float) -> float:
-    """Return the cost below which a point refutes a claim about the cost less eps.
+    """Return the cost below which a point refutes the claim that all costs are at least the cost of the fix less eps.
 
-    Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less. A
-    point far below the place, but above the level, refutes nothing.
+    The result is halfway between the two. So a cheaper point is cheaper by more than rounding, and no box remains that
+    is cheaper by less. If eps is large, a point far below the cost of the position, but above the level, refutes
+    nothing.
     """
     if eps > _MUCH:
         return least - eps + 0.5 * equal_within(_EQUAL * (1.0 + least - eps), least, noise)
@@ -405,7 +412,7 @@ def _refuting(least: float, eps: float, noise: float) -> float:
 
 @inlined
 def _holds_origin(low: Array, high: Array) -> bool:
-    """Return whether what is searched holds the place itself."""
+    """Return whether the region to search contains the position itself."""
     inside = True
     for k in range(3):
         inside = inside and low[k] <= 0.0 <= high[k]
@@ -414,7 +421,7 @@ def _holds_origin(low: Array, high: Array) -> bool:
 
 @inlined
 def _extent(low: Array, high: Array, sides: Array) -> float:
-    """Return how many times as large as a box around a fix what is searched is along one axis."""
+    """Return the greatest ratio of the region to search to the convex box around a fix, over all axes."""
     most = 0.0
     for k in range(3):
         if sides[k] > 0.0:
@@ -424,14 +431,14 @@ def _extent(low: Array, high: Array, sides: Array) -> float:
 
 @inlined
 def steepness(slope: tuple[float, float, float], noise: float) -> float:
-    """Return the greatest squared length of a slope along standard deviations whose residual is off by `noise`."""
+    """Return the greatest squared length of a slope, per standard deviation, if residuals are off by `noise`."""
     a, b, c = abs(slope[0]) + noise, abs(slope[1]) + noise, abs(slope[2]) + noise
     return a * a + b * b + c * c
 
 
 @compiled
 def _laid(cost: Cost, chart: LocalAxes, box: Box) -> tuple[float, float]:
-    """Return the cost of a fix on its surface, infinite off it, and the rounding of its residual; fill the sums."""
+    """Return the cost of a fix moved onto its surface (infinite if impossible), and its rounding; fill the sums."""
     box.at[:], box.half[:] = 0.0, 0.0
     there, noise = value_at(cost, chart, box), 0.0
     if there < inf:
@@ -451,7 +458,7 @@ def _search_sides(
     boxes: int,
     stack: Array,
 ) -> tuple[int, int]:
-    """Search all other pieces of a surface than that of the fix; return the outcome and the boxes with those before."""
+    """Search all pieces of a surface other than the piece of the fix; return the outcome and the boxes in total."""
     corners, outcome = np.empty((2, 3)), CLEAR
     for side in range(1, SIDES):
         chart = axes_of_next_piece(cost, around, side)
@@ -477,10 +484,13 @@ def _search_sides(
 def region_of(
     cost: Cost, chart: LocalAxes, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array
 ) -> bool:
-    """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
+    """Write the corners of the box to search: the region, or an enclosure of all points that cost less than rho^2.
+
+    Return False if there is no enclosure.
+    """
     if isnan(lower[0]):
         bounded = enclose(cost, chart, box, rho, low, high)
-        if chart.surface.shape[0] > 0:  # which is bounded itself
+        if chart.surface.shape[0] > 0:  # a surface is bounded by its height
             value = chart.surface[LEVEL]
             around_node(HEIGHT, chart.surface[DATA:MIDDLE], value, value, chart.origin, chart.back, low, high)
         elif not bounded:
@@ -497,7 +507,7 @@ def region_of(
         for m in range(3):
             size += abs(chart.sense[k, m]) * max(abs(low[m]), abs(high[m]))
     for k in range(3):
-        # By a share, and by the rounding of search coordinates of points so far away.
+        # By a share, and by the rounding of search coordinates of points at this distance.
         slack = _OUTWARDS * (1.0 + abs(low[k]) + abs(high[k])) if high[k] > low[k] else 0.0
         slack += chart.slip[k] * size
         low[k], high[k] = low[k] - slack, high[k] + slack

@@ -1,4 +1,4 @@
-"""Boxes on the pieces of an atlas: the stacks of a search, the ends at infinity, and the known minima among them."""
+"""Boxes on the pieces of an atlas: the stacks of a search, the ends at infinity, and the boxes of known minima."""
 
 from __future__ import annotations
 
@@ -12,27 +12,28 @@ from optloc.proof.atlas import Atlas, coordinates_on, infinity_coordinate, is_ne
 from optloc.proof.box import CENTRE, HALF, PIECE, cut_out, push, push_around, push_halves
 from optloc.proof.search_space import Box
 
-# Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest;
-# and as many that wait. A box leaves two, and six slabs around a minimum that is met in it.
+# Greatest number of boxes on the stack, and in the list of postponed boxes. The stack contains 2 D + 1 pieces, six
+# slabs around each known minimum, and one box for each halving of the deepest box. SPARE: one box adds two boxes, and
+# six slabs around a minimum that is found in it.
 CAPACITY, SPARE = 2048, 8
-# Boxes that may wait: where there are as many, those that follow are looked at in their turn, as if no lower level were
-# to be shown first. What is taken back leaves room for going into the depth.
+# Greatest number of postponed boxes. Beyond it, boxes are searched at once, as if the search had no lower level. The
+# rest of the stack leaves space for depth when postponed boxes return to it.
 _WAITING = 3 * CAPACITY // 4
-# A box at infinity of this size whose cost is below the level is not split further: across it the cost is the same to
-# many digits, so no smaller one would be dropped either. Half-widths on a face, and around a minimum.
+# A box at infinity below this size whose cost is below the level is not split: over such a box the cost is constant to
+# many digits, so no part of it would be dropped either. Half-widths on a face, and around a minimum.
 _TINY, _TINY_AROUND = 1e-5, 1e-3
-# Points closer to a minimum than this are that minimum, standard deviations: a descent ends that near.
+# Points within this many standard deviations of a minimum count as this minimum: a descent ends so close to it.
 _SAME = 1e-3
-# Share of a box below which what is left is looked at again before it is cut. Over 16 fixes by range differences a half
-# took 2 % fewer boxes than a quarter or four fifths, and 5 % fewer than no second look.
+# If contraction leaves less than this share of a box, the box is bounded again before it is halved. Over 16 fixes by
+# range differences, a half took 2 % fewer boxes than a quarter or four fifths. It took 5 % fewer than no second bound.
 SHRUNK = 0.5
-_WITHIN = 1e-9  # as of `optloc.proof.atlas.is_near_minimum`
-_BEYOND = 1e-12  # what a sum of two rounds, and a thousand times that
+_WITHIN = 1e-9  # as in `optloc.proof.atlas.is_near_minimum`
+_BEYOND = 1e-12  # a thousand times the rounding of a sum of two numbers
 
 
 @inlined
 def is_tiny(box: Box, piece: int, d: int) -> bool:
-    """Return whether a box at infinity is so small that the cost there is taken from its centre."""
+    """Return whether a box at infinity is so small that the cost at its centre represents the box."""
     return bool(max(box.half[0], box.half[1], box.half[2]) < (_TINY if piece < 2 * d else _TINY_AROUND))
 
 
@@ -40,7 +41,7 @@ def is_tiny(box: Box, piece: int, d: int) -> bool:
 def push_or_defer(
     stack: Array, size: int, aside: Array, waiting: int, box: Box, side: int, low: float, piece: int, level: float
 ) -> tuple[int, int]:
-    """Push what its cut leaves of a box, or let it wait where it costs more than a level; return both sizes."""
+    """Push the remaining part of a box, or postpone it if it costs more than a level; return both stack sizes."""
     if low > 0.0 and low * low >= level and waiting + SPARE <= _WAITING:
         return size, push_rest(aside, waiting, box.cut, box.at, box.half, side, low, piece)
     return push_rest(stack, size, box.cut, box.at, box.half, side, low, piece), waiting
@@ -48,13 +49,13 @@ def push_or_defer(
 
 @compiled
 def touches_infinity(box: Box, last: int, end: float) -> bool:
-    """Return whether a box reaches infinity, where its last coordinate ends."""
+    """Return whether a box reaches infinity, where the last coordinate has the value `end`."""
     return bool(end > -inf and box.at[last] - end <= box.half[last])
 
 
 @compiled
 def contract_at_infinity(box: Box, last: int, end: float) -> None:
-    """Take off a box what rounding has put beyond infinity, where the inverse range would be negative."""
+    """Cut off the part of a box that rounding has put beyond infinity, where the inverse range would be negative."""
     if end > -inf and box.at[last] - end < box.half[last]:
         box.half[last] = 0.5 * (box.at[last] - end + box.half[last]) * (1.0 + _BEYOND)
         box.at[last] = end + box.half[last]
@@ -62,7 +63,7 @@ def contract_at_infinity(box: Box, last: int, end: float) -> None:
 
 @inlined
 def push_rest(stack: Array, size: int, cut: Array, at: Array, half: Array, side: int, low: float, piece: int) -> int:
-    """Push what its cut leaves of a box, whole or halved across a side; return the size of the stack."""
+    """Push the remaining part of a box, whole or halved across a side; return the size of the stack."""
     share = cut_out(cut, at, half)
     if 0.0 < share < SHRUNK:
         return push(stack, size, at, half, low, piece)
@@ -71,10 +72,10 @@ def push_rest(stack: Array, size: int, cut: Array, at: Array, half: Array, side:
 
 @compiled
 def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
-    """Return whether a box lies in the convex box of a known minimum, or in one that is searched along its axes."""
+    """Return whether a box is inside the convex box of a known minimum, or inside a box that is searched elsewhere."""
     d, minima = atlas.dimension, atlas.minima
     for i in range(minima.home.shape[0]):
-        # A box around one minimum is left to those that come before it, never to itself.
+        # A box around one minimum is left only to minima with lower numbers, never to its own core.
         if piece == 2 * d + 1 + i:
             inside = True
             for k in range(d):
@@ -90,7 +91,7 @@ def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
 
 @compiled
 def is_listed(atlas: Atlas, x: Array) -> bool:
-    """Return whether a position x (D,) lies in the convex box of a known minimum, or next to it."""
+    """Return whether a position x (D,) is inside the convex box of a known minimum, or next to the minimum."""
     d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
     for i in range(minima.home.shape[0]):
         inside = coordinates_on(atlas, minima.home[i], x, u)
@@ -106,7 +107,10 @@ def is_listed(atlas: Atlas, x: Array) -> bool:
 
 @compiled
 def push_pieces(stack: Array, atlas: Atlas) -> int:
-    """Push all faces of the cube, its inside, and on top of them the surroundings of known minima, the fix last."""
+    """Push all faces of the cube, its inside, and on top the boxes around known minima; return the stack size.
+
+    The box around the fix is pushed last, so that it is searched first.
+    """
     size = push_faces(stack, atlas.dimension)
     for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
         size = push_core(stack, size, atlas, i)
@@ -128,7 +132,7 @@ def push_faces(stack: Array, d: int) -> int:
 
 @compiled
 def push_core(stack: Array, size: int, atlas: Atlas, i: int) -> int:
-    """Push what is searched along the axes of minimum i; return the size of the stack."""
+    """Push the core of minimum i without its convex box, cut into slabs; return the size of the stack."""
     low, last, piece = atlas.minima.core[i, 0].copy(), atlas.dimension - 1, 2 * atlas.dimension + 1 + i
     if low[last] == -inf:
         low[last] = infinity_coordinate(atlas, piece)

@@ -1,4 +1,7 @@
-"""From a batch of problems to what is proven of them, ``f(x) = |K phi(x) - w|^2`` over the position, and for which."""
+"""From a batch of problems to the costs ``f(x) = |K phi(x) - w|^2`` of the position, which proofs bound.
+
+Each row of measurements is a sum of nodes phi. Other unknowns are projected out or added to the covariance.
+"""
 
 from __future__ import annotations
 
@@ -21,33 +24,33 @@ from optloc.proof.nodes.level import linear_numbers
 from optloc.proof.nodes.node import LINEAR, RATE, Node, NodeRow
 from optloc.proof.nodes.rate import RATE_WIDTH, STATION, VELOCITY
 
-# From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
+# From rows of measurements to nodes: the scalar functions that sum to the rows, and their numbers.
 
-# Cosine below which two columns of whitened rows count as orthogonal: whitening costs some digits of a double.
+# Cosine below which two columns of whitened rows count as orthogonal: whitening loses some digits of a double.
 _ORTHOGONAL = 1e-9
-# Share of the length of a column up to which a number of its triangle is rounding: tens of units in the last place,
-# for the backward error of reflections goes by columns (Higham 2002, theorem 19.4).
+# Share of the length of a column below which an entry of its triangle is rounding: tens of units in the last place.
+# The backward error of reflections is relative to columns (Higham 2002, theorem 19.4).
 _DEPENDENT = 1e-14
 
 
 @dataclass(slots=True)
 class CostColumns:
-    """The nodes of a flat batch of problems as they are collected, and the design of the rows over them.
+    """The collected nodes of a flat batch of B or N problems, and the sparse design of the rows over them.
 
     Parameters
     ----------
     problem : Problem
-        Whose rows they are.
+        The problem with the rows.
     kinds : list of int
         Codes of the nodes.
     data : list of array (B, n)
-        Their numbers, B = 1 where all problems share them.
+        Numbers of the nodes; B = 1 if all problems share them.
     row, column, coefficient : list
         Sparse design: row of the problem, node, factor.
     station, epoch : list of int
-        Of each node that is of a station alone; -1 for the others.
+        Station and epoch of each node that depends on one station only; -1 for other nodes.
     shared : dict
-        The nodes that rows share, by code, station and epoch: ranges and range rates.
+        Nodes that rows share, by code, station and epoch: ranges and range rates.
     """
 
     problem: Problem
@@ -69,18 +72,15 @@ class CostColumns:
         return len(self.kinds) - 1
 
     def touch(self, row: int, column: int, coefficient: float) -> None:
-        """Let a row of the problem contain a node."""
+        """Add a node, times a coefficient, to a row of the problem."""
         self.row.append(row)
         self.column.append(column)
         self.coefficient.append(coefficient)
 
     def split(self, group: Array) -> tuple[CostColumns, Array]:
-        """Return the same with nodes that rows of one group share, and the group of each node (J,).
+        """Return a copy in which only rows of one group share nodes, and the group of each node (J,).
 
-        Parameters
-        ----------
-        group : int array (m,)
-            Group of each row.
+        `group` (m,) has the group of each row.
         """
         out, new = CostColumns(self.problem), dict[tuple[int, int], int]()
         for row, column, coefficient in zip(self.row, self.column, self.coefficient, strict=True):
@@ -91,9 +91,10 @@ class CostColumns:
         return out, np.array([own for _, own in new])
 
     def with_velocity(self) -> Array:
-        """Add what the target's velocity multiplies, components of lines of sight; return the group of each node (J,).
+        """Add the components of lines of sight that multiply the target's velocity; return the group of each node (J,).
 
-        A moving target has the range rate of a target at rest plus ``u.v``, u the unit vector from the station.
+        The range rate of a moving target is the range rate of a target at rest plus ``u.v``, u the unit vector from
+        the station. The group is the axis of the velocity, or -1 for nodes without it.
         """
         group, new = [-1] * len(self.kinds), dict[tuple[int, int], int]()
         for row, column, coefficient in list(zip(self.row, self.column, self.coefficient, strict=True)):
@@ -120,7 +121,7 @@ class CostColumns:
 
 
 def _along_axis(rate: Array, k: int) -> Array:
-    """Return the numbers (B, n) of one component of the unit vector from a station, by a rate of it."""
+    """Return the numbers (B, n) of one component of the unit vector from a station, from the numbers of a rate."""
     out = np.zeros((len(rate), RATE_WIDTH))
     out[:, STATION:VELOCITY] = rate[:, STATION:VELOCITY]
     out[:, VELOCITY + k] = 1.0
@@ -128,7 +129,7 @@ def _along_axis(rate: Array, k: int) -> Array:
 
 
 def stack_numbers(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
-    """Return the numbers (B, J, width) of nodes that have (B, n) or (1, n) each."""
+    """Return the numbers (B, J, width) of nodes with numbers (B, n) or (1, n) each."""
     out = np.zeros((max((len(part) for part in data), default=1), len(data), width(kinds)))
     for j, part in enumerate(data):
         out[:, j, : part.shape[1]] = part
@@ -136,14 +137,9 @@ def stack_numbers(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
 
 
 def columns_of(problem: Problem, observed: Array) -> CostColumns:
-    """Return the nodes that the rows of a flat batch of problems are sums of.
+    """Return the nodes that sum to the rows of a flat batch of N problems within the scope of the proof.
 
-    Parameters
-    ----------
-    problem : Problem
-        N problems within the scope of the proof.
-    observed : array (N, m)
-        Measurements less everything that is known to be added to them; azimuths are counted from them.
+    `observed` (N, m) has the measurements minus all known additions; azimuth nodes are relative to them.
     """
     made = CostColumns(problem)
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -156,16 +152,16 @@ def columns_of(problem: Problem, observed: Array) -> CostColumns:
 
 
 def _terms(model: Model, row: NodeRow) -> Iterator[tuple[float, str | Node, int]]:
-    """Yield what a row is a sum of: factors, nodes, and of which station."""
+    """Yield the terms of a row: factor, node, and station."""
     nodes = ((1.0, "range"),) if model.ranges is not None else model.nodes
-    # What each station measures by itself enters with its sign; other nodes are of the row as a whole.
+    # If each station measures separately, its terms have a sign. Other nodes belong to the row as a whole.
     for sign, station in zip(model.signs or (1,), (row.a, row.b), strict=False):
         if sign:
             yield from ((sign * factor, node, station) for factor, node in nodes)
 
 
 def _number_of(made: CostColumns, row: NodeRow, node: str | Node) -> int:
-    """Return the number of a node of one row, which is added unless it is of its station alone, as others are."""
+    """Return the number of a node of one row; a node of one station and epoch is added once and shared."""
     code, own = code_of(node), named(node)
     if not own.of_station:
         return made.add(code, own.numbers(row))
@@ -177,7 +173,7 @@ def _number_of(made: CostColumns, row: NodeRow, node: str | Node) -> int:
 
 
 def own_epochs(problem: Problem) -> int:
-    """Return at how many epochs stations, or the target, have a place or a velocity of their own."""
+    """Return the number of epochs at which stations or the target have a separate position or velocity."""
     stations = problem.stations
     if problem.motions[0].order > 0:
         return problem.epochs
@@ -186,90 +182,68 @@ def own_epochs(problem: Problem) -> int:
 
 
 def add_linear(made: CostColumns, rows: Array, origin: Array | None = None) -> list[int]:
-    """Add linear nodes of coefficients (B, q, d), zero at an origin (B, d), and return their numbers."""
+    """Add linear nodes with coefficients (B, q, d), zero at an origin (B, d), and return their numbers."""
     return [made.add(LINEAR, linear_numbers(rows[:, i], origin)) for i in range(rows.shape[1])]
 
 
-# Least squares over a position alone: what else is unknown, and enters linearly, takes its best value.
+# Least squares over the position alone: other unknowns that enter linearly take their best values.
 
 
 def roots(precision: Array) -> Array:
-    """Return L' (..., n, n) with L L' a symmetric positive semidefinite precision."""
+    """Return L' (..., n, n) with L L' equal to a symmetric positive semidefinite precision."""
     values, vectors = np.linalg.eigh(precision)
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2))
 
 
 def compress(K: Array, w: Array) -> tuple[Array, Array]:
-    """Return rows that have the same sum of squares ``|K phi - w|^2`` for every phi, at most one more than nodes.
+    """Return rows with the same sum of squares ``|K phi - w|^2`` for every phi; at most one more than nodes.
 
-    Parameters
-    ----------
-    K : array (B, q, J)
-        Whitened rows over the nodes, B = 1 or N.
-    w : array (N, q)
-        Whitened measurements.
+    K (B, q, J) are whitened rows over the nodes, with B = 1 or N, and w (N, q) are whitened measurements.
     """
     q, nodes = K.shape[-2:]
     if q <= nodes + 1:
         return K, w
     basis, upper = np.linalg.qr(K)
-    # Differences of J ranges have rank J - 1. The last row is rounding then: left in, it would be a range that no other
-    # balances, and the cost would seem to grow towards infinity.
+    # Differences of J ranges have rank J - 1, so the last row is rounding. If it stayed, it would be a range without
+    # counterpart, and the cost would seem to grow towards infinity.
     length = np.sqrt((K**2).sum(-2, keepdims=True))
     upper = np.where(np.abs(upper) > _DEPENDENT * length, upper, 0.0)
-    # What no position can fit stands in a row of its own, so that the cost keeps its value.
+    # A separate row contains the residual that no position can fit, so that the cost keeps its value.
     upper = np.concatenate([upper, np.zeros((*upper.shape[:-2], 1, nodes))], axis=-2)
     return upper, _fold(basis, w)
 
 
 def _fold(basis: Array, w: Array) -> Array:
-    """Return measurements (N, q) along orthonormal columns (B, q, J), and the length of what is across: (N, J + 1)."""
+    """Return measurements (N, q) along orthonormal columns (B, q, J), and the length of the rest: (N, J + 1)."""
     inside = (np.swapaxes(basis, -1, -2) @ w[..., None])[..., 0]
     rest = w - (basis @ inside[..., None])[..., 0]
     return np.concatenate([inside, np.sqrt((rest**2).sum(-1, keepdims=True))], axis=-1)
 
 
 def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
-    """Return the numbers of the nodes with a mark on those that are alone in their rows, with the least cost at zero.
+    """Return the numbers (B, J, width) of the nodes, with a mark on nodes that are alone in their rows.
 
-    Nodes that share no row with others: their part of the cost is a function of one number, which may be folded.
-
-    Parameters
-    ----------
-    kinds : int array (J,)
-        Codes of the nodes.
-    data : array (B, J, width)
-        Their numbers; B is N, or 1 where all share.
-    K : array (B, q, J)
-        Whitened rows.
-    w : array (N, q)
-        Whitened measurements.
-
-    Returns
-    -------
-    array (B, J, width)
+    A node gets the mark if it shares no row with other nodes and its least cost is at zero. Its cost is then a
+    function of one number, so that the absolute value of the node may replace it. `kinds` (J,) and `data` (B, J,
+    width) are codes and numbers of the nodes, and K (B, q, J) and w (N, q) are whitened rows and measurements. B is N,
+    or 1 if all problems share.
     """
     if not any(NODES[kind].mark for kind in kinds):
         return data
     information = np.swapaxes(K, -1, -2) @ K
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
-    # Relative to both columns: beside a long one any tie of a short one would look like none.
+    # Relative to the lengths of both columns: relative to a long column alone, any coupling of a short column would
+    # vanish.
     across = size[..., :, None] * size[..., None, :]
     alone = (np.abs(information) <= _ORTHOGONAL * across + across * np.eye(len(kinds)) * 2.0).all(-1)
     return mark_nodes(kinds, data, alone, size, (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0], w)
 
 
 def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Array, w: Array) -> Array:
-    """Return the numbers of nodes with a mark on those that are alone in their rows, see `mark_alone`.
+    """Return the numbers of nodes with a mark on nodes that are alone in their rows, see `mark_alone`.
 
-    Parameters
-    ----------
-    kinds, data, w : arrays
-        As there.
-    alone, size : array (B, J)
-        Whether no other node, and no other unknown, is in a node's rows; lengths of the columns K.
-    force : array (N, J)
-        ``K'w``.
+    `alone` (B, J) is true for nodes that share no row with another node or unknown, and `size` (B, J) has the lengths
+    of the columns of K. `force` (N, J) is ``K'w``.
     """
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
     out = np.array(data)
@@ -283,9 +257,9 @@ def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Arra
 
 
 class PositionCosts(NamedTuple):
-    """The maximum-likelihood costs of a flat batch of N problems over the position; B is N, or 1 where all share.
+    """The maximum-likelihood costs of a flat batch of N problems over the position; B is N, or 1 if all problems share.
 
-    Every other unknown has the value that is best for the position.
+    All other unknowns take their best values for the position.
 
     Parameters
     ----------
@@ -298,7 +272,8 @@ class PositionCosts(NamedTuple):
     w : array (N, q)
         Whitened measurements.
     level : array (N,)
-        Cost from which on angles may be off by a turn that the rows do not see; infinite without biases of angles.
+        Cost above which angles may be wrong by a full turn that the rows do not show; infinite without biases of
+        angles.
     """
 
     kinds: Array
@@ -309,11 +284,11 @@ class PositionCosts(NamedTuple):
 
     @property
     def dense(self) -> float:
-        """Return with how many nodes the time of a box grows as their square."""
+        """Return the number of nodes; the time of a box is proportional to its square."""
         return float(len(self.kinds))
 
     def take(self, items: Array | slice) -> PositionCosts:
-        """Return the costs of some of the problems; the same where these are all of them, in order."""
+        """Return the costs of some of the problems; the same object if `items` are all problems in order."""
         if not isinstance(items, slice) and np.array_equal(items, np.arange(len(self.w))):
             return self
 
@@ -326,9 +301,10 @@ class PositionCosts(NamedTuple):
 def position_costs(problem: Problem) -> PositionCosts:
     """Return the costs of a flat batch of problems over the position.
 
-    Unknown emission times and offsets without a prior are projected out; offsets, drifts and isotropic station errors
-    with Gaussian priors enlarge the covariance. Both are exact: these unknowns enter the rows linearly, a station
-    error because the nearest place to its surveyed one from which the range is another lies on the line to the target.
+    Unknown emission times and offsets without a prior are projected out. Offsets, drifts and isotropic station errors
+    with Gaussian priors enlarge the covariance. Both are exact, because these unknowns enter the rows linearly. Among
+    all station positions with a given range, the nearest to the surveyed position is on the line to the target. So a
+    station error enters linearly, too.
 
     Parameters
     ----------
@@ -341,14 +317,10 @@ def position_costs(problem: Problem) -> PositionCosts:
 
 
 def costs_of_groups(problem: Problem, group: Array) -> tuple[PositionCosts, Array]:
-    """Return costs as `position_costs` with separate nodes for each group of rows, and the groups (J,) of the nodes.
+    """Return costs like `position_costs` with separate nodes for each group of rows, and the groups (J,) of the nodes.
 
-    Parameters
-    ----------
-    problem : Problem
-        N problems whose rows are sums of ranges and logarithms of ranges.
-    group : int array (m,)
-        Group of each row; -1 for rows without a factor, such as priors.
+    The rows must be sums of ranges and of logarithms of ranges. `group` (m,) has the group of each row, and -1 for
+    rows without a factor, such as priors.
     """
     kinds, numbers, K, w, level, own = _rows_of(problem, group)
     K, w = compress(K, w)
@@ -356,14 +328,14 @@ def costs_of_groups(problem: Problem, group: Array) -> tuple[PositionCosts, Arra
 
 
 def costs_of_velocity(problem: Problem) -> tuple[PositionCosts, Array]:
-    """Return costs and groups as `costs_of_groups`: components of the target's velocity are factors of nodes."""
+    """Return costs and groups like `costs_of_groups`; the factors are components of the target's velocity."""
     kinds, numbers, K, w, level, own = _rows_of(problem, None)
     K, w = compress(K, w)
     return PositionCosts(kinds, numbers, K, w, level), own
 
 
 def factors_of_rows(problem: Problem) -> Array:
-    """Return the unknown factor (m,) of each row, -1 for none and -2 for several or another multiple."""
+    """Return the number of the unknown factor (m,) of each row; -1 for none, -2 for several or another multiple."""
     out, first = np.full(problem.count, -1), 0
     for bias in problem.biases:
         if form_of(bias).enters == "scales":
@@ -376,12 +348,12 @@ def factors_of_rows(problem: Problem) -> Array:
 def _rows_of(problem: Problem, group: Array | None) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return kinds and numbers of the nodes, rows over them, measurements (N, q), levels (N,), and groups of nodes.
 
-    Groups of rows (m,); None: the components of the target's velocity.
+    `group` has the group of each row (m,). None makes groups of the components of the target's velocity.
     """
     problem = with_station_noise(problem)
     others = OtherRows.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
-    # Absent rows have weight zero, and any finite value will do.
+    # Absent rows have weight zero, so any finite value is valid.
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
     made = columns_of(problem, known)
@@ -400,19 +372,19 @@ def _rows_of(problem: Problem, group: Array | None) -> tuple[Array, Array, Array
 
 
 class Affine(NamedTuple):
-    """The costs of all problems that differ in their measurements z alone, see `PositionCosts`.
+    """The costs of all problems that differ in their measurements z only, as an affine function; see `PositionCosts`.
 
     Parameters
     ----------
     kinds, data, K : int array (J,), array (1, J, width), array (1, q, J)
-        As of `PositionCosts`; of data what z = 0 makes of it.
+        As in `PositionCosts`; `data` is for z = 0.
     base, slope : array (p,), (p, m)
-        Whitened measurements of z = 0, and what they gain with each measurement.
+        Whitened measurements for z = 0, and their derivative with respect to z.
     basis : array (p, J), optional
-        Orthonormal columns to which they are folded (`compress`); None where they are not.
+        Orthonormal columns onto which measurements are folded (`compress`); None if they are not folded.
     place, first, gain : int array (e,), array (e,), array (e, m)
-        Numbers of the nodes that change with z, their values for z = 0, and their slopes. Each angle or ratio has one,
-        ranges and rates have none.
+        Indices of the node numbers that change with z, their values for z = 0, and their slopes. Each angle or ratio
+        has one such number; ranges and rates have none.
     """
 
     kinds: Array
@@ -426,12 +398,12 @@ class Affine(NamedTuple):
     gain: Array
 
     def room(self, count: int) -> PositionCosts:
-        """Return arrays for the costs of a number of problems."""
+        """Return arrays for the costs of a number of problems; `write` fills them."""
         data = np.repeat(self.data, count, axis=0) if len(self.place) else self.data
         return PositionCosts(self.kinds, data, self.K, np.empty((count, self.K.shape[1])), np.full(count, np.inf))
 
     def write(self, z: Array, costs: PositionCosts, item: int) -> None:
-        """Write whitened measurements and node numbers of one problem for measurements (m,)."""
+        """Write whitened measurements and node numbers of problem `item` for measurements z (m,)."""
         w = costs.w[item]
         if self.basis is None:
             np.dot(self.slope, z, out=w)
@@ -443,14 +415,11 @@ class Affine(NamedTuple):
 
 
 def affine_costs(problem: Problem) -> Affine | None:
-    """Return how the cost of a problem depends on its measurements, or None where not in a straight line.
+    """Return the cost of a problem as an affine function of its measurements, or None if it is not affine.
 
-    Parameters
-    ----------
-    problem : Problem
-        Without batch axes, and within the scope of the proof; its measurements are not looked at.
+    The problem has no batch axes and is within the scope of the proof. Its measurements are ignored.
     """
-    # an affine map is known by its images of zero and of the unit vectors
+    # an affine map is determined by its values at zero and at the unit vectors
     probes = np.concatenate([np.zeros((1, problem.count)), np.eye(problem.count)])
     kinds, numbers, K, w, level, _ = _rows_of(problem.with_rows(z=probes), np.zeros(problem.count, dtype=int))
     if np.isfinite(level).any() or len(K) > 1:
@@ -462,14 +431,14 @@ def affine_costs(problem: Problem) -> Affine | None:
     change = (data[1:] - data[0]).reshape(len(data) - 1, data[0].size)
     place = np.flatnonzero(change.any(0))
     first, gain = data[0].reshape(-1)[place], np.ascontiguousarray(change[:, place].T)
-    # arrays of one form, for which there is machine code
+    # writable C-ordered arrays, for which compiled code exists
     data, K = (np.require(array, requirements=["C", "W"]) for array in (data[:1].copy(), K))
     return Affine(kinds, data, K, base, slope, basis, place, first, gain)
 
 
 @dataclass(frozen=True, slots=True)
 class OtherRows:
-    """Unknowns beside the target's state: how rows contain them (m, n), their precision (B, n, n) and mean (B, n)."""
+    """Unknowns other than the target's state: coefficients in rows (m, n), precision (B, n, n) and mean (B, n)."""
 
     touch: Array
     precision: Array
@@ -477,7 +446,7 @@ class OtherRows:
 
     @classmethod
     def of(cls, problem: Problem) -> OtherRows:
-        """Return the unknowns of a problem beside the target's state, those of stations apart."""
+        """Return the unknowns of a problem other than the target's state, without station errors."""
         size = problem.layout.size
         touch = np.zeros((problem.count, size))
         for links, start in zip(block_links(problem), problem.starts, strict=True):
@@ -503,34 +472,35 @@ class OtherRows:
         epoch = problem.epoch
         for row, node, coefficient in zip(made.row, made.column, made.coefficient, strict=True):
             own = columns(problem.layout, "stations", epoch[row : row + 1])[0]
-            # Isotropic, so any axis stands for the line to the target: the first of the station's d.
+            # Errors are isotropic, so any axis can represent the line to the target: the first of the station's d
+            # axes.
             touch[row, own[made.station[node] * d]] += coefficient
         return OtherRows(touch, self.precision, self.mean)
 
 
 def _of_rows(problem: Problem, of_model: Callable[[Model], Any]) -> Array:
-    """Return what is said of the kind of each row (m,)."""
+    """Return the value (m,) of a function of the kind of each row."""
     return np.concatenate([np.full(rows.count, of_model(MODELS[rows.kind])) for rows in problem.rows])
 
 
 def counts_from_measured(problem: Problem) -> Array:
-    """Return which rows (m,) are of nodes that are less their measured value."""
+    """Return whether each row (m,) has a node that is relative to its measured value."""
     return _of_rows(problem, lambda model: any(named(node).counts_from_measured for _, node in model.nodes))
 
 
 def _projected(problem: Problem, made: CostColumns, others: OtherRows, value: Array) -> tuple[Array, Array]:
-    """Return whitened rows (B, q, J) over the nodes and measurements (N, q), free of the other unknowns."""
+    """Return whitened rows (B, q, J) over the nodes and measurements (N, q), with other unknowns projected out."""
     noise, J = whiten(problem.noise, problem.weight), len(made.kinds)
     used = others.touch.any(0) | others.precision.any((0, 1))
     touch, precision = others.touch[:, used], others.precision[:, used][:, :, used]
     geometry = whiten_rows(noise, np.concatenate([made.design, touch], axis=1))
     geometry = geometry if geometry.ndim == 3 else geometry[None]
     shared = len(geometry) == len(precision) == 1  # one template, many measurements: the usual batch
-    # Measurements of all problems are the columns of one matrix where everything else is shared.
+    # If all else is shared, the measurements of all problems are the columns of one matrix.
     seen = whiten_rows(noise, value.T if shared else value[..., None])
     seen = seen if seen.ndim == 3 else seen[None]
     if used.any():
-        # A prior is a row for the unknown itself; one without a prior has a row of zeros.
+        # A prior is a row for the unknown itself; an unknown without a prior has a row of zeros.
         size = max(len(geometry), len(precision))
         tail = np.zeros((size, touch.shape[1], J + touch.shape[1]))
         tail[..., J:] = roots(precision)
@@ -553,7 +523,7 @@ def position_prior(problem: Problem, made: CostColumns) -> list[int]:
 
 
 def _with_rows_of(nodes: list[int], K: Array, w: Array) -> tuple[Array, Array]:
-    """Return the rows with one of its own, with a measured zero, for each of the last nodes."""
+    """Return the rows with one more row for each of the last nodes, which has a measured value of zero."""
     if not nodes:
         return K, w
     own = np.zeros((len(K), len(nodes), K.shape[2] + len(nodes)))
@@ -564,10 +534,10 @@ def _with_rows_of(nodes: list[int], K: Array, w: Array) -> tuple[Array, Array]:
 
 
 def turned_level(problem: Problem, others: OtherRows, known: Array) -> Array:
-    """Return the cost (N,) from which on the sum of an angle and its bias may be off by a turn.
+    """Return the cost (N,) above which the sum of an angle and its bias may be wrong by a full turn.
 
-    Residuals are wrapped with their bias, nodes without it; a row can differ only where noise and bias together are
-    half a turn, and then its own chi-square is at least that squared over their variance.
+    Residuals are wrapped together with their bias, but nodes without it. A row can differ only if noise and bias
+    together are half a turn. The chi-square of the row is then at least that angle squared over their variance.
     """
     level = np.full(len(known), np.inf)
     period = _of_rows(problem, lambda model: model.period or np.nan)
@@ -582,7 +552,8 @@ def turned_level(problem: Problem, others: OtherRows, known: Array) -> Array:
         variance = variance + np.einsum("rn,bnm,rm->br", touch, covariance, touch)
     counted = counts_from_measured(problem)[rows]
     most, turn = _of_rows(problem, _most)[rows], period[rows]
-    # From the measured value to the farthest that the node can be: beyond half a turn the residual is the shorter way.
+    # Distance from the measured value to the farthest value of the node. Beyond half a turn the residual is the
+    # shorter way.
     size = np.where(counted, 0.0, np.abs(known[:, rows]))
     apart = turn - most - size
     able = biased | (~counted & (size >= 0.5 * turn - most))
@@ -590,5 +561,5 @@ def turned_level(problem: Problem, others: OtherRows, known: Array) -> Array:
 
 
 def _most(model: Model) -> float:
-    """Return how large the node of a kind with a period can be."""
+    """Return the greatest size of the node of a kind with a period, radians."""
     return sum(abs(factor) * named(node).most for factor, node in model.nodes)

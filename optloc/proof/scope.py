@@ -1,4 +1,4 @@
-"""What the proof covers: one target, the kinds of rows, biases and constraints; and what is a run."""
+"""Scope of the proof: targets, kinds of rows, biases and constraints that it covers, and the definition of a run."""
 
 from __future__ import annotations
 
@@ -15,37 +15,34 @@ from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.position_costs import factors_of_rows, own_epochs
 
-# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time: a
-# box of ten thousand nodes takes a millisecond, and plain Python takes a thousand times longer.
+# Greatest number of different ranges, angles and ratios, and of unknowns other than the position, for which a proof is
+# worth its time. A box of ten thousand nodes takes a millisecond; plain Python takes a thousand times longer.
 MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 10_000, 24, 128
-# Nodes beyond which a proof is that of a run, whose time goes with the nodes, not with their square: of stations that
-# move (of 25 nodes of five epochs no box was looked at within the budget of dense rows; up to here plain Python begins
-# where there is no machine code), and of those that stay, whose batches share their rows.
+# Beyond these numbers of nodes, the proof for runs is used. Its time is proportional to the number of nodes, not to
+# the square. SHORT is for stations that move: with 25 nodes of five epochs, the budget of dense rows did not suffice
+# for one box. Without compiled code, plain Python begins proofs up to this number. MOST_DENSE is for stations that
+# stay, whose batches share their rows.
 SHORT, MOST_DENSE = 24, 128
-# Unknown factors of rows: each box solves a system of this size, and each factor adds three columns to its rows.
+# Greatest number of unknown factors of rows: each box solves a system of this size, and each factor adds three columns
+# to its rows.
 MOST_FACTORS = 3
 
 
 def why_unsupported(problem: Problem) -> str:
-    """Return why a problem is beyond the proof, in a sentence that names what, or nothing where it is within.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of problems.
-    """
+    """Return the first reason why the proof does not cover a flat batch of problems, or "" if it covers them."""
     return next(_reasons(problem), "")
 
 
 def _reasons(problem: Problem) -> Iterator[str]:
+    """Yield all reasons why the proof does not cover a problem."""
     if len(problem.motions) != 1:
-        yield f"there are {len(problem.motions)} targets, and the proof is for one"
+        yield f"there are {len(problem.motions)} targets, but the proof covers one"
         return
     motion = problem.motions[0]
     if motion.known is not None or not problem.layout.shares("position"):
-        yield "no position is common to all rows"
+        yield "the rows do not share one position"
     if motion.order > 0:
-        yield from _beyond_courses(problem)
+        yield from _beyond_motion(problem)
     yield from _beyond_rows(problem)
     yield from _beyond_biases(problem)
     if is_scaled(problem) and not has_one_epoch_velocity(problem):
@@ -54,60 +51,61 @@ def _reasons(problem: Problem) -> Iterator[str]:
     yield from _beyond_constraints(problem)
     known = {"position", "velocity", *(bias.name for bias in problem.biases)}
     known |= {name for name, _, _ in problem.stations.errors}
-    # What `optloc.proof.position_costs` does not write as rows would be left out of the cost without a word.
+    # `optloc.proof.position_costs` writes priors on known names as rows. Other priors would silently be left out of
+    # the cost.
     for name, _, _ in prior_parts(problem):
         if name not in known:
             yield f"the prior on {name} is not covered"
 
 
-def _beyond_courses(problem: Problem) -> Iterator[str]:
-    """Yield what of a target that moves is beyond the proof: its node at an epoch is one of the place it has then."""
+def _beyond_motion(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against a moving target: a node at an epoch must depend on the position at that epoch."""
     motion = problem.motions[0]
     if motion.order > 1:
-        yield "the target accelerates, and the proof is for one that stays or moves uniformly"
+        yield "the target accelerates, but the proof covers fixed targets and uniform motion"
     if has_one_epoch_velocity(problem):
-        yield from _beyond_moments(problem)
+        yield from _beyond_velocity_at_epoch(problem)
         return
     if problem.epochs < 2:
-        yield "the target moves, and the proof of that needs several epochs"
+        yield "the target moves, and the proof then needs several epochs"
     if problem.dimension > 2 and held_height(problem) is None:
-        yield "the target moves in space, and the proof is for the plane and for heights that are kept over ground"
+        yield "the target moves in space, but the proof covers the plane and known heights over ground"
     if problem.dimension > 2 and any(name == "velocity" for name, _, _ in prior_parts(problem)):
-        yield "the prior on velocity is not covered where the target moves over ground"
+        yield "the target moves over ground, and the proof then covers no prior on velocity"
     for rows in problem.rows:
         if MODELS[rows.kind].velocity:
-            yield f"the target moves, and {rows.kind} rows depend on how fast"
+            yield f"the target moves, and {rows.kind} rows depend on its velocity"
 
 
 def has_one_epoch_velocity(problem: Problem) -> bool:
-    """Return whether the rows are of one epoch, and show by rates how fast the target moves."""
+    """Return whether all rows are of one epoch and contain rates, so that they show the velocity of the target."""
     motion = problem.motions[0]
     if motion.order != 1 or motion.known is not None or problem.epochs > 1:
         return False
     return any(MODELS[rows.kind].velocity for rows in problem.rows)
 
 
-def _beyond_moments(problem: Problem) -> Iterator[str]:
-    """Yield what of rates of one epoch is beyond the proof: they are linear in the velocity."""
+def _beyond_velocity_at_epoch(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against rates of one epoch: the proof needs rates that are linear in the velocity."""
     motion = problem.motions[0]
     if motion.over != "space" or motion.rise is not None:
-        yield "the target moves over ground, and the proof of that needs several epochs"
+        yield "the target moves over ground, and the proof then needs several epochs"
     if problem.times[0] != problem.origin:
-        yield "the target moves, and its state holds at another time than the rows"
+        yield "the target moves, and its state is for another time than the rows"
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.velocity and {node for _, node in model.nodes} != {"range_rate"}:
-            yield f"the target moves, and {rows.kind} rows depend on how fast"
+            yield f"the target moves, and {rows.kind} rows depend on its velocity"
     if problem.constraints:
-        yield "the velocity at one epoch comes with constraints, and its proof is for all positions"
+        yield "the velocity at one epoch is unknown, and the proof then covers no constraints"
     if any(form_of(bias).enters == "scales" for bias in problem.biases):
-        yield "the velocity at one epoch comes with unknown scales, and the proof takes either"
+        yield "the velocity at one epoch is unknown, and the proof then covers no unknown scales"
     if is_run(problem):
-        yield f"the velocity at one epoch is of many rows, and the proof takes {MOST_DENSE} different ranges and rates"
+        yield f"the velocity at one epoch is unknown; the proof then covers {MOST_DENSE} different ranges and rates"
 
 
 def held_height(problem: Problem) -> Band | None:
-    """Return the height that a target which moves over ground keeps, or nothing."""
+    """Return the constraint on the height of a target that moves over ground, or None."""
     for band in problem.constraints:
         if not isinstance(band, Band) or band.kind != "height" or not is_exact(band):
             continue
@@ -117,38 +115,41 @@ def held_height(problem: Problem) -> Band | None:
 
 
 def _beyond_rows(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the kinds of rows, and against the numbers of nodes and unknowns."""
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.straight is not None:
-            yield f"{model.straight} rows follow rays that bend, and the proof takes straight ones"
+            yield f"{model.straight} rows follow rays that bend, but the proof covers straight rays"
         elif model.ranges is None and not model.nodes:
-            yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind whose bounds are known"
+            yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind with known bounds"
     most = MOST_NODES if enabled() else MOST_NODES_PLAIN
     if problem.count > most and _nodes(problem) > most:
-        without = "" if enabled() else " without machine code"
-        yield f"there are {_nodes(problem)} different ranges, rates and angles, and the proof takes {most}{without}"
+        without = "" if enabled() else " without compiled code"
+        yield f"there are {_nodes(problem)} different ranges, rates and angles, but the proof covers {most}{without}"
     if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
-        yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
+        yield f"there are {problem.layout.size} unknowns, but the proof covers {MOST_UNKNOWNS}"
 
 
 def is_run(problem: Problem) -> bool:
-    """Return whether a proof is that of a run (`optloc.proof.runs`): its rows have too many nodes for dense ones."""
+    """Return whether a proof uses the method for runs (`optloc.proof.runs`): too many nodes for dense rows."""
     most = SHORT if own_epochs(problem) > 1 else MOST_DENSE
     return 2 * problem.count > most and _nodes(problem) > most
 
 
 def why_too_large(problem: Problem) -> str:
-    """Return why a problem is beyond what works with dense rows, in a sentence, or nothing where it is within."""
+    """Return the reason why a problem does not fit methods with dense rows, or an empty string if it fits."""
     number = _nodes(problem)
     if is_scaled(problem):
         return "the velocity is unknown" if has_one_epoch_velocity(problem) else "a factor of the rows is unknown"
-    return "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, over {MOST_DENSE}"
+    return (
+        "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, more than {MOST_DENSE}"
+    )
 
 
 def _nodes(problem: Problem) -> int:
-    """Return how many different ranges, rates, angles, ratios and heights the rows are made of."""
+    """Return the number of different ranges, rates, angles, ratios and heights in the rows."""
     moving, own = own_epochs(problem) > 1, 0
-    found: set[tuple[bool, int, int]] = set()
+    shared: set[tuple[bool, int, int]] = set()
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.signs is None:
@@ -156,53 +157,54 @@ def _nodes(problem: Problem) -> int:
             continue
         when = rows.epoch if moving else np.zeros_like(rows.epoch)
         for index in (rows.a, rows.b)[: model.stations]:
-            found.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
-    return own + len(found)
+            shared.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
+    return own + len(shared)
 
 
 def _beyond_biases(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the biases."""
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
         if why := form_of(bias).beyond_proof:
             yield f"the {bias.form} {bias.name!r} {why}"
         elif bias.sigma is None and angular[bias.row].any():
-            yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
+            yield f"the bias {bias.name!r} of angles has no prior, so it may include whole turns"
 
 
 def is_scaled(problem: Problem) -> bool:
-    """Return whether unknown factors multiply rows, or a velocity does; `optloc.proof.scaled` proves such fixes."""
+    """Return whether rows have unknown factors or an unknown velocity; `optloc.proof.scaled` proves these fixes."""
     return any(form_of(bias).enters == "scales" for bias in problem.biases) or has_one_epoch_velocity(problem)
 
 
 def _beyond_scale(problem: Problem) -> Iterator[str]:
-    """Yield the reasons against a proof with unknown factors: it covers a few, each of a group of rows."""
+    """Yield the reasons against unknown factors: the proof covers a few factors, each of a group of rows."""
     scales = [bias for bias in problem.biases if form_of(bias).enters == "scales"]
     name, count, factor = scales[0].name, sum(len(bias.members) for bias in scales), factors_of_rows(problem)
     if count > MOST_FACTORS:
-        yield f"there are several scales ({count}), and the proof takes {MOST_FACTORS}"
+        yield f"there are several scales ({count}), but the proof covers {MOST_FACTORS}"
     elif (factor < -1).any():
-        yield "rows have several scales, or a multiple of one, and the proof takes one scale for each row"
+        yield "rows have several scales, or a multiple of a scale, but the proof covers one scale for each row"
     free = np.concatenate([np.full(len(bias.members), bias.sigma is None) for bias in scales])
     yield from _beyond_factors(problem, factor, [*free, False, False])
     if problem.constraints:
-        yield f"the scale {name!r} comes with constraints, and its proof is for all positions"
+        yield f"the scale {name!r} is unknown, and the proof then covers no constraints"
     if problem.stations.unknown_for:
-        yield f"the scale {name!r} comes with unknown station errors, which it multiplies"
+        yield f"the scale {name!r} multiplies unknown station errors, which the proof does not cover"
     if is_run(problem):
-        yield f"the scale {name!r} is of a long run, and the proof takes {MOST_DENSE} different ranges"
+        yield f"the scale {name!r} belongs to a long run, but the proof covers {MOST_DENSE} different ranges"
 
 
 def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> Iterator[str]:
-    """Yield the reasons against kinds of rows with factors (m,), of which some have no prior."""
+    """Yield the reasons against kinds of rows with factors `factor` (m,); `free` marks factors without a prior."""
     emitting, kinds = set[int](), {rows.kind for rows in problem.rows}
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model, own = MODELS[rows.kind], {int(one) for one in factor[start : start + rows.count]}
         emitting |= own if model.emission else set()
         without_prior = any(free[one] for one in own)
         if model.ranges is None and {node for _, node in model.nodes} != {"log range"}:
-            yield f"scales come with {rows.kind} rows, and the proof takes times, ranges and levels"
+            yield f"a scale is unknown; the proof then covers times, ranges and levels, but no {rows.kind} rows"
         elif model.ranges is None and without_prior and (len(kinds) > 1 or len(own) > 1):
-            yield f"the scale of {rows.kind} rows has no prior, and other rows do not have it"
+            yield f"the scale of {rows.kind} rows has no prior, and other rows do not have this scale"
         elif without_prior and sum(model.ranges or ()) != 0 and not model.emission:
             yield f"the scale of {rows.kind} rows has no prior, so that nothing bounds the position"
     if len(emitting) > 1 and any(free[one] for one in emitting):
@@ -210,24 +212,26 @@ def _beyond_factors(problem: Problem, factor: Array, free: Sequence[bool]) -> It
 
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the errors of station positions and velocities."""
     if problem.stations.velocity_covariance is not None:
         rates = [rows.kind for rows in problem.rows if MODELS[rows.kind].velocity]
         if rates:
-            yield f"errors of the stations' velocities enter {rates[0]} rows in a way that depends on the place"
+            yield f"errors of the stations' velocities change {rates[0]} rows by amounts that depend on the position"
     if problem.stations.covariance is None:
         return
-    # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
+    # If station errors are isotropic, the admitted station position nearest to the surveyed one is on the line to the
+    # target.
     if not problem.stations.isotropic:
         yield "the station errors differ from axis to axis"
-    if problem.stations.unknown_for == "run" and _move(problem):
-        yield "station errors last the whole run while stations move, and the proof takes one line of sight for each"
+    if problem.stations.unknown_for == "run" and _stations_move(problem):
+        yield "station errors last the whole run while stations move; the proof covers one line of sight for each"
     bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
     if bent:
-        yield f"station errors enter {bent[0]} rows in a way that depends on the place"
+        yield f"station errors change {bent[0]} rows by amounts that depend on the position"
 
 
-def _move(problem: Problem) -> bool:
-    """Return whether a station that rows of several epochs name is at different places in them."""
+def _stations_move(problem: Problem) -> bool:
+    """Return whether a station of rows of several epochs has different positions at these epochs."""
     place = problem.stations.position
     if place.shape[-3] < 2:
         return False
@@ -241,11 +245,12 @@ def _move(problem: Problem) -> bool:
 
 
 def _beyond_constraints(problem: Problem) -> Iterator[str]:
+    """Yield the reasons against the constraints."""
     levels = [constraint for constraint in problem.constraints if is_exact(constraint)]
     if len(levels) > 1 and any(isinstance(level, Band) and level.kind == "height" for level in levels):
-        yield "a height that is known together with another equality leaves a line, which the proof does not follow"
+        yield "a known height and another equality leave a line, which the proof does not follow"
     if len(levels) >= problem.dimension:
-        yield "the equalities leave no way to move"
+        yield "the equalities leave no free direction"
     for constraint in problem.constraints:
         if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):
             yield f"the equality {constraint.name!r} is neither a height nor a plane"

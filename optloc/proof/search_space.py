@@ -1,4 +1,4 @@
-"""What a proof works on: the cost, search coordinates around a fix, and tables for one box."""
+"""Data of a proof: the cost, search coordinates around a fix, and tables for one box."""
 
 from __future__ import annotations
 
@@ -55,24 +55,25 @@ from optloc.proof.surface import (
     unfold_slopes,
 )
 
-# Roundings of a coordinate on its way from search coordinates to metres: three products, three sums, and the sizes of
-# what they are rounded beside.
+# Rounding of a coordinate from search coordinates to metres: three products and three sums, relative to the sizes of
+# their terms.
 _PLACED = 8.0 * 2.0**-52
-# A residual counts 34 roundings or more for each size (`optloc.proof.box.relative_rounding`), of coordinates a share.
-# Lines from a position to stations are as exact as their own lengths, for a difference of two doubles is rounded once: what is left
-# are the 8 roundings of a position as it is placed.
+# A residual counts 34 roundings or more for each size (`optloc.proof.box.relative_rounding`); coordinates count with
+# this share.
+# A line from a position to a station is as exact as its length, because the difference of two doubles is rounded once.
+# So only the 8 roundings of the position itself remain.
 LINES = 0.25
-# Rounding of a residual up to which ranges are counted from a place: costs are then right to a hundredth.
+# Rounding of a residual up to which ranges are counted from a reference position: costs are then right to a hundredth.
 _SHARP = 0.02
 
 
 class Cost(NamedTuple):
-    """The cost ``f(x) = |K phi(x) - w|^2``.
+    """The cost ``f(x) = |K phi(x) - w|^2`` of a position x, as a function of nodes phi.
 
     Parameters
     ----------
     kinds, data : array (J,), (J, width)
-        The nodes.
+        The nodes: their codes and their numbers.
     K, w : array (q, J), (q,)
         Whitened rows.
     A : array (J, J)
@@ -93,22 +94,22 @@ class Cost(NamedTuple):
 
 
 HIDDEN_REACH = 5e4
-"""How far around a minimum that does not count nothing else does, metres: such minima lie deep in the Earth."""
+"""Radius, metres, around a hidden minimum in which other points are hidden too: such minima are deep in the Earth."""
 
 
 class KnownMinima(NamedTuple):
-    """What is known of a problem beside its fix.
+    """Known minima other than the fix, and the equalities of a problem.
 
     Parameters
     ----------
     points : array (P, D)
-        Other minima, polished; boxes around them that hold no second one are set aside.
+        Other minima, polished, metres. Boxes around them without a second minimum are excluded from the search.
     hidden : int
-        The last so many of them do not count, though they may cost less: nor does what is near them.
+        The last `hidden` minima do not count, although they may cost less. Points near them do not count either.
     planes : array (e, 3)
         Normals of planes through the fix to which the claim is limited.
     surface : array (0,) or (SURFACE_WIDTH,)
-        The surface of a height to which it is limited, see `optloc.proof.surface`; never together with planes.
+        The surface of a height to which the claim is limited, see `optloc.proof.surface`; never together with planes.
     """
 
     points: Array
@@ -118,27 +119,28 @@ class KnownMinima(NamedTuple):
 
 
 class LocalAxes(NamedTuple):
-    """Search coordinates s with ``x = origin + sense s``: principal axes of the fix, one unit a standard deviation.
+    """Search coordinates s with ``x = origin + sense s``: principal axes of the fix, in units of standard deviations.
 
-    On planes there are fewer of them. On the surface of a height two: the third axis is upward, as
-    `optloc.proof.surface` says, and points are off the origin along it as far as the surface is.
+    With planes there are fewer coordinates. On the surface of a height there are two. The third axis is then upward,
+    and the distance of points from the origin along it follows from the surface (`optloc.proof.surface`).
 
     Parameters
     ----------
     origin : array (3,)
-        The fix.
+        The fix, metres.
     sense, back, gram : array (3, 3)
-        T, its inverse, and T'T; columns of T, rows of the inverse and both of T'T are zero for coordinates that there
-        are not.
+        T, its inverse, and T'T. For coordinates that do not exist, columns of T, rows of the inverse, and rows and
+        columns of T'T are zero.
     slip : array (3,)
-        How far the rounding of coordinates of one metre moves a point, search coordinates.
+        Change of search coordinates by the rounding of coordinates of one metre.
     floor : float
-        The sizes of what residuals are differences of, beside the nodes: measurements and coordinates.
+        Sizes of measurements and coordinates in residuals; the sizes of nodes are not included.
     surface : array (0,) or (SURFACE_WIDTH,)
         The surface of a height, with the axes of this piece.
     differs, middle : bool, array (3,)
-        Whether ranges on it are counted from a place, the middle of the stations: differences of ranges
-        (`optloc.proof.nodes.range.bound_difference`) bend less over boxes as large as a continent.
+        Whether ranges are counted from a reference position, and this position, the middle of the stations.
+        Differences of ranges (`optloc.proof.nodes.range.bound_difference`) are closer to linear over boxes as large as
+        a continent.
     """
 
     origin: Array
@@ -164,15 +166,16 @@ class Box(NamedTuple):
     line : array (6,)
         Working memory.
     nodes, rows, curves, sums : array (J, NODE_WIDTH), (q, ROW_WIDTH), (J, CURVE_WIDTH), (SUMS,)
-        Tables, see `optloc.proof.box`.
+        Tables, see `optloc.proof.nodes.node` (nodes, curves), `optloc.proof.box` (rows) and `optloc.proof.curvature`
+        (sums).
     solve : array (3, 3)
         Working memory.
     cut : array (6,)
-        Ends of the part of the box that is left, about its centre.
+        Ends of the remaining part of the box, relative to its centre.
     sense, gram, graph, lean : array (3, 3), (3, 3), (GRAPH_WIDTH,), (J,)
-        Of a box on a surface: its own T and T'T, the graph of the surface, and slopes along the upward axis.
+        For a box on a surface: its T and T'T, the graph of the surface, and slopes along the upward axis.
     inside : array (10, 3, 3)
-        Of a box on a surface: numbers of its place in the inside of an atlas, see `_inside_of`.
+        For a box on a surface: numbers of the inside of an atlas that contains it, see `_inside_of`.
     """
 
     at: Array
@@ -202,7 +205,7 @@ def cost_of(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
 
 @compiled
 def set_geometry(kinds: Array, K: Array, A: Array, weight: Array, groups: Groups) -> None:
-    """Write what a cost takes from its rows alone: `A`, `weight` and `groups` of `Cost`."""
+    """Write the parts of a cost that depend on its rows only: `A`, `weight` and `groups` of `Cost`."""
     for j in range(K.shape[1]):
         for m in range(j, K.shape[1]):
             total = 0.0
@@ -242,15 +245,15 @@ def empty_box(q: int, J: int) -> Box:
 def chart_at(cost: Cost, x: Array, box: Box) -> tuple[LocalAxes, bool]:
     """Return the search coordinates around a fix x (D,), and whether the rows determine them.
 
-    The tables of the box are those of the fix afterwards: values of the nodes, forces (`CURVE_WIDTH`), and sums, whose
-    gradient is that along the search coordinates.
+    Afterwards the box contains the tables of the fix: values of the nodes, forces (`CURVE_WIDTH`), and sums, whose
+    gradient is along the search coordinates.
     """
     return chart_on(cost, x, box, np.empty((0, 3)), np.empty(0))
 
 
 @compiled
 def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> tuple[LocalAxes, bool]:
-    """Return the search coordinates around a fix on planes or a surface, see `KnownMinima`; else of `chart_at`."""
+    """Return the search coordinates around a fix on planes or a surface (see `KnownMinima`), as `chart_at` does."""
     D = x.shape[0]
     vectors, numbers = np.zeros((2, 3)), np.zeros((3, 3, 3))
     origin, slip, sense, back, gram = vectors[0], vectors[1], numbers[0], numbers[1], numbers[2]
@@ -266,7 +269,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     information[0, 1] = information[1, 0] = sums[H01]
     information[0, 2] = information[2, 0] = sums[H02]
     information[1, 2] = information[2, 1] = sums[H12]
-    # `gram` holds the axes for the moment; it is written anew below.
+    # `gram` temporarily contains the axes; T'T replaces them below.
     if planes.shape[0] + surface.shape[0] == 0:
         count = D
         roughly_principal(information, gram)
@@ -275,7 +278,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         principal_along(information, gram, count)
     most = max(information[0, 0], information[1, 1], information[2, 2])
     if count == D and least_diagonal(information, D) <= FAINT * most:
-        lengths = information.copy()  # what follows overwrites it
+        lengths = information.copy()  # the calls below overwrite it
         unit = np.eye(3)
         curve_nodes(cost.kinds, cost.data, origin, unit, unit, box.half, box.line, information, nodes, curves)
         sum_up(cost.K, cost.w, cost.weight, 0.0, nodes, curves, sums)
@@ -306,7 +309,8 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     if own.shape[0] > 0 and reaches_infinity(cost.kinds, cost.K):
         middle, _ = station_cube(cost.kinds, cost.data, x)
         floor += _length_of_lines(cost, own, middle)
-        # Lines from anywhere have fewer digits than those from the fix, which very sharp rows need.
+        # Lines from the reference position have fewer exact digits than lines from the fix, which very sharp rows
+        # need.
         if relative_rounding(cost.K) * floor < _SHARP:
             chart = LocalAxes(origin, sense, back, gram, slip, floor, own, True, middle)
     return chart, good
@@ -314,7 +318,7 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
 
 @compiled
 def _length_of_lines(cost: Cost, surface: Array, middle: Array) -> float:
-    """Return the sizes of lines from anywhere on a surface, whose lengths the differences of ranges need."""
+    """Return the weighted sizes of lines from any point of a surface, which limit the accuracy of differences."""
     size, total = WGS84_A + abs(surface[LEVEL]) + abs(middle[0]) + abs(middle[1]) + abs(middle[2]), 0.0
     for j in range(cost.kinds.shape[0]):
         if cost.kinds[j] == RANGE:
@@ -324,24 +328,24 @@ def _length_of_lines(cost: Cost, surface: Array, middle: Array) -> float:
 
 @compiled
 def without_differences(chart: LocalAxes) -> LocalAxes:
-    """Return the same search coordinates, in which ranges are bounded one by one."""
+    """Return the same search coordinates with ranges that are bounded one by one."""
     origin = chart.origin
     return LocalAxes(origin, chart.sense, chart.back, chart.gram, chart.slip, chart.floor, chart.surface, False, origin)
 
 
 @compiled
 def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: Array, share: float) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes: measurements and coordinates.
+    """Return the sizes of measurements and coordinates in residuals, without the sizes of the nodes.
 
     Parameters
     ----------
     kinds, data, weight, w : arrays
-        As of `Cost`.
+        As in `Cost`.
     origin : array (3,)
         A position, metres.
     share : float
-        By what share coordinates count in ranges: LINES from a position that is a double, more from one that is worked
-        out in many steps.
+        Share of the coordinates in ranges: LINES for a position that is a double, more for a position that is computed
+        in many steps.
     """
     total = 0.0
     for i in range(w.shape[0]):
@@ -349,7 +353,7 @@ def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: A
     total = sqrt(total)
     reach = abs(origin[0]) + abs(origin[1]) + abs(origin[2])
     for j in range(kinds.shape[0]):
-        if kinds[j] == RANGE:  # as its node says: ranges are asked often enough to be spared the call
+        if kinds[j] == RANGE:  # the same as `size_of` returns: ranges skip the call, because they are common
             size = share * (reach + (abs(data[j, 0]) + abs(data[j, 1]) + abs(data[j, 2])))
         else:
             size = size_of(kinds[j], data[j], reach)
@@ -359,7 +363,7 @@ def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: A
 
 @inlined
 def write_centre(origin: Array, sense: Array, at: Array, centre: Array) -> None:
-    """Write the centre of a box at search coordinates `at` in metres."""
+    """Write the centre of a box at search coordinates `at`, in metres."""
     s0, s1, s2 = at[0], at[1], at[2]
     for k in range(3):
         centre[k] = origin[k] + (sense[k, 0] * s0 + sense[k, 1] * s1 + sense[k, 2] * s2)
@@ -367,9 +371,9 @@ def write_centre(origin: Array, sense: Array, at: Array, centre: Array) -> None:
 
 @inlined
 def widen_by_rounding(chart: LocalAxes, centre: Array, half: Array) -> None:
-    """Widen a box by how far rounding may have moved its centre, metres: all that is said of it holds where it is."""
+    """Widen a box by the rounding of its centre, metres, so that all bounds hold for the exact box."""
     size = abs(centre[0]) + abs(centre[1]) + abs(centre[2])
-    # What is added to the origin may be larger than the sum.
+    # The term that is added to the origin may be larger than the sum.
     size += 2.0 * (abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2]))
     for k in range(3):
         half[k] += chart.slip[k] * size
@@ -377,7 +381,7 @@ def widen_by_rounding(chart: LocalAxes, centre: Array, half: Array) -> None:
 
 @inlined
 def is_bounded(cost: Cost, chart: LocalAxes, box: Box) -> bool:
-    """Bound the nodes over a box; return False where it is so large that a surface is no graph over it."""
+    """Bound the nodes over a box; return False if the box is so large that a surface is no graph over it."""
     write_centre(chart.origin, chart.sense, box.at, box.centre)
     if chart.surface.shape[0] == 0:
         bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
@@ -387,7 +391,7 @@ def is_bounded(cost: Cost, chart: LocalAxes, box: Box) -> bool:
 
 @compiled
 def lay_on_surface(cost: Cost, chart: LocalAxes, box: Box) -> bool:
-    """Bound the nodes over a box whose centre is in the plane of its chart along a surface, onto which it is moved."""
+    """Move a box from the plane of its coordinates onto the surface, and bound its nodes; return False if too large."""
     put_rows(chart.sense, box.sense)
     if not lay_box(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
         box.half[2] = 0.0
@@ -405,13 +409,14 @@ def lay_on_surface(cost: Cost, chart: LocalAxes, box: Box) -> bool:
 
 @inlined
 def _inside_of(cost: Cost, chart: LocalAxes, box: Box) -> Atlas:
-    """Return the atlas whose inside holds a box on a surface: its cube is as large as the Earth.
+    """Return the atlas whose inside contains a box on a surface: its cube is as large as the Earth.
 
-    It is made of views at each use. A record that a box held would be counted, array by array, in every call.
+    The atlas consists of views that are made at each use. If the box stored the record, each call would count
+    references to all its arrays.
     """
     m = box.inside
     numbers = m[9].reshape(9)
-    # nothing reads the minima: they have room of the right kinds
+    # no code reads the minima; these arrays only have the right types
     minima = AtlasMinima(cost.groups.order[0], m[0], m[:1], m[:1], m[0], m[:1])
     return Atlas(
         chart.middle,
@@ -433,7 +438,7 @@ def _inside_of(cost: Cost, chart: LocalAxes, box: Box) -> Atlas:
 
 @compiled
 def _set_inside(inside: Atlas, box: Box) -> None:
-    """Set the centre of a box on a surface, and its axes, in the inside of an atlas."""
+    """Write the centre and axes of a box on a surface into the inside of an atlas."""
     inside.scale[0] = 1.0
     for m in range(3):
         inside.point[m] = (box.centre[m] - inside.middle[m]) / inside.radius
@@ -444,7 +449,7 @@ def _set_inside(inside: Atlas, box: Box) -> None:
 
 @compiled
 def curve_along(cost: Cost, chart: LocalAxes, box: Box) -> None:
-    """Fill the table of second derivatives along a surface of a box that lies on it."""
+    """Write the table of second derivatives along a surface for a box on it."""
     unfold_slopes(box.lean, box.nodes)
     box.half[2] = box.graph[SAG] + box.graph[SLIP]
     sense, gram, half, line, nodes, curves = box.sense, box.gram, box.half, box.line, box.nodes, box.curves
@@ -468,7 +473,7 @@ def curve_at(cost: Cost, chart: LocalAxes, box: Box) -> None:
 
 @inlined
 def curve_box(cost: Cost, chart: LocalAxes, box: Box) -> None:
-    """Fill the tables of second derivatives of a box whose nodes are bounded."""
+    """Write the tables of second derivatives of a box whose nodes are bounded."""
     curve_at(cost, chart, box)
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
@@ -476,15 +481,15 @@ def curve_box(cost: Cost, chart: LocalAxes, box: Box) -> None:
 
 @compiled
 def value_at(cost: Cost, chart: LocalAxes, box: Box) -> float:
-    """Return f at the centre of a box, infinite where it is off a surface; its first table is filled."""
+    """Return f at the centre of a box, infinite if it cannot be moved onto a surface; fill its table of nodes."""
     return cost_at(cost.K, cost.w, box.nodes) if is_bounded(cost, chart, box) else inf
 
 
 @inlined
 def rounding_at_centre(cost: Cost, chart: LocalAxes, box: Box) -> float:
-    """Return a bound of the rounding errors of a residual (its length) at the centre of a box whose nodes are bounded.
+    """Return a bound of the rounding of a residual, as a length, at the centre of a box whose nodes are bounded.
 
-    On a surface the height, which is worked out from the Earth's centre, is rounded as well.
+    On a surface, the rounding of the height is included, because it is computed from the Earth's centre.
     """
     noise = rounding_error(cost.K, cost.weight, chart.floor, box.nodes)
     if chart.surface.shape[0] > 0:
@@ -498,17 +503,18 @@ def rounding_at_centre(cost: Cost, chart: LocalAxes, box: Box) -> float:
     return noise
 
 
-# How far below the cost f of a fix another cost counts as equal, in roundings e of a residual: 8 e sqrt(f) + 24 e^2.
-# Each of two costs is off by 2 e sqrt(f) + e^2, and half of what counts as equal is left for them; a slope of the cost
-# is off by e along each of three axes, which 24 e^2 makes an eighth of the curvature, a quarter where half is left.
+# Tolerance of equal costs: 8 e sqrt(f) + 24 e^2, with f the cost of a fix and e the rounding of a residual. Each of
+# two costs has an error of 2 e sqrt(f) + e^2, and half of the tolerance is for them. A slope of the cost has an error
+# of e along each of three axes. 24 e^2 makes this an eighth of the curvature, or a quarter if half of the tolerance is
+# left.
 _COSTS, _SLOPES = 8.0, 24.0
 COARSEST = 1.0
-"""By how much costs may be off for a proof to be worth its name: a ninth of the gap at which two minima differ."""
+"""Greatest error of costs for a useful proof: a ninth of the gap below which two minima count as ambiguous."""
 
 
 @compiled
 def equal_within(eps: float, least: float, noise: float) -> float:
-    """Return how far below the cost `least` of a fix another counts as equal: eps, or more where rounding is coarse."""
+    """Return the tolerance of equal costs below the cost `least` of a fix: eps, or more if rounding is coarse."""
     return float(max(eps, noise * (_COSTS * sqrt(max(least, 0.0)) + _SLOPES * noise)))
 
 
@@ -520,7 +526,7 @@ def shapes_of(cost: Cost, chart: LocalAxes) -> Array:
 
 @compiled
 def is_convex(cost: Cost, chart: LocalAxes, box: Box, margin: float) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` all over a box, whose tables are filled."""
+    """Return whether the Hessian of f/2 exceeds `margin` over a whole box; fill the tables of the box."""
     if not is_bounded(cost, chart, box):
         return False
     curve_box(cost, chart, box)
@@ -529,14 +535,14 @@ def is_convex(cost: Cost, chart: LocalAxes, box: Box, margin: float) -> bool:
 
 @compiled
 def axes_of_next_piece(cost: Cost, chart: LocalAxes, side: int) -> LocalAxes:
-    """Return the search coordinates of another piece of a surface, one unit the Earth's least distance.
+    """Return the search coordinates of another piece of a surface, in units of the Earth's least radius.
 
     Parameters
     ----------
     cost, chart : Cost, LocalAxes
         The cost, and the search coordinates around the fix, side 0.
     side : int
-        1: the piece opposite to the fix; 2 to 5: those beside it.
+        1: the piece opposite to the fix; 2 to 5: the pieces next to it.
     """
     numbers, vectors, own = np.zeros((3, 3, 3)), np.zeros((2, 3)), chart.surface.copy()
     origin, slip, sense, back = vectors[0], vectors[1], numbers[0], numbers[1]

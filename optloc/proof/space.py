@@ -1,4 +1,7 @@
-"""The space of a branch and bound: search coordinates around a fix, or an atlas of all positions."""
+"""The space of a branch and bound: search coordinates around a fix, or an atlas of all positions.
+
+Searches for starts and covers use the same loop for both spaces.
+"""
 
 from __future__ import annotations
 
@@ -28,18 +31,18 @@ from optloc.proof.search_space import (
 
 
 class Space(NamedTuple):
-    """An atlas of all positions, or search coordinates around a fix.
+    """The space of a search: an atlas of all positions, or search coordinates around a fix.
 
     Parameters
     ----------
     far : bool
-        Whether it is the atlas.
+        Whether the space is the atlas.
     atlas : Atlas
         The pieces, with known minima.
     chart : LocalAxes
         The search coordinates, along planes or on a piece of a surface.
     minima, sides : array (P, 3)
-        Known minima in these, and half-widths of boxes around them on which the cost is convex.
+        Known minima in search coordinates, and half-widths of boxes around them in which the cost is convex.
     """
 
     far: bool
@@ -51,24 +54,24 @@ class Space(NamedTuple):
 
 @compiled
 def in_atlas(atlas: Atlas, chart: LocalAxes) -> Space:
-    """Return an atlas as the space of a search."""
+    """Return an atlas as the space of a search; `chart` fills the unused field."""
     none = np.empty((0, 3))
     return Space(True, atlas, chart, none, none)
 
 
 @compiled
 def floor_of(space: Space, cost: Cost) -> float:
-    """Return the sizes of measurements and coordinates in a residual, the nodes apart."""
+    """Return the sizes of measurements and coordinates in a residual, without the sizes of the nodes."""
     if space.far:
         return accuracy_floor_far(cost, space.atlas)
-    if space.chart.differs:  # its lines come from anywhere on a surface
+    if space.chart.differs:  # lines to stations come from anywhere on a surface
         return space.chart.floor
     return accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, space.chart.origin, LINES)
 
 
 @inlined
 def set_place(space: Space, box: Box, piece: int) -> None:
-    """Set the centre of a box."""
+    """Compute the position, and in the atlas its derivatives, of the centre of a box."""
     if space.far:
         set_centre(space.atlas, piece, box.at)
     else:
@@ -77,7 +80,7 @@ def set_place(space: Space, box: Box, piece: int) -> None:
 
 @inlined
 def set_box(space: Space, box: Box, piece: int) -> None:
-    """Set the centre of a box, and widen the box by the rounding of its centre."""
+    """Compute the position of the centre of a box, and widen the box by the rounding of its centre."""
     set_place(space, box, piece)
     if not space.far:
         widen_by_rounding(space.chart, box.centre, box.half)
@@ -87,7 +90,7 @@ def set_box(space: Space, box: Box, piece: int) -> None:
 
 @compiled
 def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
-    """Bound the nodes of a cost over a box whose centre is set; return False where a surface is no graph over it."""
+    """Bound the nodes of a cost over a box whose centre is set; return False if a surface is no graph over the box."""
     if space.far:
         bound_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes)
         return True
@@ -96,9 +99,9 @@ def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
 
 @inlined
 def bound_or_halve(space: Space, cost: Cost, box: Box, piece: int, stack: Array, size: int) -> int:
-    """Bound the nodes of a cost over a box off the stack; return -1, or without bounds the size of the stack.
+    """Bound the nodes of a cost over a box from the stack; return -1, or the stack's size if it is dropped or halved.
 
-    A box in the surroundings of a known minimum is dropped. So is a box of another piece of a surface. A box over
+    A box around a known minimum is dropped, and so is a box that belongs to another piece of a surface. A box over
     which the surface is no graph is halved.
     """
     set_box(space, box, piece)
@@ -127,7 +130,7 @@ def set_curves(space: Space, cost: Cost, box: Box) -> None:
 
 @compiled
 def place_of(space: Space, box: Box, x: Array) -> None:
-    """Write the position x (D,) of the centre of a box that is set."""
+    """Write the position x (D,), metres, of the centre of a box whose centre is set."""
     if space.far:
         write_position(space.atlas, x)
     else:

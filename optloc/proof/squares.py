@@ -1,13 +1,13 @@
-"""Squared rows of ranges over a box of an atlas: linear in the position but for one range, they clip boxes of any size.
+"""Squared rows of ranges over a box of an atlas: linear in the position and one range, they contract boxes of any size.
 
-With ``e_j = phi_j - phi_p - z_j`` the error of a range beside that of a reference station p, lines of an atlas (scaled
-by v, in half sides of the cube) obey
+The error of a range against the range of a reference station p is ``e_j = phi_j - phi_p - z_j``. With lines scaled by
+v, in half sides of the cube, the error obeys
 
     (q_j - q_p - v z_j) (q_j + q_p + v z_j) / v = N_j - N_p - 2 z_j q_p - v z_j^2,
 
-``q_j = |p - v a_j|`` and ``N_j = -2 a_j.p + v |a_j|^2`` linear. So an error is the right side over the sum of two
-ranges; and over a box only q_p bends, where each of the ranges does in the rows themselves. Any station of a group can
-be the reference: the one that bends least is.
+with ``q_j = |p - v a_j|`` and the linear function ``N_j = -2 a_j.p + v |a_j|^2``. So an error is the right side
+divided by a sum of two ranges. On the right side only q_p is not linear over a box. In the rows themselves, no range
+is linear. Any station of a group can be the reference. The module takes the station whose range is closest to linear.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from optloc.proof.nodes.node import FORCE, HIGH, LOW, NODE_WIDTH, PHI, RANGE, ra
 from optloc.proof.search_space import Box, Cost
 
 # Columns of a table of lines over a box (J, LINE_WIDTH): value, slope, least, greatest and remainder of the scaled
-# range; N and its gradient.
+# range; then N and its gradient.
 VALUE, SLOPE, LEAST, MOST, BEND, LINEAR, GRADIENT, LINE_WIDTH = 0, 1, 4, 5, 6, 7, 8, 11
 
 
@@ -46,25 +46,25 @@ class Squares(NamedTuple):
     Parameters
     ----------
     group : int array (J,)
-        Of each node the number of its group, -1 where it has no squared row.
+        Number of the group of each node; -1 for nodes without a squared row.
     groups : int
-        How many groups there are.
+        Number of groups.
     late : array (J,)
-        What is measured of each range, less what is of the reference of its group, metres.
+        Measured value of each range minus the value of the reference of its group, metres.
     spread : array (J, J)
-        How far, at a residual of length one, the difference of two ranges of a group may be from what is measured.
+        Greatest error of the difference of two ranges of a group if the residual has length one, metres.
     sizes : array (J,)
-        Sizes of the coordinates that lines are differences of, half sides of the cube.
+        Sizes of the coordinates that form each line as a difference, half sides of the cube.
     floor : float
-        Lengths of what residuals are differences of.
+        Sizes of the terms of residuals, times their weights.
     lack : float
-        How far a residual may be from what the squared rows say of it, for the rounding of what is measured.
+        Greatest error of a residual of the squared rows by the rounding of `late`.
     steep : float
-        How much longer residuals are for a change of one of the references' scaled ranges, at most.
+        Greatest change of a residual per unit change of the scaled range of a reference.
     lines : array (J, LINE_WIDTH)
         Table of lines over a box.
     K, weight, nodes, rows : arrays (q, G), (G,), (G, NODE_WIDTH), (q, ROW_WIDTH)
-        Tables of the rows, whose nodes are the ranges of references: see `optloc.proof.box`.
+        Tables of the squared rows, whose nodes are the ranges of references: see `optloc.proof.box`.
     """
 
     group: Array
@@ -84,7 +84,7 @@ class Squares(NamedTuple):
 
 @compiled
 def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
-    """Return the squared rows of a cost, where the tables of the box are those of a fix (`chart_at`)."""
+    """Return the squared rows of a cost; the tables of the box must be the tables of a fix (`chart_at`)."""
     kinds, groups, nodes = cost.kinds, cost.groups, box.nodes
     J, order, R, tie = kinds.shape[0], groups.order, groups.R, groups.tie
     group, late, spread, sizes = np.full(J, -1), np.zeros(J), np.zeros((J, J)), np.zeros(J)
@@ -94,7 +94,7 @@ def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
         if members == 0:
             break
         own, last = order[0, first : first + members], members - 1
-        # Differences of ranges only: all of them follow the reference.
+        # Only groups of range differences are usable: all ranges follow the reference.
         usable = members > 1 and reference >= 0
         for i in range(last):
             usable = usable and kinds[own[i]] == RANGE and tie[own[i]] == 1.0
@@ -130,9 +130,12 @@ def squares_of(cost: Cost, box: Box, middle: Array, radius: float) -> Squares:
 
 @compiled
 def _set_late(cost: Cost, box: Box, own: Array, R: Array, late: Array) -> float:
-    """Write what is measured of a group (the reference last); return how far that is from what the rows say.
+    """Write the measured range differences of a group, reference last; return a bound of their error.
 
-    Errors at the fix are e = R f, f the forces K'(K phi - w); A e = f, and what that is off is as long as its residual.
+    The bound is the length of a residual.
+
+    Errors at the fix are e = R f, with f the forces K'(K phi - w). Exact errors obey A e = f. The length of the
+    remaining difference bounds the error of the result.
     """
     last, nodes, curves = own.shape[0] - 1, box.nodes, box.curves
     reference = own[last]
@@ -154,7 +157,10 @@ def _set_late(cost: Cost, box: Box, own: Array, R: Array, late: Array) -> float:
 
 @compiled
 def _set_spread(own: Array, R: Array, spread: Array) -> None:
-    """Write standard deviations of the differences of a group, and a share of their terms for what rounding cancels."""
+    """Write the standard deviations of the range differences of a group.
+
+    A share of the terms is added, because the difference of variances cancels digits.
+    """
     last = own.shape[0] - 1
     for i in range(last + 1):
         for m in range(last + 1):
@@ -165,15 +171,15 @@ def _set_spread(own: Array, R: Array, spread: Array) -> None:
 
 @compiled
 def change_of_residual(atlas: Atlas, squares: Squares, half: Array) -> float:
-    """Return how much a residual may change by what the distance to the centre of the cube bends over a box."""
+    """Return the greatest change of a residual over a box by the remainder of the distance to the cube's centre."""
     return float(range_form(atlas.point, atlas.slant, triple_at(half, 0))[3] * squares.steep)
 
 
 @compiled
 def clip_to_squares(cost: Cost, atlas: Atlas, squares: Squares, rho: float, box: Box) -> bool:
-    """Clip a box around the centre set to where the residual may be shorter than rho; return whether anything is left.
+    """Contract the current box to where the residual may be shorter than rho; return whether any part remains.
 
-    What is left are the ends ``box.cut``.
+    The ends of the remaining part are written into ``box.cut``.
     """
     _fill_lines(cost, atlas, squares, box.half)
     longest = rho * (1.0 + SLACK) + SLACK + squares.lack
@@ -193,7 +199,7 @@ def clip_to_squares(cost: Cost, atlas: Atlas, squares: Squares, rho: float, box:
 
 @compiled
 def _fill_lines(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> None:
-    """Fill the table of lines over a box."""
+    """Write the table of lines over a box."""
     frame, h, lines = frame_of(atlas), triple_at(half, 0), squares.lines
     for j in range(lines.shape[0]):
         if squares.group[j] < 0:
@@ -209,7 +215,7 @@ def _fill_lines(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> None
 
 @compiled
 def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple[float, float]:
-    """Fill the table of rows; return by what share they may be longer than a residual, and the sizes of their terms."""
+    """Write the table of squared rows; return the share by which they may exceed a residual, and sizes of terms."""
     lines, rows, K, radius, scale = squares.lines, squares.rows, cost.K, atlas.radius, atlas.scale
     swing = abs(scale[1]) * half[0] + abs(scale[2]) * half[1] + abs(scale[3]) * half[2]
     far, most = abs(scale[0]) + swing, 0.0
@@ -231,7 +237,7 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
             late = (squares.late[j] - squares.late[reference]) / radius
             low = lines[j, LEAST] + lines[reference, LEAST] + scale[0] * late - swing * abs(late)
             high = lines[j, MOST] + lines[reference, MOST] + scale[0] * late + swing * abs(late)
-            # Any positive number will do; the middle, unless that is not positive.
+            # Any positive number is valid. The middle is best, but it may be negative.
             middle = max(0.5 * (low + high), 0.25 * (lines[j, MOST] + lines[reference, MOST]))
             share = max(high / middle - 1.0, 1.0 - low / middle)
             wider += cost.weight[j] * squares.spread[j, reference] * share
@@ -255,15 +261,16 @@ def _fill_rows(cost: Cost, atlas: Atlas, squares: Squares, half: Array) -> tuple
                 rows[i, J0 + 2] += weight * g2
                 squares.K[i, g] += weight * 2.0 * late
         squares.nodes[g, LOW], squares.nodes[g, HIGH] = -bend, bend
-    # Sums over all nodes of a group are rounded as often as there are of them.
+    # Sums over all nodes of a group have one rounding for each node.
     return wider, size * relative_rounding(cost.K) / relative_rounding(squares.K)
 
 
 @compiled
 def _deflate(squares: Squares, longest: float) -> None:
-    """Make rows shorter along what references may add to them, as much as is best: no residual is longer for it.
+    """Shorten the rows along the directions of the reference ranges by the best factor; no residual becomes longer.
 
-    The nearer to least squares with the errors of the rows and of the references as noise, the more is clipped.
+    This is close to least squares with the errors of rows and references as noise. The closer it is, the more of the
+    box is cut off.
     """
     rows, K = squares.rows, squares.K
     for g in range(squares.groups):

@@ -1,7 +1,8 @@
-"""Boxes that hold every point whose cost is at most a level: a region as it is, however bent, and out to infinity.
+"""Subpavings: boxes that together contain every point whose cost is at most a level, for regions of any shape.
 
-The same bounds as those of a proof, without its tests for minima: a box is left out only where its least cost is above
-the level. Boxes are halved generation by generation, so that what is left is cut about equally fine everywhere.
+The regions may be curved and reach infinity. The bounds are the bounds of a proof, without its tests for minima: a box
+is left out only if its least cost is above the level. All boxes of a generation are halved before the next generation,
+so that their sizes are about equal everywhere.
 """
 
 from __future__ import annotations
@@ -45,20 +46,20 @@ from optloc.proof.pieces import SHRUNK, push_faces
 from optloc.proof.search_space import Box, Cost, LocalAxes, chart_at, write_centre
 from optloc.proof.space import Space, floor_of, set_box, set_place
 
-# Share of its bend that halving a side must leave a box at most, to be preferred to what its slopes say: nodes that are
-# only enclosed bend as much in half the box.
+# Halving a side must reduce the sum of remainders to this share to be preferred to the steepest side. Nodes that are
+# only enclosed keep their remainders in half the box.
 _STRAIGHTER = 0.8
-# No box is halved more often: a hull of a billion standard deviations is then a thousandth of one wide, in three
-# dimensions.
+# Greatest number of halvings: in three dimensions, a hull of a billion standard deviations is then a thousandth of one
+# wide.
 _GENERATIONS = 120
-# Corners of what is searched are moved out by this share, for the rounding of the enclosure; from a half-width of the
-# second on it is none.
+# Corners of the region to search are moved outwards by this share, for the rounding of the enclosure. A half-width
+# above the second number does not count as an enclosure.
 _OUTWARDS, _ENDLESS = 1e-9, 1e300
-# Share by which the level is higher, for the rounding of two ways to compute the cost of a fix.
+# Share by which the level is raised, for the rounding of two ways to compute the cost of a fix.
 _EQUAL = 1e-9
-# Squared slope of all rows along a side below which it is none: far above where products of doubles vanish.
+# Squared slope of all rows along a side below which the slope counts as zero; far above underflow of doubles.
 _FLAT = 1e-200
-# What becomes of a box.
+# Results of a test of a box: outside the region, inside, smaller after contraction, or across the edge.
 _OUT, _IN, _SMALLER, _ACROSS = range(4)
 
 
@@ -73,27 +74,28 @@ def cover_region(
     Parameters
     ----------
     cost, box : Cost, Box
-        The cost, and tables to work with.
+        The cost, and working memory.
     x : array (D,)
-        The fix.
+        The fix, metres.
     above : float
-        By how much the highest cost of the region exceeds the cost of the fix.
+        Highest cost of the region minus the cost of the fix.
     most : int
-        How many boxes there may be.
+        Greatest number of boxes.
     bent : bool
-        Whether to take the atlas where there is one, and not only without an enclosure.
+        Whether to prefer the atlas if possible; otherwise the atlas is used only without an enclosure.
     base : array (3,)
         Written: a position m, metres.
     cells : array (2 * most, 1 + D, 1 + D)
-        Written: the centre of each box, then half of each edge, in homogeneous coordinates (P, v): the position
-        is ``m + P / v``.
+        Written: the centre of each box, then half of each edge, in homogeneous coordinates (P, v): the position is
+        ``m + P / v``.
     ends : array (2 * most,)
-        Written: the cost at infinity in the direction of the centre of each box that reaches there, else infinity.
+        Written: for each box that reaches infinity, the cost at infinity in the direction of its centre; else
+        infinity.
 
     Returns
     -------
     count, inside : int
-        Number of boxes that hold the region, and number of boxes, the first ones, inside it; -1 if none could be found.
+        Number of boxes that contain the region, -1 without boxes; the first `inside` of them are inside the region.
     level : float
         The highest cost of the region.
     """
@@ -120,7 +122,7 @@ def cover_region(
 
 @compiled
 def _push_enclosure(cost: Cost, chart: LocalAxes, box: Box, longest: float, boxes: Array) -> int:
-    """Write a box that holds all residuals shorter than `longest`; return the number of boxes, 0 without one."""
+    """Write a box around all points with residuals shorter than `longest`; return the number of boxes, 0 or 1."""
     corners = np.empty((2, 3))
     low, high = corners[0], corners[1]
     if not enclose(cost, chart, box, longest, low, high):
@@ -136,9 +138,9 @@ def _push_enclosure(cost: Cost, chart: LocalAxes, box: Box, longest: float, boxe
 
 @compiled
 def _push_atlas(cost: Cost, atlas: Atlas, box: Box, x: Array, level: float, boxes: Array) -> tuple[int, Atlas]:
-    """Write all pieces of an atlas, and the surroundings of the fix; return the number of boxes, and the atlas.
+    """Write all pieces of an atlas, and a box around the fix; return the number of boxes, and the atlas.
 
-    A long thin region is cut along the axes of the fix, where the fix has them.
+    If the fix has axes, a long thin region is cut along them.
     """
     size, wider = push_faces(boxes, atlas.dimension), with_room_for_minimum(atlas)
     if not set_minimum(cost, box, wider, 0, x, 0.0, 1e-6 * (1.0 + level), inf):
@@ -152,10 +154,10 @@ def _push_atlas(cost: Cost, atlas: Atlas, box: Box, x: Array, level: float, boxe
 
 @compiled
 def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: Array, size: int) -> tuple[int, int]:
-    """Halve the boxes of the first list by generations; return the number of boxes in the last list, and inside."""
+    """Halve the boxes of the first list by generations; return the numbers of boxes in the last list, and inside."""
     floor, count, inside = floor_of(space, cost), zero(), zero()
     for generation in range(_GENERATIONS + 1):
-        # The next generation may be twice as large, and must find room: a box leaves one inside or two to look at.
+        # The next generation may be twice as large, and needs space: a box leaves one box inside, or two to test.
         last = generation > 0 and (generation == _GENERATIONS or size + count > most)
         inside, following = count, zero()
         for i in range(size):
@@ -178,11 +180,11 @@ def _halve(cost: Cost, space: Space, box: Box, level: float, most: int, lists: A
 
 @inlined
 def _look(cost: Cost, space: Space, box: Box, front: Array, i: int, level: float, floor: float) -> int:
-    """Take a box of a list and return its fate; a box across the edge of the region is clipped to it."""
+    """Test box i of a list, and return the result; a box across the edge of the region is contracted."""
     piece, faces = int(front[i, PIECE]), 2 * space.atlas.dimension
     pop(front, i, box.at, box.half)
     set_box(space, box, piece)
-    # The boxes around the fix cover the part of a piece there.
+    # The boxes around the fix cover this part of a face or of the inside.
     if (
         space.far
         and piece <= faces
@@ -201,12 +203,12 @@ def _look(cost: Cost, space: Space, box: Box, front: Array, i: int, level: float
 
 @compiled
 def _clip(cost: Cost, box: Box, longest: float) -> int:
-    """Clip a box side by side to where the residual may be shorter than `longest`; return what becomes of it.
+    """Contract a box, side by side, to where the residual may be shorter than `longest`; return the result of the test.
 
-    With J_k the derivative of the residual along side k every point of the box obeys ``J_k.residual = J_k.middle +
-    |J_k|^2 s_k + sum_m J_k.J_m s_m + J_k.K dq``, dq the remainders from their middle. Unlike
-    `optloc.proof.box.contract_box` this needs no inverse: it works where the rows do not determine a position, whatever
-    the rounding. Over 18 fixes of all shapes both together left no fewer cells.
+    Let J_k be the derivative of the residual along side k, and dq the remainders minus the middles of their intervals.
+    Each point of the box obeys ``J_k.residual = J_k.middle + |J_k|^2 s_k + sum_m J_k.J_m s_m + J_k.K dq``. Unlike
+    `optloc.proof.box.contract_box`, this needs no inverse. So it works with any rounding, even if the rows do not
+    determine a position. Over 18 fixes of all shapes, both contractors together left no fewer cells.
     """
     rows, nodes, half = box.rows, box.nodes, box.half
     reset_cut(half, box.cut)
@@ -230,7 +232,7 @@ def _clip(cost: Cost, box: Box, longest: float) -> int:
                 for i in range(rows.shape[0]):
                     total += rows[i, J0 + k] * cost.K[i, j]
                 reach += abs(total) * radius
-        if reach < inf:  # nor where a node is not bounded, which may leave no number at all
+        if reach < inf:  # not if a node has no bound, which may give NaN
             contract_coordinate(box.cut, k, -middle / own, (longest * sqrt(own) + reach) / own)
     share = cut_out(box.cut, box.at, half)
     return _OUT if not share > 0.0 else _SMALLER if share < SHRUNK else _ACROSS
@@ -238,14 +240,14 @@ def _clip(cost: Cost, box: Box, longest: float) -> int:
 
 @inlined
 def _bound(cost: Cost, space: Space, box: Box) -> None:
-    """Bound the nodes over a box whose centre is set. No region lies on a surface."""
+    """Bound the nodes over a box whose centre is set. Covers have no surfaces."""
     if space.far:
         bound_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes)
     else:
         _bound_near(cost, space.chart, box)
 
 
-# Inlined code is called here: a call takes a third of the time to compile.
+# The inlined code is called inside a separate function, which reduces the time to compile to a third.
 
 
 @compiled
@@ -256,7 +258,7 @@ def _bound_near(cost: Cost, chart: LocalAxes, box: Box) -> None:
 
 @compiled
 def _most_residual(cost: Cost, box: Box) -> float:
-    """Return an upper bound of ``|K phi - w|`` over a box whose rows are linearised, but for rounding."""
+    """Return an upper bound of ``|K phi - w|`` over a box whose rows are linearised; rounding is not included."""
     middle, j0, j1, j2 = 0.0, 0.0, 0.0, 0.0
     for i in range(box.rows.shape[0]):
         middle += box.rows[i, MIDDLE] ** 2
@@ -269,7 +271,7 @@ def _most_residual(cost: Cost, box: Box) -> float:
 
 @compiled
 def _bends(cost: Cost, box: Box) -> float:
-    """Return how much of the residual over a box is not linear: half the widths of the remainders, weighted."""
+    """Return a bound of the nonlinear part of the residual over a box: half the widths of the remainders, weighted."""
     total = 0.0
     for j in range(cost.weight.shape[0]):
         total += 0.5 * cost.weight[j] * (box.nodes[j, HIGH] - box.nodes[j, LOW])
@@ -278,7 +280,7 @@ def _bends(cost: Cost, box: Box) -> float:
 
 @compiled
 def _is_bent(cost: Cost, box: Box, dimension: int) -> bool:
-    """Return whether over a box curvature changes the residual more than the steepest side does."""
+    """Return whether curvature changes the residual over a box more than the steepest side does."""
     most = 0.0
     for m in range(dimension):
         steep = 0.0
@@ -291,7 +293,7 @@ def _is_bent(cost: Cost, box: Box, dimension: int) -> bool:
 
 @compiled
 def _side(cost: Cost, space: Space, box: Box, piece: int) -> int:
-    """Return the side to halve: where the rows bend most of all, the one whose halving straightens them most."""
+    """Return the side to halve: the steepest side, or if curvature dominates, the best side to reduce remainders."""
     dimension = space.atlas.dimension
     side = steepest_side(box.half, box.rows, dimension)
     if _is_bent(cost, box, dimension):
@@ -308,7 +310,7 @@ def _side(cost: Cost, space: Space, box: Box, piece: int) -> int:
 
 @compiled
 def _write_cell(cost: Cost, space: Space, box: Box, boxes: Array, i: int, cells: Array, ends: Array) -> None:
-    """Write a box in homogeneous coordinates, and the cost at infinity in its direction if it reaches there."""
+    """Write a box in homogeneous coordinates, and the cost at infinity in its direction if it reaches infinity."""
     atlas, sense, d, piece = space.atlas, space.chart.sense, space.atlas.dimension, int(boxes[i, PIECE])
     pop(boxes, i, box.at, box.half)
     set_place(space, box, piece)

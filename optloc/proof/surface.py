@@ -1,11 +1,12 @@
 """Surfaces of a known height as graphs: over a box along the surface, nodes are functions of two coordinates.
 
-Off the chart's plane the surface lies at ``x(s) = c + T s + n t(s)`` around a point c of it, T along the surface and n
-the chart's upward axis, t of no slope at c. Because the height is convex with a Hessian below 1/R, t is bounded with
-its derivatives, and a node that is bounded over the box of s and t is bounded, with its curvature, along the surface.
+Around a point c of the surface, its points are ``x(s) = c + T s + n t(s)``. T is along the surface, n is the upward
+axis of the local coordinates, and t has no slope at c. The height is convex with a Hessian below 1/R, so t and its
+derivatives are bounded. If a node is bounded over the box of s and t, it is bounded along the surface, and so is its
+curvature.
 
-A whole surface is six pieces: each point lies on that of the axis, of three through the Earth's centre and both ways,
-along which it is farthest out.
+A whole surface has six pieces, one for each direction of three axes through the Earth's centre. Each point belongs to
+the direction along which it is farthest from the centre.
 """
 
 from __future__ import annotations
@@ -37,31 +38,32 @@ from optloc.proof.nodes.node import (
     triple_at,
 )
 
-# Numbers of a surface: its height, those of the node, the Earth's centre, and three orthonormal axes of a piece, the
-# last upward. One without numbers is no surface.
+# Numbers of a surface: its height, the numbers of the height node, the Earth's centre, and three orthonormal axes of a
+# piece, the last one upward. An array of length zero means no surface.
 LEVEL, DATA, MIDDLE, FIRST, SECOND, UP = 0, 1, 1 + HEIGHT_WIDTH, 4 + HEIGHT_WIDTH, 7 + HEIGHT_WIDTH, 10 + HEIGHT_WIDTH
 SURFACE_WIDTH, SIDES = 13 + HEIGHT_WIDTH, 6
-# Numbers of a graph over a box: how far it sags below its tangent plane at most, and how far off it the centre may be;
-# greatest slopes; the Hessian at the centre; its greatest size over the box, and its greatest change.
+# Numbers of a graph over a box: greatest distance below the tangent plane, and greatest distance of the centre from
+# the surface; greatest slopes; the Hessian at the centre; the greatest norm and the greatest change of the Hessian.
 SAG, SLIP, _STEEP0, _STEEP1, _BEND00, _BEND01, _BEND11, _BENT, _TURNED, GRAPH_WIDTH = range(10)
-# Newton's steps down to a surface, which double the digits of what is left. They end at the accuracy of a height; up to
-# so many times as far off the surface a place will do, because bounds count how far it is.
+# Newton steps down to a surface, each of which doubles the number of exact digits. They end at the accuracy of a
+# height. A centre that is up to `_LOOSE` times as far off the surface is accepted, because the bounds include this
+# distance.
 _STEPS, _LOOSE = 20, 10.0
-# Cosine between the normal and the chart's axis below which a surface is no graph: a piece ends at 0.57. And the share
-# of the Earth's least radius that a box may leave of the radius of curvature: heights are exact so deep.
+# Least cosine between the normal and the upward axis for which a surface counts as a graph; a piece ends at 0.57. And
+# the least radius of curvature, as a share of the Earth's least radius: heights are exact down to this depth.
 _STEEP, _LEFT = 0.2, 0.7
 
 
 @compiled
 def is_beyond(surface: Array, centre: Array, sense: Array, half: Array) -> bool:
-    """Return whether all points of a surface over a box lie on other pieces, where they are farther out.
+    """Return whether all points of a surface over a box belong to other pieces, along whose axes they are farther out.
 
     Parameters
     ----------
     surface : array (SURFACE_WIDTH,)
         The surface, with the axes of the piece.
     centre, sense, half : array (3,), (3, 3), (3,)
-        Of the box in the plane of the chart: only what is along it is read.
+        The box in the plane of the local coordinates; only components along this plane are read.
     """
     most, nearest, aside = WGS84_A + abs(surface[LEVEL]), 0.0, 0.0
     for first in (FIRST, SECOND):
@@ -80,16 +82,17 @@ def is_beyond(surface: Array, centre: Array, sense: Array, half: Array) -> bool:
 
 @compiled
 def lay_box(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, graph: Array, second: Array) -> bool:
-    """Move the centre of a box onto a surface, and the box into the tangent plane; False where it is too large.
+    """Move the centre of a box onto a surface, and the box into the tangent plane; return False if it is too large.
 
     Parameters
     ----------
     surface : array (SURFACE_WIDTH,)
         The surface.
     centre, half : array (3,)
-        Centre, metres; moved. Half-widths; the third is written: how far the surface is off the box.
+        Centre, metres; moved. Half-widths; the third is written: the greatest distance of the surface from the box.
     sense, gram : array (3, 3)
-        T of the chart, whose third column is the upward axis; turned into the tangent plane. T'T is written.
+        T of the local coordinates, whose third column is the upward axis; turned into the tangent plane. T'T is
+        written.
     graph : array (GRAPH_WIDTH,)
         Written.
     second : array (3, 3)
@@ -116,14 +119,14 @@ def lay_box(surface: Array, centre: Array, half: Array, sense: Array, gram: Arra
         for m in range(3):
             sense[m, k] += up[m] * lean
             square += sense[m, k] * sense[m, k]
-        graph[_STEEP0 + k] = sqrt(square)  # the length of the column, for now
+        graph[_STEEP0 + k] = sqrt(square)  # the length of the column, until `_write_graph` replaces it
         farthest += square * half[k] * half[k]
         size += square
     between = sense[0, 0] * sense[0, 1] + sense[1, 0] * sense[1, 1] + sense[2, 0] * sense[2, 1]
     reach = sqrt(farthest + 2.0 * abs(between) * half[0] * half[1])
-    # A tangent plane is outside the surface, and so is all between the two. Nowhere there does a height curve more than
-    # on the surface. With |w| <= reach it is at most |w|^2 / 2R in the plane. From there it falls by its slope, less
-    # the turn of the normal on the way. So t is between zero and the sag.
+    # A tangent plane is outside the surface, and so is all space between them. In this space no height curves more
+    # than on the surface. So at |w| <= reach in the plane, the height is at most |w|^2 / 2R. From there it falls by
+    # its slope, less the turn of the normal on the way. So t is between zero and the sag.
     radius = LEAST_RADIUS + surface[LEVEL]
     if not radius > _LEFT * LEAST_RADIUS:
         return False
@@ -136,7 +139,8 @@ def lay_box(surface: Array, centre: Array, half: Array, sense: Array, gram: Arra
     if not (sag <= reach and least > 0.5 * _STEEP):
         return False
     _write_graph(data, centre, half, sense, gram, graph, second, (sag, rise, least, bend, size))
-    # Twice: the mean of slopes over a box counts half of what grows with the box, and this does not.
+    # The factor 2: for changes that grow with the box, the mean of slopes over the box counts half. This distance does
+    # not grow with the box.
     graph[SLIP] = 2.0 * (abs(off) + 4.0 * exact) / least
     half[2] = graph[SAG] + graph[SLIP]
     return True
@@ -153,7 +157,7 @@ def _write_graph(
     second: Array,
     found: tuple[float, float, float, float, float],
 ) -> None:
-    """Write slopes and curvature of a surface over a box: what comes of deriving ``height(x(s)) = value``."""
+    """Write slopes and curvature of a surface over a box, from the derivatives of ``height(x(s)) = value``."""
     sag, rise, least, bend, size = found
     for k in range(3):
         for m in range(3):
@@ -163,11 +167,11 @@ def _write_graph(
         way += graph[_STEEP0 + k] * half[k]
     steep = 0.0
     for k in range(2):
-        # The normal turns by no more than its bend times the way; along the tangents it has no part at the centre.
+        # The normal turns by at most its bend times the way. At the centre it has no component along the tangents.
         graph[_STEEP0 + k] *= bend * way / least
         steep += graph[_STEEP0 + k] * graph[_STEEP0 + k]
     half[2], graph[SAG] = sag, sag
-    curve_height(data, centre, sense, half, second, graph[_BEND00 : _BEND11 + 1])  # whose changes are bounded below
+    curve_height(data, centre, sense, half, second, graph[_BEND00 : _BEND11 + 1])  # bounds of changes follow below
     graph[_BEND00], graph[_BEND01], graph[_BEND11] = -second[0, 0] / rise, -second[0, 1] / rise, -second[1, 1] / rise
     long, steep = sqrt(size), sqrt(steep)
     wide = (long + steep) * (long + steep)
@@ -179,7 +183,7 @@ def _write_graph(
 
 @compiled
 def fold_bounds(graph: Array, lean: Array, nodes: Array) -> None:
-    """Make bounds over a box (s, t) those along the surface; `lean` (J,) keeps the slopes along the upward axis."""
+    """Turn bounds over a box of (s, t) into bounds along the surface; write slopes along the upward axis to `lean`."""
     sag, slip = graph[SAG] + graph[SLIP], graph[SLIP]
     for j in range(nodes.shape[0]):
         slope = nodes[j, SLOPE2]
@@ -190,14 +194,14 @@ def fold_bounds(graph: Array, lean: Array, nodes: Array) -> None:
 
 @compiled
 def unfold_slopes(lean: Array, nodes: Array) -> None:
-    """Give nodes back their slopes along the upward axis, of which their second derivatives are made."""
+    """Restore the slopes of nodes along the upward axis, which their second derivatives need."""
     for j in range(nodes.shape[0]):
         nodes[j, SLOPE2] = lean[j]
 
 
 @compiled
 def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
-    """Make second derivatives over a box (s, t) those along the surface, by the chain rule."""
+    """Turn second derivatives over a box of (s, t) into second derivatives along the surface, by the chain rule."""
     steep = sqrt(graph[_STEEP0] * graph[_STEEP0] + graph[_STEEP1] * graph[_STEEP1])
     for j in range(nodes.shape[0]):
         slope, turn, chi = lean[j], curves[j, TURN2], curves[j, CHI]
@@ -214,8 +218,9 @@ def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
 
 @compiled
 def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> None:
-    """Clip corners (3,) of search coordinates by where the surface is of this piece, and take the third away."""
-    # A point that is farthest out along the third axis is at most so far aside: its squares sum to the distance's.
+    """Contract corners (3,) of search coordinates to this piece of the surface; set the third coordinate to 0."""
+    # A point of this piece is farthest along the third axis. So each other coordinate is at most sqrt(1/2) of its
+    # distance from the centre: the squares sum to the squared distance.
     most = sqrt(0.5) * (WGS84_A + abs(surface[LEVEL])) * (1.0 + 1e-9)
     for k in range(2):
         unit, away = triple_at(surface, FIRST if k == 0 else SECOND), 0.0
@@ -228,7 +233,7 @@ def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high
 
 @compiled
 def is_one_side(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> bool:
-    """Return whether all of a surface between corners (3,) of search coordinates belongs to their own piece."""
+    """Return whether the whole part of a surface between corners (3,) of search coordinates belongs to one piece."""
     aside, below = 0.0, 0.0
     for m in range(3):
         below += surface[UP + m] * (origin[m] - surface[MIDDLE + m])
@@ -247,21 +252,23 @@ def is_one_side(surface: Array, origin: Array, sense: Array, low: Array, high: A
 
 # Axes of search coordinates along planes or a surface.
 
-# Length of the part of an axis of space across others that will do: of one of the three it is 0.57 at least.
+# An axis of space is usable if its component across the other axes is at least this long. For one of the three axes
+# the component is at least 0.57.
 _ACROSS = 0.5
-# Sine of the angle between two planes below which their line has lost half of its digits.
+# Sine of the angle between two planes below which their common line has lost half of its digits.
 _PARALLEL = 1e-8
 
 
 @compiled
 def set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
-    """Write orthonormal axes (3, 3): those along planes or a surface first, then those across; return how many.
+    """Write orthonormal axes (3, 3): first those along planes or a surface, then across; return the number along.
 
-    None where planes are nearly parallel: what they leave is not known.
+    The result is 0 if planes are nearly parallel, because the common directions are then unknown.
     """
     bent, apart = int(surface.shape[0] > 0), True
     across = planes.shape[0] + bent + 3 - D
-    # From the last column on: the axis that a plane has not, the surface's, the planes', then whatever is left.
+    # From the last column on: the axis that a plane does not have, the normal of the surface, the normals of the
+    # planes, then any other axes.
     for number in range(3):
         k = 2 - number
         if number < 3 - D:
@@ -275,7 +282,7 @@ def set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
         if number < across:
             apart = _set_axis(axes, k, first) > _PARALLEL and apart
         else:
-            for turn in range(3):  # an axis of space, its own if that will do: without planes it is that one
+            for turn in range(3):  # an axis of space, first axis k; without planes this one is taken
                 m = (k + turn) % 3
                 start = (1.0 if m == 0 else 0.0, 1.0 if m == 1 else 0.0, 1.0 if m == 2 else 0.0)
                 if _set_axis(axes, k, start) > _ACROSS:
@@ -285,7 +292,7 @@ def set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
 
 @compiled
 def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
-    """Write the part of a vector across the axes behind k as axis k, of length one; return how long it was."""
+    """Write the unit vector of the part of `start` across the axes behind k as axis k; return the part's length."""
     length = 0.0
     for m in range(3):
         axes[m, k] = start[m]
@@ -302,7 +309,7 @@ def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
 
 @compiled
 def principal_along(information: Array, axes: Array, count: int) -> None:
-    """Turn the first `count` axes so that information (3, 3) is nearly diagonal along them; it is written so."""
+    """Turn the first `count` axes so that information (3, 3) is nearly diagonal along them; overwrite it so."""
     own, turned, vectors = np.zeros((3, 3)), axes.copy(), np.zeros((3, 3))
     for k in range(count):
         for m in range(count):

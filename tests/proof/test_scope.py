@@ -40,8 +40,8 @@ def two_planes():
         (ranging, ""),
         (accelerating, "the target accelerates"),
         (in_space, "the target moves in space"),
-        (with_scales, f"there are several scales (4), and the proof takes {MOST_FACTORS}"),
-        (two_planes, "the equalities leave no way to move"),
+        (with_scales, f"there are several scales (4), but the proof covers {MOST_FACTORS}"),
+        (two_planes, "the equalities leave no free direction"),
     ],
 )
 def test_what_is_beyond_the_proof_is_named(make, words):

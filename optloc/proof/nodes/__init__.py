@@ -1,1 +1,1 @@
-"""What a proof knows of each kind of measurement over a box."""
+"""Bounds over a box for each kind of node: ranges, rates, angles, ratios, logarithms, heights and linear forms."""

@@ -1,8 +1,8 @@
-"""Azimuths and elevations over a box: value, slope, remainder and curvature, and what several stations' enclose.
+"""Azimuths and elevations over a box: value, slope, remainder and curvature, and enclosures from several stations.
 
-The line of sight of an azimuth is the complex number z = X + iY of its horizontal part. With ``z = z_c (1 + w)``,
-``w = r + i t``, the angle changes by ``atan(t/(1+r))``, whose linear part is t. That of an elevation is rho + iZ, with
-rho the horizontal distance, a range of its own, whose argument changes as that of an azimuth does.
+The horizontal part of a line of sight is the complex number z = X + iY. With ``z = z_c (1 + w)`` and ``w = r + i t``,
+the azimuth changes by ``atan(t/(1+r))``, whose linear part is t. For an elevation the complex number is rho + iZ, with
+rho the horizontal distance. Its argument changes in the same way, and rho is itself a range.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from optloc.proof.nodes.node import (
 
 # Azimuths.
 
-# Numbers: the station, its axes (rows), the measured angle from which the node counts, wrapped, and what is not 0 where
-# the row is the node's own.
+# Numbers: the station, its axes (rows), and the wrapped measured angle to which the node is relative. The last number
+# is not 0 if no other node is in the row.
 STATION, AXES, MEASURED, ALONE, _WIDTH = 0, 6, 15, 16, 17
 
-# Share of an angle's argument that its own rounding may be: some units in the last place.
+# Rounding of an angle as a share of its argument: a few units in the last place.
 _ROUNDING = 1e-15
 
 
@@ -46,8 +46,8 @@ _ROUNDING = 1e-15
 def atan_remainder_bound(back: float, ahead: float, aside: float) -> float:
     """Return the greatest ``|atan(t/(1+r)) - t|`` over ``-back <= r <= ahead, |t| <= aside``; back must be below 1.
 
-    At t > 0 the difference falls with r. At r = -back it is greatest where ``t^2 = back (1 - back)``; at r = ahead it
-    falls with t.
+    For t > 0 the difference decreases with r. At r = -back it is greatest at ``t^2 = back (1 - back)``. At r = ahead
+    it decreases with t.
     """
     best = min(aside, sqrt(back * (1.0 - back)))
     above = atan(best / (1.0 - back)) - best
@@ -64,12 +64,12 @@ def atan_remainder(back: float, ahead: float, aside: float, bilinear: tuple[floa
     back, ahead, aside : float
         ``-back <= r <= ahead, |t| <= aside``; back below 1.
     bilinear : pair of float
-        An enclosure of ``-r t``, its leading term; what is beyond is at most ``|w|^3 / (3 (1 - |w|))``.
+        An enclosure of the leading term ``-r t``; the rest is at most ``|w|^3 / (3 (1 - |w|))``.
     """
     wide = atan_remainder_bound(back, ahead, aside)
     most = max(back, ahead)
     size = sqrt(most * most + aside * aside)
-    if size >= 1.0:  # the series that the third order is cut from ends at the origin
+    if size >= 1.0:  # the series for the third order does not converge
         return -wide, wide
     third = size * size * size / (3.0 * (1.0 - size)) + _ROUNDING * aside
     return max(-wide, bilinear[0] - third), min(wide, bilinear[1] + third)
@@ -77,7 +77,7 @@ def atan_remainder(back: float, ahead: float, aside: float, bilinear: tuple[floa
 
 @compiled
 def vector_angles(left: float, right: float, down: float, up: float) -> tuple[float, float]:
-    """Return the angles of the vectors in a rectangle, radians; all angles where it touches the cut or the origin.
+    """Return the least and greatest angle in a rectangle, radians; -pi and pi if it touches the cut or the origin.
 
     The rectangle is [left, right] along the first axis and [down, up] along the second.
     """
@@ -90,7 +90,7 @@ def vector_angles(left: float, right: float, down: float, up: float) -> tuple[fl
 
 @compiled
 def horizontal_line(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple]:
-    """Return the line's components along the first two axes, turned by the measured angle, and their pulls."""
+    """Return the line's components along the first two axes, turned by the measured angle, and their gradients."""
     c, s = cos(data[MEASURED]), sin(data[MEASURED])
     first, second = triple_at(data, AXES), triple_at(data, AXES + 3)
     ahead, aside = sum_of_forms(c, first, s, second), sum_of_forms(c, second, -s, first)
@@ -102,8 +102,8 @@ def horizontal_line(data: Array, line: Array, sense: Array) -> tuple[float, floa
 def bound_azimuth(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound an azimuth minus its measured value over a box (see `optloc.proof.nodes.node`), radians.
 
-    Where the box touches the half-plane behind the measured direction the angle jumps from pi to -pi. A row of its own
-    (number `ALONE`) is then given by its absolute value, which does not jump and costs the same.
+    If the box touches the half-plane behind the measured direction, the angle jumps from pi to -pi. If no other node
+    is in the row (number `ALONE`), the absolute value replaces the angle: it does not jump, and its cost is the same.
     """
     x, y, along, beside = horizontal_line(data, line, sense)
     h = triple_at(half, 0)
@@ -113,7 +113,7 @@ def bound_azimuth(data: Array, line: Array, sense: Array, half: Array, slope: Ar
         radial = sum_of_forms(x / squared, along, y / squared, beside)
         around = sum_of_forms(x / squared, beside, -y / squared, along)
         back, aside = reach(radial, h), reach(around, h)
-        # Neither the station's vertical nor the cut behind the measured direction is in the box.
+        # The box contains neither the station's vertical nor the cut behind the measured direction.
         if back < 1.0 and abs(value) + atan(aside / (1.0 - back)) < pi:
             low, high = product(radial, around, h)
             low, high = atan_remainder(back, back, aside, (-high, -low))
@@ -126,11 +126,11 @@ def bound_azimuth(data: Array, line: Array, sense: Array, half: Array, slope: Ar
 def _flat_azimuth(
     value: float, ahead: tuple[float, float], aside: tuple[float, float], alone: bool, slope: Array
 ) -> tuple[float, float, float]:
-    """Enclose an azimuth by two numbers; each component is a centre and a half-width."""
+    """Enclose an azimuth by a constant interval; each component is a pair of centre and half-width."""
     slope[0] = slope[1] = slope[2] = 0.0
     right, up, down = ahead[0] + ahead[1], aside[0] + aside[1], aside[0] - aside[1]
     if alone and ahead[0] - ahead[1] <= 0.0 and down <= 0.0 <= up:
-        # The greatest sidestep at the farthest advance is the least angle off the measured direction.
+        # The greatest sidestep at the farthest advance gives the least angle from the measured direction.
         least = atan2(max(up, -down), right) if right < 0.0 else 0.0
         return abs(value), least - abs(value), pi - abs(value)
     low, high = vector_angles(ahead[0] - ahead[1], right, down, up)
@@ -139,7 +139,7 @@ def _flat_azimuth(
 
 @compiled
 def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound how an azimuth curves over a box (see `optloc.proof.nodes.node`).
+    """Bound the second derivatives of an azimuth over a box (see `optloc.proof.nodes.node`).
 
     With gamma = radial + i around, the gradient is ``Im(gamma/(1+w))`` and the Hessian ``-Im(gamma gamma'/(1+w)^2)``.
     """
@@ -161,7 +161,7 @@ def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature
         return inf
     front = 1.0 - back
     size = sqrt(back * back + aside * aside)
-    # How far the factors of gradient and Hessian can be from 1, for complex w of at most this size.
+    # Greatest differences from 1 of the factors of gradient and Hessian, for complex w of at most this size.
     real, imaginary = size / front, aside / (front * front)  # of 1/(1+w) - 1
     real2, imaginary2 = size * size / front, imaginary * size * (2.0 + size)  # of w^2/(1+w)
     for k in range(3):
@@ -175,7 +175,7 @@ def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature
 
 @compiled
 def line_of_sight(data: Array, x: Array) -> Triple:
-    """Return the line from a station to a fix in the station's axes."""
+    """Return the line from a station to a fix in the station's axes, metres."""
     line = (x[0] - data[0], x[1] - data[1], x[2] - data[2])
     return (
         inner_product(triple_at(data, AXES), line),
@@ -186,7 +186,10 @@ def line_of_sight(data: Array, x: Array) -> Triple:
 
 @compiled
 def _ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
-    """Write the horizontal unit vector n across the sight: ``|n.(x' - x)| <= r sin(swing)`` at distance r."""
+    """Write the horizontal unit vector n across the sight: ``|n.(x' - x)| <= r sin(swing)`` at distance r.
+
+    Return sin(swing) and the distance of the fix.
+    """
     p, q, r = line_of_sight(data[j], x)
     flat = hypot(p, q)
     if not flat > 0.0:
@@ -197,11 +200,12 @@ def _ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) 
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the azimuth node of a row."""
     return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a), MEASURED: row.measured[:, None]})
 
 
 def _mark(numbers: Array, alone: Array) -> None:
-    """Let an azimuth alone be folded: its cost is even, so where it jumps from pi to -pi its absolute value serves."""
+    """Mark azimuths that are alone in their rows: at the jump from pi to -pi their absolute value has the same cost."""
     numbers[..., ALONE] = alone
 
 
@@ -222,16 +226,16 @@ HORIZONTAL_ANGLE = Node(
 
 # Elevations.
 
-# Numbers: as of an azimuth, but that nothing is measured from anywhere: column 15 stays zero.
+# Numbers as in an azimuth, but the node is not relative to a measured value: column 15 stays zero.
 _UPRIGHT_WIDTH = 16
 
 
 @compiled
 def _upright(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple, Triple]:
-    """Return horizontal distance and rise of a line, and the pulls of outward, sideways and upward unit vectors."""
+    """Return horizontal distance and rise of a line, and gradients along outward, sideways and upward unit vectors."""
     x, y, along, beside = horizontal_line(data, line, sense)
     rho = sqrt(x * x + y * y)
-    # On the station's vertical any direction is outward; what is bounded there is not used.
+    # On the station's vertical any direction is outward; the bounds there are not used.
     ex, ey = (x / rho, y / rho) if rho > 0.0 else (1.0, 0.0)
     up = triple_at(data, AXES + 6)
     return (
@@ -245,7 +249,7 @@ def _upright(data: Array, line: Array, sense: Array) -> tuple[float, float, Trip
 
 @compiled
 def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
-    """Bound an elevation over a box (see `optloc.proof.nodes.node`), radians; it may hold the station's vertical."""
+    """Bound an elevation over a box (see `optloc.proof.nodes.node`), radians; the station's vertical may be inside."""
     rho, rise, outward, sideways, upward = _upright(data, line, sense)
     h = triple_at(half, 0)
     value = atan2(rise, rho)
@@ -259,14 +263,14 @@ def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: 
         around = sum_of_forms(rho / squared, upward, -rise / squared, outward)
         back, aside = reach(radial, h), reach(around, h)
         if back < 1.0:
-            # rho = (linear part) + q, 0 <= q <= bulge, moves r by q rho/r^2 and t by -q rise/r^2.
+            # rho = (linear part) + q with 0 <= q <= bulge changes r by q rho/r^2 and t by -q rise/r^2.
             ahead, shift = bulge * rho / squared, bulge * rise / squared
             low, high = product(radial, around, h)
             cross = abs(shift) * back + ahead * aside
             bilinear = -high - cross + min(ahead * shift, 0.0), -low + cross + max(ahead * shift, 0.0)
             low, high = atan_remainder(back, back + ahead, aside + abs(shift), bilinear)
             low, high = low - max(shift, 0.0), high - min(shift, 0.0)
-    # Where the line of sight turns by much, two numbers say more than a slope and its remainder.
+    # If the line of sight turns by much, a constant interval is tighter than a slope with its remainder.
     bottom, top = _flat_elevation((rise, reach(upward, h)), max(least, 0.0), rho + reach(outward, h) + bulge)
     if top - bottom < high - low:
         slope[0] = slope[1] = slope[2] = 0.0
@@ -277,19 +281,20 @@ def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: 
 
 @compiled
 def _flat_elevation(rise: tuple[float, float], near: float, far: float) -> tuple[float, float]:
-    """Enclose an elevation by two numbers: rise is a centre and a half-width, near and far horizontal distances."""
+    """Enclose an elevation by a constant interval: rise is centre and half-width, near and far horizontal distances."""
     down, up = rise[0] - rise[1], rise[0] + rise[1]
     return atan2(down, near if down < 0.0 else far), atan2(up, far if up < 0.0 else near)
 
 
 @compiled
 def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound how an elevation curves over a box (see `optloc.proof.nodes.node`).
+    """Bound the second derivatives of an elevation over a box (see `optloc.proof.nodes.node`).
 
-    In the unit vectors along the line (a), upwards across it (b) and sideways (c), all pulled and divided by the range,
-    the gradient is b and the Hessian ``-(a b' + b a') - tan(elevation) c c'``; the frame turns over the box.
+    The unit vectors along the line (a), upwards across it (b) and sideways (c) are mapped to search coordinates and
+    divided by the range. The gradient is b, and the Hessian is ``-(a b' + b a') - tan(elevation) c c'``. The frame
+    turns over the box.
     """
-    bound_elevation(data, line, sense, half, turn)  # for its slope alone: `turn` is overwritten below
+    bound_elevation(data, line, sense, half, turn)  # for its slope only: `turn` is overwritten below
     if is_zero_slope(turn):
         return unbounded_curvature(curvature, turn)
     rho, rise, outward, sideways, upward = _upright(data, line, sense)
@@ -308,12 +313,12 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
         for m in range(3):
             curvature[k, m] = -(a[k] * b[m] + b[k] * a[m]) - tan * c[k] * c[m]
     back, aside, bulge = reach(a, h), reach(b, h), hypot_excess(least, swing) / r
-    yaw = swing / least  # tangents of the frame's turns about the vertical, and up or down
+    yaw = swing / least  # tangents of the frame's turns: about the vertical, and up or down
     pitch = (aside + bulge * abs(rise) / r) / (1.0 - back) if back < 1.0 else inf
     if not (yaw < 1.0 and pitch < 1.0 and abs(tan) * pitch < 1.0):
         turn[0] = turn[1] = turn[2] = inf
         return inf
-    # First the range changes, then the frame turns up or down, then about the vertical.
+    # Three changes in order: the range changes, then the frame turns up or down, then about the vertical.
     near = 1.0 / (1.0 - back)
     stretch = max(back * near, back + aside + bulge)
     steeper = pitch * (1.0 + tan * tan) / (1.0 - abs(tan) * pitch)
@@ -326,10 +331,10 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
 
 @compiled
 def _swung(u: Triple, v: Triple, tangent: float, more: Triple, near: float, stretch: float) -> Triple:
-    """Return bounds of the change of u when it turns towards v and beyond by `more`, and the range changes.
+    """Return bounds of the change of u when it turns towards v, changes further by `more`, and the range changes.
 
-    By an angle whose tangent is at most `tangent`, ``u cos + v sin - u`` is at most ``tangent^2/2 |u| + tangent |v|``.
-    `near` and `stretch` bound r/r' and its difference from 1.
+    For an angle whose tangent is at most `tangent`, ``u cos + v sin - u`` is at most
+    ``tangent^2/2 |u| + tangent |v|``. `near` and `stretch` bound r/r' and its difference from 1.
     """
     bent = 0.5 * tangent * tangent
     return (
@@ -348,7 +353,7 @@ def _frame_turn(
     curvature: Array,
     turn: Array,
 ) -> float:
-    """Write the change of an elevation's gradient and return that of its Hessian, from the change of its frame.
+    """Write the change of an elevation's gradient and return the change of its Hessian, from the change of its frame.
 
     `steep` is the tangent of the elevation and a bound of its change.
     """
@@ -370,7 +375,8 @@ def _frame_turn(
 def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
     """Write the unit vector v across the sight and the horizontal: ``|v.(x' - x)| <= r (sin e + 1 - cos a)``.
 
-    At distance r, with e the swing of the elevation and a that of the azimuth beside it, below a quarter turn.
+    Here r is the distance, and e is the greatest change of the elevation. The greatest change of the azimuth from the
+    same station is a, below a quarter turn.
     """
     turn = _azimuth_beside(kinds, data, swing, j)
     p, q, r = line_of_sight(data[j], x)
@@ -386,7 +392,7 @@ def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row:
 
 @compiled
 def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
-    """Return how far the azimuth may swing that the station of elevation j measures, pi if there is none."""
+    """Return the greatest change of the azimuth from the station of elevation j; pi without this azimuth."""
     least = pi
     for m in range(kinds.shape[0]):
         if kinds[m] == AZIMUTH:
@@ -399,6 +405,7 @@ def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
 
 
 def _upright_numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the elevation node of a row."""
     return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a)})
 
 

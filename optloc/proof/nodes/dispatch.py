@@ -1,9 +1,9 @@
-"""The table of nodes, and the functions that choose by a node's code, written from it.
+"""The table of nodes, and generated functions that choose by the code of a node.
 
-Machine code calls no function that it does not know when it is made, so for each thing that a proof asks of a node a
-chain of ``if kind == code`` is written out from the table and compiled like any other function. The chain of the nodes
-that optloc ships is always the same, and its machine code is kept on disk. A node from outside lengthens the chain;
-what calls it is compiled anew then, and kept on disk under a name of its own.
+Compiled code can call only functions that are known when it is compiled. So for each property of a node, a chain of
+``if kind == code`` is generated from the table and compiled like any other function. The chain of the shipped nodes is
+always the same, and its compiled code is stored on disk. A user's node lengthens the chain. Its callers are then
+compiled again, and stored on disk under another name.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_centre, c
 from optloc.proof.nodes.rate import RATE_OF_RANGE
 from optloc.proof.nodes.ratio import RATIO_OF_RANGES
 
-# In the order of their codes (`optloc.proof.nodes.node`); those from outside follow as they are met.
+# In the order of their codes (`optloc.proof.nodes.node`). Nodes of users follow in the order of their first use.
 _SHIPPED = (
     *(DISTANCE, LINEAR_FORM, HORIZONTAL_ANGLE, VERTICAL_ANGLE, RATIO_OF_RANGES, GEODETIC_HEIGHT, RATE_OF_RANGE),
     LOGARITHM,
@@ -36,28 +36,30 @@ _NAMES = {node.name: node for node in NODES}
 
 
 def named(node: str | Node) -> Node:
-    """Return a node that a `Model` names, or that it holds itself."""
+    """Return the node with a name that a `Model` uses, or the node itself if the model contains it."""
     if isinstance(node, Node):
         return node
     if node not in _NAMES:
-        raise InvalidProblem(f"the proof knows no node {node!r}", "nodes", nearest(node, list(_NAMES)))
+        raise InvalidProblem(f"the proof has no node {node!r}", "nodes", nearest(node, list(_NAMES)))
     return _NAMES[node]
 
 
-# Functions that ask one thing of a node by its code: arguments, the answer of a node, and what is said of all others.
+# Functions that return a property of a node by its code: arguments, the expression for a node, and the default.
 
 _Writer = Callable[[Node, int], str]
 
 
 def _call(field: str, arguments: str) -> _Writer:
+    """Return a writer of calls of a node's function, or of an empty text for nodes without the function."""
     return lambda node, code: "" if getattr(node, field) is None else f"{field}_{code}({arguments})"
 
 
 def _constant(field: str) -> _Writer:
+    """Return a writer of the value of a node's field."""
     return lambda node, code: repr(getattr(node, field))
 
 
-_QUESTIONS: dict[str, tuple[str, _Writer, str]] = {
+_PROPERTIES: dict[str, tuple[str, _Writer, str]] = {
     "size_of": ("kind, data, reach", _call("size", "data, reach"), "1.0"),
     "ball_of": ("kind, data, least, most", _call("ball", "data, least, most"), "0.0, 0.0, 0.0, inf"),
     "ray_of": ("kind, kinds, data, swing, j, x, row", _call("ray", "kinds, data, swing, j, x, row"), "-1.0, 0.0"),
@@ -68,20 +70,20 @@ _QUESTIONS: dict[str, tuple[str, _Writer, str]] = {
 }
 
 
-def _question(name: str, nodes: list[Node]) -> str:
-    """Return the text of a function that asks one thing of a node."""
-    arguments, answer, others = _QUESTIONS[name]
+def _property_source(name: str, nodes: list[Node]) -> str:
+    """Return the source of a function that returns one property of a node."""
+    arguments, write, default = _PROPERTIES[name]
     lines = [f"def {name}({arguments}):"]
     for code, node in enumerate(nodes):
-        said = answer(node, code)
-        if said and said != others:
-            lines.append(f"    if kind == {code}:\n        return {said}")
-    return "\n".join([*lines, f"    return {others}", ""])
+        expression = write(node, code)
+        if expression and expression != default:
+            lines.append(f"    if kind == {code}:\n        return {expression}")
+    return "\n".join([*lines, f"    return {default}", ""])
 
 
-# Loops over all nodes of a table but ranges in the near chart, and all nodes over a piece of an atlas. They are written
-# out whole, with the cases inside: a function for the cases alone would be handed seven arrays for each node, and to
-# hand on an array counts references, which costs half as much as to bound an angle.
+# Loops over all nodes except ranges in search coordinates around a fix, and over all nodes over a piece of an atlas.
+# Each loop contains the cases as text. A separate function for the cases would take seven arrays for each node.
+# Passing arrays counts references, which takes half as long as the bound of an angle.
 
 _LOOPS = {
     "bound_others": """
@@ -163,7 +165,7 @@ def curve_pieces(atlas, kinds, data, half, nodes, curves):
 
 
 def _near_case(node: Node, code: int, call: str) -> list[str]:
-    """Return the lines that bound or curve a node over a box in the near chart."""
+    """Return the source lines that bound or curve a node over a box in search coordinates around a fix."""
     if node.points == 1:
         return [call.format(code, "line[:3], sense")]
     second = ["for k in range(3):", "    line[3 + k] = centre[k] - data[j, 3 + k]"]
@@ -171,7 +173,7 @@ def _near_case(node: Node, code: int, call: str) -> list[str]:
 
 
 def _far_case(node: Node, code: int, call: str) -> list[str]:
-    """Return the lines that bound or curve a node over a box of an atlas, if scaled lines serve as well."""
+    """Return the source lines that bound or curve a node over a box of an atlas, if it works with scaled lines."""
     if node.infinity not in (SCALED, BALANCED):
         return []
     if node.points == 1:
@@ -180,7 +182,7 @@ def _far_case(node: Node, code: int, call: str) -> list[str]:
 
 
 def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
-    """Yield the cases of a loop, by the code of the node."""
+    """Yield the source lines of the cases of a loop, in the order of the codes."""
     near, bounds = name.endswith("others"), name.startswith("bound")
     if bounds:
         call = "value, low, high = bound_{}(own, {}, half, slope)"
@@ -203,12 +205,14 @@ def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
 
 
 def text_of(name: str, nodes: list[Node]) -> str:
-    """Return the text of a function that chooses by the codes of nodes."""
-    return _question(name, nodes) if name in _QUESTIONS else _LOOPS[name].format(cases="\n".join(_cases(name, nodes)))
+    """Return the source of a function that chooses by the codes of nodes."""
+    if name in _PROPERTIES:
+        return _property_source(name, nodes)
+    return _LOOPS[name].format(cases="\n".join(_cases(name, nodes)))
 
 
 _KERNELS = ("bound", "curve", "size", "ball", "ray")
-# What the loops name beside the functions of the nodes.
+# Functions that the loops call, other than the functions of the nodes.
 _NAMED = (range_form, triple_at, frame_of, set_line, bound_difference, curve_centre, curve_difference)
 _COLUMNS = (
     *("RANGE", "PHI", "SLOPE0", "SLOPE1", "SLOPE2", "LOW", "HIGH", "FORM"),
@@ -221,8 +225,8 @@ def _kernels(node: Node) -> Iterator[tuple[str, Any]]:
     yield from ((name, getattr(node, name)) for name in _KERNELS if getattr(node, name) is not None)
 
 
-def _written(name: str, nodes: list[Node]) -> Callable[..., Any]:
-    """Return a function that chooses, as if it stood in this file: machine code on disk belongs to a file."""
+def _generated(name: str, nodes: list[Node]) -> Callable[..., Any]:
+    """Return a generated function with the name of this file, because stored compiled code belongs to a file."""
     space: dict[str, Any] = {
         "__name__": __name__,
         "inf": inf,
@@ -230,44 +234,47 @@ def _written(name: str, nodes: list[Node]) -> Callable[..., Any]:
     }
     space |= {function.__name__: function for function in _NAMED}
     space |= {f"{field}_{code}": kernel for code, own in enumerate(nodes) for field, kernel in _kernels(own)}
-    exec(compile(text_of(name, nodes), __file__, "exec"), space)  # noqa: S102  # text of our own making
+    exec(compile(text_of(name, nodes), __file__, "exec"), space)  # noqa: S102  # generated text
     made: Callable[..., Any] = space[name]
     return made
 
 
-bound_others = compiled(_written("bound_others", NODES))
-curve_others = compiled(_written("curve_others", NODES))
-bound_pieces = compiled(_written("bound_pieces", NODES))
-curve_pieces = compiled(_written("curve_pieces", NODES))
-size_of = compiled(_written("size_of", NODES))
-ball_of = compiled(_written("ball_of", NODES))
-ray_of = compiled(_written("ray_of", NODES))
-has_ray = inlined(_written("has_ray", NODES))
-shape_of = inlined(_written("shape_of", NODES))
-infinity_of = inlined(_written("infinity_of", NODES))
-points_of = inlined(_written("points_of", NODES))
+bound_others = compiled(_generated("bound_others", NODES))
+curve_others = compiled(_generated("curve_others", NODES))
+bound_pieces = compiled(_generated("bound_pieces", NODES))
+curve_pieces = compiled(_generated("curve_pieces", NODES))
+size_of = compiled(_generated("size_of", NODES))
+ball_of = compiled(_generated("ball_of", NODES))
+ray_of = compiled(_generated("ray_of", NODES))
+has_ray = inlined(_generated("has_ray", NODES))
+shape_of = inlined(_generated("shape_of", NODES))
+infinity_of = inlined(_generated("infinity_of", NODES))
+points_of = inlined(_generated("points_of", NODES))
 
-# Nodes from outside.
+# Nodes of users.
 
 _LOCK = Lock()
 
 
 def code_of(node: str | Node) -> int:
-    """Return the code of a node; one that is new to this process takes its place in the table, and in all chains."""
-    found = named(node)
+    """Return the code of a node; add a new node to the table and to all chains."""
+    entry = named(node)
     with _LOCK:
-        if found not in _CODES:
-            _CODES[found] = len(NODES)
-            NODES.append(found)
-            _renew()
-        return _CODES[found]
+        if entry not in _CODES:
+            _CODES[entry] = len(NODES)
+            NODES.append(entry)
+            _regenerate()
+        return _CODES[entry]
 
 
-def _renew() -> None:
-    """Write the chains again, for all nodes."""
-    replace({globals()[name]: _written(name, NODES) for name in (*_LOOPS, *_QUESTIONS)})
+def _regenerate() -> None:
+    """Generate the chains again, for all nodes."""
+    replace({globals()[name]: _generated(name, NODES) for name in (*_LOOPS, *_PROPERTIES)})
 
 
 def width(kinds: Iterable[int]) -> int:
-    """Return how many numbers are kept of each node of a problem: a million problems of ranges need no more."""
+    """Return the number of columns for the numbers of nodes.
+
+    The result is the greatest width, so that a million problems of ranges take little memory.
+    """
     return max((NODES[kind].width for kind in kinds), default=DISTANCE.width)

@@ -1,9 +1,10 @@
-"""What levels and surfaces are of, over a box: linear forms of the position, and its geodetic height.
+"""Linear forms of the position and geodetic heights, with bounds over a box.
 
-Linear forms (coordinates, planes, priors) are exact. A height is a distance to the ellipsoid, so it curves like the
-ranges to the centres of two balls: an ellipsoid contains, at each of its points, the tangent ball of its least radius
-of curvature b^2/a, and lies in that of its greatest, a^2/b (Blaschke's rolling theorem). Above it the height is convex,
-its Hessian between 0 and 1/(b^2/a + height) across the normal.
+Linear forms (coordinates, planes, priors) are exact. A height is the distance to the ellipsoid, so it curves like the
+ranges to the centres of two balls. At each of its points, the ellipsoid contains the tangent ball of its least radius
+of curvature b^2/a. It is inside the tangent ball of its greatest radius of curvature a^2/b (Blaschke's rolling
+theorem). Above the ellipsoid the height is convex, and its Hessian is between 0 and 1/(b^2/a + height) across the
+normal.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from optloc.proof.nodes.node import (
 
 # Linear forms.
 
-# Numbers: where the form n.(x - o) is zero, and its coefficients.
+# Numbers of the form n.(x - o): its zero o, and its coefficients n.
 ORIGIN, COEFFICIENTS, _NUMBERS = 0, 3, 6
 
 
 @compiled
 def bound_linear(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
-    """Bound a linear form over a box (see `optloc.proof.nodes.node`), which has no remainder."""
+    """Bound a linear form over a box (see `optloc.proof.nodes.node`); it has no remainder."""
     n = triple_at(data, COEFFICIENTS)
     write_triple(turned_form(n, sense), slope)
     return inner_product(n, triple_at(line, 0)), 0.0, 0.0
@@ -50,7 +51,7 @@ def bound_linear(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
 @compiled
 def size_linear(data: Array, reach: float) -> float:
-    """Return the size of what a linear form is a difference of."""
+    """Return the size of the terms of a linear form, which limits its accuracy."""
     size = reach + (abs(data[ORIGIN]) + abs(data[ORIGIN + 1]) + abs(data[ORIGIN + 2]))
     return float(size * (abs(data[COEFFICIENTS]) + abs(data[COEFFICIENTS + 1]) + abs(data[COEFFICIENTS + 2])))
 
@@ -62,8 +63,8 @@ def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
 
 
 def _of_row(row: NodeRow) -> Array:
-    """Return the numbers of a row: none is linear in the position; priors make these nodes themselves."""
-    raise NotImplementedError("a row of measurements does not say which linear form it is of")
+    """Raise an error: no measurement is linear in the position. Priors make linear nodes directly."""
+    raise NotImplementedError("a row of measurements does not name a linear form")
 
 
 LINEAR_FORM = Node("linear", _NUMBERS, 1, _of_row, bound_linear, shape=FLAT, size=size_linear)
@@ -76,19 +77,19 @@ POINT, ECEF, ROTATION, HEIGHT_WIDTH = 0, 3, 6, 15
 _B = WGS84_A * (1.0 - WGS84_F)
 _E2 = WGS84_F * (2.0 - WGS84_F)
 LEAST_RADIUS = _B * _B / WGS84_A
-# What Bowring's latitude and rounding leave, metres; see `optloc.models.primitives.geodetic_height`.
+# Error of Bowring's latitude and of rounding, metres; see `optloc.models.primitives.geodetic_height`.
 EXACT = 1e-8
-# Deeper than this, where many normals meet, Bowring's latitude is no longer exact.
+# Below this height, metres, normals intersect, and Bowring's latitude is not exact.
 _DEEP = -2e6
 
 
 @compiled
 def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Return height, distance from the axis, and sine and cosine of the latitude, as `optloc.models.primitives` does.
+    """Return height, distance from the axis, sine and cosine of the latitude, computed like `optloc.models.primitives`.
 
     Coordinates are Earth-centred Earth-fixed, metres.
     """
-    p = sqrt(x * x + y * y + 1e-12)  # a micrometre off the axis, as in the model: there is a meridian everywhere
+    p = sqrt(x * x + y * y + 1e-12)  # a micrometre off the axis, as in the model: so each point has a meridian
     rise, run = z * WGS84_A, p * _B
     whole = sqrt(rise * rise + run * run)
     su, cu = rise / whole, run / whole
@@ -105,7 +106,7 @@ def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
 
 @compiled
 def _ecef(data: Array, line: Array) -> Triple:
-    """Return Earth-centred Earth-fixed coordinates of the end of a line."""
+    """Return Earth-centred Earth-fixed coordinates, metres, of the end of a line."""
     along, origin = triple_at(line, 0), triple_at(data, ECEF)
     return (
         inner_product(triple_at(data, ROTATION), along) + origin[0],
@@ -129,7 +130,8 @@ def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, 
 def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound a geodetic height over a box (see `optloc.proof.nodes.node`), metres.
 
-    Deep in the Earth the model's formula is no exact height; there it lies between ``-|x| - a`` and ``|x| - b``.
+    Deep in the Earth the model's formula is not an exact height. There the height is between ``-|x| - a`` and
+    ``|x| - b``.
     """
     height, up, _, _, _ = normal_at(data, line)
     h = triple_at(half, 0)
@@ -148,11 +150,12 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
 @compiled
 def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound how a geodetic height curves over a box (see `optloc.proof.nodes.node`).
+    """Bound the second derivatives of a geodetic height over a box (see `optloc.proof.nodes.node`).
 
-    The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian and
-    prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2: ``3 p q^2`` with ``p^2 + q^2 = 1`` (1.155) for the
-    turning normal and the stretching tangents, ``3/2 e^2 (1 + e^2)`` (0.01) for curvature that changes with latitude.
+    The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian
+    and prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2. The bound covers ``3 p q^2`` with
+    ``p^2 + q^2 = 1`` (1.155), for the turning normal and the stretching tangents, and ``3/2 e^2 (1 + e^2)`` (0.01),
+    for curvature that changes with latitude.
     """
     height, up, east, north, sp = normal_at(data, line)
     h = triple_at(half, 0)
@@ -165,7 +168,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
     prime = WGS84_A / sqrt(flat)
     meridian = prime * (1.0 - _E2) / flat
     u, v = turned_form(east, sense), turned_form(north, sense)
-    # The least radius of curvature anywhere in the box, below its lowest point.
+    # The inverse of the least radius of curvature in the box, below its lowest point.
     bend = 1.0 / (LEAST_RADIUS + height - way)
     change = 1.2 * bend * bend * way
     chi = 0.0
@@ -182,7 +185,10 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
 
 @compiled
 def earth_ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
-    """Return a ball around the Earth's centre: a height is at least the distance from there less the equator's."""
+    """Return a ball around the Earth's centre for heights up to `most`.
+
+    A height is at least the distance from the Earth's centre minus the equatorial radius.
+    """
     origin = triple_at(data, ECEF)
     first, second, third = triple_at(data, ROTATION), triple_at(data, ROTATION + 3), triple_at(data, ROTATION + 6)
     c = sum_of_forms(1.0, sum_of_forms(origin[0], first, origin[1], second), origin[2], third)
@@ -190,12 +196,13 @@ def earth_ball(data: Array, least: float, most: float) -> tuple[float, float, fl
 
 
 def height_numbers(problem: Problem) -> Array:
-    """Return the numbers (1, n) of the node that is the geodetic height of a position in the problem's frame."""
+    """Return the numbers (1, n) of the node for the geodetic height of a position in the problem's frame."""
     frame = problem.frame
     return lay_out({ECEF: frame.origin_ecef()[None], ROTATION: frame.rotation_to_ecef().reshape(1, 9)})
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (1, n) of the height node of a row."""
     return height_numbers(row.problem)
 
 

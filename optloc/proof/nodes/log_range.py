@@ -1,6 +1,7 @@
-"""Logarithms of ranges over a box: signal strengths in decibels are multiples of them.
+"""Logarithms of ranges over a box; signal strengths in decibels are multiples of them.
 
-Differences of logarithms stay finite and smooth at infinity, where scaled lines serve as well: their scale falls out.
+Differences of logarithms stay finite and smooth at infinity. Scaled lines give the same differences, because the scale
+cancels.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from optloc.proof.nodes.node import (
     write_triple,
 )
 
-# The least range with a logarithm: a place at the station itself has none.
+# Least range with a logarithm: at the station the logarithm does not exist.
 _LEAST = 1e-300
 
 
@@ -35,8 +36,8 @@ _LEAST = 1e-300
 def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
     """Bound the logarithm of a range over a box (see `optloc.proof.nodes.node`).
 
-    With r' = r (1 + t) elsewhere in the box ``log r' = log r + t + (log(1 + t) - t)``. The bracket is never positive,
-    and falls with |t|. In a box that may touch the station the logarithm has no lower end.
+    For a range r' = r (1 + t) in the box, ``log r' = log r + t + (log(1 + t) - t)``. The bracket is never positive,
+    and decreases with |t|. In a box that may contain the station, the logarithm has no lower bound.
     """
     h = triple_at(half, 0)
     r, u, least, most, far = range_form(line, sense, h)
@@ -47,7 +48,7 @@ def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: 
     below, above = least / r - 1.0, far / r - 1.0
     low, high = log1p(below), log1p(above)
     less, more = min(log1p(below) - below, log1p(above) - above), most / r
-    # Else two numbers for the whole box say more than a slope and its remainder.
+    # Otherwise a constant interval for the whole box is tighter than a slope with its remainder.
     if more - less <= high - low:
         write_triple(sum_of_forms(1.0 / r, u, 0.0, u), slope)
         return phi, less, more
@@ -57,9 +58,9 @@ def bound_logarithm(data: Array, line: Array, sense: Array, half: Array, slope: 
 
 @compiled
 def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound how the logarithm of a range curves over a box (see `optloc.proof.nodes.node`).
+    """Bound the second derivatives of the logarithm of a range over a box (see `optloc.proof.nodes.node`).
 
-    With u the gradient and B the Hessian of the range, they are g = u/r and ``B/r - g g'``.
+    With u the gradient and B the Hessian of the range, the gradient is g = u/r and the Hessian is ``B/r - g g'``.
     """
     h = triple_at(half, 0)
     bound_logarithm(data, line, sense, half, turn)
@@ -76,7 +77,7 @@ def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvatu
         bend[4] / r - g[1] * g[2],
         bend[5] / r - g[2] * g[2],
     )
-    # g' - g = (u' - u - g (r' - r)) / r', as of any quotient.
+    # g' - g = (u' - u - g (r' - r)) / r', as for any quotient.
     wide = sum_of_forms(1.0 / least, du, swing / least, (abs(g[0]), abs(g[1]), abs(g[2])))
     dg = length(wide)
     change = (chi + swing * norm / r) / least + dg * (2.0 * length(g) + dg)
@@ -87,6 +88,7 @@ def curve_logarithm(data: Array, line: Array, sense: Array, half: Array, curvatu
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the node of a row: the station's position."""
     return row.place(row.a)
 
 

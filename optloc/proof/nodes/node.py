@@ -1,29 +1,30 @@
-"""What a node is: a scalar function of the position that residuals are sums of, and all that a proof must know of it.
+"""Nodes: scalar functions of the position that residuals are sums of, and the functions that bound a node over a box.
 
-Residuals are ``K phi(x) - w``, whitened, with one node phi_j a column. Each kind of node is a file of this folder with
-one `Node`; `optloc.proof.nodes.dispatch` lists them. A measurement kind names its nodes in its `optloc.models.Model`.
+Residuals are ``K phi(x) - w``, whitened, with one column for each node phi_j. Each kind of node is a file of this
+folder with one `Node`; `optloc.proof.nodes.dispatch` lists them. A measurement kind names its nodes in its
+`optloc.models.Model`.
 
-All vectors here have three numbers. In the plane the third of a point, of a line and of every axis is 0, `sense` has a
-column and a row of zeros, and the third half-width is 0: nothing depends on the third search coordinate then.
+All vectors here have three numbers. In the plane the third number of a point, of a line and of every axis is 0, and so
+is the third half-width. `sense` has a column and a row of zeros. So nothing depends on the third search coordinate.
 
 Over a box (centre c, half-widths h in search coordinates s, x = c + T s) a node is bounded by two functions of
 
-    data (width,)  the node's own numbers, points first
-    line (3,)      c minus the point data[0:3] (in the inverse-range chart the scaled line p - varpi a)
+    data (width,)  numbers of the node, points first
+    line (3,)      c minus the point data[0:3] (in an atlas the scaled line p - varpi a)
     sense (3, 3)   derivative of the line with respect to s (T near; [e_j, e_k, -a] far)
     half (3,)      half-widths h
 
-(nodes of two points have ``line_b, sense_b`` of the second, data[3:6], after ``line, sense``):
+(nodes of two points also have ``line_b, sense_b`` of the second point, data[3:6], after ``line, sense``):
 
 ``bound(data, line, sense, half, slope) -> (value, low, high)``
-    value at the centre; writes its gradient with respect to s into slope (3,); low and high enclose the remainder
-    ``phi(s) - value - slope.s`` for all |s_k| <= half_k. What cannot be bounded sharply has slope 0 and a wide
-    interval, of which an end may be infinite.
+    returns the value at the centre, and an interval [low, high]. The interval contains the remainder
+    ``phi(s) - value - slope.s`` for all |s_k| <= half_k. Writes the gradient with respect to s into slope (3,).
+    Without a sharp bound, the slope is 0 and the interval is wide; an end may be infinite.
 ``curve(data, line, sense, half, curvature, turn) -> chi``
-    writes the Hessian with respect to s at the centre into curvature (3, 3), a bound of the change of each component of
-    the gradient over the box into turn (3,), and returns a bound of the spectral norm of the change of the Hessian;
-    infinite turn or chi where there is none. Over t times the box, 0 < t < 1, these bounds and those of the remainder
-    are at most t times as large wherever chi is finite.
+    writes the Hessian with respect to s at the centre into curvature (3, 3), and a bound of the change of each
+    component of the gradient over the box into turn (3,). Returns a bound of the spectral norm of the change of the
+    Hessian. Without a bound, turn or chi is infinite. Wherever chi is finite, these bounds and the bounds of the
+    remainder over t times the box, 0 < t < 1, are at most t times as large.
 """
 
 from __future__ import annotations
@@ -39,40 +40,41 @@ from optloc.base.types import Array
 from optloc.kernels.jit import compiled, inlined
 from optloc.problem.problem import Problem
 
-# Codes of the shipped nodes, by which machine code knows them; nodes from outside are counted on. ANY stands for a node
-# of which nothing is known but its tables.
+# Codes of the shipped nodes in compiled code; nodes of users get the next codes. ANY is a node of which only the
+# tables are known.
 RANGE, LINEAR, AZIMUTH, ELEVATION, RATIO, HEIGHT, RATE, LOG_RANGE = range(8)
 ANY = -1
 
-# How a node curves: not at all, with a Hessian that is nowhere negative (a bound of its force from below is enough
-# then), or in any way.
+# Curvature of a node: zero; a Hessian that is nowhere negative, for which a lower bound of the force is enough; or
+# any.
 FLAT, CONVEX, MIXED = range(3)
-# What becomes of a node at infinity. It grows without end, and so does the cost. Or it depends on the directions of its
-# lines alone, so that scaled lines serve as well. Or only differences of such nodes are finite: ranges; or logarithms,
-# for whose differences scaled lines serve.
+# Behaviour of a node at infinity. GROWS: it grows without limit, and so does the cost. SCALED: it depends on the
+# directions of its lines only, so that scaled lines give the same value. DIFFERENCE: only differences of such nodes
+# are finite (ranges). BALANCED: only differences are finite, and scaled lines give the same differences (logarithms).
 GROWS, SCALED, DIFFERENCE, BALANCED = range(4)
 
-# Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, enclosure of the remainder and
-# its middle. Of a range over a piece of an atlas its curvature needs more: all numbers of `range_form` except the last.
+# Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, interval of the remainder and
+# the middle of this interval. For a range over a piece of an atlas, FORM has the numbers of `range_form` except the
+# last, which its curvature needs.
 PHI, SLOPE0, SLOPE1, SLOPE2, LOW, HIGH, BETWEEN, FORM, NODE_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 13
-# Columns of a table of second derivatives (J, CURVE_WIDTH): the Hessian's entries, bounds of the change of the gradient
-# and of the Hessian, and what the rows add to them: the force K'(K phi - w) on the node, its pull K'J, and how far the
-# force may be from what it is computed to be.
+# Columns of a table of second derivatives (J, CURVE_WIDTH): the Hessian's entries, and bounds of the change of the
+# gradient and of the Hessian. Then numbers that depend on the rows: the force K'(K phi - w) on the node, its pull K'J,
+# and a bound of the rounding of the force.
 H00, H01, H02, H11, H12, H22, TURN0, TURN1, TURN2, CHI, FORCE, PULL0, PULL1, PULL2, BLUR, CURVE_WIDTH = range(16)
 
 
 @dataclass(frozen=True, slots=True)
 class NodeRow:
-    """The row of a flat batch of N problems that a node is made for.
+    """The row of a flat batch of N problems for which a node is made.
 
     Parameters
     ----------
     problem : Problem
         The problems.
     a, b, epoch : int
-        Stations and epoch of the row; -1 for a station that it does not have.
+        Stations and epoch of the row; -1 for a station that the row does not have.
     measured : array (N,)
-        Its measured value less everything that is known to be added.
+        Measured values of the row minus all known additions.
     """
 
     problem: Problem
@@ -82,20 +84,20 @@ class NodeRow:
     measured: Array
 
     def place(self, station: int) -> Array:
-        """Return the position (B, d) of a station; B is N, or 1 where all problems share it."""
+        """Return the position (B, d), metres, of a station; B is N, or 1 if all problems share it."""
         position = self.problem.stations.position
         picked = position[..., self.epoch if position.shape[-3] > 1 else 0, station, :]
         return picked if picked.ndim == 2 else picked[None]
 
     def velocity(self, station: int) -> Array:
-        """Return the velocity (B, d) of a station."""
+        """Return the velocity (B, d), m/s, of a station."""
         velocity = self.problem.stations.velocity
-        assert velocity is not None  # a problem of kinds with velocities has them
+        assert velocity is not None  # problems with velocity kinds have station velocities
         picked = velocity[..., self.epoch if velocity.shape[-3] > 1 else 0, station, :]
         return picked if picked.ndim == 2 else picked[None]
 
     def axes(self, station: int) -> Array:
-        """Return the axes (B, 9) of a station, rows of three."""
+        """Return the axes (B, 9) of a station, row by row."""
         axes, d = self.problem.stations.axes, self.problem.dimension
         if axes is None:
             return np.eye(3).reshape(1, 9)
@@ -107,7 +109,7 @@ class NodeRow:
 
 
 def lay_out(parts: dict[int, Array]) -> Array:
-    """Return the numbers (B, n) of a node from its parts (B or 1, k) by the column where each begins; else zero."""
+    """Return the numbers (B, n) of a node from parts (B or 1, k), keyed by first column; other columns are zero."""
     last = max(start + part.shape[1] for start, part in parts.items())
     out = np.zeros((max(len(part) for part in parts.values()), last))
     for start, part in parts.items():
@@ -125,13 +127,13 @@ class Node:
     Parameters
     ----------
     name : str
-        By which a `Model` names it.
+        Name for use in a `Model`.
     width : int
-        How many numbers it has.
+        Number of the node's numbers.
     points : int
-        How many points these begin with, and lines the functions take: 1 or 2.
+        Number of points at the beginning of the numbers, and of lines that the functions take: 1 or 2.
     numbers : callable
-        ``(Row) -> array (B, n <= width)``: its numbers for a row of a batch, B = 1 where all problems share them.
+        ``(NodeRow) -> array (B, n <= width)``: the numbers for a row of a batch, B = 1 if all problems share them.
     bound, curve : callable
         As above; None for ranges, which are bounded all at once.
     shape : int
@@ -139,24 +141,25 @@ class Node:
     infinity : int
         GROWS, SCALED, DIFFERENCE or BALANCED.
     size : callable, optional
-        ``(data, reach) -> float``: the size of what the value is a difference of, where the lengths of the
-        coordinates sum to `reach`; it limits the accuracy. None: 1, as angles and ratios.
+        ``(data, reach) -> float``: the size of the terms of the value, which limits its accuracy; `reach` is the sum
+        of the sizes of the coordinates. None: 1, as for angles and ratios.
     ball : callable, optional
-        ``(data, least, most) -> (x, y, z, radius)``: a ball that holds all points at which the node is in an interval;
-        infinite where there is none. None: there never is one.
+        ``(data, least, most) -> (x, y, z, radius)``: a ball that contains all points at which the node is in an
+        interval; infinite radius without a ball. None: the node has no balls.
     ray : callable, optional
-        ``(kinds, data, swing, j, x, row) -> (width, far)``: of node j, which is within `swing` (J,) of its value at a
-        fix x. Writes a unit vector into row (3,): points at distance r off the station are within ``r width`` of the
-        fix along it, and the fix itself is `far`. A negative width where nothing is known. None: it never is.
+        ``(kinds, data, swing, j, x, row) -> (width, far)`` for node j, which is within `swing` (J,) of its value at a
+        fix x. Writes a unit vector into row (3,). Points at distance r from the station are within ``r width`` of the
+        fix along this vector, and `far` is the distance of the fix. A negative width means no bound. None: the node
+        has no bounds of this kind.
     of_station : bool
-        Whether it is of a station at an epoch alone, so that all rows which name it share the node.
+        Whether the node depends on one station and epoch only, so that all rows with this node share it.
     counts_from_measured : bool
-        Whether the node is its quantity less the measured value.
+        Whether the node is the quantity minus the measured value.
     most : float
         Greatest size of the node, for kinds with a period: residuals are wrapped, nodes are not.
     mark : callable, optional
-        ``(numbers, alone)``: marks nodes whose rows are their own, with the least cost at zero, in their numbers
-        (B, n, width), from where they are (B, n).
+        ``(numbers, alone)``: marks nodes that share no row with other nodes and have their least cost at zero.
+        `numbers` (B, n, width) is changed, and `alone` (B, n) says for which nodes.
     """
 
     name: str
@@ -176,12 +179,12 @@ class Node:
     mark: Callable[[Array, Array], None] | None = None
 
 
-# Linear forms of a box's coordinates as triples of numbers: their reach, their products, ranges over a box.
+# Linear forms of a box's coordinates as triples of numbers: their greatest values, their products, ranges over a box.
 #
 # A box is ``|s_k| <= h_k``; a linear form u.s is the triple of its coefficients.
 
 Triple = tuple[float, float, float]
-# A symmetric matrix: entries 00, 01, 02, 11, 12, 22. Numbers, not an array: machine code keeps them in registers.
+# A symmetric matrix: entries 00, 01, 02, 11, 12, 22. A tuple, because compiled code keeps its numbers in registers.
 Symmetric = tuple[float, float, float, float, float, float]
 # A range over a box, see `range_form`.
 RangeForm = tuple[float, Triple, float, float, float]
@@ -189,7 +192,7 @@ RangeForm = tuple[float, Triple, float, float, float]
 
 @compiled
 def triple_at(numbers: Array, at: int) -> Triple:
-    """Return three numbers from an index on."""
+    """Return three consecutive numbers of an array as a triple."""
     return numbers[at], numbers[at + 1], numbers[at + 2]
 
 
@@ -229,13 +232,13 @@ def write_triple(u: Triple, out: Array) -> None:
 
 @compiled
 def is_zero_slope(slope: Array) -> bool:
-    """Return whether a slope (3,) is zero, as that of a node which is only enclosed."""
+    """Return whether a slope (3,) is zero, as for a node with a constant interval."""
     return bool(slope[0] == 0.0 and slope[1] == 0.0 and slope[2] == 0.0)
 
 
 @compiled
 def unbounded_curvature(curvature: Array, turn: Array) -> float:
-    """Say that a node's curvature has no bound over a box: no Hessian, infinite change of the gradient; return inf."""
+    """Write the results of a node without bounds of curvature: zero Hessian, infinite change of slope; return inf."""
     for k in range(3):
         turn[k] = inf
         for m in range(3):
@@ -251,13 +254,13 @@ def reach(u: Triple, h: Triple) -> float:
 
 @compiled
 def largest_row_value(matrix: Array, k: int, h: Triple) -> float:
-    """Return the greatest value over a box of ``|(matrix s)_k|``: with a Hessian, of the change of a gradient."""
+    """Return the greatest ``|(matrix s)_k|`` over a box; for a Hessian, a bound of a gradient component's change."""
     return float(abs(matrix[k, 0]) * h[0] + abs(matrix[k, 1]) * h[1] + abs(matrix[k, 2]) * h[2])
 
 
 @compiled
 def product(u: Triple, v: Triple, h: Triple) -> tuple[float, float]:
-    """Return an enclosure of ``(u.s)(v.s)`` over a box: squares have a sign, which the product of reaches forgets."""
+    """Return an enclosure of ``(u.s)(v.s)`` over a box, which uses the sign of squares."""
     low = high = 0.0
     for k in range(3):
         square = u[k] * v[k] * h[k] * h[k]
@@ -273,15 +276,15 @@ def product(u: Triple, v: Triple, h: Triple) -> tuple[float, float]:
 
 @compiled
 def scaled(low: float, high: float, least: float, most: float) -> tuple[float, float]:
-    """Return an enclosure of a number in [low, high] divided by one in [least, most], both of these positive."""
+    """Return an enclosure of a number in [low, high] divided by a number in [least, most], with most >= least > 0."""
     return low / (least if low < 0.0 else most), high / (least if high > 0.0 else most)
 
 
 @inlined
 def hypot_excess(along: float, across: float) -> float:
-    """Return a bound of ``hypot(a, b) - a`` for all a >= along and |b| <= across: it falls with a."""
+    """Return a bound of ``hypot(a, b) - a``, which decreases with a, for all a >= along and |b| <= across."""
     whole = sqrt(along * along + across * across)
-    # The difference of two numbers that are nearly one would lose all digits: as a quotient it loses none.
+    # A difference of two nearly equal numbers would lose all digits; the quotient loses none.
     return across * across / (whole + along) if along > 0.0 else whole - along
 
 
@@ -289,27 +292,27 @@ def hypot_excess(along: float, across: float) -> float:
 def largest_quadratic(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
     """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= 1.
 
-    The maximum is at a corner. The signs of a corner make all three mixed terms positive where their product is;
-    otherwise one of them must be negative: the smallest.
+    The maximum is at a corner. If the product of the three mixed terms is positive, the signs of a corner make all of
+    them positive. Otherwise one of them must be negative: the smallest.
     """
     u, v, t = abs(b), abs(c), abs(e)
     mixed = u + v + t
     if b * c * e < 0.0:
         mixed -= 2.0 * min(u, v, t)
-    # Rounding may leave a form that is nowhere positive below zero, of which no root could be taken.
+    # Rounding may make the form slightly negative, and the callers take its square root.
     return max(0.0, a + d + f + 2.0 * mixed)
 
 
 @inlined
 def length_across(sense: Array, u: Triple, h: Triple) -> float:
-    """Return a bound over a box of the length of ``sense s`` without its part along a unit vector.
+    """Return a bound over a box of the length of ``sense s`` without its component along a unit vector.
 
     Parameters
     ----------
     sense : array (3, 3)
         Derivative of a line.
     u : triple
-        Pull of the unit vector.
+        Gradient of the component along the unit vector.
     h : triple
         Half-widths.
     """
@@ -323,7 +326,7 @@ def length_across(sense: Array, u: Triple, h: Triple) -> float:
 
 @inlined
 def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
-    """Return a range over a box: its value r, slope u, the least r + u.s, a bound of the remainder, and the greatest.
+    """Return a range over a box: value r, slope u, least r + u.s, greatest remainder, and greatest value.
 
     The range is ``r + u.s + q`` with ``0 <= q <= remainder``.
     """
@@ -332,7 +335,7 @@ def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
     per = 1.0 / r if r > 0.0 else 0.0
     u = turned_form((n[0] * per, n[1] * per, n[2] * per) if r > 0.0 else (1.0, 0.0, 0.0), sense)
     swing, aside = reach(u, h), length_across(sense, u, h)
-    # The farthest corner, up to the rounding of its root.
+    # The distance of the farthest corner, enlarged by the rounding of the root.
     far = sqrt((r + swing) * (r + swing) + aside * aside) * (1.0 + 1e-15)
     return r, u, r - swing, hypot_excess(r - swing, aside), far
 
@@ -341,7 +344,7 @@ def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
 def range_hessian(
     sense: Array, h: Triple, r: float, u: Triple, least: float, remainder: float
 ) -> tuple[Symmetric, Triple, float, float]:
-    """Return the Hessian of a range; bounds of the change of its gradient (a triple) and Hessian, and its norm.
+    """Return the Hessian of a range, bounds of the changes of its gradient and Hessian, and a norm of the Hessian.
 
     Parameters
     ----------
@@ -350,14 +353,18 @@ def range_hessian(
     h : triple
         Half-widths.
     r, u, least, remainder
-        What `range_form` returns; `least` must be positive.
+        Results of `range_form`; `least` must be positive.
 
     Returns
     -------
     hessian : symmetric
         ``sense' P sense / r``.
-    turn, change, norm
-        As above.
+    turn : triple
+        Bound of the change of each component of the gradient.
+    change : float
+        Bound of the change of the Hessian.
+    norm : float
+        Trace of the Hessian, which bounds its norm.
     """
     g, per = _gram(sense, u), 1.0 / r
     hessian = (g[0] * per, g[1] * per, g[2] * per, g[3] * per, g[4] * per, g[5] * per)
@@ -377,7 +384,7 @@ def range_hessian(
 
 @inlined
 def largest_entries(matrix: Symmetric, h: Triple) -> Triple:
-    """Return the greatest values over a box of the entries of ``matrix s``, see `row_reach`."""
+    """Return the greatest sizes over a box of the entries of ``matrix s``, see `row_reach`."""
     m00, m01, m02, m11, m12, m22 = matrix
     b, c, e = abs(m01), abs(m02), abs(m12)
     return (
@@ -404,7 +411,7 @@ def write_symmetric(matrix: Symmetric, out: Array) -> None:
 
 @inlined
 def _gram(sense: Array, u: Triple) -> Symmetric:
-    """Return ``sense'sense - u u'``, of which rounding may not make a squared length negative."""
+    """Return ``sense'sense - u u'``; squared lengths that rounding makes negative are set to zero."""
     a, b, c = sense[0, 0], sense[0, 1], sense[0, 2]
     d, e, f = sense[1, 0], sense[1, 1], sense[1, 2]
     p, q, r = sense[2, 0], sense[2, 1], sense[2, 2]

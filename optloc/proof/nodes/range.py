@@ -1,6 +1,6 @@
-"""Ranges: all of a problem at once over a box, and less the distance to the centre of an atlas out to infinity.
+"""Ranges over a box: all ranges of a problem at once; and ranges minus the distance to the centre of an atlas.
 
-Most rows are sums of ranges, so their loops are written out: what all of them share is computed once for a box.
+Most rows are sums of ranges, so these loops are written out: values that all ranges share are computed once for a box.
 """
 
 from __future__ import annotations
@@ -46,16 +46,17 @@ from optloc.proof.nodes.node import (
 )
 from optloc.proof.nodes.ratio import quotient_hessian, quotient_remainder
 
-# How a range curves over a box, see `range_bend`.
+# Second derivatives of a range over a box, see `range_bend`.
 RangeBend = tuple[Symmetric, Triple, float, float]
 
 
 @compiled
 def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, nodes: Array) -> int:
-    """Bound all ranges over a box; return how many nodes are none.
+    """Bound all ranges over a box; return the number of other nodes.
 
-    With u the direction of the line v, a = r + u.d and b = |d - u u.d| the remainder is ``sqrt(a^2 + b^2) - a``, which
-    falls with a (of either sign) and grows with b: it is at most its value at the least a and the greatest b.
+    Let u be the direction of the line v, a = r + u.d and b = |d - u u.d|. The remainder is ``sqrt(a^2 + b^2) - a``. It
+    decreases with a (of either sign) and increases with b. So it is at most its value at the least a and the greatest
+    b.
 
     Parameters
     ----------
@@ -69,12 +70,12 @@ def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: A
         Rows of ranges are written.
     """
     others = 0
-    # Numbers by names of their own: an entry of an array would be loaded anew after every entry that is written.
+    # Local variables: an array entry would be loaded again after each entry that is written.
     c0, c1, c2, h0, h1, h2 = centre[0], centre[1], centre[2], half[0], half[1], half[2]
     t00, t01, t02 = sense[0, 0], sense[0, 1], sense[0, 2]
     t10, t11, t12 = sense[1, 0], sense[1, 1], sense[1, 2]
     t20, t21, t22 = sense[2, 0], sense[2, 1], sense[2, 2]
-    # Entries of T'T times half-widths: all of a quadratic form over the box but for the direction.
+    # Entries of T'T times half-widths: the part of the quadratic form that does not depend on the direction.
     m00, m01, m02 = gram[0, 0] * h0 * h0, gram[0, 1] * h0 * h1, gram[0, 2] * h0 * h2
     m11, m12, m22 = gram[1, 1] * h1 * h1, gram[1, 2] * h1 * h2, gram[2, 2] * h2 * h2
     for j in range(kinds.shape[0]):
@@ -104,8 +105,9 @@ def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: A
 def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: Array) -> None:
     """Write Hessians of all ranges, and bounds of their change, into the table of second derivatives.
 
-    With P the projection across the direction u of the line and r' >= A the range elsewhere in the box, the gradient
-    T'u changes by ``(T'P d - q T'u) / r'`` and the Hessian ``T'P T / r`` by a difference of quotients.
+    Let P be the projection across the direction u of the line, and r' >= A the range elsewhere in the box. The
+    gradient T'u changes by ``(T'P d - q T'u) / r'``, and the Hessian ``T'P T / r`` changes by a difference of
+    quotients.
 
     Parameters
     ----------
@@ -116,7 +118,7 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
     nodes : array (J, NODE_WIDTH)
         Filled by `bound_ranges`.
     curves : array (J, CURVE_WIDTH)
-        Rows of ranges are written, see `optloc.proof.box`.
+        Rows of ranges are written, see `optloc.proof.nodes.node`.
     """
     h0, h1, h2 = half[0], half[1], half[2]
     m00, m01, m02, m11, m12, m22 = gram[0, 0], gram[0, 1], gram[0, 2], gram[1, 1], gram[1, 2], gram[2, 2]
@@ -136,7 +138,7 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
             eta, slope = sqrt(e0 * e0 + e1 * e1 + e2 * e2), sqrt(g0 * g0 + g1 * g1 + g2 * g2)
             norm = sqrt(n00 * n00 + n11 * n11 + n22 * n22 + 2.0 * (n01 * n01 + n02 * n02 + n12 * n12))
             chi = (eta * (2.0 * slope + eta) + norm * (swing + most) * per) * near
-        else:  # the station may be in the box, where the gradient turns by anything
+        else:  # the station may be in the box, where the gradient has any direction
             per, chi = 1.0 / r if r > 0.0 else 0.0, inf
             e0, e1, e2 = sqrt(m00) + abs(g0), sqrt(m11) + abs(g1), sqrt(m22) + abs(g2)
         curves[j, H00], curves[j, H01], curves[j, H02] = n00 * per, n01 * per, n02 * per
@@ -144,8 +146,8 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
         curves[j, TURN0], curves[j, TURN1], curves[j, TURN2], curves[j, CHI] = e0, e1, e2, chi
 
 
-# Behaviour at infinity. Where every row's coefficients of ranges sum to zero, the distance to the centre of the cube of
-# an atlas may be taken off every range. What is left,
+# Behaviour at infinity. An atlas needs rows in which the coefficients of ranges sum to zero. Then the distance to the
+# centre of its cube can be subtracted from each range. The result,
 #
 #     R (|p - v a| - |p|) / v = R (-2 a.p + v |a|^2) / (|p - v a| + |p|),
 #
@@ -156,18 +158,19 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
 def bound_difference(
     frame: AtlasFrame, data: Array, centre: RangeForm, h: Triple, away: Array, sense: Array
 ) -> tuple[float, float, float, Triple, RangeForm]:
-    """Return a range less the distance to the centre over a box, metres: value, ends of the remainder, slope, its form.
+    """Return value, remainder, slope and form over a box of a range minus the distance to the centre, metres.
 
-    A quotient N/S with N linear, as ratios are (`optloc.proof.nodes.ratio.bound_ratio`), and at most ``R |a|`` in size.
+    It is a quotient N/S with linear N, like ratios (`optloc.proof.nodes.ratio.bound_ratio`), and its size is at most
+    ``R |a|``.
 
     Parameters
     ----------
     frame : AtlasFrame
-        Where the box lies.
+        Position of the box.
     data : array (width,)
-        The node.
+        Numbers of the node.
     centre : tuple
-        What `optloc.proof.nodes.node.range_form` says of p.
+        Result of `optloc.proof.nodes.node.range_form` for p.
     h : triple
         Half-widths.
     away, sense : array (3,), (3, 3)
@@ -183,7 +186,7 @@ def bound_difference(
     if least > 0.0:
         g = sum_of_forms(1.0 / size, n, -phi / size, u)
         low, high = quotient_remainder(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
-        # By the triangle inequality the difference of the two distances is within |a| of zero.
+        # By the triangle inequality, the difference of the two distances is at most |a| in size.
         if high - low <= 2.0 * a:
             return radius * phi, radius * low, radius * high, sum_of_forms(radius, g, 0.0, g), form
     return radius * phi, radius * (-a - phi), radius * (a - phi), (0.0, 0.0, 0.0), form
@@ -191,7 +194,7 @@ def bound_difference(
 
 @inlined
 def curve_centre(slant: Array, centre: RangeForm, h: Triple) -> RangeBend:
-    """Return how the distance to the centre of the cube curves over a box, for `curve_difference`."""
+    """Return the second derivatives of the distance to the cube's centre over a box, for `curve_difference`."""
     r, u, least, q, _ = centre
     if not least > 0.0:
         return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (inf, inf, inf), inf, inf
@@ -209,16 +212,16 @@ def curve_difference(
     away: Array,
     sense: Array,
 ) -> tuple[Symmetric, Triple, float]:
-    """Return how a range less the distance to the centre curves over a box: Hessian, and bounds of what changes.
+    """Return Hessian and bounds of changes over a box of a range minus the distance to the centre.
 
     Parameters
     ----------
     frame, data, centre, h, away, sense
-        As of `bound_difference`.
+        As in `bound_difference`.
     node : array (NODE_WIDTH,)
-        What that found.
+        Result of `bound_difference`.
     bent : tuple
-        What `curve_centre` says of p.
+        Result of `curve_centre`.
     """
     m0, m1, m2 = frame.middle
     still, own = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -235,7 +238,7 @@ def curve_difference(
     size, u = r + r0, sum_of_forms(1.0, u, 1.0, u0)
     # The numerator of the quotient is linear.
     changes = (still, sum_of_forms(1.0, ds, 1.0, ds0), 0.0, change + change0, norm + norm0, reach(u, h) + q + q0)
-    # In metres: the value, its slope, and so all that becomes of them.
+    # Value and slope are in metres, so all results are in metres.
     return quotient_hessian(
         slope, u, (node[PHI], size, least + least0), changes, h, own, add_symmetric(second, second0)
     )
@@ -243,16 +246,18 @@ def curve_difference(
 
 @compiled
 def _size(data: Array, reach: float) -> float:
+    """Return the size of the terms of a range, metres, which limits its accuracy."""
     return float(reach + (abs(data[0]) + abs(data[1]) + abs(data[2])))
 
 
 @compiled
 def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
-    """Return the ball of a range: around its station."""
+    """Return the ball of a range: the ball around its station."""
     return data[0], data[1], data[2], most
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the range node of a row: the station's position."""
     return row.place(row.a)
 
 

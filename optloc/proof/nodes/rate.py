@@ -1,7 +1,7 @@
-"""Range rates of a target that stays, over a box: the component along the line of sight of the station's velocity.
+"""Range rates of a fixed target over a box: the component of the station's velocity along the line of sight.
 
-A rate is ``n.w / |n|`` with n the line from the station and w its velocity reversed: a quotient of a linear form and a
-range, of the direction of the line alone, so it stays finite and smooth at infinity.
+A rate is ``n.w / |n|``, with n the line from the station and w the reversed velocity of the station. This quotient of
+a linear form and a range depends on the direction of the line only, so it stays finite and smooth at infinity.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from optloc.proof.nodes.node import (
 )
 from optloc.proof.nodes.ratio import quotient_hessian, quotient_remainder
 
-# Numbers: the station, and its velocity reversed.
+# Numbers: the station, and its reversed velocity.
 STATION, VELOCITY, RATE_WIDTH = 0, 3, 6
 
 
 @compiled
 def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
-    """Bound a range rate over a box (see `optloc.proof.nodes.node`): a quotient, or what its directions allow."""
+    """Bound a range rate over a box (see `optloc.proof.nodes.node`): as a quotient, or by the cone of directions."""
     h, n, w = triple_at(half, 0), triple_at(line, 0), triple_at(data, VELOCITY)
     r, u, least, most, far = range_form(line, sense, h)
     phi = inner_product(w, n) / r if r > 0.0 else 0.0
@@ -45,7 +45,7 @@ def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array
     if least > 0.0:
         g = sum_of_forms(1.0 / r, turned_form(w, sense), -phi / r, u)
         less, more = quotient_remainder(phi, g, u, most, (0.0, 0.0), (least, far), h)
-        # Else two numbers for the whole box say more than a slope and its remainder.
+        # Otherwise a constant interval for the whole box is tighter than a slope with its remainder.
         if more - less <= high - low:
             write_triple(g, slope)
             return phi, less, more
@@ -55,16 +55,17 @@ def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array
 
 @compiled
 def _cone(phi: float, speed: float, least: float, aside: float) -> tuple[float, float]:
-    """Return the least and greatest rate over all directions that a box holds.
+    """Return the least and greatest rate over all directions from the station to the points of a box.
 
-    They lie in a cone around that to its centre: along it lines are at least `least`, across it at most `aside`.
+    The directions are in a cone around the direction to the centre. Along it, lines are at least `least` long; across
+    it, at most `aside`.
     """
     if not (least > 0.0 and speed > 0.0):
         return -speed, speed
     size = sqrt(least * least + aside * aside)
     cosine, sine, along = least / size, aside / size, phi / speed
     beside = sqrt(max(0.0, 1.0 - along * along))
-    # Where the cone holds the velocity itself the rate is the speed.
+    # If the cone contains the direction of the velocity, the rate is the speed.
     high = 1.0 if along >= cosine else along * cosine + beside * sine
     low = -1.0 if along <= -cosine else along * cosine - beside * sine
     return speed * low, speed * high
@@ -72,7 +73,7 @@ def _cone(phi: float, speed: float, least: float, aside: float) -> tuple[float, 
 
 @compiled
 def curve_rate(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound how a range rate curves over a box (see `optloc.proof.nodes.node`)."""
+    """Bound the second derivatives of a range rate over a box (see `optloc.proof.nodes.node`)."""
     h, n, w = triple_at(half, 0), triple_at(line, 0), triple_at(data, VELOCITY)
     bound_rate(data, line, sense, half, turn)
     r, u, least, most, _ = range_form(line, sense, h)
@@ -82,7 +83,7 @@ def curve_rate(data: Array, line: Array, sense: Array, half: Array, curvature: A
     second, ds, chi, norm = range_hessian(sense, h, r, u, least, most)
     g = sum_of_forms(1.0 / r, turned_form(w, sense), -phi / r, u)
     changes = ((0.0, 0.0, 0.0), ds, 0.0, chi, norm, reach(u, h) + most)
-    flat = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # a linear form does not bend
+    flat = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # a linear form has no curvature
     own, wander, chi = quotient_hessian(g, u, (phi, r, least), changes, h, flat, second)
     write_symmetric(own, curvature)
     write_triple(wander, turn)
@@ -91,12 +92,13 @@ def curve_rate(data: Array, line: Array, sense: Array, half: Array, curvature: A
 
 @compiled
 def _size(data: Array, reach: float) -> float:
-    """Return the size of what a rate is a sum of: the speed."""
+    """Return the size of the terms of a rate, at least the speed of the station."""
     return float(abs(data[VELOCITY]) + abs(data[VELOCITY + 1]) + abs(data[VELOCITY + 2]))
 
 
 def _numbers(row: NodeRow) -> Array:
-    # The target stays: what it would add is the station's velocity reversed.
+    """Return the numbers (B, n) of the range-rate node of a row."""
+    # For a fixed target, the relative velocity is the reversed velocity of the station.
     return lay_out({STATION: row.place(row.a), VELOCITY: -row.velocity(row.a)})
 
 

@@ -40,11 +40,12 @@ def bound_ratio(
 ) -> tuple[float, float, float]:
     """Bound a ratio of ranges over a box (see `optloc.proof.nodes.node`).
 
-    In two steps, exact but for the enclosures of what is in them: with ``N = r_a^2 - r_b^2`` (affine in the
-    position), S = r_a + r_b, delta = N/S = r_a - r_b and phi = 1 + delta/r_b, the remainder of a quotient phi = N/S is
-    ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'`` with g its slope, and S' = S + u.s + q_S elsewhere in the box.
+    There are two quotients. With ``N = r_a^2 - r_b^2`` (affine in the position) and S = r_a + r_b, the first is delta
+    = N/S = r_a - r_b. The second is phi = 1 + delta/r_b. The remainder of a quotient phi = N/S with slope g is
+    ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'``. Here q are remainders, u is the slope of S, and S' = S + u.s + q_S.
+    Only the enclosures of q_N and q_S are inexact.
 
-    Where the box may touch station b the ratio has no upper end.
+    If the box may contain station b, the ratio has no upper bound.
     """
     h = triple_at(half, 0)
     ra, ua, least_a, most_a, far_a = range_form(line, sense, h)
@@ -53,7 +54,8 @@ def bound_ratio(
     low = max(least_a, 0.0) / far_b if far_b > 0.0 else 0.0
     if least_b > 0.0:
         high = far_a / least_b
-        # First the difference, whose numerator is affine, then the ratio from it: a range in the numerator would curve.
+        # First the difference, whose numerator is affine, then the ratio from it: a range as numerator would have
+        # curvature.
         n, q = _squares(line, sense, line_b, sense_b, h)
         size, u, most = ra + rb, sum_of_forms(1.0, ua, 1.0, ub), most_a + most_b
         delta = ra - rb
@@ -62,7 +64,7 @@ def bound_ratio(
         q = quotient_remainder(delta, g, u, most, q, (least, far_a + far_b), h)
         g = sum_of_forms(1.0 / rb, g, -(phi - 1.0) / rb, ub)
         less, more = quotient_remainder(phi - 1.0, g, ub, most_b, q, (least_b, far_b), h)
-        # Else two numbers for the whole box say more than a slope and its remainder.
+        # Otherwise a constant interval for the whole box is tighter than a slope with its remainder.
         if more - less <= high - low:
             write_triple(g, slope)
             return phi, less, more
@@ -87,7 +89,7 @@ def quotient_remainder(
     Parameters
     ----------
     phi, g : float, triple
-        Its value and slope.
+        Value and slope of the quotient.
     u, most : triple, float
         Slope of S, and the greatest remainder of S, which is not negative.
     above : pair of float
@@ -99,14 +101,14 @@ def quotient_remainder(
     """
     low, high = product(g, u, h)
     swing = reach(g, h)
-    # The value of the quotient in the box times what S exceeds its slope by, and that is never negative.
+    # The value of the quotient in the box, times the remainder of S, which is never negative.
     low, high = low + min((phi - swing) * most, 0.0), high + max((phi + swing) * most, 0.0)
     return scaled(above[0] - high, above[1] - low, below[0], below[1])
 
 
 @compiled
 def _squares(line: Array, sense: Array, line_b: Array, sense_b: Array, h: Triple) -> tuple[Triple, tuple[float, float]]:
-    """Return slope and remainder of ``|line|^2 - |line_b|^2`` over a box: the product of difference and sum."""
+    """Return slope and remainder of ``|line|^2 - |line_b|^2`` over a box, as the product of difference and sum."""
     apart = (line[0] - line_b[0], line[1] - line_b[1], line[2] - line_b[2])
     n, low, high = turned_form(apart, sense), 0.0, 0.0
     n = sum_of_forms(1.0, n, 1.0, turned_form(apart, sense_b))
@@ -130,7 +132,7 @@ def curve_ratio(
     curvature: Array,
     turn: Array,
 ) -> float:
-    """Bound how a ratio of ranges curves over a box (`optloc.proof.nodes.node`), in the two steps of `bound_ratio`."""
+    """Bound the second derivatives of a ratio over a box (`optloc.proof.nodes.node`), in two steps like the ratio."""
     h = triple_at(half, 0)
     bound_ratio(data, line, sense, line_b, sense_b, half, turn)
     ra, ua, least_a, qa, _ = range_form(line, sense, h)
@@ -153,7 +155,7 @@ def curve_ratio(
     )
     centre = (delta, size, least_a + least_b)
     second, wander, chi = quotient_hessian(g, u, centre, changes, h, second, add_symmetric(own, bend))
-    # What became of the difference is the numerator of the second step.
+    # The result for the difference is the numerator of the second step.
     g = sum_of_forms(1.0 / rb, g, -delta / (rb * rb), ub)
     changes = (wander, db, chi, chi_b, norm_b, reach(ub, h) + qb)
     second, wander, chi = quotient_hessian(g, ub, (delta / rb, rb, least_b), changes, h, second, bend)
@@ -164,7 +166,7 @@ def curve_ratio(
 
 @compiled
 def _square_bend(sense: Array, sense_b: Array) -> Symmetric:
-    """Return the Hessian of ``|line|^2 - |line_b|^2``, a constant."""
+    """Return the constant Hessian of ``|line|^2 - |line_b|^2``."""
     return (
         _square_entry(sense, sense_b, 0, 0),
         _square_entry(sense, sense_b, 0, 1),
@@ -177,6 +179,7 @@ def _square_bend(sense: Array, sense_b: Array) -> Symmetric:
 
 @compiled
 def _square_entry(sense: Array, sense_b: Array, k: int, m: int) -> float:
+    """Return entry (k, m) of the Hessian of ``|line|^2 - |line_b|^2``."""
     entry = 0.0
     for i in range(3):
         entry += sense[i, k] * sense[i, m] - sense_b[i, k] * sense_b[i, m]
@@ -193,7 +196,7 @@ def quotient_hessian(
     curvature: Symmetric,
     bend: Symmetric,
 ) -> tuple[Symmetric, Triple, float]:
-    """Return the Hessian of a quotient phi = N/S, and bounds of the change of its gradient and of that Hessian.
+    """Return the Hessian of a quotient phi = N/S, and bounds of the changes of its gradient and its Hessian.
 
     Parameters
     ----------
@@ -202,8 +205,8 @@ def quotient_hessian(
     centre : three numbers
         phi, S, and the least S over the box, positive.
     changes : tuple
-        Bounds of the change of the gradients of N and S (triples), of their Hessians, the norm of the Hessian of S at
-        the centre, and the change of S.
+        Bounds of the change of the gradients of N and S (triples), and of their Hessians; the norm of the Hessian of S
+        at the centre; and a bound of the change of S.
     h : triple
         Half-widths.
     curvature, bend : symmetric
@@ -215,7 +218,7 @@ def quotient_hessian(
     b00, b01, b02, b11, b12, b22 = bend
     g0, g1, g2 = g
     u0, u1, u2 = u
-    per, most = 1.0 / size, 1.0 / least  # a quotient takes as long as five products
+    per, most = 1.0 / size, 1.0 / least  # one division takes as long as five products
     own = (
         (c00 - 2.0 * g0 * u0 - phi * b00) * per,
         (c01 - g0 * u1 - u0 * g1 - phi * b01) * per,
@@ -224,7 +227,7 @@ def quotient_hessian(
         (c12 - g1 * u2 - u1 * g2 - phi * b12) * per,
         (c22 - 2.0 * g2 * u2 - phi * b22) * per,
     )
-    # phi' r' = N', so the change of phi is (N' - N - phi (S' - S)) / S': its own slope, and what that changes by.
+    # phi' S' = N', so the change of phi is (N' - N - phi (S' - S)) / S': its slope, and the change of the slope.
     rise = (reach(g, h) * size + reach(dn, h) + abs(phi) * reach(ds, h)) * most
     norm = own[0] * own[0] + own[3] * own[3] + own[5] * own[5]
     norm += 2.0 * (own[1] * own[1] + own[2] * own[2] + own[4] * own[4])
@@ -240,9 +243,9 @@ def quotient_hessian(
 
 @compiled
 def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
-    """Return the ball of Apollonius: points with ``r_a <= q r_b``, q < 1, fill one."""
+    """Return the ball of Apollonius: the points with ``r_a <= q r_b``, q < 1, form a ball."""
     q = most if most < 1.0 else (1.0 / least if least > 1.0 else 1.0)
-    if not q * q < 1.0 - 1e-9:  # nearly half of space, whose ball says nothing and is badly rounded
+    if not q * q < 1.0 - 1e-9:  # nearly half of space: such a ball is useless and badly rounded
         return 0.0, 0.0, 0.0, inf
     near, far = (STATION, STATION_B) if most < 1.0 else (STATION_B, STATION)
     q = max(q, 0.0)
@@ -255,6 +258,7 @@ def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, 
 
 
 def _numbers(row: NodeRow) -> Array:
+    """Return the numbers (B, n) of the ratio node of a row: the positions of both stations."""
     return lay_out({STATION: row.place(row.a), STATION_B: row.place(row.b)})
 
 

@@ -1,1 +1,1 @@
-"""The proof of runs: rows by the hundred of a target that stays."""
+"""Proofs of runs: many epochs with hundreds of rows, of a target that stays or moves uniformly."""

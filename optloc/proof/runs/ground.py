@@ -1,9 +1,10 @@
-"""A target that keeps a known height over the Earth: its places at all epochs, and bounds of how these bend.
+"""A target at a known height over the Earth: its positions at all epochs, and bounds of their derivatives.
 
-Its state has four numbers: where it is along two axes of a plane, and its velocity along them. The surface gives the
-rest: the place lies on it, and the velocity along it. Where the target is at an epoch is then a function of the place's
-two numbers q and the way's w, which is the velocity times the time. Values are those of `optloc.models.course.carry`;
-derivatives at a state are differences, whose error the bound of the third derivatives of that function says.
+The state has four numbers: the position along two axes of a plane, and the velocity along these axes. The surface
+determines the rest: the position is on the surface, and the velocity is along it. So the position at an epoch is a
+function of the two position numbers q and of w, the velocity times the time. Values are computed like
+`optloc.models.course.carry`. Derivatives at a state are finite differences, whose error is bounded by the third
+derivatives of this function.
 """
 
 from __future__ import annotations
@@ -19,24 +20,24 @@ from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.proof.nodes.level import EXACT, LEAST_RADIUS, normal_at
 from optloc.proof.nodes.node import Triple, inner_product, sum_of_forms, triple_at, write_triple
 
-# What is carried over the Earth.
+# The surface, and states on it.
 
 
 class Ground(NamedTuple):
-    """A surface of constant height, and the four numbers of a state on it.
+    """A surface of constant height, and the axes of states on it.
 
     Parameters
     ----------
     data : array (HEIGHT_WIDTH,)
-        Numbers of the height, see `optloc.proof.nodes.level`; none where courses are straight.
+        Numbers of the height node, see `optloc.proof.nodes.level`; empty for straight motion.
     axes : array (3, 3)
-        Orthonormal axes in the frame: two along which states are counted, and the one upward, as rows.
+        Orthonormal axes in the frame, as rows: the two axes of states, and the upward axis.
     level : float
         Height of the state, metres.
     rise : array (K,)
-        What heights of the epochs are above it, metres.
+        Heights at the epochs above the height of the state, metres.
     span : float
-        Seconds of the epoch farthest from the time at which the state holds.
+        Greatest time between an epoch and the state, seconds.
     """
 
     data: Array
@@ -51,19 +52,19 @@ STRAIGHT = Ground(np.zeros(0), np.eye(3), 0.0, np.zeros(0), 0.0)
 
 @compiled
 def over_ground(ground: Ground) -> bool:
-    """Return whether courses are carried over the Earth, and not straight."""
+    """Return whether targets move over the Earth, rather than straight."""
     return bool(ground.data.shape[0] > 0)
 
 
-# Newton's steps onto a surface, and their end: the accuracy of a height.
+# Newton steps onto a surface, and the tolerance: the accuracy of a height.
 _STEPS, _CLOSE = 20, EXACT
-# As of `optloc.models.course`.
+# As in `optloc.models.course`.
 _STILL, _E2 = 1e-14, WGS84_F * (2.0 - WGS84_F)
 
 
 @compiled
 def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Triple]:
-    """Return what is left of the height (metres), the place of two numbers on the surface, and its normal."""
+    """Return the remaining height error, metres, the point of the surface with two given numbers, and its normal."""
     data, e, f, up = (
         ground.data,
         triple_at(ground.axes[0], 0),
@@ -72,7 +73,7 @@ def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Tr
     )
     place = sum_of_forms(first, e, second, f)
     centre = _centre(data)
-    # above the Earth's centre by about what a sphere has there
+    # start at about the height of a sphere above the Earth's centre
     aside = (first - inner_product(e, centre)) ** 2 + (second - inner_product(f, centre)) ** 2
     above = inner_product(up, centre) + sqrt(max((WGS84_A + ground.level) ** 2 - aside, 0.0))
     place = sum_of_forms(1.0, place, above, up)
@@ -89,7 +90,7 @@ def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Tr
 
 @compiled
 def _centre(data: Array) -> Triple:
-    """Return the Earth's centre in the frame."""
+    """Return the Earth's centre in the frame, metres."""
     x, y, z = data[3], data[4], data[5]
     first, second, third = triple_at(data, 6), triple_at(data, 9), triple_at(data, 12)
     c = sum_of_forms(1.0, sum_of_forms(x, first, y, second), z, third)
@@ -98,7 +99,7 @@ def _centre(data: Array) -> Triple:
 
 @compiled
 def horizontal_vector(ground: Ground, normal: Triple, first: float, second: float) -> Triple:
-    """Return the vector along the surface that has two components along the axes."""
+    """Return the vector along the surface that has two given components along the axes."""
     up = triple_at(ground.axes[2], 0)
     plan = sum_of_forms(first, triple_at(ground.axes[0], 0), second, triple_at(ground.axes[1], 0))
     return sum_of_forms(1.0, plan, -inner_product(plan, normal) / inner_product(up, normal), up)
@@ -106,7 +107,7 @@ def horizontal_vector(ground: Ground, normal: Triple, first: float, second: floa
 
 @compiled
 def place_over_ground(ground: Ground, start: Triple, way: Triple, rise: float) -> Triple:
-    """Return the place that a target reaches over ground, as `optloc.models.course.carry` does, in the frame."""
+    """Return the position, in the frame, that a target reaches over ground, like `optloc.models.course.carry`."""
     data = ground.data
     height, up, _, _, sp = normal_at(data, np.array(start))
     climb = inner_product(way, up)
@@ -123,18 +124,18 @@ def place_over_ground(ground: Ground, start: Triple, way: Triple, rise: float) -
 
 # Derivatives at a state.
 
-# Metres of the differences: their error is (step^2 / 6) times the third derivative, 1e-9 of a lever, where rounding of
-# 1e-8 m leaves 1e-10.
+# Step of the differences, metres. The error is (step^2 / 6) times the third derivative, 1e-9 of a derivative; the
+# rounding of positions, 1e-8 m, gives 1e-10.
 _STEP = 200.0
-# Places of differences: the state, two each along the four numbers, and two each along each pair of them.
+# Points of the differences: the state, two along each of the four numbers, and two along each pair of numbers.
 _PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 FIRST_ORDER, SECOND_ORDER = 9, 21
-# What is rounded of a place, metres.
+# Rounding of a position, metres.
 _ROUNDED = 4.0 * EXACT
 
 
 def _moves() -> Array:
-    """Return the moves (21, 4) of the places of differences, in steps."""
+    """Return the moves (21, 4) from the state to the points of the differences, in steps."""
     own = np.eye(4)
     pairs = [own[i] + own[j] for i, j in _PAIRS]
     return np.array([np.zeros(4), *(sign * move for move in (*own, *pairs) for sign in (1.0, -1.0))])
@@ -145,10 +146,10 @@ _MOVES = _moves()
 
 @compiled
 def set_starts(ground: Ground, state: Array, begin: int, end: int, starts: Array) -> None:
-    """Write places and normals (SECOND_ORDER, 6) of some of the states of differences."""
+    """Write positions and normals (SECOND_ORDER, 6) of the points `begin` to `end` of the differences."""
     for k in range(begin, end):
         twin = k
-        for other in range(k):  # those along ways alone start at one place
+        for other in range(k):  # points that differ in the velocity only have one start
             if _MOVES[other, 0] == _MOVES[k, 0] and _MOVES[other, 1] == _MOVES[k, 1]:
                 twin = other
         if twin < k:
@@ -163,7 +164,7 @@ def set_starts(ground: Ground, state: Array, begin: int, end: int, starts: Array
 def set_reached(
     ground: Ground, state: Array, time: float, rise: float, starts: Array, begin: int, end: int, reached: Array
 ) -> None:
-    """Write where some of the states of differences lead (SECOND_ORDER, 3)."""
+    """Write the positions (SECOND_ORDER, 3) that the points `begin` to `end` of the differences reach at a time."""
     for k in range(begin, end):
         first, second = time * state[2] + _STEP * _MOVES[k, 2], time * state[3] + _STEP * _MOVES[k, 3]
         way = horizontal_vector(ground, triple_at(starts[k], 3), first, second)
@@ -172,13 +173,13 @@ def set_reached(
 
 @compiled
 def slope_of(reached: Array, i: int, a: int) -> float:
-    """Return the derivative of a coordinate of a place along one of (q, w)."""
+    """Return the derivative of coordinate i of a position with respect to number a of (q, w)."""
     return float((reached[1 + 2 * a, i] - reached[2 + 2 * a, i]) / (2.0 * _STEP))
 
 
 @compiled
 def set_second(reached: Array, i: int, out: Array) -> None:
-    """Write the second derivatives (4, 4) of a coordinate of a place."""
+    """Write the second derivatives (4, 4) of coordinate i of a position."""
     share, here = 1.0 / (_STEP * _STEP), reached[0, i]
     for a in range(4):
         out[a, a] = share * (reached[1 + 2 * a, i] - here + (reached[2 + 2 * a, i] - here))
@@ -190,35 +191,37 @@ def set_second(reached: Array, i: int, out: Array) -> None:
 
 # Bounds of derivatives over a box.
 
-# Greatest distance from the middle of the plane, and greatest way, as shares of the Earth's least radius; least cosine
-# between the plane's axis and the normals.
+# Greatest distance from the middle of the plane, and greatest way, as shares of the Earth's least radius; and least
+# cosine between the plane's axis and the normals.
 _ASIDE, _FAR, _LEAN = 0.85, 0.5, 0.5
-# How far a normal of the ellipsoid leans from the line through the Earth's centre, radians: e^2 / 2 and a little.
+# Greatest angle between a normal of the ellipsoid and the line to the Earth's centre, radians: slightly above e^2 / 2.
 _DEFLECTION = 0.0034
-# Of normals of surfaces of constant height, in radii: derivatives of first order 1 / R, of second 1.2 / R^2 (see
-# `optloc.proof.nodes.level.curve_height`), of third 4 / R^3: those of a sphere are at most 3 (across the normal), and
-# what changes with the latitude adds some e^2 of that.
+# Bounds of the derivatives of normals of surfaces of constant height, in radii R. First order: 1 / R. Second: 1.2 /
+# R^2 (see `optloc.proof.nodes.level.curve_height`). Third: 4 / R^3; for a sphere it is at most 3 (across the normal),
+# and the change with latitude adds about e^2 times this.
 _FIRST, _SECOND, _THIRD = 1.0, 1.2, 4.0
-# Of the radius b / (1 - e^2 y^2) of the sphere by a component y of the normal, in b: its three derivatives.
+# Bounds of the three derivatives of the sphere's radius b / (1 - e^2 y^2), in units of b, with respect to a component
+# y of the normal.
 _E = _E2 / (1.0 - _E2)
 _RADIUS = (2.1 * _E, 2.1 * _E, 25.0 * _E * _E)
-# Of sin(w) / w and (1 - cos(w)) / w^2 by w^2: derivatives are largest at zero.
+# Bounds of the derivatives of sin(w) / w and (1 - cos(w)) / w^2 with respect to w^2; they are largest at zero.
 _SINE, _DROP = (1.0 / 6.0, 1.0 / 60.0, 1.0 / 840.0), (1.0 / 24.0, 1.0 / 360.0, 1.0 / 6720.0)
 
-# A bound of a function of one variable with those of its first three derivatives, and derivatives of an outer function.
+# A bound of a function of one variable with bounds of its first three derivatives; and derivatives of an outer
+# function.
 Jet = tuple[float, float, float, float]
 Derivatives = tuple[float, float, float]
 
 
 @compiled
 def curvature_bounds(ground: Ground, state: Array, half: Array) -> tuple[bool, float, float, float]:
-    """Return whether the places of a box of states are bounded, and bounds of their derivatives by (q, w).
+    """Return whether the positions of a box of states are bounded, and bounds of their derivatives by (q, w).
 
-    The first three derivatives, per metre, metre^2 and metre^3. All functions are looked at along lines of (q, w), one
-    metre a metre: a bound of the k-th derivative along each bounds that of the function. With u the normal at the
-    start p, ``u.p' = 0`` and ``u.w = 0`` give p and w, the sphere ``Y = p + S w - D u``, and the place ``F = Y + G n``
-    follows with the normal n at Y and the height G that is left. Of ``Y'' + G'' n`` and ``Y''' + G''' n`` what is
-    along n in the first is taken away by the second.
+    The bounds are of the first three derivatives: per metre, metre^2 and metre^3. All functions are bounded along
+    lines of (q, w), in metres. A bound of the k-th derivative along each line bounds the derivative of the function.
+    Let u be the normal at the start p. Then ``u.p' = 0`` and ``u.w = 0`` determine p and w, and the sphere is
+    ``Y = p + S w - D u``. The position is ``F = Y + G n``, with n the normal at Y and G the remaining height. In
+    ``Y'' + G'' n`` and ``Y''' + G''' n`` the second term cancels the part of the first along n.
 
     Parameters
     ----------
@@ -229,7 +232,7 @@ def curvature_bounds(ground: Ground, state: Array, half: Array) -> tuple[bool, f
     """
     centre, way2, plan2, high = _centre(ground.data), 0.0, 0.0, 0.0
     for k in range(2):
-        # with the places of differences beside the box
+        # including the points of differences next to the box
         aside = abs(state[k] - inner_product(triple_at(ground.axes[k], 0), centre)) + half[k] + 2.0 * _STEP
         way = ground.span * (abs(state[2 + k]) + half[2 + k]) + 2.0 * _STEP
         plan2, way2 = plan2 + aside * aside, way2 + way * way
@@ -241,7 +244,7 @@ def curvature_bounds(ground: Ground, state: Array, half: Array) -> tuple[bool, f
     lean = asin(plan / radius) + _DEFLECTION
     if not cos(lean) > _LEAN:
         return False, inf, inf, inf
-    # the sphere lies at most so far below the level of its start
+    # greatest depth of the sphere below the level of its start
     radius -= 1.1 * (way / cos(lean)) ** 2 / radius
     turns = (_FIRST / radius, _SECOND / radius**2, _THIRD / radius**3)
     place, normal, along = _begun(turns, lean, way)
@@ -251,10 +254,11 @@ def curvature_bounds(ground: Ground, state: Array, half: Array) -> tuple[bool, f
 
 @compiled
 def errors_of(third: float) -> tuple[float, float]:
-    """Return bounds of the errors of slopes and of second derivatives as norms over (q, w), by the third derivatives.
+    """Return bounds of the errors of slopes and second derivatives, as norms over (q, w), from the third derivatives.
 
-    A difference along one number is off by ``b3 h^2 / 6``, a second one by ``b3 h / 3``, one along two by
-    ``(2 2^1.5 + 4) b3 h / 12``; four numbers at right angles double the first, and quadruple the others.
+    A first difference has an error of ``b3 h^2 / 6``. The error of a second difference is ``b3 h / 3`` along one
+    number, and ``(2 2^1.5 + 4) b3 h / 12`` along two. Four orthogonal numbers double the first error, and quadruple
+    the others.
     """
     first = 2.0 * (third * _STEP * _STEP / 6.0 + _ROUNDED / _STEP)
     return first, 4.0 * (0.6 * third * _STEP + 4.0 * _ROUNDED / (_STEP * _STEP))
@@ -262,7 +266,7 @@ def errors_of(third: float) -> tuple[float, float]:
 
 @compiled
 def _begun(turns: Derivatives, lean: float, way: float) -> tuple[Jet, Jet, Jet]:
-    """Return bounds of the place on the surface (its first number is no bound), the normal there, and the way."""
+    """Return bounds of the position on the surface (without a bound of its value), the normal there, and the way."""
     n1, n2, _ = turns
     c, s = cos(lean), sin(lean)
     p1 = 1.0 / c
@@ -270,7 +274,7 @@ def _begun(turns: Derivatives, lean: float, way: float) -> tuple[Jet, Jet, Jet]:
     place = (inf, p1, p2, (3.0 * n1 * p1 * p2 + n2 * p1**3) / c)
     normal = _composed(1.0, turns, place)
     u1, u2, u3 = normal[1], normal[2], normal[3]
-    # the way upward: its plan along the normal, over what of the normal is upward
+    # the upward part of the way: the product of its plan with the normal, divided by the upward part of the normal
     across = _inverse((1.0, u1, u2, u3), c)
     upward = _product((way * s, s + way * u1, 2.0 * u1 + way * u2, 3.0 * u2 + way * u3), across)
     return place, normal, (way / c, 1.0 + upward[1], upward[2], upward[3])
@@ -280,7 +284,7 @@ def _begun(turns: Derivatives, lean: float, way: float) -> tuple[Jet, Jet, Jet]:
 def _ended(
     turns: Derivatives, level: float, high: float, place: Jet, normal: Jet, along: Jet
 ) -> tuple[float, float, float]:
-    """Return bounds of the first three derivatives of where a way leads."""
+    """Return bounds of the first three derivatives of the position at the end of a way."""
     n1, n2, _ = turns
     flat = WGS84_A * sqrt(1.0 - _E2)
     outer = (_RADIUS[0] * flat, _RADIUS[1] * flat, _RADIUS[2] * flat)
@@ -291,7 +295,8 @@ def _ended(
     ahead, below = _product(_composed(1.0, _SINE, angle), along), _product(fallen, normal)
     y1, y2, y3 = place[1] + ahead[1] + below[1], place[2] + ahead[2] + below[2], place[3] + ahead[3] + below[3]
     turned = _composed(1.0, turns, (inf, y1, y2, y3))
-    # the height left, and its change: the normal at the end is nearly that at the start, across which p' and w' go
+    # The remaining height, and its change. The normal at the end is nearly the normal at the start, and p' and w' are
+    # orthogonal to the normal at the start.
     off = along[0] + fallen[0]
     g0 = fallen[0] + 0.5 * n1 * off * off + high
     g1 = n1 * off * (place[1] + ahead[1]) + normal[1] * along[0] + below[1]
@@ -305,6 +310,7 @@ def _ended(
 
 @compiled
 def _product(f: Jet, g: Jet) -> Jet:
+    """Return bounds of a product of two functions, from bounds of the functions and of their derivatives."""
     return (
         f[0] * g[0],
         f[1] * g[0] + f[0] * g[1],
@@ -315,7 +321,7 @@ def _product(f: Jet, g: Jet) -> Jet:
 
 @compiled
 def _composed(most: float, outer: Derivatives, own: Jet) -> Jet:
-    """Return bounds of a function of a function, by its greatest value and the outer one's derivatives."""
+    """Return bounds of a composed function, from its greatest value and the outer function's derivatives."""
     a, b, c = own[1], own[2], own[3]
     bent = outer[2] * a**3 + 3.0 * outer[1] * a * b
     return most, outer[0] * a, outer[1] * a * a + outer[0] * b, bent + outer[0] * c
@@ -323,34 +329,34 @@ def _composed(most: float, outer: Derivatives, own: Jet) -> Jet:
 
 @compiled
 def _inverse(f: Jet, least: float) -> Jet:
-    """Return bounds of one over a function that is nowhere less than a positive number."""
+    """Return bounds of the inverse of a function that is at least a positive number."""
     return _composed(1.0 / least, (1.0 / least**2, 2.0 / least**3, 6.0 / least**4), f)
 
 
-# From states in space to those on the surface, and back.
+# From states in space to states on the surface, and back.
 
 
-# Cosine between the frame's third axis and the normal from which on it is the upward one of states.
+# Cosine between the frame's third axis and the normal above which the frame's third axis is the upward axis of states.
 _UPRIGHT = 0.9
 
 
 def axes_at(data: Array, place: Array) -> Array:
-    """Return the axes of states around a place (3,): the frame's where its third is upward, else east, north, up."""
+    """Return the axes of states around a position (3,): the frame's if the third is upward, else east, north, up."""
     _, up, east, north, _ = normal_at(data, np.ascontiguousarray(place))
     return np.eye(3) if up[2] > _UPRIGHT else np.array([east, north, up])
 
 
 def state_on(ground: Ground, state: Array) -> Array:
-    """Return the four numbers of states (..., 6) on the surface."""
+    """Return the four numbers (..., 4) of states (..., 6) on the surface."""
     plan = ground.axes[:2]
     return np.concatenate([state[..., :3] @ plan.T, state[..., 3:] @ plan.T], axis=-1)
 
 
 def corners_on(ground: Ground, corners: Array) -> Array:
-    """Return the least box (2, 4) of states on the surface that holds all those of a box (2, 6)."""
+    """Return the least box (2, 4) of states on the surface that contains all states of a box (2, 6)."""
     plan, out = ground.axes[:2], np.zeros((2, 4))
     for k in range(4):
-        for axis in np.flatnonzero(plan[k % 2]):  # what an axis does not see need not be limited
+        for axis in np.flatnonzero(plan[k % 2]):  # components without influence on an axis may be unlimited
             out[:, k] += np.sort(plan[k % 2, axis] * corners[:, 3 * (k // 2) + axis])
     return out
 

@@ -80,10 +80,11 @@ from optloc.proof.surface import SIDES, is_one_side, reach_of_piece
 
 # Boxes around known minima on which the cost is convex.
 
-# Sides are tried smaller by this factor, so often: from the first, standard deviations, to a millionth of it.
+# First half-width, standard deviations, the factor by which it is reduced, and the number of trials, which reduce it
+# to a millionth.
 _WIDEST, _SMALLER, _TRIALS = 100.0, 0.8, 62
-# The box searched along the axes of a minimum, in convex boxes and standard deviations at least: beyond it the cost of
-# a run is high enough for boxes along the axes of space.
+# Half-widths of the box searched along the axes of a minimum: in units of the convex box, and at least this many
+# standard deviations. Outside, the cost of a run is high enough for boxes along the axes of space.
 _WIDER, _WIDE = 3.0, 40.0
 
 
@@ -91,7 +92,10 @@ _WIDER, _WIDE = 3.0, 40.0
 def _convex_sides(
     run: RunCost, space: Space, tables: RunTables, at: Array, piece: int, hull: Array, margin: float, sides: Array
 ) -> bool:
-    """Write half-widths (3,), none beyond the hull, of a box around a place on which the cost is convex."""
+    """Write half-widths (3,), at most the hull, of a box around a position on which the cost is convex.
+
+    Return False without a convex box.
+    """
     box, share, floor = tables.box, _WIDEST, floor_of(space, run.cost)
     for _ in range(_TRIALS):
         put(at, box.at)
@@ -108,7 +112,7 @@ def _convex_sides(
 
 @inlined
 def _margin(tables: RunTables, noise: float, eps: float) -> float:
-    """Return how convex a box must be for its cost to fall by no more than eps below that of its centre."""
+    """Return the margin of convexity of a box for which its cost falls at most eps below the cost of its centre."""
     total = 0.0
     for k in range(3):
         slope = abs(tables.box.sums[G0 + k]) + tables.box.sums[LENGTH0 + k] * noise
@@ -120,7 +124,7 @@ def _margin(tables: RunTables, noise: float, eps: float) -> float:
 def _set_far(
     run: RunCost, space: Space, tables: RunTables, i: int, x: Array, value: float, eps: float, limit: float
 ) -> bool:
-    """Write a minimum and its surroundings into an atlas; see `optloc.proof.global_search.set_minimum`."""
+    """Write a minimum and the boxes around it into an atlas; see `optloc.proof.convex_boxes.set_minimum`."""
     atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
     minima, piece = atlas.minima, 2 * d + 1 + i
     minima.home[i] = piece_of(atlas, x, minima.start[i])
@@ -128,7 +132,7 @@ def _set_far(
         return False
     if not cost_at_coordinates(run, space, tables, piece, hull) >= value:
         return False
-    for k in range(d):  # the axes of few rows, in units of all
+    for k in range(d):  # scale the axes, which few rows gave, to all rows
         own = box.sums[symmetric_entry(k, k)]
         if not own > 0.0:
             return False
@@ -158,7 +162,10 @@ def _set_near(
     eps: float,
     hidden: bool,
 ) -> bool:
-    """Write a minimum in search coordinates, and the sides of a convex box around it."""
+    """Write a minimum in search coordinates, and the sides of a convex box around it.
+
+    Return False if x is no minimum or costs too little.
+    """
     chart, box, hull, shift, at = space.chart, tables.box, np.zeros(3), np.zeros(3), space.minima[i]
     for k in range(3):
         at[k] = 0.0
@@ -176,7 +183,7 @@ def _set_near(
         limit_half_widths(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
     if not _convex_sides(run, space, tables, at, 0, hull, margin, space.sides[i]):
         return False
-    # Where the box is, up to the rounding of its centre.
+    # The box is reduced by the rounding of its centre.
     widen_by_rounding(chart, box.centre, shift)
     for k in range(3):
         space.sides[i, k] = max(space.sides[i, k] - shift[k], 0.0)
@@ -188,7 +195,7 @@ def _set_near(
 
 @compiled
 def _reaches_infinity(run: RunCost) -> bool:
-    """Return whether the cost stays finite at infinity, so that the atlas holds; see `reaches_infinity`."""
+    """Return whether the cost stays finite at infinity, so that the atlas applies; see `reaches_infinity`."""
     kinds, rows = run.cost.kinds, run.rows
     ones, out = np.zeros(kinds.shape[0]), np.zeros(rows.w.shape[0])
     for j in range(kinds.shape[0]):
@@ -200,7 +207,7 @@ def _reaches_infinity(run: RunCost) -> bool:
 
 @compiled
 def cost_of_place(run: RunCost, x: Array, tables: RunTables) -> float:
-    """Return the cost at a position x (D,)."""
+    """Return the cost at a position x (D,), metres."""
     cost, box, axes = run.cost, tables.box, np.zeros((3, 3))
     box.half[:], box.centre[:] = 0.0, 0.0
     for k in range(x.shape[0]):
@@ -210,20 +217,20 @@ def cost_of_place(run: RunCost, x: Array, tables: RunTables) -> float:
 
 
 class ProofTask(NamedTuple):
-    """What is to be proven of one fix.
+    """The request for a proof of one fix.
 
     Parameters
     ----------
     x : array (D,)
-        The fix.
+        The fix, metres.
     beside : KnownMinima
-        What else is known.
+        Known minima, and planes or a surface.
     aim : Goal
-        What is to be shown of every box.
+        The conditions to show for each box.
     eps : float
-        How far below the cost of the fix still counts as equal.
+        A cost that is lower than the cost of the fix by at most eps counts as equal.
     budget : int
-        How many boxes may be looked at.
+        Greatest number of boxes.
     found : array (D,)
         Written: a better or other point.
     """
@@ -248,14 +255,14 @@ def prove_run(
     upper: Array,
     found: Array,
 ) -> tuple[int, int, float]:
-    """Prove of a run what `optloc.proof.local_search.prove_locally` proves of a cost; arguments and result as there.
+    """Prove the claim of `optloc.proof.local_search.prove_locally` for a run; for arguments and result see there.
 
-    Over all space where the cost stays finite at infinity; else within a region, around a surface, or within what
-    encloses the level of the cost of few rows.
+    If the cost stays finite at infinity, the search is over all space. Otherwise it is within a region, around a
+    surface, or within an enclosure of the level of the cost of few rows.
     """
     tables, D = tables_of(run), x.shape[0]
     chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
-    chart = without_differences(chart)  # few rows are balanced where all may not be
+    chart = without_differences(chart)  # few rows may be balanced although all rows are not
     least = cost_of_place(run, x, tables)
     middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
@@ -275,7 +282,7 @@ def prove_run(
 
 @compiled
 def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables) -> float:
-    """Return a bound of the rounding errors of a residual (its length) at a fix, and in the atlas of all positions."""
+    """Return a bound of the rounding of a residual, as a length, at a fix or in the atlas of all positions."""
     middle, radius = station_cube(run.cost.kinds, run.cost.data, x)
     atlas, none = atlas_of(middle, radius, x.shape[0], 0), np.empty((0, 3))
     space = Space(False, atlas, chart, none, none)
@@ -288,7 +295,7 @@ def _blur(run: RunCost, chart: LocalAxes, x: Array, far: bool, tables: RunTables
 def _prove_far(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables
 ) -> tuple[int, int, float]:
-    """Prove over all space."""
+    """Prove the claim over all space."""
     none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
     space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
     for p in range(1 + others.shape[0]):
@@ -309,7 +316,7 @@ def _prove_far(
 
 @compiled
 def _verdict(outcome: int, aim: Goal) -> int:
-    """Return the verdict of a proof by the outcome of its search."""
+    """Return the verdict of a proof for the outcome of its search."""
     if outcome == CLEAR:
         return UNIQUE if aim.level > aim.value else VALUE
     if outcome == SPENT:
@@ -323,7 +330,7 @@ def _verdict(outcome: int, aim: Goal) -> int:
 def _prove_near(
     run: RunCost, task: ProofTask, atlas: Atlas, around: LocalAxes, tables: RunTables, lower: Array, upper: Array
 ) -> tuple[int, int, float]:
-    """Prove in search coordinates around a fix: a region, what few rows enclose, or all pieces of a surface."""
+    """Prove the claim in search coordinates around a fix: in a region, in an enclosure, or around a surface."""
     corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
     stack, total, bound = np.zeros((CAPACITY, DEPTH)), 0, aim.value
     rho = sqrt(max(aim.level, aim.value + task.eps))
@@ -355,7 +362,7 @@ def _prove_near(
 def _beside(
     run: RunCost, task: ProofTask, atlas: Atlas, chart: LocalAxes, tables: RunTables, corners: Array, own: bool
 ) -> Space:
-    """Return search coordinates with their known minima, that of the fix (`own`) first; none where it is none."""
+    """Return search coordinates with their known minima, the fix (`own`) first; empty if the fix is no minimum."""
     others, known, place = task.beside.points, zero(), np.empty(task.x.shape[0])
     room = np.zeros((2, 1 + others.shape[0], 3))
     space = Space(False, atlas, chart, room[0], room[1])
@@ -373,9 +380,9 @@ def _beside(
 
 
 def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
-    """Return the outcome of the proofs of n fixes of n long problems, see `optloc.proof.batch.prove_all`.
+    """Return the results of the proofs of n fixes of n long problems, see `optloc.proof.batch.prove_all`.
 
-    Plain Python would take a second for ten boxes: without machine code none is looked at.
+    Plain Python would take a second for ten boxes. Without compiled code no box is searched.
     """
     n, d = asked.x.shape
     verdict, boxes, bound, whole = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.bool_)
@@ -408,7 +415,7 @@ def prove_runs(costs: Runs, asked: ProofRequest) -> ProofResult:
 
 
 def runs_lack_code(costs: Runs | CourseCosts, count: int) -> bool:
-    """Return whether proofs of so many long problems were left because there is no machine code of them yet."""
+    """Return whether proofs of `count` long problems were skipped because their compiled code is not yet available."""
     return enabled() and not may_use_code(prove_run if isinstance(costs, Runs) else prove_course, count)
 
 
@@ -428,9 +435,9 @@ def costs_of_runs(costs: Runs, x: Array) -> tuple[Array, Array]:
 
 
 def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
-    """Return the outcome of the proofs of n fixes of n problems of a moving target; x holds velocities as well.
+    """Return the results of the proofs of n fixes of n problems of a moving target; x contains velocities as well.
 
-    Without machine code none is looked at, as of `prove_runs`.
+    Without compiled code no box is searched, as in `prove_runs`.
     """
     n, size = asked.x.shape
     verdict, boxes, bound = np.full(n, BUDGET), np.zeros(n, np.int64), np.full(n, -inf)
@@ -459,7 +466,7 @@ def prove_courses(costs: CourseCosts, asked: ProofRequest) -> ProofResult:
 def _on_surface(
     courses: tuple[ConstantVelocityCost, ConstantVelocityCost], state: Array
 ) -> tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], Ground]:
-    """Return courses with the axes along which states are counted around one, and what they are carried over."""
+    """Return courses whose axes of states are set around one state, and the surface on which they move."""
     if not over_ground(courses[0].ground):
         return courses, courses[0].ground
     axes = axes_at(courses[0].ground.data, state[:3])

@@ -1,10 +1,10 @@
-"""Rows by the hundred: bounds of a cost over a box in a time that is linear in the rows.
+"""Bounds over a box for hundreds of rows, in a time that is proportional to the number of rows.
 
-The rows of a long run touch few nodes each, and share a few unknowns that enter them linearly: offsets, drifts. With
-``e = S phi - w`` (S sparse, whitened) and Q the directions that these unknowns reach, the cost is ``f = |P e|^2``,
-``P = 1 - Q Q'``. The dense rows P S are never made: every unit vector v with ``Q'v = 0`` has ``|P e| >= v.e``, and what
-v.e is over a box takes one pass over the entries of S. Second derivatives are summed over all nodes before a bound is
-taken: in a long run they cancel.
+Each row of a long run depends on few nodes. All rows share a few unknowns that enter linearly, such as offsets and
+drifts. The residual without them is ``e = S phi - w`` (S sparse, whitened). With Q an orthonormal basis of their
+directions, the cost is ``f = |P e|^2``, ``P = 1 - Q Q'``. The dense rows P S are never computed. Each unit vector v
+with ``Q'v = 0`` gives the bound ``|P e| >= v.e``. Bounds of v.e over a box need one pass over the entries of S. Second
+derivatives are summed over all nodes before they are bounded, because they cancel in a long run.
 """
 
 from __future__ import annotations
@@ -48,23 +48,23 @@ from optloc.proof.nodes.node import (
 
 # Unit in the last place of a double at 1.
 _ULP = 2.0**-52
-# Roundings within a node, and in its slopes.
+# Number of roundings within a node and in its slopes.
 _WITHIN = 32
 
 
 class RunRows(NamedTuple):
-    """Whitened rows ``e = S phi - w`` and what other unknowns reach.
+    """Whitened rows ``e = S phi - w``, and the directions of other unknowns.
 
     Parameters
     ----------
     start : int array (q + 1,)
-        Where the entries of each row begin, and the end.
+        Index of the first entry of each row, and the end.
     column, factor : int array (n,), array (n,)
-        The node of each entry of S, and the entry.
+        The node and the value of each entry of S.
     w : array (q,)
         Whitened measurements.
     basis : array (p, q)
-        Orthonormal: what the other unknowns can change.
+        Orthonormal basis Q' of the changes of rows by the other unknowns.
     weight : array (J,)
         Lengths of the columns of S.
     """
@@ -89,7 +89,7 @@ class RunWorkspace(NamedTuple):
     lines, pulls : array (3, q), (3, J)
         Columns of the Jacobian ``P S Phi``, and of ``S'P S Phi``.
     reach, length : array (J,), (q,)
-        A number for each node, and what the rows make of it.
+        A number for each node, and the products of the rows with these numbers.
     """
 
     residual: Array
@@ -129,7 +129,7 @@ def multiply_transposed(rows: RunRows, values: Array, out: Array) -> None:
 
 @compiled
 def project_out_unknowns(rows: RunRows, values: Array) -> None:
-    """Take off values (q,) what other unknowns can change."""
+    """Subtract from values (q,) their part that the other unknowns can explain."""
     for _ in range(2):  # twice is exact (Parlett)
         for k in range(rows.basis.shape[0]):
             along, own = 0.0, rows.basis[k]
@@ -141,7 +141,7 @@ def project_out_unknowns(rows: RunRows, values: Array) -> None:
 
 @compiled
 def greatest_length(rows: RunRows, values: Array, out: Array) -> float:
-    """Return the greatest length of ``S y`` over all y with ``|y_j| <= values_j``."""
+    """Return a bound of the length of ``S y`` over all y with ``|y_j| <= values_j``."""
     total = 0.0
     for i in range(out.shape[0]):
         most = 0.0
@@ -153,14 +153,14 @@ def greatest_length(rows: RunRows, values: Array, out: Array) -> float:
 
 @compiled
 def rounding_of_residual(rows: RunRows, floor: float, nodes: Array) -> float:
-    """Return a bound of the rounding errors of a residual (its length).
+    """Return a bound of the rounding of a residual, as a length.
 
     Parameters
     ----------
     rows : RunRows
         The rows.
     floor : float
-        What limits the accuracy beside the nodes: lengths of w and of coordinates times their weights.
+        Further sizes that limit the accuracy: the length of w, and coordinates times their weights.
     nodes : array (J, NODE_WIDTH)
         Table of the box.
     """
@@ -172,13 +172,13 @@ def rounding_of_residual(rows: RunRows, floor: float, nodes: Array) -> float:
 
 @compiled
 def relative_rounding_of(rows: RunRows) -> float:
-    """Return the relative rounding error of sums over nodes and rows: one a term, and 32 within a node."""
+    """Return the relative rounding of sums over nodes and rows: one for each term, and 32 within a node."""
     return float((_WITHIN + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
 
 
 @compiled
 def share_within(rows: RunRows) -> float:
-    """Return the share of these digits that what is rounded within a node alone has, as coordinates are."""
+    """Return the share of this rounding within a node, which is the rounding of coordinates."""
     return float(_WITHIN / (_WITHIN + rows.w.shape[0] + rows.weight.shape[0]))
 
 
@@ -198,13 +198,13 @@ def residual_at(rows: RunRows, nodes: Array, sheet: RunWorkspace) -> float:
     return total
 
 
-# How much a projection may leave of what lies in the span: as of whitened rows, but for their number.
+# Greatest part that a projection may leave of a vector in the span: the rounding of whitened rows.
 _BALANCED = 1e-11
 
 
 @compiled
 def is_balanced(rows: RunRows, ones: Array, out: Array) -> bool:
-    """Return whether equal changes of some nodes (J,) change no row but by what the other unknowns explain."""
+    """Return whether equal changes of the marked nodes (J,) change the rows only as the other unknowns can explain."""
     size = greatest_length(rows, ones, out)
     multiply(rows, ones, out)
     project_out_unknowns(rows, out)
@@ -218,7 +218,7 @@ def is_balanced(rows: RunRows, ones: Array, out: Array) -> bool:
 def least_length(
     half: Array, nodes: Array, curves: Array, lean: Array, slip: float, sheet: RunWorkspace, cost: float, curved: bool
 ) -> float:
-    """Return a lower bound of ``|P e|`` over a box, rounding apart; negative where it says nothing.
+    """Return a lower bound of ``|P e|`` over a box, without rounding; a negative result means that no bound is known.
 
     Parameters
     ----------
@@ -227,20 +227,21 @@ def least_length(
     nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
         Tables of the box.
     lean, slip : array (J,), float
-        Slopes of nodes across a surface, and how far off it the centre may be; 0 elsewhere.
+        Slopes of nodes across a surface, and greatest distance of the centre from it; 0 without a surface.
     sheet : RunWorkspace
-        As `residual_at` has left it.
+        Filled by `residual_at`.
     cost : float
-        What that returned.
+        Result of `residual_at`.
     curved : bool
-        Whether second derivatives are there. A node counts with them, or with the enclosure of its remainder: where a
-        third-order remainder is the smaller.
+        Whether second derivatives are available. Each node counts with its second derivatives and a third-order
+        remainder, or with the interval of its remainder, whichever gives the better bound.
     """
     n = sqrt(cost)
     if not n > 0.0:
         return -1.0
     h0, h1, h2 = half[0], half[1], half[2]
-    # A Hessian that changes by chi over the box, evenly along every ray: a sixth of it is left of the third order.
+    # A Hessian that changes by chi over the box, evenly along each ray, leaves a third-order remainder of a sixth of
+    # chi.
     third = (h0 * h0 + h1 * h1 + h2 * h2) / 6.0
     g0 = g1 = g2 = m00 = m01 = m02 = m11 = m12 = m22 = rest = 0.0
     for j in range(nodes.shape[0]):
@@ -250,8 +251,8 @@ def least_length(
         g1 += force * s1
         g2 += force * s2
         enclosed = min(force * nodes[j, LOW], force * nodes[j, HIGH])
-        if curved and (s0 != 0.0 or s1 != 0.0 or s2 != 0.0):  # no slope may stand for one that was not used
-            # Twice: slopes and Hessians of a place off the surface are others, too, by much less.
+        if curved and (s0 != 0.0 or s1 != 0.0 or s2 != 0.0):  # a slope of zero may replace an unused slope
+            # The factor 2: slopes and Hessians of a point off the surface also differ, by much less.
             left = -abs(force) * (curves[j, CHI] * third + 2.0 * abs(lean[j]) * slip)
             if left > enclosed:
                 rest += left
@@ -275,10 +276,11 @@ def least_length(
 def sum_up_rows(
     rows: RunRows, half: Array, nodes: Array, curves: Array, noise: float, sheet: RunWorkspace, sums: Array
 ) -> float:
-    """Fill sums (SUMS,) of a box and bounds of the Hessian's change in sums[C00:]; return one of the rest's norm.
+    """Write sums (SUMS,) of a box, and bounds of the Hessian's change; return a bound of the norm of the rest.
 
-    Along s the Jacobian changes by ``P S (N s + r)``, ``|r| <= chi |s| / 2``, and forces by ``S'P S (Phi s + q)`` with
-    q the remainders. What is linear in s is summed over the nodes, entry by entry, before its bound is taken.
+    Along s the Jacobian changes by ``P S (N s + r)`` with ``|r| <= chi |s| / 2``. Forces change by
+    ``S'P S (Phi s + q)`` with q the remainders. The part that is linear in s is summed over the nodes, entry by entry,
+    before it is bounded. The bounds of the change are in sums[C00:].
 
     Parameters
     ----------
@@ -287,9 +289,9 @@ def sum_up_rows(
     half, nodes, curves : arrays
         The box and its tables.
     noise : float
-        The rounding of a residual.
+        Bound of the rounding of a residual.
     sheet : RunWorkspace
-        As `residual_at` has left it; filled.
+        Filled by `residual_at`; lines and pulls are written.
     sums : array (SUMS,)
         Written.
     """
@@ -326,7 +328,7 @@ def sum_up_rows(
 
 @compiled
 def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None:
-    """Write what is linear in s of the Hessian's change: the third derivatives but for the nodes' own."""
+    """Write the part of the Hessian's change that is linear in s; the nodes' third derivatives are not included."""
     third = np.zeros((3, 6))  # entry (l, m) along k: sum_j pull_jk N_jlm
     for j in range(curves.shape[0]):
         for k in range(3):
@@ -340,7 +342,8 @@ def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None
                     third[k, symmetric_entry(a, b)] + third[a, symmetric_entry(k, b)] + third[b, symmetric_entry(k, a)]
                 )
                 change += half[k] * abs(turn)
-            # The rounding of J'J counts as change, twice: for the mean over a line half of a change counts.
+            # The rounding of J'J counts as change. It is doubled, because the mean over a line takes half of each
+            # change.
             blur = sums[LENGTH0 + a] * sums[BLUR0 + b] + sums[LENGTH0 + b] * sums[BLUR0 + a]
             sums[C00 + symmetric_entry(a, b)] = change + 2.0 * blur
 
@@ -349,14 +352,15 @@ def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None
 def _rest(
     rows: RunRows, half: Array, nodes: Array, curves: Array, blur: float, sheet: RunWorkspace, sums: Array
 ) -> float:
-    """Return a bound of the norm of what else changes in the Hessian; arguments as of `sum_up_rows`."""
+    """Return a bound of the norm of the rest of the Hessian's change; arguments as in `sum_up_rows`."""
     h0, h1, h2, reach = half[0], half[1], half[2], sheet.reach
     size = sqrt(h0 * h0 + h1 * h1 + h2 * h2)
     own = cross = ball = 0.0
     for j in range(nodes.shape[0]):
         chi = curves[j, CHI]
         p0, p1, p2 = abs(sheet.pulls[0, j]), abs(sheet.pulls[1, j]), abs(sheet.pulls[2, j])
-        # Of its own Hessian with its force, and with what that changes to first order; of its gradient's second order.
+        # First, the change of the node's Hessian times its force and the first-order change of the force. Then the
+        # second-order change of its gradient.
         ball += (abs(sheet.force[j]) + p0 * h0 + p1 * h1 + p2 * h2) * chi
         cross += sqrt(p0 * p0 + p1 * p1 + p2 * p2) * chi * size
         bend = norm_of(curves, j)
@@ -371,7 +375,7 @@ def _rest(
     for j in range(nodes.shape[0]):
         reach[j] = curves[j, CHI]
     wide = greatest_length(rows, reach, sheet.length)
-    # Changes of forces of second order, with Hessians and with their changes; and the square of the Jacobian's.
+    # Second-order changes of forces, times Hessians and times their changes; and the square of the Jacobian's change.
     jump = bent * size + 0.5 * wide * size
     return float(ball + cross + 2.0 * own + remainder * (bent + wide) + jump * jump)
 
@@ -386,7 +390,7 @@ def norm_of(curves: Array, j: int) -> float:
 
 @compiled
 def is_convex_by(half: Array, sums: Array, ball: float, margin: float) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` all over a box, by its sums and bounds of their change."""
+    """Return whether the Hessian of f/2 exceeds `margin` over a whole box, from its sums and bounds of their change."""
     if not ball < inf:
         return False
     d0 = sums[C00] + sums[C01] + sums[C02] + ball + margin

@@ -1,4 +1,7 @@
-"""From long problems to runs: sparse rows over the nodes, and the dense rows of few epochs, which cost nowhere more."""
+"""From long problems to costs of runs: sparse rows over the nodes, and dense rows of a few epochs.
+
+The cost of the few rows is nowhere more than the cost of all rows.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +41,15 @@ from optloc.proof.search_space import (
     cost_of,
 )
 
-# From a problem to its rows, and to those of few epochs.
+# From a problem to all its rows, and to the rows of a few epochs.
 
-# Nodes of the first look. Runs of five stations at 200 and 600 epochs: with a tenth of them a box cost as much as the
-# looks at all rows that it spared, with three times as many no fewer were needed.
+# Nodes of the few rows, tested in runs of five stations at 200 and 600 epochs. A tenth of all nodes took as much time
+# for a box as the bounds with all rows that it saved. Three times this number did not save more of these bounds.
 _LOOK = 60
 
 
-# Nodes of dense rows whose budget of boxes is whole, and of a run from which on it is not: 500 nodes take 50 us a box.
+# Nodes of dense rows that get the whole budget of boxes, and nodes of a run above which the budget is reduced: 500
+# nodes take 50 us a box.
 _DENSE, _LONG = 12, 500
 
 
@@ -55,11 +59,11 @@ class RunCost(NamedTuple):
     Parameters
     ----------
     cost : Cost
-        Its nodes, weights and measurements; the rows are left out.
+        Nodes, weights and measurements of the cost; the dense rows are empty.
     rows : RunRows
-        All rows.
+        All rows, sparse.
     look : Cost
-        The cost of few of them, which is nowhere larger.
+        The cost of a few of the rows, which is nowhere larger.
     """
 
     cost: Cost
@@ -76,7 +80,7 @@ class Runs:
     runs : tuple of RunCost
         One for each problem.
     level : array (N,)
-        Cost from which on angles may be off by a turn that the rows do not see.
+        Cost above which angles may be wrong by a full turn that the rows do not show.
     """
 
     runs: tuple[RunCost, ...]
@@ -84,9 +88,9 @@ class Runs:
 
     @property
     def dense(self) -> float:
-        """Return with how many nodes of dense rows a box would be as dear, as far as it may take boxes from a budget.
+        """Return the number of dense nodes that a box of this run counts as in the budget of boxes.
 
-        Long runs take fewer boxes than short ones, so only the root of what a box takes longer counts.
+        Long runs take fewer boxes than short ones, so the number grows only with a root of the time for a box.
         """
         return float(_DENSE * max(1.0, len(self.runs[0].cost.kinds) / _LONG) ** 0.25)
 
@@ -105,12 +109,12 @@ def run_costs(problem: Problem) -> Runs:
 
 
 def _quickest(count: int) -> AbstractContextManager[None]:
-    """Return a context with plain kernels, unless machine code is at hand or worth its compilation."""
+    """Return a context with plain Python kernels, unless compiled code is available or worth its compilation."""
     return nullcontext() if may_use_code(cost_of, count) else plain()
 
 
 def few_costs(problem: Problem) -> PositionCosts:
-    """Return the cost of few rows of one long problem, a batch of one."""
+    """Return the cost of a few rows of one long problem, a batch of one."""
     with _quickest(1):
         run, level = _run_cost(with_station_noise(problem))
     look = run.look
@@ -118,7 +122,7 @@ def few_costs(problem: Problem) -> PositionCosts:
 
 
 def _read(problem: Problem) -> tuple[OtherRows, Array, Array, CostColumns]:
-    """Return the other unknowns, measurements without what is known to be added, which are there, and the nodes."""
+    """Return the other unknowns, measurements minus known additions, whether they are present, and the nodes."""
     others = OtherRows.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
     usable = (problem.weight > 0.0) & np.isfinite(known)
@@ -128,15 +132,15 @@ def _read(problem: Problem) -> tuple[OtherRows, Array, Array, CostColumns]:
 
 
 def _run_cost(problem: Problem) -> tuple[RunCost, float]:
-    """Return one problem of a batch of one as a run, and its level of turns."""
+    """Return one problem, a batch of one, as a run, and its level (see `Runs`)."""
     others, known, usable, made = _read(problem)
     priors = position_prior(problem, made)
     kinds = np.array(made.kinds)
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
     prior = _rows_at(priors, len(kinds))
-    whole = _System.of(problem, usable[0], made, others, value, prior)
+    whole = _WhitenedRows.of(problem, usable[0], made, others, value, prior)
     data = whole.marked(kinds, made.numbers[:1])
-    few = _System.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, prior)
+    few = _WhitenedRows.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, prior)
     used = np.bincount(few.nodes.indices, minlength=len(kinds)) > 0
     dense = project_out(few.unknowns, np.column_stack([few.nodes[:, used].toarray(), few.measured]))
     present = (dense != 0.0).any(1)
@@ -147,19 +151,19 @@ def _run_cost(problem: Problem) -> tuple[RunCost, float]:
     return RunCost(cost, rows, look), float(turned_level(problem, others, known)[0])
 
 
-# From a problem whose target moves: its nodes are of the places at their epochs.
+# Problems of a moving target: nodes depend on the positions at their epochs.
 
 
 @dataclass(frozen=True, slots=True)
 class CourseCosts:
-    """The costs of a flat batch of problems of a moving target, as `Runs` holds those of one that stays.
+    """The costs of a flat batch of problems of a moving target, like `Runs` for a fixed target.
 
     Parameters
     ----------
     courses : tuple of (ConstantVelocityCost, ConstantVelocityCost)
-        All rows of each problem, and those of few epochs, which cost nowhere more.
+        All rows of each problem, and the rows of a few epochs, whose cost is nowhere more.
     level : array (N,)
-        As of `Runs`.
+        As in `Runs`.
     """
 
     courses: tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], ...]
@@ -167,7 +171,7 @@ class CourseCosts:
 
     @property
     def dense(self) -> float:
-        """Return with how many nodes of dense rows a box would be as dear, as far as it takes boxes from a budget."""
+        """Return the number of dense nodes that a box of these costs counts as in the budget of boxes."""
         return float(_DENSE)
 
     def take(self, items: Array | slice) -> CourseCosts:
@@ -177,14 +181,14 @@ class CourseCosts:
 
 
 def course_costs(problem: Problem) -> CourseCosts:
-    """Return the costs of a flat batch of N problems over position and velocity, all else at its best values."""
+    """Return the costs of a flat batch of N problems over position and velocity, with other unknowns at their best."""
     problem = with_station_noise(problem)
     costs = [_course_cost(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
     return CourseCosts(tuple(courses for courses, _ in costs), np.array([level for _, level in costs]))
 
 
 def _course_cost(problem: Problem) -> tuple[tuple[ConstantVelocityCost, ConstantVelocityCost], float]:
-    """Return one problem of a batch of one as courses of all rows and of few, and its level of turns."""
+    """Return one problem, a batch of one, as costs of all rows and of few rows, and its level (see `Runs`)."""
     others, known, usable, made = _read(problem)
     since = problem.times - problem.origin
     when = np.zeros(len(made.kinds))
@@ -193,24 +197,24 @@ def _course_cost(problem: Problem) -> tuple[tuple[ConstantVelocityCost, Constant
     rise = np.zeros(len(made.kinds))
     rise[made.column] = _rise(problem)[problem.epoch[made.row]]
     prior, times = _state_prior(problem, made, max(float(np.ptp(since)), 1.0))
-    # a prior is of the state itself, wherever heights are reported to be at that time
+    # a prior applies to the state itself, at any reported height
     when = np.stack([np.concatenate([when, times]), np.concatenate([rise, np.zeros(len(times))])], axis=1)
     parts = [usable[0], usable[0] & _few(problem, len(when))]
-    systems = [_System.of(problem, part, made, others, value, prior) for part in parts]
+    systems = [_WhitenedRows.of(problem, part, made, others, value, prior) for part in parts]
     courses = [_course(problem, system, made, when) for system in systems]
     return (courses[0], courses[1]), float(turned_level(problem, others, known)[0])
 
 
 def _rise(problem: Problem) -> Array:
-    """Return what heights of a course are above that of its state, (k,), metres."""
+    """Return the heights (k,) of a moving target above the height of its state, metres."""
     rise = problem.motions[0].rise
     return np.zeros(problem.epochs) if rise is None else np.reshape(rise[..., 0], (-1, problem.epochs))[0]
 
 
 def _state_prior(problem: Problem, made: CostColumns, span: float) -> tuple[Any, list[float]]:
-    """Add the nodes of priors on position and velocity; return their rows over all nodes, and when nodes are, seconds.
+    """Add the nodes of priors on position and velocity; return their rows over all nodes, and their times, seconds.
 
-    A velocity is the difference of two places, a span of time apart, over that.
+    A velocity is the difference of two positions, divided by the time between them.
     """
     from scipy import sparse
 
@@ -233,8 +237,8 @@ def _state_prior(problem: Problem, made: CostColumns, span: float) -> tuple[Any,
     return sparse.csr_array(entries, shape=(count, len(made.kinds))), times
 
 
-def _course(problem: Problem, system: _System, made: CostColumns, when: Array) -> ConstantVelocityCost:
-    """Return whitened rows as a course over the nodes that they touch, by time and height (J, 2) of these."""
+def _course(problem: Problem, system: _WhitenedRows, made: CostColumns, when: Array) -> ConstantVelocityCost:
+    """Return whitened rows as a cost over the nodes that they use; `when` (J, 2) has the nodes' times and heights."""
     used = np.flatnonzero(np.bincount(system.nodes.indices, minlength=len(when)))
     order = used[np.lexsort((when[used, 1], when[used, 0]))]
     epochs, first = np.unique(when[order], axis=0, return_index=True)
@@ -247,7 +251,7 @@ def _course(problem: Problem, system: _System, made: CostColumns, when: Array) -
 
 
 def _ground(problem: Problem, since: Array, rise: Array) -> Ground:
-    """Return what a course is carried over; its axes are those of the frame until a place is known."""
+    """Return the surface on which a target moves; its axes are the axes of the frame until a position is known."""
     level = held_height(problem)
     if level is None:
         return STRAIGHT
@@ -256,7 +260,7 @@ def _ground(problem: Problem, since: Array, rise: Array) -> Ground:
 
 
 def _few(problem: Problem, nodes: int) -> Array:
-    """Return which rows (m,) the first look takes: those of epochs evenly apart, or every so many."""
+    """Return whether each row (m,) is one of the few: rows of evenly spaced epochs, or evenly spaced rows."""
     epochs = np.unique(problem.epoch)
     key = np.searchsorted(epochs, problem.epoch) if len(epochs) >= _LOOK // 3 else np.arange(problem.count)
     apart = max(1, round(nodes / _LOOK))
@@ -264,8 +268,8 @@ def _few(problem: Problem, nodes: int) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _System:
-    """Whitened rows over nodes (sparse) and over other unknowns, with the rows of their priors, and measurements."""
+class _WhitenedRows:
+    """Whitened rows over nodes (sparse) and over other unknowns, with rows of priors, and the measurements (q,)."""
 
     nodes: Any
     unknowns: Array
@@ -274,8 +278,9 @@ class _System:
     @classmethod
     def of(
         cls, problem: Problem, present: Array, made: CostColumns, others: OtherRows, value: Array, prior: Any
-    ) -> _System:
-        from scipy import sparse  # with the first long run: problems of one epoch need none
+    ) -> _WhitenedRows:
+        """Return the whitened rows of one problem; `present` (m,) marks the rows to use."""
+        from scipy import sparse  # imported with the first long run: problems of one epoch do not need it
 
         size, white = len(made.kinds), _whitening(problem, present)
         design = sparse.csr_array((made.coefficient, (made.row, made.column)), shape=(problem.count, size))
@@ -290,7 +295,7 @@ class _System:
         )
 
     def marked(self, kinds: Array, data: Array) -> Array:
-        """Return the numbers (J, width) of its nodes, with a mark on those that are alone in their rows."""
+        """Return the numbers (J, width) of the nodes, with a mark on nodes that share no row with others."""
         shared = (np.diff(self.nodes.indptr) > 1) | self.unknowns.any(1)
         touched = self.nodes != 0.0
         size = np.sqrt(np.asarray(self.nodes.multiply(self.nodes).sum(0)))
@@ -299,7 +304,7 @@ class _System:
         return plainly(mark_nodes(kinds, data, alone[None], size[None], force[None], self.measured[None])[0])
 
     def rows(self) -> RunRows:
-        """Return them for machine code."""
+        """Return the rows as arrays for compiled code."""
         basis = span_of(self.unknowns) if self.unknowns.shape[1] else self.unknowns
         kept = basis.any(0)
         start, column = (np.asarray(index, dtype=np.int64) for index in (self.nodes.indptr, self.nodes.indices))
@@ -309,14 +314,14 @@ class _System:
 
 
 def _rows_at(nodes: list[int], size: int) -> Any:
-    """Return rows (n, size), sparse, of one each of some nodes."""
+    """Return sparse rows (n, size), each of which contains one of the nodes."""
     from scipy import sparse
 
     return sparse.csr_array((np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), size))
 
 
 def _whitening(problem: Problem, present: Array) -> Any:
-    """Return the sparse matrix (q, m) that whitens the rows, zero for those that are absent."""
+    """Return the sparse matrix (q, m) that whitens the rows; absent rows become zero."""
     from scipy import sparse
 
     blocks = []

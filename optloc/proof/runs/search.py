@@ -1,7 +1,7 @@
 """The search of a run: boxes of all space, along a surface or of a region.
 
-Each box is looked at with the rows of few epochs first, which cost never more than all of them do, and with all rows
-only where those of few say nothing.
+Each box is first bounded with the rows of a few epochs, whose cost is never more than the cost of all rows. All rows
+are used only if this bound is not sufficient.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from optloc.proof.surface import SLIP
 
 
 class RunTables(NamedTuple):
-    """Working memory: a box for few nodes and one for all, and a sheet for all rows."""
+    """Working memory: a box for the nodes of few epochs (`small`), a box for all nodes, and arrays for all rows."""
 
     small: Box
     box: Box
@@ -63,9 +63,9 @@ class RunTables(NamedTuple):
 
 @compiled
 def tables_of(run: RunCost) -> RunTables:
-    """Return tables for a run."""
+    """Return working memory for a run."""
     box = empty_box(0, run.cost.kinds.shape[0])
-    box.lean[:], box.graph[:] = 0.0, 0.0  # which only a surface writes
+    box.lean[:], box.graph[:] = 0.0, 0.0  # only boxes on a surface write these
     return RunTables(empty_box(run.look.K.shape[0], run.look.K.shape[1]), box, workspace_of(run.rows))
 
 
@@ -73,7 +73,7 @@ def tables_of(run: RunCost) -> RunTables:
 def sum_at(run: RunCost, space: Space, tables: RunTables, floor: float) -> tuple[float, float]:
     """Return the cost at the centre of a box that is set, and the norm of the rest of its Hessian's change.
 
-    The sums of the box are filled. Both are infinite where nothing is bounded.
+    The sums of the box are filled. Both results are infinite if the nodes cannot be bounded.
     """
     box, sheet = tables.box, tables.sheet
     if not set_nodes(space, run.cost, box):
@@ -86,15 +86,16 @@ def sum_at(run: RunCost, space: Space, tables: RunTables, floor: float) -> tuple
 
 # The search.
 
-# Boxes are looked at with all rows where few of them cost less than so many levels at the centre: elsewhere halves are
-# dropped by few as well.
+# All rows are used if the few rows cost less than this many levels at the centre of a box. Otherwise few rows will
+# exclude the halves of the box as well.
 _WORTH = 4.0
-# The test for stationary points is made where the cost at the centre is within so many levels, as in
-# `optloc.proof.global_search`; and boxes at infinity are not split below a size.
+# The test for stationary points runs if the cost at the centre is within this many levels, as in
+# `optloc.proof.global_search`; and boxes at infinity are not split below this size.
 _NEAR, _TINY = 100.0, 1e-5
-# Boxes on the stack: pieces, slabs around known minima, and one for each halving of the deepest.
+# Boxes on the stack: pieces, slabs around known minima, and one for each halving of the deepest box.
 CAPACITY = 4096
-# Looks at few rows for each at all rows, at most: they take a twentieth of the time.
+# Greatest number of bounds with few rows, as a multiple of the budget for all rows: few rows take a twentieth of the
+# time.
 _LOOKS = 10
 
 
@@ -116,22 +117,22 @@ def search_run(
     run : RunCost
         The cost.
     space : Space
-        Where the boxes are.
+        Space of the boxes.
     tables : RunTables
         Working memory.
     stack, size : array (capacity, DEPTH), int
         The boxes.
     aim : Goal
-        What is to be shown of each.
+        The conditions to show for each box.
     budget : int
-        How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
+        Greatest number of boxes with all rows; with few rows, `_LOOKS` times this number is allowed.
     found : array (D,)
         Written: the point of the outcomes CHEAPER and ANOTHER.
 
     Returns
     -------
     outcome, boxes, bound
-        As of `optloc.proof.global_search.search_globally`.
+        As in `optloc.proof.global_search.search_globally`.
     """
     look, small, d, boxes, looks, lows = run.look, tables.small, found.shape[0], 0, 0, 0
     floors = floor_of(space, look), floor_of(space, run.cost)
@@ -164,7 +165,7 @@ def search_run(
             if _is_done(run, space, tables, aim, here, low, touching, floors[1]):
                 continue
             lows += int(here < aim.level)
-            # At the first, second, fourth ... low centre: found early, and seldom looked for in vain.
+            # At low centre number 1, 2, 4 and so on: minima are found early, with few descents in vain.
             if here < aim.level and lows & (lows - 1) == 0:
                 if _descends(run, space, tables, aim.level, found):
                     return ANOTHER, looks, 0.0
@@ -186,7 +187,7 @@ def _is_done(
     touching: bool,
     floor: float,
 ) -> bool:
-    """Return whether a box that has a cost at its centre and a bound need not be split."""
+    """Return whether a box, with the cost at its centre and a bound, is finished."""
     if exceeds_level(low, aim.level):
         return True
     if not (aim.whole or exceeds_level(low, aim.value)) or not here < _NEAR * (aim.level + 1.0):
@@ -199,7 +200,7 @@ def _is_done(
 
 @compiled
 def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) -> bool:
-    """Return whether a small box at infinity costs less than a level there."""
+    """Return whether a box at infinity is very small and its cost at infinity is below a level."""
     half, box = tables.small.half, tables.box
     if not max(half[0], half[1], half[2]) < _TINY:
         return False
@@ -210,12 +211,12 @@ def _is_flat_out(run: RunCost, space: Space, tables: RunTables, level: float) ->
 
 @compiled
 def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: float) -> tuple[float, float]:
-    """Return the cost at the centre of a box and a lower bound of the residual over it, negative where none is."""
+    """Return the cost at the centre of a box, and a lower bound of the residual over it, negative without a bound."""
     box, sheet, rows = tables.box, tables.sheet, run.rows
     if not set_nodes(space, run.cost, box):
         return inf, -1.0
     here = residual_at(rows, box.nodes, sheet)
-    if here < level:  # no bound will do
+    if here < level:  # no bound can exceed the level
         return here, -1.0
     noise, slip = rounding_of_residual(rows, floor, box.nodes), box.graph[SLIP]
     low = least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, False) - noise
@@ -227,15 +228,15 @@ def _bound(run: RunCost, space: Space, tables: RunTables, floor: float, level: f
 
 # Descents.
 
-# Steps, and the length of one in standard deviations that ends it.
+# Greatest number of steps, and the length of the last step, standard deviations.
 _STEPS, _CLOSE = 40, 1e-3
-# How far outside its piece of an atlas a descent may go: beyond it others descend.
+# Greatest coordinate of a descent in an atlas, whose pieces end at 1. Beyond it, boxes of other pieces descend.
 _ASIDE = 1.5
 
 
 @compiled
 def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
+    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum."""
     box, d, home = tables.box, found.shape[0], 0
     u, before, face = box.at.copy(), np.zeros(3), False
     if space.far:
@@ -271,7 +272,7 @@ def _descends(run: RunCost, space: Space, tables: RunTables, level: float, found
 
 @compiled
 def cost_at_coordinates(run: RunCost, space: Space, tables: RunTables, home: int, u: Array) -> float:
-    """Return the cost at coordinates of a piece, with its derivatives in the sums of the box."""
+    """Return the cost at coordinates u (3,) of a piece; its derivatives are written into the sums of the box."""
     tables.box.half[:] = 0.0
     put(u, tables.box.at)
     if space.far:
@@ -281,12 +282,12 @@ def cost_at_coordinates(run: RunCost, space: Space, tables: RunTables, home: int
 
 @compiled
 def rounding_at_place(run: RunCost, space: Space, tables: RunTables, floor: float) -> float:
-    """Return a bound of the rounding errors of a residual (its length) at a place whose nodes are bounded.
+    """Return a bound of the rounding of a residual, as a length, at a point whose nodes are bounded.
 
-    On a surface that of the height as well, see `optloc.proof.search_space.rounding_at_centre`.
+    On a surface, the rounding of the height is included, see `optloc.proof.search_space.rounding_at_centre`.
     """
     box, values, total = tables.box, tables.sheet.length, 0.0
-    multiply(run.rows, box.lean, values)  # zero but on a surface
+    multiply(run.rows, box.lean, values)  # zero except on a surface
     project_out_unknowns(run.rows, values)
     for value in values:
         total += value * value
@@ -295,7 +296,7 @@ def rounding_at_place(run: RunCost, space: Space, tables: RunTables, floor: floa
 
 @compiled
 def _step(box: Box, damping: float) -> float:
-    """Write a damped Newton step into box.solve[0]; return its squared length, NaN where there is none."""
+    """Write a damped Newton step into box.solve[0]; return its squared length, or NaN if there is no step."""
     sums = box.sums
     h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
     if not positive_along(h0, h1, h2, h3, h4, h5, h3 != 0.0, h5 != 0.0):

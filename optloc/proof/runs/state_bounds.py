@@ -1,4 +1,4 @@
-"""The residual of a course and its second derivatives, bounded over boxes of states."""
+"""Bounds of the residual of a moving target, and of its second derivatives, over boxes of states."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _SWEEPS = 3
 
 @compiled
 def _reach(course: ConstantVelocityCost, table: StateTable, direction: Array, curved: bool) -> float:
-    """Return a lower bound of ``|P e|`` over a box from one direction (q,), rounding apart; see `least_length`."""
+    """Return a lower bound of ``|P e|`` over a box from a direction (q,), without rounding; see `least_length`."""
     n, d, force = table.at.shape[0], table.lever.shape[1], table.sheet.force
     length, total, rest = 0.0, 0.0, 0.0
     for i in range(direction.shape[0]):
@@ -85,10 +85,10 @@ def _reach(course: ConstantVelocityCost, table: StateTable, direction: Array, cu
 
 @compiled
 def least_length(course: ConstantVelocityCost, table: StateTable, cost: float, curved: bool) -> float:
-    """Return a lower bound of ``|P e|`` over a box, rounding apart; negative where it says nothing.
+    """Return a lower bound of ``|P e|`` over a box, without rounding; a negative result means that no bound is known.
 
-    The residual at the centre and the Jacobian are set. Of the directions that are tried the last is the residual
-    nearest to zero of the linear part.
+    The residual at the centre and the Jacobian must be set. The direction of the bound is the shortest residual of the
+    linear part.
     """
     sheet, lines, n = table.sheet, table.lines, table.at.shape[0]
     if not cost > 0.0:
@@ -118,10 +118,10 @@ def least_length(course: ConstantVelocityCost, table: StateTable, cost: float, c
 
 @compiled
 def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tuple[float, float]:
-    """Fill gradient, Hessian and its change of first order; return bounds of the rest's norm and the gradient's blur.
+    """Write gradient, Hessian and its first-order change; return bounds of the rest and of the gradient's rounding.
 
-    As `optloc.proof.runs.rows.sum_up_rows`, in units of the half-widths of the box; nodes, Hessians of nodes, residual
-    and Jacobian are set, `noise` is the rounding of a residual.
+    The method is `optloc.proof.runs.rows.sum_up_rows`, in units of the half-widths of the box. Nodes, Hessians of
+    nodes, residual and Jacobian must be set; `noise` is the rounding of a residual.
     """
     rows, sheet, lines, pulls, n = course.rows, table.sheet, table.lines, table.pulls, table.at.shape[0]
     multiply_transposed(rows, sheet.residual, sheet.force)
@@ -144,9 +144,7 @@ def sum_up(course: ConstantVelocityCost, table: StateTable, noise: float) -> tup
     for m in range(n):
         for other in range(m):
             table.hessian[other, m] = table.hessian[m, other]
-        for other in range(
-            n
-        ):  # the rounding of J'J counts as change, twice: for the mean over a line half of it counts
+        for other in range(n):  # the rounding of J'J, doubled as in `sum_up_rows`
             table.change[m, other] += 4.0 * sqrt(widest) * blur
     ball = _rest(course, table, noise + relative_rounding_of(rows) * longest)
     return ball, sqrt(widest) * noise + blur * (longest + noise)
@@ -168,7 +166,7 @@ def _blur_of_lines(course: ConstantVelocityCost, table: StateTable) -> float:
 
 @compiled
 def _missed(course: ConstantVelocityCost, table: StateTable) -> float:
-    """Return a bound of what differences leave out of each column of the Jacobian."""
+    """Return a bound of the error of finite differences in each column of the Jacobian."""
     total = 0.0
     if table.lever.shape[1] == 3:
         first, _ = errors_of(table.limits[2])
@@ -183,7 +181,7 @@ def _missed(course: ConstantVelocityCost, table: StateTable) -> float:
 
 @compiled
 def _turn(course: ConstantVelocityCost, table: StateTable) -> None:
-    """Add the nodes' part of the Hessian, and write what is linear in s of its change."""
+    """Add the nodes' part to the Hessian, and write the part of its change that is linear in s."""
     n = table.at.shape[0]
     third = np.zeros((n, n, n))
     for j in range(course.kinds.shape[0]):
@@ -204,7 +202,7 @@ def _turn(course: ConstantVelocityCost, table: StateTable) -> None:
 
 @compiled
 def _rest(course: ConstantVelocityCost, table: StateTable, blur: float) -> float:
-    """Return a bound of the norm of what else changes in the Hessian; see `optloc.proof.runs.rows`."""
+    """Return a bound of the norm of the rest of the Hessian's change; see `optloc.proof.runs.rows`."""
     rows, sheet, reach, n = course.rows, table.sheet, table.sheet.reach, table.at.shape[0]
     own = cross = ball = 0.0
     size = sqrt(float(n))
@@ -230,7 +228,7 @@ def _rest(course: ConstantVelocityCost, table: StateTable, blur: float) -> float
 
 @compiled
 def is_convex(table: StateTable, ball: float, margin: float) -> bool:
-    """Return whether the Hessian of f/2, in lengths of 1, exceeds `margin` all over a box whose sums are filled."""
+    """Return whether the Hessian of f/2, in lengths of 1, exceeds `margin` over a whole box whose sums are filled."""
     if not ball < inf:
         return False
     n, matrix = table.at.shape[0], table.solve
@@ -245,9 +243,9 @@ def is_convex(table: StateTable, ball: float, margin: float) -> bool:
 
 @compiled
 def has_no_minimum(table: StateTable, ball: float, noise: float) -> bool:
-    """Return whether no minimum of the cost can lie in a box whose sums are filled.
+    """Return whether a box whose sums are filled contains no minimum of the cost.
 
-    The gradient does not vanish, or the cost bends downwards along a coordinate.
+    This holds if the gradient does not vanish, or if the cost has negative curvature along a coordinate.
     """
     n, matrix = table.at.shape[0], table.solve
     if not ball < inf:
@@ -298,7 +296,7 @@ def hessian_of_state(course: ConstantVelocityCost, state: Array) -> Array:
 
 
 def axes_of(hessian: Array, state: Array, corners: Array) -> StateAxes | None:
-    """Return the principal axes of the cost at a state (n,), in standard deviations; None where it is no minimum."""
+    """Return the principal axes of the cost at a state (n,), in standard deviations; None if it is no minimum."""
     size = np.sqrt(np.maximum(np.diag(hessian), 0.0))
     if not (np.isfinite(hessian).all() and size.all()):
         return None

@@ -1,4 +1,4 @@
-"""The search through boxes of positions and velocities for a target in uniform motion, and its proof in a region."""
+"""The search of boxes of positions and velocities for a target in uniform motion, and its proof in a region."""
 
 from __future__ import annotations
 
@@ -43,26 +43,27 @@ from optloc.proof.search_space import COARSEST, equal_within
 
 # The search.
 
-# As of `optloc.proof.runs.search`: where boxes are looked at with all rows, and where minima are excluded by
-# derivatives, in levels; boxes on the stack; and looks at few rows for each at all rows.
+# As in `optloc.proof.runs.search`: levels below which boxes are bounded with all rows, and below which derivatives
+# exclude minima; boxes on the stack; and the greatest number of bounds with few rows, as a multiple of the budget for
+# all rows.
 _WORTH, _NEAR, _CAPACITY, _LOOKS = 4.0, 100.0, 4096, 10
-# Share of the steepest side's change that counts for all sides alike.
+# Each side also counts with this share of the steepest side's change.
 _ALIKE = 0.1
 
 
 class Search(NamedTuple):
-    """Where is looked, and what is known there.
+    """Data of a search, and the known minima.
 
     Parameters
     ----------
     whole, few : ConstantVelocityCost
-        All rows, and those of few epochs, which cost nowhere more.
+        All rows, and the rows of a few epochs, whose cost is nowhere more.
     axes : StateAxes
         The coordinates.
     table, small : StateTable
         Working memory for all rows, and for few.
     floors : tuple of 2 float
-        Sizes of what residuals of all and of few rows are differences of, beside the nodes.
+        Sizes of measurements and coordinates in the residuals of all and of few rows, without the nodes.
     minima, sides : array (P, n)
         Known minima, and half-widths of boxes around them on which the cost is convex.
     """
@@ -79,25 +80,25 @@ class Search(NamedTuple):
 
 @compiled
 def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: int, found: Array) -> tuple[int, int]:
-    """Search boxes for minima that cost less than a level; return the outcome and how many boxes were looked at.
+    """Search boxes for minima that cost less than a level; return the outcome and the number of boxes.
 
     Parameters
     ----------
     search : Search
-        Where.
+        Data of the search.
     stack, size : array (capacity, 2 n), int
         The boxes: centres, half-widths.
     aim : Goal
-        What is to be shown of each.
+        The conditions to show for each box.
     budget : int
-        How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
+        Greatest number of boxes with all rows; with few rows, `_LOOKS` times this number is allowed.
     found : array (n,)
         Written: the state of the outcomes CHEAPER and ANOTHER.
 
     Returns
     -------
     outcome, boxes
-        CLEAR, CHEAPER (a state costs less than `aim.better`), ANOTHER (a minimum below the level is not known), SPENT.
+        CLEAR, CHEAPER (a state costs less than `aim.better`), ANOTHER (an unknown minimum below the level), or SPENT.
     """
     axes, table, small, n = search.axes, search.table, search.small, found.shape[0]
     boxes, looks, lows = 0, 0, 0
@@ -122,13 +123,14 @@ def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: i
             inside = _is_inside(axes, table.at, found)
             if inside and here < aim.better:
                 return CHEAPER, looks
-            # in the inside of a region costs are least where the gradient vanishes; its edge has to cost the level
+            # inside a region, the gradient vanishes at a minimum; on the edge of the region the cost must exceed the
+            # level
             if where > 0 and here < _NEAR * (aim.level + 1.0):
                 ball, noise = _curve(search, table)
                 if has_no_minimum(table, ball, noise):
                     continue
             lows += int(inside and here < aim.level)
-            # at the first, second, fourth ... low centre: found early, and seldom looked for in vain
+            # at low centre number 1, 2, 4 and so on: minima are found early, with few descents in vain
             if inside and here < aim.level and lows & (lows - 1) == 0 and _descends(search, aim.level, found):
                 return ANOTHER, looks
         size = _push_halves(stack, size, small, _steepest(small))
@@ -139,12 +141,12 @@ def search_courses(search: Search, stack: Array, size: int, aim: Goal, budget: i
 def _look(
     course: ConstantVelocityCost, axes: StateAxes, table: StateTable, floor: float, level: float
 ) -> tuple[float, float]:
-    """Return the cost at the centre of a box that is set and a lower bound of the residual over it."""
+    """Return the cost at the centre of a box that is set, and a lower bound of the residual over it."""
     set_box(course, axes, table)
     here = residual_at(course.rows, table.nodes, table.sheet)
     noise = rounding_of_residual(course.rows, floor, table.nodes)
     set_lines(course, table)
-    if here < level:  # no bound will do
+    if here < level:  # no bound can exceed the level
         return here, -1.0
     low = least_length(course, table, here, False) - noise
     if exceeds_level(low, level):
@@ -155,7 +157,7 @@ def _look(
 
 @compiled
 def _curve(search: Search, table: StateTable) -> tuple[float, float]:
-    """Fill the sums of a box that was looked at with all rows, see `sum_up`."""
+    """Fill the sums of a box that was bounded with all rows, see `sum_up`."""
     noise = rounding_of_residual(search.whole.rows, search.floors[0], table.nodes)
     set_bends(search.whole, search.axes, table)
     return sum_up(search.whole, table, noise)
@@ -163,7 +165,7 @@ def _curve(search: Search, table: StateTable) -> tuple[float, float]:
 
 @compiled
 def _where(axes: StateAxes, at: Array, half: Array) -> int:
-    """Return -1 where no state of a box is in the region, 1 where all are in its inside, else 0."""
+    """Return -1 if no state of a box is in the region, 1 if all are inside it, and 0 otherwise."""
     inside = 1
     for i in range(at.shape[0]):
         middle, reach = axes.origin[i], 0.0
@@ -191,7 +193,7 @@ def _is_inside(axes: StateAxes, at: Array, state: Array) -> bool:
 
 @compiled
 def _is_known(search: Search, at: Array, half: Array) -> bool:
-    """Return whether a box lies where the cost is convex around a known minimum."""
+    """Return whether a box is inside the convex box of a known minimum."""
     for p in range(search.minima.shape[0]):
         inside = True
         for m in range(at.shape[0]):
@@ -203,7 +205,7 @@ def _is_known(search: Search, at: Array, half: Array) -> bool:
 
 @compiled
 def _steepest(table: StateTable) -> int:
-    """Return the side of a box that was looked at along which the residual changes most."""
+    """Return the side of a linearised box along which the residual changes most."""
     best, steepest, side, n = -1.0, 0.0, 0, table.at.shape[0]
     for m in range(n):
         table.move[m] = 0.0
@@ -234,13 +236,13 @@ def _push_halves(stack: Array, size: int, table: StateTable, side: int) -> int:
 
 # Descents.
 
-# Steps, and the length of one in standard deviations that ends it.
+# Greatest number of steps, and the length of the last step, standard deviations.
 _STEPS, _CLOSE = 40, 1e-3
 
 
 @compiled
 def _descends(search: Search, level: float, found: Array) -> bool:
-    """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
+    """Return whether the centre of a box descends to an unknown minimum below the level, and write this minimum."""
     table = search.table
     before, damping = table.at.copy(), 1e-3
     now = _linearise(search, table)
@@ -271,7 +273,7 @@ def _descends(search: Search, level: float, found: Array) -> bool:
 
 @compiled
 def _linearise(search: Search, table: StateTable) -> float:
-    """Return the cost at coordinates that are set, with residual, Jacobian and slope in lengths of 1."""
+    """Return the cost at the coordinates of the box; write residual, Jacobian and slope in lengths of 1."""
     for m in range(table.at.shape[0]):
         table.half[m], table.unit[m] = 0.0, 1.0
     set_box(search.whole, search.axes, table)
@@ -282,7 +284,7 @@ def _linearise(search: Search, table: StateTable) -> float:
 
 @compiled
 def _step(table: StateTable, damping: float) -> float:
-    """Write a damped Gauss-Newton step; return its squared length in units of what is left, NaN where there is none."""
+    """Write a damped Gauss-Newton step; return its squared length in standard deviations, or -1 without a step."""
     n, matrix, lines = table.at.shape[0], table.solve, table.lines
     for m in range(n):
         table.slope[m] = 0.0
@@ -307,15 +309,16 @@ def _step(table: StateTable, damping: float) -> float:
 
 # Known minima.
 
-# Sides are tried smaller by this factor, so often: from the first, standard deviations, to a millionth of it.
+# First half-width, standard deviations, the factor by which it is reduced, and the number of trials, which reduce it
+# to a millionth.
 _WIDEST, _SMALLER, _TRIALS = 100.0, 0.8, 62
 
 
 @compiled
 def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) -> bool:
-    """Write a minimum and the sides of a convex box around it; return False where it is none, or costs less than that.
+    """Write a minimum and the sides of a convex box around it; return False if x is no minimum or costs too little.
 
-    Within the box no cost is more than eps below that of the minimum.
+    In the box the cost is at most eps below the cost of the minimum.
     """
     axes, table, n = search.axes, search.table, state.shape[0]
     for m in range(n):
@@ -339,7 +342,7 @@ def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) 
         residual_at(search.whole.rows, table.nodes, table.sheet)
         set_lines(search.whole, table)
         ball, noise = _curve(search, table)
-        blur = noise / share  # of the slope, which the margin is made of
+        blur = noise / share  # rounding of the slope, from which the margin is computed
         if is_convex(table, ball, margin + n * blur * (blur + 2.0 * sqrt(eps * margin)) / eps):
             for m in range(n):
                 search.sides[p, m] = share
@@ -362,27 +365,27 @@ def prove_course(
     budget: int,
     found: Array,
 ) -> tuple[int, int, float]:
-    """Prove of a course what `optloc.proof.local_search.prove_locally` proves of a cost, within a region.
+    """Prove the claim of `optloc.proof.local_search.prove_locally` for a moving target, within a region.
 
     Parameters
     ----------
     whole, few : ConstantVelocityCost
-        All rows, and those of few epochs.
+        All rows, and the rows of a few epochs.
     axes : StateAxes
-        Of the fix, with the region.
+        Axes around the fix, with the region.
     others : array (P, n)
         Other known minima.
     kappa, eps : float
-        Gap to prove, and how far below the cost of the fix still counts as equal.
+        Gap to prove, and the tolerance within which a lower cost counts as equal to the cost of the fix.
     budget : int
-        How many boxes may be looked at.
+        Greatest number of boxes.
     found : array (n,)
         Written: a better or other state.
 
     Returns
     -------
     verdict, boxes, bound
-        As there.
+        As in `optloc.proof.local_search.prove_locally`.
     """
     x, n = axes.origin, axes.origin.shape[0]
     table, small, room = table_of(whole), table_of(few), np.zeros((2, 1 + others.shape[0], n))
@@ -414,7 +417,7 @@ def prove_course(
 
 @compiled
 def _set_first(axes: StateAxes, at: Array, half: Array) -> None:
-    """Write the box that holds a region."""
+    """Write the box that contains a region."""
     for m in range(at.shape[0]):
         for i in range(at.shape[0]):
             low, high = axes.corners[0, i], axes.corners[1, i]

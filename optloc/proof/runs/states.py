@@ -1,9 +1,9 @@
 """A target in uniform motion: bounds of a cost over boxes of positions and velocities.
 
-The rows are those of a run; a node of an epoch at time t is bounded over the places of all states of a box, which lie
-in a box of space again: ``p + t v`` in the plane, and over ground what `optloc.proof.runs.ground` says. Slopes and
-Hessians with respect to the state follow by the chain rule, and are summed over all nodes before a bound is taken.
-Coordinates are the principal axes of the cost at the fix.
+The rows are the rows of a run. For a box of states, the target's positions at the time t of an epoch are in a box of
+space. The nodes of this epoch are bounded over this box. In the plane these positions are ``p + t v``; over ground,
+see `optloc.proof.runs.ground`. Slopes and Hessians with respect to the state follow by the chain rule, and are summed
+over all nodes before they are bounded. Search coordinates are the principal axes of the cost at the fix.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from optloc.proof.runs.rows import (
 )
 from optloc.proof.search_space import accuracy_floor
 
-# What is searched.
+# Data of the search.
 
 
 class ConstantVelocityCost(NamedTuple):
@@ -54,13 +54,13 @@ class ConstantVelocityCost(NamedTuple):
     kinds, data : int array (J,), array (J, width)
         The nodes, epoch by epoch.
     first : int array (K + 1,)
-        Where the nodes of each epoch begin, and the end.
+        Index of the first node of each epoch, and the end.
     since : array (K,)
-        Seconds of each epoch from the time at which the state holds.
+        Time of each epoch after the time of the state, seconds.
     rows : RunRows
         All rows.
     ground : Ground
-        What the target is carried over; `optloc.proof.runs.ground.STRAIGHT` in the plane.
+        The surface on which the target moves; `optloc.proof.runs.ground.STRAIGHT` in the plane.
     """
 
     kinds: Array
@@ -77,9 +77,9 @@ class StateAxes(NamedTuple):
     Parameters
     ----------
     origin : array (n,)
-        Position and velocity of the fix, n = 4.
+        Position and velocity of the fix, n = 4, metres and m/s.
     turn, back : array (n, n)
-        Their derivative with respect to s, and its inverse.
+        Derivative of the state with respect to s, and its inverse.
     corners : array (2, n)
         Lowest and highest state of the region.
     """
@@ -91,40 +91,40 @@ class StateAxes(NamedTuple):
 
 
 class StateTable(NamedTuple):
-    """Working memory for one box of a course.
+    """Working memory for one box of states.
 
     Parameters
     ----------
     at, half : array (n,)
-        The box.
+        Centre and half-widths of the box, search coordinates.
     unit : array (n,)
-        Lengths in which derivatives are taken: half-widths of a box, or one.
+        Units of derivatives: half-widths of a box, or one.
     lever : array (K, d, n)
-        Derivatives of the places of each epoch with respect to coordinates in these lengths.
+        Derivatives of the position at each epoch with respect to coordinates in these units.
     places : array (K, 2, 3)
-        Middle and half-widths of the places of each epoch, metres.
+        Middle and half-widths of the box of positions at each epoch, metres.
     sizes : array (K, 2)
-        Squared lengths of the states' part in each epoch's place, metres^2: greatest over the box, and a bound of that
-        of a move of length one.
+        Squared lengths of the state's change in the position at each epoch, metres^2: the greatest over the box, and a
+        bound for a step of length one.
     starts, reached, second : array (SECOND_ORDER, 6), (K, SECOND_ORDER, 3), (3, 4, 4)
         Over ground: see `optloc.proof.runs.ground`.
     limits : array (3,)
-        Bounds of the first three derivatives of places over ground.
+        Bounds of the first three derivatives of positions over ground.
     nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
-        Tables of all nodes, with derivatives with respect to the place.
+        Tables of all nodes, with derivatives with respect to the position.
     bends : array (J, n, n)
         Lower triangles of the Hessians of all nodes with respect to coordinates, at the centre.
     rests : array (J, 3)
-        Bounds of what a node is off by its second-order form, of the norm of its Hessian's change over the box, and
-        of the Hessian's norm.
+        Bounds of three numbers of each node: its third-order remainder, the norm of its Hessian's change over the box,
+        and the norm of its Hessian.
     sheet : RunWorkspace
-        Of the rows.
+        Working memory of the rows.
     lines, pulls : array (n, q), (n, J)
-        Columns of the Jacobian, and what they pull at the nodes.
+        Columns of the Jacobian, and their products with the columns of the rows.
     slope, along : array (n,)
         The gradient of f/2 at the centre, and the inner products of the Jacobian with a direction.
     hessian, change : array (n, n)
-        The Hessian of f/2 at the centre, and by how much its entries change to first order.
+        The Hessian of f/2 at the centre, and bounds of the first-order change of its entries.
     move : array (n,)
         A step.
     solve : array (n, n)
@@ -156,15 +156,15 @@ class StateTable(NamedTuple):
     solve: Array
 
 
-# Numbers of a state: place and velocity, along two axes each.
+# Numbers of a state: position and velocity, along two axes each.
 STATE = 4
-# A half-width covers the rounding of centres: relative to itself, and some units in the last place of these.
+# Each half-width grows by the rounding of centres: a share of the half-width, and a few units in the last place.
 WIDER, SHIFT = 1e-12, 1e-15
 
 
 @compiled
 def table_of(course: ConstantVelocityCost) -> StateTable:
-    """Return working memory for boxes."""
+    """Return working memory for boxes of states."""
     J, K, q, n = course.kinds.shape[0], course.since.shape[0], course.rows.w.shape[0], STATE
     over = over_ground(course.ground)
     vectors, matrices = np.zeros((6, n)), np.zeros((3, n, n))
@@ -197,14 +197,14 @@ def table_of(course: ConstantVelocityCost) -> StateTable:
 
 @compiled
 def put(table: StateTable, at: Array, half: Array) -> None:
-    """Set a box, whose derivatives are taken in its half-widths."""
+    """Set a box, with its half-widths as the units of derivatives."""
     for m in range(at.shape[0]):
         table.at[m], table.half[m], table.unit[m] = at[m], half[m], half[m]
 
 
 @compiled
 def set_box(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Bound all nodes over a box that is set, and write the levers of its unit."""
+    """Bound all nodes over a box that is set, and write the derivatives of positions in its units."""
     if over_ground(course.ground):
         _carry(course, axes, table)
     else:
@@ -216,7 +216,7 @@ def set_box(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) ->
 
 @compiled
 def _bound(course: ConstantVelocityCost, table: StateTable) -> None:
-    """Bound all nodes over the places of their epochs."""
+    """Bound all nodes over the positions at their epochs."""
     plan, line = np.zeros((3, 3)), np.zeros(6)
     for i in range(table.lever.shape[1]):
         plan[i, i] = 1.0
@@ -227,7 +227,7 @@ def _bound(course: ConstantVelocityCost, table: StateTable) -> None:
 
 @compiled
 def _shift(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Write places and levers of a course in the plane."""
+    """Write positions and their derivatives for a target that moves in the plane."""
     at, half = table.at, table.half
     for k in range(course.since.shape[0]):
         time, place, reach = course.since[k], table.places[k, 0], table.places[k, 1]
@@ -249,7 +249,7 @@ def _shift(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> 
 
 @compiled
 def _carry(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Write places and levers of a course over ground, and bounds of the derivatives of its places."""
+    """Write positions and their derivatives for a target that moves over ground, and bounds of the derivatives."""
     ground, state, half = course.ground, np.zeros(STATE), np.zeros(STATE)
     for i in range(STATE):
         state[i] = axes.origin[i]
@@ -287,17 +287,17 @@ def _carry(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> 
 
 @compiled
 def _rest_of_places(table: StateTable, k: int, blur: float) -> float:
-    """Return how far places over ground are from their linear form, metres."""
+    """Return the greatest distance of positions over ground from their linear form, metres."""
     return float(0.5 * table.limits[1] * table.sizes[k, 0] + blur * sqrt(table.sizes[k, 0]))
 
 
-# Of a remainder without a bound: no product with it is NaN.
+# A remainder without a bound: finite, so that no product with it is NaN.
 _ANY = 1e300
 
 
 @compiled
 def _fold(course: ConstantVelocityCost, table: StateTable) -> None:
-    """Add to the bounds of nodes what places over ground are off their linear form."""
+    """Add the nonlinear part of positions over ground to the bounds of nodes."""
     blur, _ = errors_of(table.limits[2])
     for k in range(course.since.shape[0]):
         rest = _rest_of_places(table, k, blur)
@@ -336,7 +336,7 @@ def set_bends(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) 
 
 @compiled
 def _pull_back(curve: Array, lever: Array, out: Array) -> None:
-    """Add ``L'N L`` to the lower triangle of a matrix (n, n), N the Hessian of a node."""
+    """Add ``L'N L`` to the lower triangle of a matrix (n, n), with N the Hessian of a node and L the lever."""
     d, n = lever.shape
     for m in range(n):
         for i in range(d):
@@ -349,7 +349,7 @@ def _pull_back(curve: Array, lever: Array, out: Array) -> None:
 
 @compiled
 def _carry_beside(course: ConstantVelocityCost, axes: StateAxes, table: StateTable) -> None:
-    """Write where the states lead that second derivatives of places over ground are taken from."""
+    """Write the positions over ground from which second derivatives are computed as differences."""
     state = np.zeros(STATE)
     for i in range(STATE):
         state[i] = axes.origin[i]
@@ -363,11 +363,11 @@ def _carry_beside(course: ConstantVelocityCost, axes: StateAxes, table: StateTab
 
 @compiled
 def _bends_over(table: StateTable, k: int, j: int, chi: float, size: float) -> tuple[float, float, float]:
-    """Return bounds of change and norm of the Hessian of a node over ground, states in metres, and what slopes miss.
+    """Return bounds for a node over ground: change and norm of its Hessian, and the error of its slope times the reach.
 
-    With g slope and N Hessian of the node by the place, and F the place: ``F''(g) + F'(N, F')``. What does not shrink
-    with the box, the error of differences, counts three times: a remainder of third order is a sixth of a change that
-    does, and half of one that does not.
+    States are in metres. With g slope and N Hessian of the node with respect to the position F, the Hessian is
+    ``F''(g) + F'(N, F')``. The error of differences does not shrink with the box, and counts three times: a
+    third-order remainder is a sixth of a change that shrinks with the box, but half of a change that does not.
     """
     b1, b2, b3 = table.limits[0], table.limits[1], table.limits[2]
     first, second = errors_of(b3)
@@ -383,7 +383,7 @@ def _bends_over(table: StateTable, k: int, j: int, chi: float, size: float) -> t
 
 @compiled
 def _bend_over(course: ConstantVelocityCost, axes: StateAxes, table: StateTable, k: int) -> None:
-    """Add what the second derivatives of a place over ground are to the Hessians of its nodes."""
+    """Add the second derivatives of a position over ground to the Hessians of its nodes."""
     time, n = course.since[k], STATE
     scaled, own = np.zeros((n, n)), np.zeros((n, n))
     for i in range(3):
@@ -408,12 +408,12 @@ def _bend_over(course: ConstantVelocityCost, axes: StateAxes, table: StateTable,
                     table.bends[j, m, other] += table.nodes[j, SLOPE0 + i] * table.second[i, m, other]
 
 
-# States by themselves.
+# Single states.
 
 
 @compiled
 def cost_of_state(course: ConstantVelocityCost, state: Array) -> tuple[float, float]:
-    """Return the cost of any position and velocity (2 d,), at its height or not, and the rounding of its residual."""
+    """Return the cost of a position and velocity (2 d,), and the rounding of its residual; the height may be any."""
     table, d = table_of(course), state.shape[0] // 2
     for k in range(course.since.shape[0]):
         for i in range(d):
@@ -431,14 +431,14 @@ def cost_of_state(course: ConstantVelocityCost, state: Array) -> tuple[float, fl
 
 @compiled
 def floor_of(course: ConstantVelocityCost, state: Array) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes, over all places of a state."""
+    """Return the sizes of measurements and coordinates in residuals, without nodes, over all positions of a state."""
     d, last, most = state.shape[0] // 2, 0.0, np.zeros(3)
     for time in course.since:
         last = max(last, abs(time))
     for i in range(d):
         most[i] = abs(state[i]) + last * abs(state[d + i])
     if over_ground(course.ground):
-        most[:] = WGS84_A + abs(course.ground.level)  # places are found from the Earth's centre
-    # Sums over nodes and rows round what becomes of coordinates, not these.
+        most[:] = WGS84_A + abs(course.ground.level)  # positions are computed from the Earth's centre
+    # Sums over nodes and rows do not round coordinates, so coordinates count with a share of the rounding.
     share = share_within(course.rows)
     return accuracy_floor(course.kinds, course.data, course.rows.weight, course.rows.w, most, share)

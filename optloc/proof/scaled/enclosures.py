@@ -1,4 +1,4 @@
-"""Boxes that hold all cheap positions of a cost with unknown factors that grows without end."""
+"""Enclosures of a cost with unknown factors that grows without limit: boxes around all positions of low cost."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from optloc.proof.search_space import Cost, LocalAxes, chart_at, cost_of, empty_
 def stays_finite(scaled: Scaled) -> bool:
     """Return whether the cost and the factors stay finite at infinity: the nodes of each factor are balanced.
 
-    Far away, levels with a free exponent have the cost of a linear field, because the exponent grows with the distance.
+    Far away, levels with a free exponent have the cost of a linear field, because the exponent grows with the
+    distance.
     """
     last = scaled.lift.shape[0] - scaled.lift.shape[1]
     for j in range(scaled.group.shape[0]):
@@ -39,14 +40,15 @@ def stays_finite(scaled: Scaled) -> bool:
     return True
 
 
-# Costs that grow without end: rows without a factor enclose the cheap positions, as a prior on the position does. Or
-# priors keep the factors from zero, and balls around the stations do.
+# For costs that grow without limit, there are four enclosures. Rows without a factor enclose the positions of low
+# cost, such as a prior on the position. If priors keep the factors from zero, balls around the stations do.
+# Differences of two waves, and a linear field of levels, give balls as well.
 
-# Share of the diagonal that a pivot must exceed, as in `optloc.proof.enclosure`.
+# Least pivot as a share of the diagonal, as in `optloc.proof.enclosure`.
 _PIVOT = 1e-9
-# Least factor of use: the balls of a smaller one are ten times larger.
+# Least useful factor: the balls of a smaller factor are ten times larger.
 _SMALLEST = 0.1
-# Least difference of two factors of use.
+# Least useful difference of two factors.
 _LEAST_GAP = 0.03
 
 
@@ -54,7 +56,7 @@ _LEAST_GAP = 0.03
 def first_enclosed(
     scaled: Scaled, chart: LocalAxes, x: Array, levels: Array, least: float, low: Array, high: Array
 ) -> int:
-    """Return the first level whose positions are enclosed, or the number of levels; write the corners of their box."""
+    """Return the index of the first level whose positions are enclosed, or the number of levels; write the corners."""
     for k in range(levels.shape[0]):
         level = max(levels[k], least)
         if (
@@ -97,7 +99,8 @@ def _without_factors(scaled: Scaled) -> Cost:
     R, groups = cost.A.copy(), empty_groups(columns)
     if columns == 0 or not invert(R, columns, _PIVOT):
         return cost
-    # One group of all nodes: each coordinate of a prior without correlation is a group, which bounds nothing alone.
+    # One group of all nodes. Without it, each coordinate of an uncorrelated prior would be a group, which alone bounds
+    # no position.
     for j in range(columns):
         groups.order[0, j] = j
         for m in range(columns):
@@ -109,7 +112,7 @@ def _without_factors(scaled: Scaled) -> Cost:
 
 @compiled
 def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box that holds all positions where a cost is below a level; return False for no box."""
+    """Write the corners of a box around all positions whose cost is below a level; return False without a box."""
     q, J = cost.K.shape
     if q == 0 or J == 0:
         return False
@@ -120,9 +123,9 @@ def _enclose(cost: Cost, chart: LocalAxes, x: Array, level: float, low: Array, h
 
 @compiled
 def _factor_at(scaled: Scaled, g: int, rho: float) -> float:
-    """Return the end of the range that a prior allows for a factor, the least for negative rho; 1 for no factor.
+    """Return an end of a factor's range from its prior: the least for negative rho, else the greatest; 1 for no factor.
 
-    Without a prior it is infinite, or -1.
+    Without a prior the greatest is infinite, and the least -1.
     """
     if g < 0:
         return 1.0
@@ -144,7 +147,7 @@ def _is_of_ranges(scaled: Scaled) -> bool:
 
 @compiled
 def _open(x: Array, low: Array, high: Array) -> None:
-    """Write the corners of all positions."""
+    """Write infinite corners, which contain all positions."""
     low[:], high[:] = -inf, inf
     for k in range(x.shape[0], 3):
         low[k] = high[k] = 0.0
@@ -162,7 +165,7 @@ def _fitted(scaled: Scaled, R: Array, j: int) -> float:
 
 @compiled
 def _meet_balls(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box that holds the balls of all ranges; return False without balls.
+    """Write the corners of a box that contains the intersection of the balls of all ranges; return False without balls.
 
     A range times the factor is within ``rho sqrt(R_jj)`` of its least-squares value, with R the inverse of K'K.
     """
@@ -185,8 +188,9 @@ def _meet_balls(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: A
 def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
     """Write the corners of a box around stations with two waves of one emission time; return False without any.
 
-    The difference of both arrivals is the range times the difference of the factors. K'K has the vector of ones as its
-    null space, which no difference of nodes feels: any multiple of its square makes K'K regular.
+    The difference of both arrivals is the range times the difference of the factors. The null space of K'K is the
+    vector of ones, and differences of nodes do not depend on it. So a multiple of its square is added, which makes K'K
+    regular.
     """
     cost, found = scaled.cost, False
     R, J, rho, size = cost.A.copy(), cost.kinds.shape[0], np.sqrt(level), 0.0
@@ -216,12 +220,12 @@ def _meet_differences(scaled: Scaled, chart: LocalAxes, x: Array, level: float, 
 
 @compiled
 def _meet_field(scaled: Scaled, chart: LocalAxes, x: Array, level: float, low: Array, high: Array) -> bool:
-    """Write the corners of a box around a ball outside which levels with a free exponent cost too much; or False.
+    """Write the corners of a box outside which levels with a free exponent cost too much; or return False.
 
-    Let places s_j be at most D/2 from the middle. Then ``log r_j`` is ``log D - u.s_j / D`` within ``(s_j / D)^2``.
-    With ``q = k u / D`` and ``M = K s`` the residual is ``w + M q`` within |q| B / D. Here B is the sum of
-    ``|K_j| s_j^2``. Let r be the length of the best field, and m the least singular value of M. For
-    ``D > B (|w| + r) / (m (r - rho))`` all q leave a residual longer than rho.
+    Let all stations s_j be within D/2 of their middle. For a position at distance D in direction u, ``log r_j`` is
+    ``log D - u.s_j / D`` within ``(s_j / D)^2``. With ``q = k u / D`` and ``M = K s``, the residual is ``w + M q``
+    within |q| B / D, where B is the sum of ``|K_j| s_j^2``. Let r be the length of the residual of the best field, and
+    m the least singular value of M. For ``D > B (|w| + r) / (m (r - rho))`` each q leaves a residual longer than rho.
     """
     cost, J, rho = scaled.cost, scaled.cost.kinds.shape[0], np.sqrt(level)
     d, middle, widest, bend, whole = x.shape[0], np.zeros(3), 0.0, 0.0, 0.0

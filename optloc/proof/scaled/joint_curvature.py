@@ -4,8 +4,8 @@ The coordinates are offsets s and ``t = R (k - best - B s)``, with R and U as in
 the derivative of the best factors. So the Hessian at the centre has no entry between s and t, and its part along t is
 the identity.
 
-The statements are about points whose factors fit their position best, and are not zero or may be negative. All minima
-are such points, and so is the cheapest point of each position.
+The statements are about points whose factors fit their position best, and are either not zero or may be negative. All
+minima are such points, and so is the point of least cost at each position.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from optloc.proof.scaled.reduction import (
 )
 from optloc.proof.search_space import Box
 
-# Share of the information that its rounding is below: sums over some tens of rows and nodes.
+# Rounding as a share of the information: sums over some tens of rows and nodes.
 _ROUNDED = 1e-11
-# Rounds in which the offsets narrow the factors, and they them.
+# Rounds in which offsets and factors narrow each other's ranges.
 _ROUNDS = 2
 
 
 @compiled
 def sum_scaled(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) -> float:
-    """Fill Hessian, gradient and bounds of their change over a box; return the bound of the norm of the rest.
+    """Write Hessian, gradient and bounds of their change over a box; return a bound of the norm of the rest.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def _change_of(box: Box, j: int) -> float:
 
 @inlined
 def _derive(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write derivatives of residual and factors, pulls, changes of derivatives, and reaches of the coordinates."""
+    """Write derivatives of residual and factors, pulls, changes of derivatives, and half-widths of the coordinates."""
     nodes, E, lean, back, third = box.nodes, sheet.E, sheet.lean, sheet.back, sheet.third
     (q, J), G = scaled.cost.K.shape, back.shape[0]
     for j in range(J):
@@ -104,7 +104,7 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> N
             sheet.force[j] -= scaled.cost.K[i, j] * sheet.w[i]
     for m in range(3):
         sheet.reach[m] = box.half[m]
-        for g in range(G):  # the sum of forces times slopes, and with the inverse of R, in memory that is free
+        for g in range(G):  # sum of forces times slopes, then times the inverse of R, in unused memory
             third[g, m] = third[G + g, m] = 0.0
         for i in range(q):
             E[i, m] = 0.0
@@ -134,7 +134,7 @@ def _derive(scaled: Scaled, noise: float, box: Box, sheet: ScaledWorkspace) -> N
 
 @inlined
 def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Return the largest coordinate of a factor, at points whose factors are best."""
+    """Return the largest coordinate t of a factor, at points whose factors are best."""
     nodes, half, G, reach = box.nodes, box.half, sheet.back.shape[0], sheet.spin[g] + noise
     for m in range(3):
         reach += abs(sheet.third[G + g, m]) * half[m]
@@ -154,7 +154,7 @@ def _reach_of(scaled: Scaled, noise: float, g: int, box: Box, sheet: ScaledWorks
 
 @inlined
 def _set_turn(scaled: Scaled, j: int, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write the pulls on a node, and how its multiples in the derivatives of the residual change over a box."""
+    """Write the pulls on a node, and the changes over a box of its multiples in the derivatives of the residual."""
     nodes, g, G = box.nodes, scaled.group[j], sheet.back.shape[0]
     change = _change_of(box, j)
     for m in range(3):
@@ -226,7 +226,7 @@ def _rest_of(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorksp
 
 @inlined
 def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorkspace) -> float:
-    """Add the second derivatives of a node times its force to the sums; return what the change of them adds."""
+    """Add the second derivatives of a node times its force to the sums; return a bound of the norm of their change."""
     curves, sums, third, g, G = box.curves, box.sums, sheet.third, scaled.group[j], sheet.back.shape[0]
     force, rest, linear = sheet.force[j], _rest_of(scaled, noise, j, box, sheet), 0.0
     for n in range(3 + G):
@@ -253,7 +253,7 @@ def _add_node(scaled: Scaled, noise: float, j: int, box: Box, sheet: ScaledWorks
 
 @inlined
 def _add_third(box: Box, sheet: ScaledWorkspace) -> None:
-    """Add what forces change in a straight line to the bounds of the Hessian's change; they change together."""
+    """Add the linear changes of forces to the bounds of the Hessian's change, summed over the nodes."""
     G = sheet.back.shape[0]
     for at in range(6):
         for n in range(3 + G):
@@ -264,7 +264,7 @@ def _add_third(box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _add_mixed(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
-    """Add the same to the bounds of the change between offsets and factors."""
+    """Add the linear changes of forces to the bounds of the change of entries between offsets and factors."""
     G = sheet.back.shape[0]
     for h in range(G):
         for k in range(3):
@@ -279,7 +279,7 @@ def _add_mixed(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace) -> None:
-    """Add the change of ``E'E`` to the bounds of the Hessian's change; `squares`: the positive part of it as well."""
+    """Add the change of ``E'E`` to the bounds of the Hessian's change; `squares`: including its positive part."""
     A, sums, turn, tie, G = scaled.cost.A, box.sums, sheet.turn, sheet.tie, sheet.back.shape[0]
     for j in range(A.shape[0]):
         for k in range(3 + G):
@@ -298,9 +298,9 @@ def _add_changes(scaled: Scaled, squares: bool, box: Box, sheet: ScaledWorkspace
 
 @compiled
 def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: ScaledWorkspace) -> bool:
-    """Return whether the Hessian of f/2 exceeds `margin` all over a box, at all factors of interest.
+    """Return whether the Hessian of f/2 exceeds `margin` over a whole box, at all factors within their ranges.
 
-    Then the box has one stationary point at most, of those whose residual is as short as the ranges of factors say.
+    If so, the box has at most one stationary point whose residual is short enough for these ranges.
     """
     away = sum_scaled(scaled, False, box, sheet) + margin
     if not away < inf:
@@ -323,10 +323,10 @@ def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: ScaledWorks
 
 @compiled
 def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
-    """Clip a box to where a minimum with a short residual may be; or return False for no such place.
+    """Contract a box to where a minimum with a short residual may be; return False if no part remains.
 
-    Interval Newton in the offsets, as `optloc.proof.curvature.contract_to_minima`. The coordinates of the factors of a
-    stationary point are as far from zero as the entries of their rows change.
+    Interval Newton in the offsets, as in `optloc.proof.curvature.contract_to_minima`. At a stationary point, the
+    entries of the Hessian's change in the rows of the factors bound the factors' coordinates.
     """
     reset_cut(box.half, box.cut)
     ball = sum_scaled(scaled, True, box, sheet)
@@ -354,7 +354,7 @@ def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
 
 @compiled
 def slope_of(box: Box, eps: float) -> float:
-    """Return the margin of convexity at which the slope at the centre of a box lowers the cost by eps at most."""
+    """Return the margin of convexity for which the slope at the centre of a box lowers the cost by at most eps."""
     total = 0.0
     for k in range(3):
         slope = abs(box.sums[G0 + k]) + box.sums[NOISE0 + k]

@@ -1,19 +1,20 @@
-"""A box of a cost with unknown factors: they are projected out of the rows, and their ranges are bounded.
+"""A box of a cost with unknown factors: the factors are projected out of the rows, and their ranges are bounded.
 
-The cost is ``f(x, k) = |sum_g k_g (K_g phi(x) + l_g) + K_0 phi(x) - w|^2`` with k >= 0. Each node belongs to one factor
-or to none. A prior on a factor is a row in which K is zero. At the centre c of a box the columns of the factors are
-``a_g = K_g phi(c) + l_g``. With ``A = U R``, U orthonormal, and ``P = 1 - U U'`` follows ``P A = 0``. So no x of the
-box and no k cost less than
+The cost is ``f(x, k) = |sum_g k_g (K_g phi(x) + l_g) + K_0 phi(x) - w|^2`` with k >= 0. Each node belongs to one
+factor or to none. A prior on a factor is a row in which K is zero. At the centre c of a box the columns of the factors
+are ``a_g = K_g phi(c) + l_g``. With ``A = U R``, U orthonormal, and ``P = 1 - U U'`` follows ``P A = 0``. So no x of
+the box and no k cost less than
 
     |P (sum_g k_g K_g (phi(x) - phi(c)) + K_0 phi(x) - w)|^2.
 
-All bounds of rows therefore hold for the projected rows, with nodes times the factors in the middle of their ranges. By
-how much a factor may differ from the middle times the slopes of its nodes is one more node without slopes for each
-coordinate: its column is the projected derivative of the rows along that coordinate. The rows along U bound k. At each
-position the residual of the best factors is orthogonal to their columns. So their ranges shrink with the box.
+So all bounds of rows hold for the projected rows, in which each node is multiplied by the middle of its factor's
+range. A factor may differ from the middle. This difference times the slopes of its nodes is one more node without
+slopes for each coordinate. The column of this node is the projected derivative of the rows along the coordinate. The
+rows along U bound k. At each position the residual of the best factors is orthogonal to their columns, so the ranges
+shrink with the box.
 
-The components of a target's velocity at one epoch are such factors, which may be negative. Their nodes are components
-of unit vectors from stations. Bounds of ``k >= 0`` hold for their sizes then.
+The components of a target's velocity at one epoch are factors, too, and may be negative. Their nodes are components of
+unit vectors from stations. The bounds that need ``k >= 0`` then hold for the sizes of the factors.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from optloc.proof.box import (
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, SLOPE0
 from optloc.proof.search_space import Box, Cost
 
-# Factor of the rounding of projected rows: each number goes through three more sums than in rows as they are.
+# Factor for the rounding of projected rows: each number is in three more sums than in the original rows.
 _PROJECTED = 4.0
 # Relative rounding of a bound of a factor.
 _ROUNDED = 1e-12
-# Share of a column that must remain without the columns of other factors: less is rounding.
+# Least share of a column that must remain after projection by the columns of other factors: less is rounding.
 _DEPENDENT = 1e-10
 # Numbers of a box: the cost at its centre, and the sizes that limit the accuracy.
 HERE, FLOOR, SPAN = range(3)
@@ -77,7 +78,7 @@ class ScaledWorkspace(NamedTuple):
         Projected rows and residuals at the centre. The last columns belong to the ranges of the factors along each
         coordinate.
     weight : array (J + 3 G,)
-        Lengths of the columns of K: before the projection, after it for nodes without a lower end.
+        Lengths of the columns of K: before the projection, or after it for nodes without a lower bound.
     nodes, rows : array (J + 3 G, NODE_WIDTH), (q, ROW_WIDTH)
         Nodes times factors, without their values; rows over them.
     unit, pull, V : array (q, G), (G, J), (G, J)
@@ -85,10 +86,10 @@ class ScaledWorkspace(NamedTuple):
     back : array (G, G)
         The inverse of R.
     best, least, most : array (G,)
-        Factors at the centre as if they had no sign, and their ranges of interest.
+        Best factors at the centre, of any sign, and the ranges of the factors.
     fall, rise : array (G, G + 1)
-        Largest decrease and increase of each factor by the change of the columns of factors. The last column is that
-        by the nodes without a factor.
+        Largest decrease and increase of each factor by the change of the columns of factors. The last column is the
+        change by the nodes without a factor.
     spin : array (G,)
         Longest residual along each column of U.
     span : array (SPAN,)
@@ -103,7 +104,8 @@ class ScaledWorkspace(NamedTuple):
     cross : array (G, 3 + G)
         Changes of the entries of the Hessian that belong to the factors.
     third : array (3 + 2 G, 6)
-        Sums of the nodes' second derivatives: with their pulls along all coordinates, and of each factor with forces.
+        Sums of the nodes' second derivatives: times their pulls along all coordinates, and for each factor times
+        forces.
     reach : array (3 + G,)
         Half-widths of the box, and of the coordinates of the factors.
     """
@@ -180,16 +182,16 @@ def reduce_rows(scaled: Scaled, floor: float, box: Box, sheet: ScaledWorkspace) 
     scaled : Scaled
         The cost.
     floor : float
-        The sizes that limit the accuracy of residuals, apart from the nodes.
+        Sizes of measurements and coordinates that limit the accuracy of residuals.
     box : Box
         Its nodes are filled.
     sheet : ScaledWorkspace
-        Written, except the ranges of the factors. Without independent columns `best` is NaN.
+        Written, except the ranges of the factors. If the columns are dependent, `best` is NaN.
 
     Notes
     -----
-    A logarithm without a lower end counts from its upper end, not from the centre, where it may be far below all
-    others. The cost at the centre is infinite then.
+    A logarithm without a lower bound counts from its upper end. At the centre it may be far below all other values.
+    The cost at the centre is then infinite.
     """
     K, weight, nodes, lift = scaled.cost.K, scaled.cost.weight, box.nodes, scaled.lift
     (q, J), G, size, unit, w = K.shape, lift.shape[1], floor, sheet.unit, sheet.w
@@ -287,7 +289,7 @@ def _project(scaled: Scaled, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _forwards(sheet: ScaledWorkspace) -> float:
-    """Return the cost of factors that are not negative: a negative best factor becomes zero, of several all do."""
+    """Return the cost that is added if a best factor is negative, but may not be: all factors become zero."""
     G, cost = sheet.best.shape[0], 0.0
     low = 0
     for g in range(G):
@@ -306,10 +308,11 @@ def _forwards(sheet: ScaledWorkspace) -> float:
 
 @compiled
 def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> bool:
-    """Write the ranges of factors at which points of a box have residuals shorter than rho; False for no factors.
+    """Write the ranges of factors for points of a box with residuals shorter than rho; False if a range is empty.
 
-    The rows are reduced. ``k = best + R^-1 U'(residual) - R^-1 U'(change of the rows)``, and the change grows with k.
-    So the greatest factors solve a system whose inverse has no negative entry, or they have priors.
+    The rows must be reduced. The factors obey ``k = best + R^-1 U'(residual) - R^-1 U'(change of the rows)``, and the
+    change grows with k. So the greatest factors follow from a system whose inverse has no negative entry, or from
+    priors.
     """
     G, least, most, spin = sheet.best.shape[0], sheet.least, sheet.most, sheet.spin
     blur, bounded = relative_rounding(scaled.cost.K) * sheet.span[FLOOR], True
@@ -336,14 +339,15 @@ def bound_factors(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) 
     for g in range(G):
         if not (least[g] > 0.0 or scaled.free):
             return True
-    # Best factors: the residual is orthogonal to their columns, which are the less oblique to U the smaller the box is.
+    # For the best factors the residual is orthogonal to their columns. The smaller the box, the closer these columns
+    # are to U.
     _turn(scaled, rho + blur, box, sheet)
     return _narrow(scaled.free, sheet, blur)
 
 
 @inlined
 def _bound_by_priors(scaled: Scaled, rho: float, sheet: ScaledWorkspace) -> None:
-    """Narrow the ranges of the factors to what the rows of priors allow: the last rows, one for each factor."""
+    """Narrow the ranges of the factors by the rows of priors: the last rows, one for each factor."""
     lift, w = scaled.lift, scaled.cost.w
     q, G = lift.shape
     for g in range(G):
@@ -356,8 +360,8 @@ def _bound_by_priors(scaled: Scaled, rho: float, sheet: ScaledWorkspace) -> None
 
 @inlined
 def _swing(scaled: Scaled, blur: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write how much the change of each column of the rows over a box, and its rounding, may change the factors."""
-    nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third  # memory that is free
+    """Write the greatest change of the factors by the change of each column of the rows over a box, with rounding."""
+    nodes, half, V, slopes = box.nodes, box.half, sheet.V, sheet.third  # unused memory
     G, J = V.shape
     for g in range(G):
         slopes[: G + 1], sheet.fall[g], sheet.rise[g] = 0.0, 0.0, 0.0
@@ -376,7 +380,7 @@ def _swing(scaled: Scaled, blur: float, box: Box, sheet: ScaledWorkspace) -> Non
         for h in range(G + 1):
             both = abs(slopes[h, 0]) * half[0] + abs(slopes[h, 1]) * half[1] + abs(slopes[h, 2]) * half[2] + rounded
             sheet.fall[g, h], sheet.rise[g, h] = sheet.fall[g, h] + both, sheet.rise[g, h] + both
-            if scaled.free:  # of a factor of any sign a decrease may be an increase
+            if scaled.free:  # for a factor of any sign, a decrease may be an increase
                 sheet.fall[g, h] = sheet.rise[g, h] = max(sheet.fall[g, h], sheet.rise[g, h])
 
 
@@ -397,7 +401,7 @@ def _reach_of(sheet: ScaledWorkspace, g: int, blur: float) -> float:
 
 @inlined
 def _narrow(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
-    """Narrow the ranges of the factors, which are bounded; return False where one is empty."""
+    """Narrow the ranges of the factors, which are bounded; return False if a range is empty."""
     G, least, most, fall, rise = sheet.best.shape[0], sheet.least, sheet.most, sheet.fall, sheet.rise
     for g in range(G):
         reach = _reach_of(sheet, g, blur)
@@ -423,14 +427,13 @@ def _narrow(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
 
 @inlined
 def _solve_swing(free: bool, sheet: ScaledWorkspace, blur: float) -> bool:
-    """Bound the greatest factors by ``(1 - N) k <= best + reach``; return False where that has no solution k >= 0.
+    """Bound the greatest factors by ``(1 - N) k <= best + reach``; return False if there is no solution k >= 0.
 
-    Of factors that may be negative these are sizes.
-
-    With positive pivots the inverse of 1 - N has no negative entry (an M-matrix). Elimination without pivoting.
+    If factors may be negative, k are their sizes. If all pivots are positive, the inverse of 1 - N has no negative
+    entry (an M-matrix). The elimination has no pivoting.
     """
     G, most = sheet.best.shape[0], sheet.most
-    matrix, right = sheet.cross, sheet.reach  # memory that is free
+    matrix, right = sheet.cross, sheet.reach  # unused memory
     for g in range(G):
         start = abs(sheet.best[g]) if free else sheet.best[g]
         right[g] = start + _reach_of(sheet, g, blur) + sheet.fall[g, G]
@@ -470,7 +473,7 @@ def _set_slopes(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> None:
 
 @inlined
 def _turn(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write how long a residual along U may be whose factors are the best at their position."""
+    """Write the greatest length of residuals along U, for factors that are best at their position."""
     nodes, half, back = box.nodes, box.half, sheet.back
     J, G = nodes.shape[0], back.shape[0]
     sheet.spin[:] = 0.0
@@ -492,7 +495,7 @@ def _turn(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
 
 @compiled
 def bound_rows(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> float:
-    """Return a lower bound of the residual over a box whose factors are bounded, negative where it says nothing."""
+    """Return a lower bound of the residual over a box whose factors are bounded; negative if no bound is known."""
     nodes, out, G = box.nodes, sheet.nodes, sheet.best.shape[0]
     if not is_bounded(sheet):
         return -1.0
@@ -528,7 +531,7 @@ def _length_of(sheet: ScaledWorkspace, j: int) -> float:
 
 @inlined
 def _has_signs(scaled: Scaled, sheet: ScaledWorkspace) -> bool:
-    """Return whether nodes without a lower end add to the residual along the direction of its bound, rounding apart."""
+    """Return whether nodes without a lower bound only add to the residual along its direction, beyond rounding."""
     good = True
     for j in range(scaled.cost.K.shape[1]):
         if sheet.nodes[j, LOW] == -inf:
@@ -542,7 +545,7 @@ def _has_signs(scaled: Scaled, sheet: ScaledWorkspace) -> bool:
 
 @inlined
 def _add_range(g: int, box: Box, sheet: ScaledWorkspace) -> None:
-    """Project the columns of the range of a factor; write by how much it may differ from the middle times the box."""
+    """Project the columns of the range of a factor; write half of its range times the half-widths of the box."""
     K, out, J, unit = sheet.K, sheet.nodes, box.nodes.shape[0], sheet.unit
     wide = 0.5 * (sheet.most[g] - sheet.least[g])
     for k in range(3):
@@ -580,7 +583,7 @@ def is_positive(sheet: ScaledWorkspace) -> bool:
 
 @inlined
 def size_of(sheet: ScaledWorkspace) -> float:
-    """Return the sizes that limit the accuracy of residuals at any factors of a box."""
+    """Return the sizes that limit the accuracy of residuals, at any factors of a box."""
     most = 1.0
     for g in range(sheet.best.shape[0]):
         most = max(most, size_of_factor(sheet, g) if sheet.most[g] < inf else abs(sheet.best[g]))
@@ -589,13 +592,13 @@ def size_of(sheet: ScaledWorkspace) -> float:
 
 @inlined
 def rounding_of_residual(scaled: Scaled, sheet: ScaledWorkspace) -> float:
-    """Return a bound of the rounding errors of a residual (its length) in a box."""
+    """Return a bound of the rounding of a residual, as a length, in a box."""
     return float(relative_rounding(scaled.cost.K) * size_of(sheet))
 
 
 @compiled
 def clip_rows(scaled: Scaled, rho: float, box: Box, sheet: ScaledWorkspace) -> None:
-    """Write the ends of what is left of a box where residuals may be shorter than rho; its rows are bounded."""
+    """Write the ends of the part of a box in which residuals may be shorter than rho; its rows must be bounded."""
     reset_cut(box.half, box.cut)
     if not is_bounded(sheet):
         return

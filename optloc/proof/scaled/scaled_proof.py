@@ -46,8 +46,9 @@ from optloc.proof.search_space import (
 )
 from optloc.proof.space import Space, floor_of, in_atlas
 
-# Nodes of a moving target that count for the budget of boxes. Of 30 scenes in space with 200 m of noise 9 were open
-# after the 3 500 boxes of all 35 nodes, 4 after the 10 800 of 20 nodes (0.6 s), and 3 after 30 000.
+# Greatest number of nodes of a moving target that count for the budget of boxes. Of 30 scenes in space with 200 m of
+# noise, 9 were open after the 3 500 boxes of all 35 nodes. After the 10 800 boxes of 20 nodes (0.6 s) 4 were open, and
+# after 30 000 boxes 3.
 _MOST_COUNTED = 20
 
 
@@ -57,9 +58,9 @@ class ScaledCosts(NamedTuple):
     Parameters
     ----------
     kinds, data, K, w, level
-        As of `optloc.proof.position_costs.PositionCosts`; priors on the factors are the last rows.
+        As in `optloc.proof.position_costs.PositionCosts`; priors on the factors are the last rows.
     lift, group, free : array (B, q, G), int array (J,), bool
-        As of `optloc.proof.scaled.reduction.Scaled`.
+        As in `optloc.proof.scaled.reduction.Scaled`.
     """
 
     kinds: Array
@@ -73,7 +74,7 @@ class ScaledCosts(NamedTuple):
 
     @property
     def dense(self) -> float:
-        """Return with how many nodes the time of a box grows as their square."""
+        """Return the number of nodes; the time of a box is proportional to its square."""
         return float(min(len(self.kinds), _MOST_COUNTED if self.free else len(self.kinds)))
 
     def take(self, items: Array | slice) -> ScaledCosts:
@@ -87,7 +88,7 @@ class ScaledCosts(NamedTuple):
         )
 
     def one(self, i: int) -> Scaled:
-        """Return the cost of one problem."""
+        """Return the cost of problem i."""
         data, K, lift = (plainly(each[i if len(each) > 1 else 0]) for each in (self.data, self.K, self.lift))
         return Scaled(cost_of(self.kinds, data, K, plainly(self.w[i])), lift, self.group, self.free)
 
@@ -117,7 +118,8 @@ def _priors(problem: Problem, count: int) -> tuple[Array, Array]:
     return np.concatenate(root), np.concatenate(known, axis=1)
 
 
-# Share of the longest column that is rounding, in rows that no velocity touches: whitening costs some digits.
+# Share of the longest column below which entries are rounding, in rows without a velocity: whitening loses some
+# digits.
 _NOTHING = 1e-12
 
 
@@ -135,9 +137,9 @@ def largest_rate(problem: Problem) -> float:
 def velocity_costs(problem: Problem) -> ScaledCosts:
     """Return the costs of a flat batch of problems of a target of unknown velocity at one epoch.
 
-    Rates are linear in the velocity, whose components are factors of the components of unit vectors. The rows are
-    turned so that the last rows contain none of these, and bound the position at every velocity. The factors are in
-    units of the largest rate: bounds of rounding then do not depend on the unit of length.
+    Rates are linear in the velocity, whose components are factors of the components of unit vectors. An orthogonal
+    transform of the rows removes these components from the last rows, which bound the position at every velocity. The
+    factors are in units of the largest rate, so that bounds of rounding do not depend on the unit of length.
     """
     costs, group = costs_of_velocity(problem)
     w, d, speed = costs.w, problem.dimension, largest_rate(problem)
@@ -165,19 +167,19 @@ def velocity_costs(problem: Problem) -> ScaledCosts:
 def prove_scaled(
     scaled: Scaled, x: Array, others: Array, gaps: Array, eps: float, budget: int, rivals: Array, found: Array
 ) -> tuple[int, int, float, float, int]:
-    """Prove of a cost with unknown factors what `optloc.proof.global_search.prove_globally` proves of a cost.
+    """Prove the claim of `optloc.proof.global_search.prove_globally` for a cost with unknown factors.
 
     Parameters
     ----------
     scaled : Scaled
         The cost.
     x, others, gaps, eps, budget, rivals, found
-        As there; others (P, D) are the known minima.
+        As in `prove_everywhere`; others (P, D) are the known minima.
 
     Returns
     -------
     verdict, boxes, bound, gap, met
-        As there.
+        As in `prove_everywhere`.
     """
     cost, tables, D, rest = scaled.cost, tables_of(scaled), x.shape[0], rest_of(scaled)
     far, endless = stays_finite(scaled), scaled.free and not scaled.lift.any()
@@ -220,7 +222,7 @@ def prove_scaled(
         work, space, stack, size, levels, eps, True, budget, rivals, found
     )
     if outcome == INFINITE and endless:
-        return OPEN, boxes, -inf, gaps[0], 0  # factors may grow without end, and make the cost at infinity any less
+        return OPEN, boxes, -inf, gaps[0], 0  # factors without a limit reduce the cost at infinity
     return verdict_of(outcome, boxes, bound, shown, met, gaps, least - eps)
 
 
@@ -237,7 +239,7 @@ def _with_minima(
     eps: float,
     stack: Array,
 ) -> tuple[Space, int]:
-    """Return the atlas with known minima, and the number of boxes pushed: 0 where the fix is no minimum."""
+    """Return the atlas with known minima, and the number of boxes on the stack: 0 if the fix is no minimum."""
     known, at, rho = zero(), np.empty(x.shape[0]), np.sqrt(max(levels[0], least))
     for p in range(atlas.minima.home.shape[0]):
         put(x if p == 0 else others[p - 1], at)
@@ -265,7 +267,7 @@ def _in_box(
     high: Array,
     stack: Array,
 ) -> tuple[Space, int]:
-    """Return search coordinates with known minima, and the number of boxes pushed: 0 where the fix is no minimum."""
+    """Return search coordinates with known minima, and the number of boxes on the stack: 0 if the fix is no minimum."""
     rho, hull = np.sqrt(max(levels[0], least)), np.zeros(3)
     room, known = np.zeros((2, 1 + others.shape[0], 3)), zero()
     space = Space(False, atlas, chart, room[0], room[1])
@@ -284,17 +286,17 @@ def _in_box(
 
 
 def prove_all_scaled(costs: ScaledCosts, asked: ProofRequest) -> ProofResult:
-    """Return the outcome of the proofs of n fixes of n problems, see `optloc.proof.batch.prove_all`.
+    """Return the results of the proofs of n fixes of n problems, see `optloc.proof.batch.prove_all`.
 
-    Claims are about all positions, whatever region is asked for. Few proofs begin in plain Python, because most of
-    them end before machine code is loaded.
+    Claims are for all positions; requested regions are ignored. A few proofs begin in plain Python, because most of
+    them end before compiled code is loaded.
     """
     n, d = asked.x.shape
     out, asked = empty_answer(n, d), ProofRequest(*map(plainly, asked))
     out.everywhere[:] = True
 
     def prove(i: int, most: int) -> None:
-        if np.array_equal(asked.region[i], asked.fallback[i]):  # what is tried after all positions
+        if np.array_equal(asked.region[i], asked.fallback[i]):  # a second trial after a proof for all positions
             out.verdict[i], out.bound[i], out.gap[i] = BUDGET, -inf, asked.gaps[i, -1]
             return
         others, budget = asked.others[i, : asked.known[i]], min(int(asked.budget[i]), most)
@@ -308,7 +310,7 @@ def prove_all_scaled(costs: ScaledCosts, asked: ProofRequest) -> ProofResult:
         with plain(), np.errstate(all="ignore"):
             for i in left:
                 prove(i, few)
-        # with more boxes a larger gap may be proven than with few, and minima may be met
+        # more boxes may prove a larger gap and find minima
         left = [i for i in left if out.boxes[i] >= few and asked.budget[i] > few]
     if left and enabled() and may_use_code(prove_scaled, n):
         map_on_threads(lambda i: prove(i, int(asked.budget[i])), left)
@@ -316,7 +318,7 @@ def prove_all_scaled(costs: ScaledCosts, asked: ProofRequest) -> ProofResult:
 
 
 def scaled_lack_code(count: int) -> bool:
-    """Return whether proofs ended early because there is no machine code of them yet."""
+    """Return whether proofs ended early because their compiled code is not yet available."""
     return enabled() and not may_use_code(prove_scaled, count)
 
 
@@ -335,7 +337,7 @@ def _evaluate(scaled: Scaled, x: Array, out: Array) -> None:
         bound_nodes(cost.kinds, cost.data, near.centre, axes, axes, near.half, near.line, near.nodes)
         floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, near.centre, LINES)
         reduce_rows(scaled, floor, near, tables.sheet)
-        tables.sheet.most[:] = inf  # the best factors alone count
+        tables.sheet.most[:] = inf  # only the best factors count
         out[0, p], out[1, p] = tables.sheet.span[HERE], rounding_of_residual(scaled, tables.sheet)
 
 

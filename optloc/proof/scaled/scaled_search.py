@@ -1,4 +1,4 @@
-"""The search of all positions for minima of a cost with an unknown factors, in the pieces of an atlas."""
+"""The search of all positions for minima of a cost with unknown factors, in the pieces of an atlas."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ from optloc.proof.space import Space, floor_of, in_atlas, set_box, set_curves, s
 
 
 class ScaledTables(NamedTuple):
-    """Working memory: a box of the atlas with its sheet, one around a position, and rows without factors."""
+    """Working memory: a box of the atlas with its rows, a box around a position, and rows without factors."""
 
     box: Box
     sheet: ScaledWorkspace
@@ -73,7 +73,7 @@ class ScaledTables(NamedTuple):
 
 @compiled
 def tables_of(scaled: Scaled) -> ScaledTables:
-    """Return tables for a cost."""
+    """Return working memory for a cost."""
     cost = scaled.cost
     q, J = cost.K.shape
     look = Cost(cost.kinds, cost.data, np.zeros((q, J)), np.zeros(q), cost.A, cost.weight, cost.groups)
@@ -85,7 +85,7 @@ def tables_of(scaled: Scaled) -> ScaledTables:
 
 @compiled
 def look_at(scaled: Scaled, sheet: ScaledWorkspace, box: Box, look: Cost) -> None:
-    """Write rows that are the cost, its slope and information at a point whose rows are reduced, without factors."""
+    """Write rows without factors that have the same cost, slope and information at a point whose rows are reduced."""
     J = box.nodes.shape[0]
     for i in range(sheet.K.shape[0]):
         total = sheet.w[i]
@@ -99,7 +99,7 @@ def look_at(scaled: Scaled, sheet: ScaledWorkspace, box: Box, look: Cost) -> Non
 
 @compiled
 def cost_near(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
-    """Return the least cost over the factors at the centre of the box around a position; its sums are filled."""
+    """Return the least cost over the factors at the centre of the box around a position; fill its sums."""
     near, cost = tables.near, scaled.cost
     near.half[:] = 0.0
     write_centre(chart.origin, chart.sense, near.at, near.centre)
@@ -111,14 +111,14 @@ def cost_near(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
     return float(tables.sheet.span[HERE])
 
 
-# Steps of a descent, the length of the shortest in standard deviations, and damping, as in `optloc.proof.descents`.
+# Steps of a descent, the length of the last step, standard deviations, and damping, as in `optloc.proof.descents`.
 _STEPS, _CLOSE, _DAMPING, _LESS, _MORE, _LEAST = 40, 1e-3, 1e-6, 0.1, 10.0, 1e-4
 _SAME_COST = 1e-13
 
 
 @compiled
 def descend_scaled(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> float:
-    """Move the box around a position to a minimum; return its cost, or infinity where none is reached."""
+    """Move the box around a position to a minimum; return its cost, or infinity if no minimum is reached."""
     near = tables.near
     now, damping, start = cost_near(scaled, chart, tables), _DAMPING, near.at.copy()
     for _ in range(_STEPS):
@@ -144,10 +144,10 @@ def descend_scaled(scaled: Scaled, chart: LocalAxes, tables: ScaledTables) -> fl
 
 # Known minima.
 
-# First half-widths of a convex box, standard deviations, and its growth; the surroundings that are searched along its
-# axes, as in `optloc.proof.convex_boxes`.
+# First half-widths of a convex box, standard deviations, and their growth; and the half-widths of the box searched
+# along the axes of a minimum, as in `optloc.proof.convex_boxes`.
 _FIRST, _GROWTH, _WIDEST, _WIDER, _WIDE = 3.0, 2.0, 1e4, 3.0, 3.0
-_SMALLEST = 1e-6  # standard deviations: a smaller box holds only rounding
+_SMALLEST = 1e-6  # standard deviations: a smaller box is rounding
 
 
 @compiled
@@ -185,7 +185,7 @@ def set_scaled_minimum(
     eps: float,
     rho: float,
 ) -> bool:
-    """Write a minimum and its surroundings into an atlas; return False if it is no minimum or costs too little.
+    """Write a minimum and the boxes around it into an atlas; return False if it is no minimum or costs too little.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def set_scaled_minimum(
     chart : LocalAxes
         Search coordinates around the fix.
     atlas, i, x, value, eps
-        As of `optloc.proof.convex_boxes.set_minimum`.
+        As in `optloc.proof.convex_boxes.set_minimum`.
     rho : float
         Longest residual of interest.
     """
@@ -233,9 +233,9 @@ def set_near_minimum(
     scaled, tables, space : Scaled, ScaledTables, Space
         The cost, working memory, and search coordinates, in which the minimum is written.
     i, hull : int, array (3,)
-        Which minimum, and half-widths beyond which nothing is searched.
+        Number of the minimum, and its greatest half-widths.
     value, eps, rho
-        As of `set_scaled_minimum`.
+        As in `set_scaled_minimum`.
     """
     at, sides, shift = space.minima[i], space.sides[i], np.zeros(3)
     if not _convex(scaled, tables, space, 0, at, np.zeros(3), rho, 0.0) or not tables.sheet.span[HERE] >= value:
@@ -261,7 +261,7 @@ def _grow(
     margin: float,
     sides: Array,
 ) -> bool:
-    """Write the sides of a convex box around a minimum; return False where there is no box."""
+    """Write the sides of a convex box around a minimum; return False without a convex box."""
     size = _FIRST
     while not _convex(scaled, tables, space, piece, at, np.minimum(hull, size), rho, margin):
         size *= 0.5
@@ -284,10 +284,10 @@ def _grow(
 
 
 class ScaledSearchWorkspace(NamedTuple):
-    """A cost and working memory for its search; the tables hold `box` and `near` as well.
+    """A cost and working memory for its search; `box` and `near` are also in the tables.
 
-    Of costs whose factors may be negative `rest` are the rows that no factor touches. Where the columns of the factors
-    vanish, as with a velocity far away, these bound the cost alone. Of other costs it has no rows.
+    If factors may be negative, `rest` has the rows without factors. Where the columns of the factors vanish, as with a
+    velocity far away, only these rows bound the cost. For other costs `rest` has no rows.
     """
 
     scaled: Scaled
@@ -300,7 +300,7 @@ class ScaledSearchWorkspace(NamedTuple):
 
 @compiled
 def rest_of(scaled: Scaled) -> Cost:
-    """Return the rows that no factor touches, over the first nodes: `optloc.proof.scaled.scaled_proof` orders both."""
+    """Return the rows without factors, over the first nodes; `optloc.proof.scaled.scaled_proof` orders both."""
     K, first, count, nodes = scaled.cost.K, zero(), zero(), zero()
     for i in range(K.shape[0] if scaled.free else 0):
         last, own = zero(), True
@@ -318,7 +318,7 @@ def rest_of(scaled: Scaled) -> Cost:
 
 @inlined
 def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
-    """Return a lower bound of the residual by the rows that no factor touches, negative where it says nothing."""
+    """Return a lower bound of the residual from the rows without factors; negative if no bound is known."""
     rest = work.rest
     if rest.w.shape[0] == 0:
         return -1.0
@@ -330,6 +330,7 @@ def _bound_rest(work: ScaledSearchWorkspace, space: Space, box: Box) -> float:
 
 @compiled
 def _bound_row(work: ScaledSearchWorkspace, space: Space, stack: Array, row: int, level: float) -> tuple[float, float]:
+    """Return the result of `optloc.proof.level_search.bound_row` for a cost with unknown factors."""
     scaled, box, sheet, piece = work.scaled, work.box, work.tables.sheet, int(stack[row, PIECE])
     pop(stack, row, box.at, box.half)
     contract_at_infinity(box, space.atlas.dimension - 1, infinity_coordinate(space.atlas, piece) if space.far else -inf)
@@ -373,7 +374,7 @@ def _side_of_rest(work: ScaledSearchWorkspace, space: Space, touching: bool, rho
 
 @inlined
 def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
-    """Clip a box whose factors have no bound by the rows without factors; return what `side_of_rest` does."""
+    """Contract a box whose factors have no bound by the rows without factors; return the result of `side_of_rest`."""
     rest, box = work.rest, work.box
     reset_cut(box.half, box.cut)
     if rest.w.shape[0] == 0:
@@ -386,6 +387,7 @@ def _side_of_rows(work: ScaledSearchWorkspace, rho: float, d: int) -> int:
 
 @compiled
 def _descend_near(work: ScaledSearchWorkspace, chart: LocalAxes) -> float:
+    """Return the result of `optloc.proof.level_search.descend_near` for a cost with unknown factors."""
     return descend_scaled(work.scaled, chart, work.tables)
 
 
@@ -400,13 +402,15 @@ def _set_rival(
     eps: float,
     rho: float,
 ) -> bool:
+    """Return the result of `optloc.proof.level_search.set_rival` for a cost with unknown factors."""
     return set_scaled_minimum(work.scaled, work.tables, atlas, chart, i, x, value, eps, rho)
 
 
 @compiled
 def _cost_set(work: ScaledSearchWorkspace, atlas: Atlas) -> float:
+    """Return the result of `optloc.proof.level_search.cost_set` for a cost with unknown factors."""
     bound_pieces(atlas, work.scaled.cost.kinds, work.scaled.cost.data, work.box.half, work.box.nodes)
-    if work.scaled.free and not work.scaled.lift.any():  # their columns vanish at infinity
+    if work.scaled.free and not work.scaled.lift.any():  # the columns of factors vanish at infinity
         return float(cost_at(work.rest.K, work.rest.w, work.box.nodes))
     reduce_rows(work.scaled, work.floor, work.box, work.tables.sheet)
     return float(work.tables.sheet.span[HERE])
