@@ -63,8 +63,8 @@ _FREE = 1e-5
 # Greatest number of steps of a mirror image: in flat networks half of the rivals are reached in seven steps, nine of
 # ten in fifteen, the last in fifty.
 _MOST = 60
-# A point belongs to the fix if its squared distance is below NEAR (squared standard deviations), and its cost has risen
-# by at least the share RISEN of the quadratic rise. Another minimum would be cheaper.
+# A point belongs to the fix if two conditions hold: its squared distance is below NEAR (squared standard deviations),
+# and its cost has risen by at least the share RISEN of the quadratic rise. Another minimum would be cheaper.
 NEAR, RISEN = 9.0, 0.5
 # Squared length of the undamped step, in standard deviations, below which a refinement has converged: 0.01 squared.
 _ARRIVED = 1e-4
@@ -182,13 +182,10 @@ def _note_nearest(rows: Any, room: EngineWorkspace, nearest: Array, every: bool)
 def watch(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> float:
     """Abandon refinements that cannot lead to a rival, and return the number of active lanes.
 
-    A refinement ends for one of two reasons:
-
-    - No position in a ball of radius D about it has a cost as low as a rival's. (After a step of length D, all
-    residuals
-      together differ from their linear prediction by at most ``bow D^2 / r``.)
-    - It has returned to the fix: it is within three standard deviations, and the cost has risen as the curvature at the
-      fix predicts.
+    A refinement ends for one of two reasons. First: no position in a ball of radius D about it has a cost as low as a
+    rival's. (After a step of length D, all residuals together differ from their linear prediction by at most
+    ``bow D^2 / r``.) Second: it has returned to the fix. That is, it is within three standard deviations, and the cost
+    has risen as the curvature at the fix predicts.
 
     Parameters
     ----------

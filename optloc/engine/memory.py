@@ -104,7 +104,7 @@ class EngineModel(NamedTuple):
     ahead : array (n, d)
         Directions from the mean of the stations in which candidates are placed.
     limit : float
-        Cost of a candidate above which another position may be a better minimum.
+        Cost above which the best candidate fits poorly, so that another position may be a better minimum.
     """
 
     row: Array

@@ -121,10 +121,7 @@ class Plan:
         return few if narrow else many
 
     def at_hand(self, count: int) -> bool:
-        """Return whether `count` problems can run now.
-
-        Machine code exists, or so many problems are worth compiling for.
-        """
+        """Return whether `count` problems can run: their machine code exists or may be compiled now."""
         return usable(self.kernel(count, often=True), count)
 
     def run(self, load: Load, z: Array, threads: int | None = None, start: Array | None = None) -> tuple[Answer, int]:
@@ -199,7 +196,7 @@ _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
 def blank_answer(count: int, d: int, size: int, shared: int, sides: int) -> Answer:
-    """Return empty arrays for `count` answers, for numbers of coordinates, unknowns, shared unknowns and constraints."""
+    """Return empty arrays for answers: numbers of problems, coordinates, unknowns, shared unknowns, constraints."""
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),

@@ -1,6 +1,6 @@
 """Rows that are sums of ranges, with emission times as the only other unknowns.
 
-The rows are reduced to a linear map of the ranges, and to *loops*: combinations of rows that no range changes.
+A linear map of the ranges, and loops.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ from optloc.kernels.systems import LANES, principal_axes
 
 
 class RangeRows(NamedTuple):
-    """Whitened rows over ranges r: the cost is ``|u - K r|^2`` plus the cost of loops, which no range changes.
+    """Whitened rows over ranges r.
+
+    The cost is ``|u - K r|^2`` plus the cost of *loops*, row sums that no range changes.
 
     Parameters
     ----------
@@ -59,8 +61,7 @@ class RangeRows(NamedTuple):
     level : bool
         Whether a common change of all ranges has no effect on K r. Then the cost has limits at infinity.
     wander : array (s,)
-        Variances of isotropic errors of station positions, square metres. They are part of the noise: the cheapest
-        error that changes a range is along the line to the target.
+        Variances of isotropic station errors, m^2: noise, as the cheapest change of a range is along the line of sight.
     offset : int64 array (s,)
         First index of the errors of each station in parameter vectors; -1 if they are not unknowns.
     """
@@ -132,7 +133,7 @@ def keep(model: EngineModel, rows: RangeRows, stations: int, d: int, size: int) 
 
 @compiled
 def load(block: RangeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Write the cost of the loops; if the stations have changed, also write the map from directions at infinity."""
+    """Write the cost of the loops; for new stations also the map from directions at infinity."""
     first, loop = len(room.place) + len(block.rows.K) + len(block.rows.start), room.scalar[LOOP]
     for lane in range(LANES):
         loop[lane] = 0.0
@@ -191,7 +192,7 @@ def costs(block: RangeBlock, room: EngineWorkspace) -> None:
 def bow_of(block: RangeBlock, room: EngineWorkspace) -> float:
     """Return a bound b of the curvature of all residuals, 1/metres: over a step D at range r they differ by b D^2 / r.
 
-    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``. All residuals together differ from theirs by at most
+    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``, and all residuals together theirs by at most
     ``norm(K) sqrt(s) D^2 / 2 r``. If a common error of all ranges has no effect, half of this bound is valid.
     """
     return float(block.rows.norm * np.sqrt(len(block.r)) * (0.25 if block.rows.level else 0.5))
@@ -230,10 +231,7 @@ def finish(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: 
 
 @compiled
 def _emit(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Write the emission times in metres.
-
-    Linear map less the share of the ranges, plus the measurement they are relative to.
-    """
+    """Write the emission times, metres: their linear map less the share of the ranges, plus their reference."""
     item, r, sent, start, d = room.item, block.r, block.sent, block.rows.start, room.d
     first = len(room.place) + len(block.rows.K)
     for j in range(len(start)):
@@ -522,9 +520,8 @@ def _begin(
 ) -> None:
     """Write g, gaps of the eigenvalues, the cost without ranges, the least eigenvalue, and the first multiplier.
 
-    Multipliers are relative to minus the least eigenvalue, where no digits cancel. The first multiplier is the largest
-    for which one component alone has length one. There the direction is not shorter than one, and Newton's steps
-    converge from this side.
+    Multipliers are relative to minus the least eigenvalue, where no digits cancel. The first is the largest for which
+    one component alone has length one: the direction is not shorter there, and Newton's steps converge from this side.
     """
     q, d = len(u), len(g)
     for lane in range(LANES):
@@ -549,10 +546,9 @@ def _begin(
 def _step(
     scalar: Array, g: Array, gap: Array, total: Array, least: Array, more: Array, low: Array, todo: Array
 ) -> bool:
-    """Write the lower bounds at the multipliers (W,), take Newton steps where they matter.
+    """Write the lower bounds at the multipliers; take Newton steps if the bound is low.
 
-    Return whether one was taken. A step matters if the lower bound is still within `BEYOND_DOUBT` of the cost of the
-    fix.
+    Return whether any was taken.
     """
     d, square, cube = len(g), scalar[SPARE], todo
     for lane in range(LANES):
@@ -599,10 +595,7 @@ def _lengthen(y: Array, gap: Array, spare: Array) -> None:
 
 @compiled
 def _weigh(u: Array, block: RangeBlock, room: EngineWorkspace, y: Array, left: Array, cost: Array) -> None:
-    """Write the cost (W,) of emitters at infinity in directions y (d, W).
-
-    The sum of squared residuals loses fewer digits than the bound.
-    """
+    """Write the cost (W,) of emitters at infinity in directions y (d, W), more accurate than the bound."""
     for lane in range(LANES):
         cost[lane] = room.scalar[LOOP, lane]
     for k in range(len(u)):

@@ -197,7 +197,8 @@ def _span(vector: Array, base: Array, r: Array) -> None:
 def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> None:
     """Write the principal axes of the position's information, each one sigma long, to AXES.
 
-    If `inverse` is True, the information is that in inverse range. If `held` is True, the covariance is used instead.
+    If `inverse` is True, the information is expressed in inverse range. If `held` is True, the axes come from the
+    covariance.
     """
     d, base, work, axes = room.d, room.axes[BASE], room.axes[EIGEN], room.axes[AXES]
     source = room.matrix[H_TRIAL if held else MARGIN if room.vector.shape[1] > d else H]
@@ -285,7 +286,7 @@ def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) 
 
 @compiled
 def _spare_still(room: EngineWorkspace, axis: int) -> None:
-    """Set the rise of the cost to that of a Gaussian along an axis of length zero: a surface holds the fix there."""
+    """Set the rise of the cost to the rise of a Gaussian along an axis of length zero, where a surface holds the fix."""
     scalar = room.scalar
     for lane in range(LANES):
         if room.axes[EIGEN, axis, axis, lane] == 0.0:
