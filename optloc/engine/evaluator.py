@@ -42,7 +42,7 @@ def keep(model: EngineModel, rows: Any, stations: int, d: int, size: int) -> Any
 
 @compiled
 def load(rows: Any, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Load the measurements z (N, m) of a block; `anew` is True if its stations have changed."""
+    """Load the measurements z (N, m) of a block; `anew` is True if the positions of its stations have changed."""
     raise NotImplementedError
 
 

@@ -192,9 +192,9 @@ class Answer(NamedTuple):
 
     @property
     def kappa(self) -> Array:
-        """Deviation of the costs from a quadratic function, in metres and in inverse range (N, 2).
+        """Return the deviation (N, 2) of the costs from a quadratic function, in metres and in inverse range.
 
-        NaN if not measured.
+        The value is NaN if it was not measured.
         """
         return self.number[:, KAPPA:]
 

@@ -1,7 +1,4 @@
-"""Rows that are sums of ranges, with emission times as the only other unknowns.
-
-A linear map of the ranges, and loops.
-"""
+"""Rows that are sums of ranges, with emission times as the only other unknowns: a linear map of ranges, and loops."""
 
 from __future__ import annotations
 
@@ -41,9 +38,7 @@ from optloc.kernels.systems import LANES, principal_axes
 
 
 class RangeRows(NamedTuple):
-    """Whitened rows over ranges r.
-
-    The cost is ``|u - K r|^2`` plus the cost of *loops*, row sums that no range changes.
+    """Whitened rows over ranges r: the cost is ``|u - K r|^2`` plus the cost of *loops* (sums that no range changes).
 
     Parameters
     ----------
@@ -385,10 +380,7 @@ def _costs(K: Array, u: Array, place: Array, x: Array, r: Array, left: Array, lo
 
 @compiled
 def bend(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write half the second derivatives of the cost to H_TRIAL.
-
-    The information less the curvature of the wave fronts.
-    """
+    """Write half the second derivatives of the cost (information less curvature of the wave fronts) to H_TRIAL."""
     vector, matrix, scalar, K = room.vector, room.matrix, room.scalar, block.rows.K
     s, d = room.place.shape[:2]
     left, pull = scalar[SPARE], scalar[HIGH]
@@ -505,8 +497,7 @@ def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
         y = vector[INVERSE]
         for j in range(d):
             for lane in range(LANES):
-                # a component without gradient along an axis without stiffness stays zero; `_lengthen` adds the missing
-                # length
+                # a component without gradient and stiffness stays zero; `_lengthen` adds the missing length
                 y[j, lane] = g[j, lane] / (gap[j, lane] + more[lane]) if g[j, lane] != 0.0 else 0.0
         _lengthen(y, gap, scalar[SPARE])
         _weigh(u, block, room, y, scalar[SPARE], scalar[HIGH])
@@ -546,7 +537,7 @@ def _begin(
 def _step(
     scalar: Array, g: Array, gap: Array, total: Array, least: Array, more: Array, low: Array, todo: Array
 ) -> bool:
-    """Write the lower bounds at the multipliers; take Newton steps if the bound is low.
+    """Write the lower bounds at the multipliers, take Newton steps if the bound is low.
 
     Return whether any was taken.
     """
@@ -563,8 +554,7 @@ def _step(
     moving = 0.0
     for lane in range(LANES):
         length = np.sqrt(square[lane])
-        # a direction that is too short even here is the hard case: the mean of two directions of equal cost; the bound
-        # is valid
+        # a direction that is too short even here is the hard case: two directions of equal cost; the bound is valid
         left = length > 1.0 + _UNIT and low[lane] <= scalar[FIX_COST, lane] + BEYOND_DOUBT
         # Newton's step for 1 / length = 1, which is nearly linear
         more[lane] += square[lane] * (length - 1.0) / cube[lane] if left else 0.0

@@ -286,7 +286,7 @@ def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) 
 
 @compiled
 def _spare_still(room: EngineWorkspace, axis: int) -> None:
-    """Set the rise of the cost to the rise of a Gaussian along an axis of length zero, where a surface holds the fix."""
+    """Set the rise of the cost to that of a Gaussian along axes of length zero, where a surface holds the fix."""
     scalar = room.scalar
     for lane in range(LANES):
         if room.axes[EIGEN, axis, axis, lane] == 0.0:

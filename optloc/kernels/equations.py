@@ -111,7 +111,7 @@ def _epochs(
 ) -> None:
     """Write the equations of the local unknowns of each epoch.
 
-    Sum the equations of the shared unknowns in `room.after`.
+    The equations of the shared unknowns are summed in `room.after`.
     """
     group, packet, last = 0, 0, t.shared + t.local
     clear(m, room.now, (last + 1) ** 2, used)

@@ -119,7 +119,7 @@ class Filtered(NamedTuple):
 class _Space(NamedTuple):
     """Workspace of one state.
 
-    Memory of a lane, matrices (n, n), rows (m, n + 1) with the residual last, and vectors.
+    It contains the memory of one lane, matrices (n, n), rows (m, n + 1) with the residual last, and vectors.
     """
 
     m: Array

@@ -142,7 +142,7 @@ def meet(rows: Array, on_cone: bool, y: Array, other: Array, settled: Array, two
 def _open_axis(A: Array, lane: int) -> int:
     """Return the axis of the only eigenvalue on the diagonal of A that is zero up to rounding.
 
-    -1 if there is not exactly one.
+    The result is -1 if there is not exactly one such eigenvalue.
     """
     n, first, most, second = len(A), 0, 0.0, np.inf
     for k in range(n):
@@ -169,7 +169,7 @@ def _meet_lane(
 ) -> None:
     """Write the points of `meet` for one lane.
 
-    Eigenvalues on the diagonal of A, eigenvectors in the columns of `axes`.
+    The eigenvalues are on the diagonal of A, the eigenvectors in the columns of `axes`.
     """
     n, first = len(y), _open_axis(A, lane)
     if first < 0:

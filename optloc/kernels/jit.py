@@ -304,10 +304,7 @@ def compiled(function: _Function) -> _Function:
 
 
 def inlined(function: _Function) -> _Function:
-    """Return a function like `compiled`, which compiled callers always inline.
-
-    Each array argument of a call costs time.
-    """
+    """Return a function like `compiled`, which compiled callers always inline, since each array argument costs time."""
     return cast(_Function, _Kernel(function, taken_in=True))
 
 

@@ -67,7 +67,7 @@ def _value(c: Array, degree: int, t: float) -> float:
 def _root(c: Array, degree: int, low: float, high: float, left: float) -> float:
     """Return the root between two points of different signs.
 
-    By Newton's step if it stays between them, else by halving.
+    The iteration uses Newton's step if it stays between the points, else the middle.
     """
     t = high
     for _ in range(_MOST):

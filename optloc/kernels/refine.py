@@ -139,7 +139,7 @@ def is_over(tag: Array, lane: int, limit: int) -> bool:
 def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: int, limit: int) -> tuple[int, int]:
     """Give the lanes of ended starts to the next starts, or close them.
 
-    Return the number of open lanes and the next start.
+    Returns the number of open lanes and the next start.
     """
     b = 0
     while b < used:

@@ -333,7 +333,7 @@ def positive_along(a: float, b: float, c: float, d: float, e: float, f: float, s
 def principal(matrix: Array, vectors: Array) -> None:
     """Diagonalise a symmetric 3x3 matrix by Jacobi rotations in place.
 
-    Write the eigenvectors to the columns of `vectors`.
+    `vectors` receives the eigenvectors in columns.
     """
     _rotate_until(matrix, vectors, 0.0)
 

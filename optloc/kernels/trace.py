@@ -335,7 +335,7 @@ def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict
 def evaluate(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
     """Return the outputs of a tape for numbers or arrays, computed by numpy.
 
-    The reference for the compiled interpreter.
+    Tests compare the compiled interpreter with this function.
     """
     own: list[Any] = [0.0] * tape.registers
     for seed, register in tape.inputs:
