@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Kind = Literal["conic", "nonlinear"]
-"""What a back end solves."""
+"""Kind of the programs that a back end solves."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from formulations.algebra import Array
 from formulations.backend import Choice, SolverError, using
 
 PASSED, FAILED = "backend-passed", "backend-failed"
-"""How the lines begin that say what came of it: solvers print lines of their own."""
+"""Start of the lines with a result, since solvers print other lines."""
 
 # Three ranges to a position, which the constraints of some programs exclude.
 _STATION = np.array([[0.0, 0.0], [1.0, 0.1], [0.2, 0.9]])
@@ -42,13 +42,13 @@ def _conic(name: str) -> str:
         found = [each(rows, right, paraboloid(2)) for each in (hull, shor)]
         solved = [one for one in found if np.isfinite(one.y).all()]
         if not solved:
-            return f"it solves no program of cones ({found[0].answer.message or found[0].answer.status})"
+            return f"it solves no conic program ({found[0].answer.message or found[0].answer.status})"
         if any(np.abs(one.y[:2] - _PLACE).max() > _NEAR for one in solved):
-            return "its answer is wrong"
+            return "its solution is wrong"
         # two stations with bearings away from each other: no point is in front of both
         apart = common(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 0.0], [1.0, 0.0]]), np.full(2, 0.1))
         if apart.meet:
-            return "it finds a common point of cones that have none"
+            return "it reports a common point of cones that do not meet"
     return ""
 
 
@@ -58,9 +58,9 @@ def _nonlinear(name: str) -> str:
     if isinstance(free, str) or isinstance(held, str):
         return str(free if isinstance(free, str) else held)
     if not (free.success and held.success):
-        return f"it ends without an answer ({held.status if free.success else free.status})"
+        return f"it ends without a solution ({held.status if free.success else free.status})"
     if np.abs(free.x - _PLACE).max() > _NEAR or held.x[0] > 0.5 + _NEAR:
-        return "its answer is wrong"
+        return "its solution is wrong"
     hopeless: list[dict[str, Any]] = [
         {"equalities": lambda x, p: [x[0] ** 2 + 1.0]},
         {"inequalities": lambda x, p: [x[0] - 1.0, -x[0]]},
@@ -70,7 +70,7 @@ def _nonlinear(name: str) -> str:
     for each in hopeless:
         found = _solve(name, **each)
         if not isinstance(found, str) and found.success:
-            return "it calls a point a solution where there is none"
+            return "it reports success for a program without a solution"
     return ""
 
 

@@ -1,17 +1,17 @@
-r"""Parametrised conic problems, canonicalised once and re-solved on Clarabel's own data.
+r"""Parametrised conic problems, canonicalised once and solved again with Clarabel's data.
 
 A cvxpy problem that obeys the parameter rules (DPP) becomes
 
 .. math:: \min_x \tfrac12 x^\top P x + q^\top x + d \quad\text{subject to}\quad A x + s = b, \; s \in K,
 
 in which `P`, `q`, `d`, `A`, `b` are affine in the parameters. The affine maps are taken out of cvxpy once; a later
-solve is a few sparse products, an update of Clarabel's data and the bare solve. Its dual point `z`, projected on the
+solve needs only a few sparse products, an update of Clarabel's data and the solve. Its dual point `z`, projected on the
 dual cone, gives
 
 .. math:: \min \ge d - \tfrac12 x^\top P x - b^\top z - \rho \, |P x + q + A^\top z|
 
-for every minimiser with :math:`|x^*| \le \rho`, whatever the solver reports: the "optimal value" is never used as a
-bound.
+for every minimiser with :math:`|x^*| \le \rho`, independent of the solver's report: the "optimal value" is never used
+as a bound.
 
 Threads may share a relaxation: each thread has separate numbers, and calls of cvxpy run one at a time.
 

@@ -4,7 +4,7 @@ A node is a station at one epoch: place :math:`s_i`, velocity :math:`v_i`. Range
 
 .. math:: r_i = |x - s_i|, \qquad r_i\, q_i = -(x - s_i) \cdot v_i,
 
-and the rows say :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without `b` where one station hears its Doppler shift) or
+and the rows say :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without `b` if one station measures the Doppler shift) or
 :math:`z_l = R_l \cdot r + A_l \cdot b + n_l` with unknowns `b`, an offset of the emitter's frequency for instance. A
 row of rates times :math:`r_a` has no quotient left:
 
@@ -16,38 +16,38 @@ are known from the pass before,
 
 .. math:: \min_x \; |W \,\mathrm{diag}(1/\rho)\, L\, y|^2,
 
-is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with what holds for every
-source, the last two within their bounds:
+is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with rules that hold for
+every source (the last two only within their bounds):
 
 - ties: :math:`Y_{r_i r_i} = |x - s_i|^2`, :math:`Y_{\beta_j r_i} = w_{ji}`, and
   :math:`Y_{q_b r_b} = -(x - s_b) \cdot v_b` of a rate's own range;
 - products taken in two orders: :math:`w_{ji} r_n = w_{jn} r_i` and :math:`w_{ji} \beta_l = w_{li} \beta_j`, where the
   product of a rate with its own range is the linear form above;
-- Cauchy and Schwarz, :math:`r_i r_n \ge |(x - s_i) \cdot (x - s_n)|` (that is the triangle inequality),
+- Cauchy and Schwarz, :math:`r_i r_n \ge |(x - s_i) \cdot (x - s_n)|` (the triangle inequality),
   :math:`q_b^2 \le |v_b|^2`, and :math:`|x - s_i| \le r_i`;
 - where the height is known, :math:`(x - c)^\top E (x - c) = 1`, else :math:`|x| \le` `reach`; squared both are linear
   in `Y`, and the ellipsoid is a surface of constant height only nearly (`formulations.range_height.ellipsoid`);
-- so that `Y` stays bounded, `b` within ten speeds of the fastest node of what a fit of the rows by `b` alone says.
+- to keep `Y` bounded: `b` differs from its fit without the source by at most ten speeds of the fastest node.
 
 Limits: the value is a lower bound of that weighted cost for the last :math:`\rho`, not of the likelihood's
 (both agree at a point whose ranges are :math:`\rho`). It is not tight: the first row of `Y` gives a position, and
 the rest the region around it in which the relaxation does not decide. A frequency offset leaves two places, one on each
-side of a satellite's track, of which `Y` is the mean: then its first moment lies between them, and the points
+side of a satellite's track, of which `Y` is the mean. Then the first moment is between them, and the points
 
 .. math:: \bar x, \quad \bar x \pm \sqrt{\lambda_k}\, e_k, \qquad Y_{xx} - \bar x \bar x^\top = \sum_k \lambda_k e_k
    e_k^\top
 
-hold both (a mean of two points has one eigenvalue, and they are at plus and minus its root). They are starts for a
+contain both (a mean of two points has one eigenvalue, and they are at plus and minus its root). They are starts for a
 local method and prove no uniqueness; they are worst for differences of rates of a single pair.
 
 The size is limited: `normal_points` averages rows that are adjacent in time.
 
 Sources: B. Song, W. Wen, Q. Zhang, B. Xu and L.-T. Hsu, "Certifiably optimal Doppler positioning using opportunistic
 LEO satellites", arXiv:2509.17198 (2025) (place, ranges, clock drift and its products with the ranges lifted, and
-weights from the ranges of the pass before: the programme for one station a row, without the products in two orders and
-the inequalities); G. Wang, Y. Li and N. Ansari, "A semidefinite relaxation method for source localization using TDOA
-and FDOA measurements", IEEE Trans. Veh. Technol. 62 (2013), p. 853 (range and rate of the reference as unknowns that
-are lifted with the source); H. D. Sherali and W. P. Adams, "A reformulation-linearization technique", Kluwer 1999
+weights from the ranges of the previous pass: the programme for one station a row, without the products in two orders
+and the inequalities); G. Wang, Y. Li and N. Ansari, "A semidefinite relaxation method for source localization using
+TDOA and FDOA measurements", IEEE Trans. Veh. Technol. 62 (2013), p. 853 (range and rate of the reference as unknowns
+that are lifted with the source); H. D. Sherali and W. P. Adams, "A reformulation-linearization technique", Kluwer 1999
 (products in two orders).
 """
 
@@ -88,7 +88,7 @@ class Shape:
     product : tuple of (int, int)
         Unknown j of beta and node i of each product w.
     surface : bool
-        Whether the source lies on an ellipsoid; else within a reach.
+        Whether the source is on an ellipsoid; else it is within a reach.
     """
 
     dimension: int
@@ -375,7 +375,7 @@ def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None
 def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
     """Return the node whose range multiplies a row, the node whose rate is an unknown, -1 for none, and the sign."""
     if (np.abs(rates).sum(axis=1) > 2.0).any() or (np.abs(rates.sum(axis=1)) > 1.0).any():
-        raise ValueError("a row of rates is one rate, or the difference of two")
+        raise ValueError("a row of rates must be one rate, or the difference of two")
     # a rate that is always zero needs no unknown; a rate that many rows share should be only one unknown
     moving = (speed != 0.0).any(axis=1)
     often = np.where(moving, 1.0 + np.abs(rates).sum(axis=0), 0.0)

@@ -10,8 +10,9 @@ a second-order cone that no point behind the station satisfies. A ball of radius
 .. math:: \max_{p,\, r \le 1} \; r \quad\text{subject to these N cones},
 
 decides whether the cones meet (:math:`r \ge 0`), gives the centre of the largest inscribed ball, and otherwise, from
-its dual, multipliers that prove that they do not. With :math:`\theta_i = t \sigma_i` the set grows with t (the worst
-scaled angle is quasi-convex): bisection on t, helped by the angles really attained, finds the global minimax fix.
+its dual, multipliers that prove that the cones do not meet. With :math:`\theta_i = t \sigma_i` the set grows with t
+(the worst scaled angle is quasi-convex). Bisection on t, accelerated by the attained angles, finds the global minimax
+fix.
 
 Sources: M. S. Lobo, L. Vandenberghe, S. Boyd and H. Lebret, "Applications of second-order cone programming", Linear
 Algebra Appl. 284 (1998); F. Kahl and R. Hartley, "Multiple-view geometry under the L-infinity norm", IEEE Trans.
@@ -125,7 +126,7 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
 def extent(
     direction: ArrayLike, station: ArrayLike, bound: ArrayLike, towards: ArrayLike, *, backend: str = "CLARABEL"
 ) -> Array:
-    """Return how far the common points of the cones reach in given directions.
+    """Return the extent of the common points of the cones in given directions.
 
     Parameters
     ----------

@@ -257,7 +257,7 @@ class Program:
             return "it stopped at a limit"
         slope, broken = (_numbers(value) for value in self._check(x, data))
         if not np.isfinite(slope).all():
-            return "the cost has no gradient there"
+            return "the cost has no gradient at this point"
         return "" if np.abs(broken).max(initial=0.0) <= _BROKEN else "the constraints are not met"
 
 

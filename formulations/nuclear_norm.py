@@ -11,7 +11,7 @@ sum of the singular values, its convex envelope on matrices of bounded norm, and
 .. math:: \min_o \; \|G(o)\|_* - \langle W, G(o) \rangle \quad\text{subject to}\quad o_j \le \min_i z_{ij}.
 
 *First pass*, :math:`W = 0`: the nuclear norm. It is **not tight**: distances that are too small make all of `G` small,
-so that the least nuclear norm lies between the true times and those of the nearest stations. Without the bounds on
+so that the least nuclear norm is between the true times and the times at the nearest stations. Without the bounds on
 `o` the solution is beyond them.
 
 *Further passes*, :math:`W = U_d V_d^\top` of the pass before: the truncated nuclear norm, the sum of the singular

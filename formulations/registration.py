@@ -17,9 +17,10 @@ with unknown biases :math:`\delta`. Squaring and subtracting :math:`r_0^2` leave
 
 linear in :math:`\theta` and the lifts :math:`\lambda` of :math:`|x(t)|^2`. For a fixed target the one lift is
 :math:`|x|^2`, and all stationary points of that problem with its quadratic constraint are found exactly. Stations in
-one plane leave the distance from it open; it follows from :math:`r_0` up to its sign, which gives two branches.
+one plane do not determine the distance from the plane; it follows from :math:`r_0` up to its sign, which gives two
+branches.
 
-Rows are divided by :math:`r_i`, so that their errors are those of the ranges. All lengths are in one unit in which
+Rows are divided by :math:`r_i`, so that their errors are range errors. All lengths are in one unit in which
 stations and target are of order one to a hundred.
 
 Sources: Y. T. Chan and K. C. Ho, "A simple and efficient estimator for hyperbolic location", IEEE Trans. Signal

@@ -15,8 +15,8 @@ ranges,
 The lift :math:`Y = y y^\top` is relaxed to :math:`Y \succeq 0` and solved with the price :math:`\eta \,
 \operatorname{mean}_k |p_k|^2`, read off the lift.
 
-It is never formed. With the biases in the lift the cost is a sum over the windows, and so are the definitions: of `Y`
-only the blocks of :math:`u_k = (1, p, v, \delta, r_1(k), f_i(k))` occur, which have the block of :math:`(1, p, v,
+The lift is never formed. With the biases in the lift the cost is a sum over the windows, and so are the definitions: of
+`Y` only the blocks of :math:`u_k = (1, p, v, \delta, r_1(k), f_i(k))` occur, which have the block of :math:`(1, p, v,
 \delta)` in common. If all blocks are semidefinite and agree in their common part, they are the blocks of a semidefinite
 matrix, because the graph of this pattern is chordal. The best moments of the biases give :math:`f^\top M f` again. So
 `K` blocks of a dozen rows are the same relaxation as the lift of all windows, whose time grows with the sixth power of
@@ -27,14 +27,15 @@ ranges :math:`r_i`, compared with whose squares they would be rounding for an in
 
 Both the price and the prior are needed. A misfit `m` of the second equality can be absorbed in the moments alone,
 :math:`2 \operatorname{cov}(r_1, f) = m`, for which :math:`\operatorname{var}(r_1) \operatorname{var}(f) \ge m^2 / 4`
-suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without end and every target has
-cost zero in the limit; with it misfits cost about :math:`\sqrt{\eta \sum M_{ff} m^2}`. Without the prior, `M` is
-zero for remainders common to all windows, so that such misfits cost nothing again and the price draws the target into
-the array. The relaxation is not tight (at the best price its misfit is about a twentieth of what noise leaves): it
+suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without bound and every target
+has cost zero in the limit; with it misfits cost about :math:`\sqrt{\eta \sum M_{ff} m^2}`. Without the prior, `M` is
+zero for remainders common to all windows, so that these misfits cost nothing again and the price moves the target into
+the array. The relaxation is not tight (at the best price its misfit is about a twentieth of the misfit by noise): it
 gives starts, not bounds.
 
-The best price depends on the unknown distance: too high, and it draws the target in; too low, and the slack throws it
-out. So a ladder of prices is solved, and the answers are ranked by the cost of the data at their targets.
+The best price depends on the unknown distance. A price that is too high moves the target into the array; with a price
+that is too low, the slack moves it far away. So the problem is solved for several prices, and the solutions are ranked
+by the cost of the data at their targets.
 
 Sources: R. Grone, C. R. Johnson, E. M. Sa and H. Wolkowicz, "Positive definite completions of partial Hermitian
 matrices", Linear Algebra Appl. 58 (1984), theorem 7 (the blocks); N. Z. Shor, "Quadratic optimization problems", Sov.
@@ -144,8 +145,8 @@ def registration(
 
     Notes
     -----
-    The module's text. Shifted and scaled inside, so the answer does not depend on origin or unit. Built once per
-    shape and back end in each process.
+    See the text of the module. The data are shifted and scaled, so the result does not depend on origin or unit. Built
+    once per shape and back end in each process.
     """
     run = RegistrationWindows.of(station, z, whiten, sigma, design, mean, time)
     if not run.finite:
@@ -221,7 +222,7 @@ class RegistrationWindows:
         gram = np.broadcast_to(np.swapaxes(W, -1, -2) @ W, (K, C, C))
         origin = s.mean(axis=(0, 1))
         scale = float(np.sqrt(((s - origin) ** 2).sum(axis=-1).mean()))
-        # the fine unit is that of biases and noise, compared with lengths of the size of the array
+        # a small unit for biases and noise, which are small compared with the size of the array
         noise = 1.0 / np.einsum("kii->ki", gram).mean()
         fine = float(np.sqrt(((E * spread) ** 2).sum(axis=1).mean() + noise))
         clock, power = (0.0, 1.0), np.ones((K, 1))

@@ -8,11 +8,11 @@ convex where it exists, and
 
 .. math:: k(t) = T(t)^{-1/2} - (\kappa + \sigma t)^{-1/2}
 
-is concave in every interval. Newton's iteration on `k`, started where `k <= 0` beside a pole, therefore climbs
-monotonically to the first root on that side of the pole or meets `k' <= 0`, which proves there is none. Every
+is concave in every interval. Newton's iteration on `k`, started near a pole where `k <= 0`, therefore climbs
+monotonically to the first root on that side of the pole, or reaches `k' <= 0`, which proves that no root exists. Every
 interval holds at most two roots, one per end, so the two sides of all poles, and for ``sigma > 0`` the zero of the
-right side, list all real roots without a polynomial and without a bracket. Each root is held as its distance from its
-own pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
+right side, list all real roots without a polynomial and without a bracket. Each root is stored as the distance from its
+pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
 
 Sources: J. J. More and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4 (1983), section 3
 (the concave form on the last interval); the use on every interval is the same inequality.
@@ -107,7 +107,7 @@ def everything(equation: Secular) -> Roots:
     Returns
     -------
     Roots
-        Slots: d to the left of each pole, d to the right, and one beside the zero of the right side (K = 2d + 1).
+        Slots: d to the left of each pole, d to the right, and one next to the zero of the right side (K = 2d + 1).
 
     Notes
     -----

@@ -1,22 +1,24 @@
-r"""Linear rows of which a few are grossly wrong, with the position in second-order cones.
+r"""Linear rows of which a few have gross errors, with the position in second-order cones.
 
 .. math::
     \min_{y, e} \; \tfrac12 |B y - g - e|^2 + \sum_g \lambda_g |e_g| \quad\text{subject to}\quad
     |M_k (y, 1)| \le m_k^\top (y, 1), \; k = 1, \dots, K
 
-The rows are whitened; `e` are gross errors in sigmas, zero in all rows but a few; :math:`e_g` are those of one group of
-rows (one row by default, or all rows of one station). The penalty is the convex hull of counting the groups in error,
-so the programme is convex: without cones it is the regression with Huber's loss of threshold :math:`\lambda`, and
+The rows are whitened; `e` are gross errors in sigmas, zero in all rows but a few; :math:`e_g` are the errors of one
+group of rows (one row by default, or all rows of one station). The penalty is the convex hull of counting the groups in
+error, so the programme is convex: without cones it is the regression with Huber's loss of threshold :math:`\lambda`,
+and
 
 .. math:: e_g = (1 - \lambda_g / |r_g|)_+ \, r_g, \quad r = B y - g
 
-at every optimum. Groups with :math:`e_g \ne 0` are the *support*. What is relaxed: the count of wrong groups becomes
-the sum of their sizes, which pulls every one of them towards zero by :math:`\lambda_g`; and the quadrics on which
-squared ranges lie become the cones that they bound. The answer is therefore a start and a guess of the support, to be
-refined and tested without the rows of the support; it is no estimate.
+at every optimum. Groups with :math:`e_g \ne 0` are the *support*. The relaxation: the count of wrong groups becomes
+the sum of their sizes, which shrinks each of them towards zero by :math:`\lambda_g`. The quadrics of squared ranges
+become the cones that they bound. So the solution is not an estimate. It is a start and a guess of the support, to be
+refined and tested without the rows of the support.
 
 The threshold is the universal one, :math:`\lambda = \sqrt{2 \ln m}` of m rows, which the largest of m normal errors
-exceeds with a probability that goes to zero; a group of p rows has the threshold that :math:`\chi_p` exceeds as seldom.
+exceeds with a probability that goes to zero. A group of p rows has the threshold that :math:`\chi_p` exceeds with the
+same probability.
 
 Sources: D. L. Donoho and I. M. Johnstone, "Ideal spatial adaptation by wavelet shrinkage", Biometrika 81 (1994) (the
 universal threshold); M. Yuan and Y. Lin, "Model selection and estimation in regression with grouped variables", J. R.
@@ -106,7 +108,7 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
     -------
     cvxpy.Problem
         Parameters ``rows`` (m, n), ``right`` (m,), ``price`` (G,) and one ``cone k`` (length + 1, n + 1) for each cone:
-        the vector's rows, then that of its bound; variables ``y``, ``error``.
+        the rows of the vector, then the row of its bound; variables ``y``, ``error``.
 
     Notes
     -----

@@ -6,7 +6,7 @@ for two quadrics. The *cone*, :math:`y = (x, r)`, `C = diag(1, .., 1, -1)`, `h =
 point and `r` is its distance (range differences, arrival times, range sums, bearings). The *paraboloid*, :math:`y =
 (x, w)`, `C = diag(1, .., 1, 0)`, `h = (0, .., 0, -1/2)`: `w` is :math:`|x|^2` (ranges, ratios of ranges, bearings).
 
-A multiplier :math:`\lambda` makes every stationary point but the apex of the cone a solution of
+A multiplier :math:`\lambda` makes every stationary point, except the apex of the cone, a solution of
 :math:`(B^\top B + \lambda C) y = B^\top g - \lambda h`. Both cases become :math:`\sum_j c_j^2/(t - p_j)^2 = \kappa +
 \sigma t` (:mod:`formulations.secular`), with d poles:
 
@@ -16,7 +16,7 @@ A multiplier :math:`\lambda` makes every stationary point but the apex of the co
 - paraboloid: `w` is eliminated by its own (linear) equation and :math:`t = \lambda`.
 
 The global minimiser is the root above the last pole, where :math:`B^\top B + \lambda C` is positive semidefinite (no
-gap). A singular `A` is the hard case: a root sits on a pole, and both _line_points of the solution line with the
+gap). A singular `A` is the hard case: a root is on a pole, and both intersections of the solution line with the
 quadric appear.
 
 Sources: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), section 3; A.
@@ -58,7 +58,7 @@ _FLAT = 1e-13  # eigenvalues of the scaled normal matrix below this, some hundre
 _FLOOR = 1e-15  # relative floor of the roots of secular weights: some roundings, so that no pole vanishes
 _LEAST = 1e-200  # the floor if all weights vanish: a square far above the smallest number
 # Relative distance from the cone above which a point is invalid. Of 50 000 problems, a third of them with columns
-# scaled over eight decades, 99 % of the points are within 3e-16 and all but 2e-4 of them within this.
+# scaled over eight decades, 99 % of the points are within 3e-16, and all except 2e-4 of them are within this value.
 _OFF = 1e-6
 
 # The line of solutions: singular values below this share of the largest count as zero; one decade above the rounding of
@@ -507,7 +507,7 @@ def _paraboloid_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
 # The intersection of a line of least-squares solutions with the quadric.
 #
 # Where B has rank n - 1 (or its weakest direction is noise) the minimisers of |B y - g|^2 are the line y_0 + t v, and
-# the constraint is a quadratic in t. This is for the few problems whose v lies almost on the cone: there no multiplier
+# the constraint is a quadratic in t. This is for the few problems whose v is almost on the cone: there no multiplier
 # separates the two solutions from one at infinity.
 
 

@@ -104,7 +104,7 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch |
 
 def _find_ranges(one: Problem) -> Ranges | None:
     """Return the least-squares ranges of one problem as linear maps: the ranges of unit vectors of measurements."""
-    return ranges(weighed(_probe(hold_still(one.flat()))))
+    return ranges(weighed(_unit_measurements(hold_still(one.flat()))))
 
 
 # Probability of the chi-square test below which the general solver searches for a better position, as
@@ -144,7 +144,7 @@ def _height_of(one: Problem) -> int | None:
     return None
 
 
-def _probe(problem: Problem) -> Problem:
+def _unit_measurements(problem: Problem) -> Problem:
     """Return one problem for each row, whose measurement is one in this row and zero in all others."""
     # The images of the unit vectors define a linear map.
     parts = np.split(np.eye(problem.count), problem.starts[1:], axis=1)
@@ -192,13 +192,13 @@ def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission
         linear[: len(known)] = found.offset[:, known].T
         station[SIGN, : len(known)], station[RANGED, : len(known)] = found.sign[0, known], 1.0
         reference = int(np.searchsorted(known, found.reference[0])) if found.free.all() else -1
-    station[HEARD], station[SEEN] = _hearing(one, node)
+    station[HEARD], station[SEEN] = _observed_stations(one, node)
     row = np.stack([one.correction + added, precision, 1.0 / (1.0 + gain)])
     anchor, ahead = _anchors(one)[0], directions(one.dimension)
     return EngineModel(row, anchor, linear, station, reference, white, admission, BY_SQUARES, -1, ahead, np.inf)
 
 
-def _hearing(one: Problem, node: Array) -> tuple[Array, Array]:
+def _observed_stations(one: Problem, node: Array) -> tuple[Array, Array]:
     """Return two arrays (s,): 1.0 for stations that have a row, and 1.0 for stations that have an angle."""
     moving = one.stations.position.shape[-3] > 1
     heard, seen = np.zeros(node.shape[1]), np.zeros(node.shape[1])

@@ -201,7 +201,7 @@ class _Block:
 
 
 @dataclass(slots=True)
-class _Scene:
+class _LiftedProblem:
     """One problem, its least-squares ranges, the index of each station, and the constants collected so far."""
 
     problem: Problem
@@ -277,7 +277,7 @@ def lift(problem: Problem, found: Ranges | None, node: dict[tuple[int, int], int
     on_cone : bool
         Whether the last coordinate is a range.
     """
-    scene = _Scene(problem, found, node, on_cone, [])
+    scene = _LiftedProblem(problem, found, node, on_cone, [])
     lifted = [
         scene.block(rows, start)
         for rows, start in zip(problem.rows, problem.starts, strict=True)

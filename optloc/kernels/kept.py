@@ -75,7 +75,7 @@ def _used(path: Path) -> float:
         return 0.0
 
 
-class _KeptPlace:
+class _CacheLocator:
     """The location of the machine code of a function, with the interface of a cache locator of numba."""
 
     def __init__(self, function: Callable[..., Any], place: Path, digest: str) -> None:
@@ -103,7 +103,7 @@ def _entries() -> tuple[Any, Any]:
     numba: Any = caching  # half typed
 
     class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
-        def __init__(self, place: _KeptPlace, function: Callable[..., Any]) -> None:
+        def __init__(self, place: _CacheLocator, function: Callable[..., Any]) -> None:
             self._locator, self._lineno = place, function.__code__.co_firstlineno
             self._filename_base = base_of(name_of(function), place.get_disambiguator())
 
@@ -142,7 +142,7 @@ def _cache_type() -> Any:
     class CachedKernel(numba.FunctionCache):  # type: ignore[misc]
         def __init__(self, kernel: Compilable, place: Path, *, callee: bool) -> None:
             function = kernel.function
-            self._impl_class = partial(_entries()[callee], _KeptPlace(function, place, digest_of(kernel)))
+            self._impl_class = partial(_entries()[callee], _CacheLocator(function, place, digest_of(kernel)))
             super().__init__(function)
             self._name = name_of(function)
             self._installed = None if callee else installed()

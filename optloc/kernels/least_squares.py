@@ -200,7 +200,7 @@ def _iterate(
         start = start if limits is None else limits.clip(start)
         state = _DescentState.begin(problem, start, weights)
         active = np.arange(len(start))
-        part = _LanePart(problem, weights, face, _blur(problem, len(start)), folded, limits)
+        part = _ActiveProblems(problem, weights, face, _blur(problem, len(start)), folded, limits)
         for iteration in range(rules.limit):
             # MAX_ITERATIONS is the initial status: these problems have not ended.
             moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
@@ -241,7 +241,7 @@ class _DescentState:
 
 
 @dataclass(frozen=True, slots=True)
-class _LanePart:
+class _ActiveProblems:
     """The active problems of a refinement, with their weights and constraints."""
 
     problem: Problem
@@ -251,11 +251,11 @@ class _LanePart:
     folded: Folded | None
     limits: Limits | None
 
-    def take(self, items: Array) -> _LanePart:
+    def take(self, items: Array) -> _ActiveProblems:
         """Return the selected problems."""
         folded = None if self.folded is None else self.folded.take(items)
         limits = None if self.limits is None else self.limits.take(items)
-        return _LanePart(
+        return _ActiveProblems(
             self.problem.take(items), self.weights.take(items), self.face, self.blur[items], folded, limits
         )
 
@@ -294,7 +294,7 @@ def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | fl
     return np.asarray(_ROUNDINGS * np.finfo(float).eps * WGS84_A * np.sqrt(np.maximum(information, 0.0)))
 
 
-def _advance(part: _LanePart, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
+def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
     """Try one step of every active problem."""
     # In most batches all problems end together: while all are active, arrays are not copied.
     everything = len(active) == len(state.x)
@@ -365,20 +365,20 @@ def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: 
         return None
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
     if not depends_on_place(problem):
-        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules)
+        return _refine_with_weights(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules)
     width = problem.layout.n_shared + offsets_of(problem)
     # Each problem has different weights. They are computed in parts, so that the derivatives fit into the memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
 
     def work(part: Array) -> Refined | None:
-        return _anew(problem.take(own[part]), start[part], rules)
+        return _refine_reweighted(problem.take(own[part]), start[part], rules)
 
     done = mapped(work, parts) if len(parts) > 1 else [work(parts[0])]
     found = [one for one in done if one is not None]
     return _join(found) if len(found) == len(parts) else None
 
 
-def _at_once(
+def _refine_with_weights(
     problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: StopRules
 ) -> Refined | None:
     """Return the refinement by machine code with given weights, or None if machine code is not supported."""
@@ -406,14 +406,14 @@ def _at_once(
     return Refined(done.x, done.cost, done.status, done.iterations, make)
 
 
-def _anew(problem: Problem, start: Array, rules: StopRules) -> Refined | None:
+def _refine_reweighted(problem: Problem, start: Array, rules: StopRules) -> Refined | None:
     """Return the refinement of one start of each problem.
 
     It runs with the weights at the start, and again with the weights at the result (`WEIGHINGS` times).
     """
     done = None
     for _ in range(WEIGHINGS):
-        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules)
+        done = _refine_with_weights(problem, start, np.arange(len(start)), whitener_at(problem, start), rules)
         if done is None:
             return None
         start = done.x

@@ -334,7 +334,7 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ca
         made = trace(problem, links, frozenset(inputs), moved)
         if made is None:
             return None
-        found.append(_Kind(links, made, inputs))
+        found.append(_TracedRows(links, made, inputs))
     return _fill(problem, RowGroups.sorted(problem, groups), found, sources.lookup())
 
 
@@ -346,7 +346,7 @@ def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
+class _TracedRows:
     """A block of rows, its tape, and the number in `Sources` of each input of each row."""
 
     links: BlockLinks
@@ -354,7 +354,7 @@ class _Kind:
     inputs: dict[int, Array]
 
 
-def _fill(problem: Problem, groups: RowGroups, found: list[_Kind], lookup: Array) -> CachedTables:
+def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])
@@ -414,7 +414,7 @@ def _table(*columns: Array) -> Array:
     return out
 
 
-def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) -> Array:
+def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: Array) -> Array:
     """Return the index of each input of each evaluated row, see `Sources.lookup`."""
     out, start = np.zeros(int(source_at[-1]), dtype=np.int64), 0
     for kind in found:
@@ -441,7 +441,7 @@ def _list(
     return np.concatenate(terms), np.concatenate(factors), at
 
 
-def _tapes(found: list[_Kind]) -> tuple[Array, dict[str, Array]]:
+def _tapes(found: list[_TracedRows]) -> tuple[Array, dict[str, Array]]:
     """Return the constants of the tapes of all kinds, and the tapes one after the other."""
     tapes = [kind.trace.tape for kind in found]
     constants = [pair for tape in tapes for pair in tape.constants]

@@ -121,12 +121,12 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
     even, parts, ok = _reduce(rest, between, vector, size, inverse)
     out = np.empty((*block.shape[:-3], k, length, right.shape[-1]))
     out[..., ::2, :, :] = even
-    behind = _behind(even, m)
+    behind = _following_even(even, m)
     out[..., 1::2, :, :] = own - back @ even[..., :m, :, :] - on @ behind
     return out, _inner(parts, back, on, self_, k) if inverse else parts, ok
 
 
-def _behind(even: Array, count: int) -> Array:
+def _following_even(even: Array, count: int) -> Array:
     """Return the values of the even blocks that follow the odd ones; zero after the last block."""
     out = np.zeros((*even.shape[:-3], count, *even.shape[-2:]))
     out[..., : even.shape[-3] - 1, :, :] = even[..., 1:, :, :]
@@ -136,7 +136,7 @@ def _behind(even: Array, count: int) -> Array:
 def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _ChainParts:
     """Return the blocks of the inverse from the blocks of the even ones: x_odd = own - back x_before - on x_after."""
     m, first = k // 2, parts.inner[..., : k // 2, :, :]
-    second, across = _behind(parts.inner, m), np.zeros_like(back)
+    second, across = _following_even(parts.inner, m), np.zeros_like(back)
     across[..., : parts.beside.shape[-3], :, :] = parts.beside
     with_before = -(back @ first + on @ across.mT)
     with_after = -(back @ across + on @ second)
