@@ -153,6 +153,7 @@ def sight_courses(
 
 
 def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
+    """Return the data of a fit, with the least range in a weight."""
     normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
     size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)

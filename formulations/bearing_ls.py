@@ -285,6 +285,7 @@ def lengths(line: Array, least: Array) -> Array:
 
 
 def _local(point: Array, S: Array, turn: Array | None) -> Array:
+    """Return the lines of sight to a point, in the axes of each station."""
     line = point[..., None, :] - S
     return line if turn is None else np.einsum("...ij,...j->...i", turn, line)
 

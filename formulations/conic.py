@@ -167,6 +167,7 @@ class Relaxation:
         bound: bool,
         reach: float | None,
     ) -> ConicAnswer:
+        """Return the solution by Clarabel, without cvxpy."""
         data.feed(values)
         try:
             solution = _solver(data, settings).solve()
@@ -486,6 +487,7 @@ class _Product:
 
     @classmethod
     def of(cls, matrix: Any) -> _Product:
+        """Return the product with a sparse matrix."""
         entries = matrix.tocoo()
         return cls(matrix.shape[0], entries.row.astype(np.int64), entries.col.astype(np.int64), entries.data)
 

@@ -299,6 +299,7 @@ def direction_problem(count: int) -> Any:
 
 @keep
 def _relaxation(count: int, backend: str) -> Relaxation:
+    """Return the relaxation, built once for each size and back end."""
     # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in five stops early
     settings = tight(backend, 1e-9, static_regularization_constant=1e-7)
     return Relaxation(direction_problem(count), backend=backend, settings=settings)
@@ -315,12 +316,14 @@ class _Cost:
 
 
 def _frames(angle: Array, axes: ArrayLike | None) -> Array:
+    """Return the frames (N, 3, 3) of directions: direction, tangent of azimuth, tangent of elevation."""
     seen = rays(angle[:, 0], angle[:, 1], axes)
     assert seen.upward is not None
     return np.stack([seen.ahead, seen.across, seen.upward], axis=1)
 
 
 def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
+    """Return the solution of the relaxation for a quadratic cost."""
     count = len(S)
     # w in units in which the largest tangent weight is one; otherwise the lift of errors of a milliradian would vanish
     size = float(cost.square[:, 1:].max()) or 1.0

@@ -346,6 +346,7 @@ def doppler(
 
 
 def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer) -> DopplerStart:
+    """Return the start in the units of the caller from a solution of the relaxation."""
     lift, d = answer.values["lift"], scene.shape.dimension
     point, beta = lift[0, 1 : 1 + d], scene.shape.places[0]
     spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
@@ -367,6 +368,7 @@ def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer)
 
 
 def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
+    """Return a start of NaN."""
     rows, unknowns = design
     point, none = np.full((1 + 2 * dimension, dimension), np.nan), np.full(unknowns, np.nan)
     return DopplerStart(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
@@ -390,6 +392,7 @@ def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
 
 
 def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, rate: Mask, surface: bool) -> Shape:
+    """Return the structure of the programme for the given rows."""
     known = design.shape[1]
     others = tuple(int(node) for node in np.unique(second[second >= 0]))
     of = {node: known + i for i, node in enumerate(others)}
@@ -515,6 +518,7 @@ def _products(shape: Shape, lift: Any) -> list[Any]:
 
 @keep
 def _relaxation(shape: Shape, backend: str) -> Relaxation:
+    """Return the relaxation, built once for each structure and back end."""
     # a decade below the default of Clarabel: the errors of precise rows are 1e-5 of their rates
     return Relaxation(doppler_problem(shape), backend=backend, settings=tight(backend, 1e-9))
 

@@ -155,6 +155,7 @@ class _Fit:
     clocks: bool
 
     def run(self, at: StationFactors) -> LowRank:
+        """Return the fits from given starts."""
         count = at.alpha.shape[0]
         scale = np.broadcast_to(self.weight, (count, *self.z.shape))
         damping = np.full(count, _DAMPING)
@@ -246,10 +247,12 @@ class _Projected:
 
 
 def _where(mask: Mask, one: Array, other: Array) -> Array:
+    """Return items of `one` where the mask (S,) is True, else items of `other`."""
     return np.where(mask.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
 def _chosen(mask: Mask, one: StationFactors, other: StationFactors) -> StationFactors:
+    """Return stations of `one` where the mask (S,) is True, else of `other`."""
     return StationFactors(
         _where(mask, one.alpha, other.alpha), _where(mask, one.u, other.u), _where(mask, one.b, other.b)
     )

@@ -237,6 +237,7 @@ def angles(point: Array, direction: Array, station: Array) -> Array:
 
 
 def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
+    """Return the common points of cones whose half-angles are `level` times their scale."""
     theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
     return common(u, S, theta, backend=backend)
 
@@ -246,6 +247,7 @@ def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
 
 @keep
 def _relaxation(kind: str, count: int, dim: int, backend: str) -> Relaxation:
+    """Return the cone program, built once for each kind, size and back end."""
     settings = tight(backend, 1e-10)  # the sign of a margin is a proof: two decades below the default of Clarabel
     if kind == "edge":
         return Relaxation(edge_problem(count, dim), backend=backend, settings=settings)
@@ -303,6 +305,7 @@ def edge_problem(count: int, dim: int) -> Any:
 
 
 def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
+    """Return the constraints of the cones, with new parameters."""
     import cvxpy as cp
 
     rows = dim - 1

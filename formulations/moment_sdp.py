@@ -163,6 +163,7 @@ def moment_problem(stations: int, dimension: int) -> Any:
 
 @keep
 def _relaxation(stations: int, dimension: int, backend: str) -> Relaxation:
+    """Return the relaxation, built once for each size and back end."""
     # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in four stops early
     settings = tight(backend, 1e-8, static_regularization_constant=1e-7)
     return Relaxation(moment_problem(stations, dimension), backend=backend, settings=settings)

@@ -269,11 +269,13 @@ class _Locks:
         self.held: list[threading.Lock] = []
 
     def acquire(self) -> None:
+        """Acquire the locks of all programs."""
         self.held = [program.lock for program in self.programs]
         for lock in self.held:
             lock.acquire()
 
     def release(self) -> None:
+        """Release the locks of all programs."""
         for lock in self.held:
             lock.release()
 
@@ -304,6 +306,7 @@ def _column(expressions: Any, count: int | None = None) -> Any:
 
 
 def _check(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return a value as an array; raise ValueError if its shape is wrong."""
     array = np.asarray(value, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, {shape} expected")
@@ -311,6 +314,7 @@ def _check(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _numbers(value: Any) -> Array:
+    """Return values of CasADi as a vector."""
     return np.asarray(value.full(), dtype=np.float64).ravel()
 
 

@@ -223,6 +223,7 @@ def outer_approximation(
     levels: list[Array] = []
 
     def cut(at: Array) -> None:
+        """Add the tangents of the criterion at a point (n,)."""
         f, slope = gradients(design, at, criterion)
         column = np.zeros((places, 1)) if worst else -np.eye(places)
         cuts.append(np.hstack([slope, column - (1.0 if worst else 0.0)]))

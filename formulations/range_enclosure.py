@@ -202,7 +202,7 @@ class _Error:
     variance: Array
 
     def reference(self, row: Array, middle: float) -> tuple[float, float] | None:
-        """Return an upper bound of r_1 from its row of the left inverse."""
+        """Return the interval of r_1 from its row of the left inverse, or None if the errors are too large."""
         # r_1 <= middle + rest + slope r_1: if the slope reaches one, the errors grow with the range without bound
         slope = self._along(row * self.side)
         rest = self._along(row * self.excess) + self._square(row)
@@ -217,9 +217,11 @@ class _Error:
         return both + self._square(row)
 
     def _along(self, row: Array) -> float:
+        """Return a bound of twice ``row' w`` for errors w with a cost of at most rho^2."""
         return 2.0 * self.rho * float(np.linalg.norm(self.root.T @ row))
 
     def _square(self, row: Array) -> float:
+        """Return a bound of ``row' w^2`` for errors w with a cost of at most rho^2."""
         return self.rho**2 * float(np.abs(row) @ self.variance)
 
 

@@ -509,4 +509,5 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
 
 
 def _value(c: Array, t: Array) -> Array:
+    """Return the values of polynomials at t; coefficients are constant first."""
     return np.asarray(c[:, :1] + t * (c[:, 1:2] + t * c[:, 2:]))

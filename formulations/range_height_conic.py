@@ -73,6 +73,7 @@ def lifted_problem() -> Any:
 
 @keep
 def _relaxation(backend: str) -> Relaxation:
+    """Return the relaxation, built once for each back end."""
     # a tenth of a millimetre in Earth radii; a matrix of size three allows this tolerance
     return Relaxation(lifted_problem(), backend=backend, settings=tight(backend, 1e-11))
 

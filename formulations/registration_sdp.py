@@ -319,6 +319,7 @@ def registration_problem(windows: int, stations: int, dimension: int, order: int
 
 @keep
 def _relaxation(windows: int, stations: int, dimension: int, order: int, biases: int, backend: str) -> Relaxation:
+    """Return the relaxation, built once for each shape and back end."""
     return Relaxation(registration_problem(windows, stations, dimension, order, biases), backend=backend)
 
 
@@ -345,6 +346,7 @@ def _parameters(run: RegistrationWindows) -> dict[str, Array]:
 
 
 def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: ConicAnswer) -> RegistrationStart:
+    """Return the start in the units of the caller from a solution of the relaxation."""
     shared, inside = answer.values["shared"], slice(1, 1 + len(weight))
     target = shared[0, inside]
     cost, shift = run.cost(target)
@@ -363,5 +365,6 @@ def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: Con
 
 
 def _block(answer: ConicAnswer, window: int) -> Array:
+    """Return the block of a window from a solution of the relaxation."""
     across = answer.values[f"across {window}"]
     return np.block([[answer.values["shared"], across], [across.T, answer.values[f"own {window}"]]])

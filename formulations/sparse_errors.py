@@ -135,6 +135,7 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
 
 @keep
 def _relaxation(n: int, groups: tuple[int, ...], cones: tuple[int, ...], backend: str) -> Relaxation:
+    """Return the relaxation, built once for each structure and back end."""
     # the size distinguishes errors within a threshold from exact zeros: two decades below Clarabel's default tolerance
     return Relaxation(sparse_problem(n, groups, cones), backend=backend, settings=tight(backend, 1e-10))
 

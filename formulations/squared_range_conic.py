@@ -115,6 +115,7 @@ def hull_problem(quadric: Quadric) -> Any:
 
 @keep
 def _relaxation(kind: str, quadric: Quadric, backend: str) -> Relaxation:
+    """Return the relaxation, built once for each quadric and back end."""
     problem = shor_problem(quadric) if kind == "shor" else hull_problem(quadric)
     # In 200 random problems in space, the greatest error of the point is 1e-3 at Clarabel's default of 1e-8. It is 1e-4
     # here, after two more iterations; at 1e-11 one solve in seven stops early.

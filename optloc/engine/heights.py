@@ -69,6 +69,7 @@ def _place_stations(model: EngineModel, room: EngineWorkspace, w: Array, lane: i
 
 @compiled
 def _dot(w: Array, a: int, b: int) -> float:
+    # Return the inner product of two rows of `w`.
     return float(w[a, 0] * w[b, 0] + w[a, 1] * w[b, 1] + w[a, 2] * w[b, 2])
 
 

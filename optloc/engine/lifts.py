@@ -254,11 +254,13 @@ class _LiftedProblem:
         return NUMBER, self._keep(float(self.found.sign[0, known.argmax()]) if self.on_cone else 0.0)
 
     def _axis(self, rows: Rows, i: int, cell: int) -> float:
+        """Return a component of the axes of the station of a row; `cell` numbers the components row by row."""
         axes, d = self.problem.stations.axes, self.problem.dimension
         assert axes is not None
         return float(axes[int(rows.epoch[i]) if len(axes) > 1 else 0, rows.a[i], cell // d, cell % d])
 
     def _keep(self, value: float) -> int:
+        """Append a constant of the structure, and return its index."""
         self.number.append(value)
         return len(self.number) - 1
 

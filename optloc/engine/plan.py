@@ -97,6 +97,7 @@ class Plan:
         return Load(model, self.rows(problem), self._places(problem))
 
     def _places(self, problem: Problem) -> Array:
+        """Return the positions (N or 1, s, d) of the stations with rows, metres."""
         position = problem.stations.position
         flat = position.reshape(-1, *position.shape[-3:])
         # Usually all stations have rows, and their positions need no copy.
@@ -295,6 +296,7 @@ def _is_taped(problem: Problem) -> bool:
 
 
 def _make(problem: Problem) -> Plan | None:
+    """Return the plan of problems, or None if they have no degrees of freedom, no tapes or no start."""
     one = _bare(problem)
     dof = int(degrees_of_freedom(one.flat())[0])
     if dof < 0 or problem.layout.find("position")[0].start:

@@ -129,6 +129,7 @@ def find_even(eigen: Array, out: Array) -> None:
 
 @compiled
 def _even(eigen: Array, i: int, j: int, lane: int) -> float:
+    # Return 1.0 if two eigenvalues of a lane are equal up to `_EQUAL`, else 0.0.
     first, second = eigen[i, i, lane], eigen[j, j, lane]
     most = max(first, second)
     return 1.0 if abs(first - second) <= _EQUAL * most and most > 0.0 else 0.0

@@ -186,6 +186,7 @@ def filter_scan(
 
 @compiled
 def _space(rows: ScanRows, item: int, n: int) -> _Space:
+    # Return the workspace for states of n components.
     t, m, none = rows.tables, rows.z.shape[2], np.zeros((1, 0))
     place, observed = np.zeros((0, 4), np.int64), np.zeros((1, m))
     c = Numbers(rows.common, place, rows.source, none, none, observed, none, none, none[0])

@@ -38,6 +38,7 @@ _LOADING = held_by_forks(Lock())
 
 @cache
 def _numba() -> Any:
+    """Return the module numba, or None if it is missing or disabled."""
     try:
         import numba
     except ImportError:
@@ -166,6 +167,7 @@ def compiling(tell: Callable[[str, bool], None]) -> Iterator[None]:
 
 
 def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
+    """Register a listener for compilations, and return the function that removes it."""
     from numba.core import event
 
     events: Any = event  # without types
@@ -188,6 +190,7 @@ _BEGUN: set[str] = set()
 
 
 def _text() -> str:
+    """Return the progress line."""
     if not _BEGUN:
         return "loading machine code"
     loaded = {kernel.name for kernel in _KERNELS}
@@ -198,6 +201,7 @@ REPORTER = Reporter(_text)
 
 
 def _report(name: str, done: bool) -> None:
+    """Count the start or the end of a compilation."""
     if done:
         _DONE.add(name)
         _BEGUN.discard(name)
@@ -283,6 +287,7 @@ def at_hand(kernel: Callable[..., Any]) -> bool:
 
 @cache  # cached, because a look into the folder takes longer than the work of the kernel
 def _was_kept(kernel: _Kernel) -> bool:
+    """Return whether the machine code of a kernel is on disk."""
     return is_kept(kernel)
 
 

@@ -69,6 +69,7 @@ def _clear(place: Path) -> None:
 
 
 def _used(path: Path) -> float:
+    """Return the time at which a folder was last used, seconds; 0 if it no longer exists."""
     try:
         return path.stat().st_mtime
     except OSError:  # another process has removed it
@@ -148,10 +149,12 @@ def _cache_type() -> Any:
             self._installed = None if callee else installed()
 
         def _index_key(self, sig: Any, codegen: Any) -> Any:
+            """Return the key of an entry, with the names of fields of named tuples."""
             # numba distinguishes named tuples by class and types of the fields, but not by the names of the fields.
             return *super()._index_key(sig, codegen), tuple(map(_fields, getattr(sig, "args", sig)))
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
+            """Return the stored machine code for a signature, or None."""
             try:
                 found = self._from_installed(sig, target_context)
                 return super().load_overload(sig, target_context) if found is None else found
@@ -160,6 +163,7 @@ def _cache_type() -> Any:
                 return None
 
         def _from_installed(self, sig: Any, target_context: Any) -> Any:
+            """Return the installed machine code for a signature, or None."""
             if self._installed is None:
                 return None
             place, made = self._installed
@@ -170,6 +174,7 @@ def _cache_type() -> Any:
             return None if data is None else self._impl.rebuild(target_context, data)
 
         def save_overload(self, sig: Any, data: Any) -> None:
+            """Store machine code for a signature, and remove old versions of the function."""
             place, base = Path(self._cache_path), self._impl.filename_base
             try:
                 try:
@@ -244,6 +249,7 @@ def _leave_last(place: Path, name: str, base: str) -> None:
 
 
 def _installed_folder() -> Path | None:
+    """Return the folder of installed machine code, or None."""
     found = installed()
     return None if found is None else found[0]
 

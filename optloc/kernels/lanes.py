@@ -160,6 +160,7 @@ def blur_of(sigma: Array, size: Array, m: Array, room: LaneCells, lane: int, ite
 
 @compiled
 def _fill(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
+    # Copy the numbers of a problem to a lane, from `cell` on, and return the next cell.
     row = item if source.shape[0] > 1 else 0
     for i in range(source.shape[1]):
         m[cell + i, lane] = source[row, i]
@@ -212,6 +213,7 @@ def run(code: Array, first: int, last: int, r: Array, count: Constant) -> None:
 
 @compiled
 def _rare(operation: int, r: Array, to: int, u: int, v: int, count: Constant) -> None:
+    # Run one of the less frequent operations on the first `count` numbers of registers.
     if operation == NEG:
         for i in range(count):
             r[to, i] = -r[u, i]

@@ -157,6 +157,7 @@ def refine(
 
 
 def _remade(problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None) -> Refined:
+    """Return the refinement by numpy, with weights at the start."""
     return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
 
@@ -173,15 +174,18 @@ class _Weights:
 
     @classmethod
     def of(cls, problem: Problem, start: Array) -> _Weights:
+        """Return the weights of a problem at given starts (N, size)."""
         at = start if depends_on_place(problem) else None
         one = whole(problem, len(start))
         return cls(whiten(weighed(problem, at).noise, problem.weight) if one else None, at)
 
     def take(self, items: Array) -> _Weights:
+        """Return the weights of the selected problems."""
         matrices = None if self.matrices is None else tuple(w.take(items) for w in self.matrices)
         return _Weights(matrices, None if self.at is None else self.at[items])
 
     def equations(self, problem: Problem, x: Array) -> Normal:
+        """Return the normal equations at vectors x (N, size) with these weights."""
         return equations_at(problem, x, self.matrices, at=self.at)
 
 
@@ -226,6 +230,7 @@ class _DescentState:
 
     @classmethod
     def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _DescentState:
+        """Return the state at given starts (N, size)."""
         count = len(start)
         equations = _own(weights.equations(problem, start))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
@@ -331,6 +336,7 @@ def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: 
 
 
 def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
+    """Store accepted vectors and their equations in the state."""
     if better.all() and len(active) == len(state.x):
         state.x, state.equations = x, _own(after)
         return
@@ -341,10 +347,12 @@ def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: N
 
 
 def _own(equations: Normal) -> Normal:
+    """Return normal equations whose arrays are writable."""
     return Normal(*(array if array.flags.writeable else np.array(array) for array in equations.parts))
 
 
 def _at(equations: Normal, index: Array) -> Normal:
+    """Return the normal equations of the selected problems."""
     return Normal(*(part[index] for part in equations.parts))
 
 

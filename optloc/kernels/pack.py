@@ -194,6 +194,7 @@ def _whiteners(noise: tuple[Whitener, ...]) -> Divided:
 
 
 def _priors(problem: Problem) -> Divided:
+    """Return the means and precisions of the priors as `Divided`, with one line of `place` for each prior."""
     layout, parts, heads = problem.layout, [], []
     for name, mean, precision in prior_parts(problem):
         slot, shared = layout.find(name)
@@ -275,6 +276,7 @@ def folding(problem: Problem) -> Folding | None:
 
 
 def _fold(problem: Problem) -> Folding | None:
+    """Return the common rows of the epochs, see `folding`."""
     k, rows, local, start = problem.epochs, [], np.zeros(problem.count, dtype=np.int64), 0
     for block, first in zip(problem.rows, problem.starts, strict=True):
         own = _alike(block.epoch, k, block.a, block.b, block.target)
@@ -310,6 +312,7 @@ def fold(problem: Problem, found: Folding) -> Problem:
     count, k = problem.batch_shape[0], problem.epochs
 
     def spread(array: Array | None, core: int) -> Array | None:
+        """Return an array for the batch of epochs, from an array with an axis of epochs."""
         # numbers of each epoch, with an axis of epochs of length 1 or k
         if array is None or (array.ndim == core and array.shape[0] == 1):
             return array
@@ -317,6 +320,7 @@ def fold(problem: Problem, found: Folding) -> Problem:
         return whole.reshape(count * k, 1, *whole.shape[2:])
 
     def repeat(array: Array | None, core: int) -> Array | None:
+        """Return an array for the batch of epochs, repeated for the epochs of each run."""
         return array if array is None or array.ndim == core or len(array) == 1 else np.repeat(array, k, axis=0)
 
     s = problem.stations
@@ -348,6 +352,7 @@ def fold(problem: Problem, found: Folding) -> Problem:
 
 
 def _fold_bias(bias: Bias, own: Array, found: Folding) -> Bias:
+    """Return a bias for the batch of epochs."""
     return replace(bias, row=found.local[bias.row[own]], member=bias.member[own], coefficient=bias.coefficient[own])
 
 
@@ -359,6 +364,7 @@ def fold_whiteners(noise: tuple[Whitener, ...], found: Folding, count: int) -> t
 
 
 def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
+    """Return rows of one kind for the batch of epochs."""
     first = own[0]
     return replace(
         rows,

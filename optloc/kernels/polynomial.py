@@ -57,6 +57,7 @@ def real_roots(c: Array, low: float, high: float, work: Array, out: Array) -> in
 
 @compiled
 def _value(c: Array, degree: int, t: float) -> float:
+    # Return the value of a polynomial at t, by Horner's rule.
     value = c[degree]
     for i in range(degree - 1, -1, -1):
         value = value * t + c[i]

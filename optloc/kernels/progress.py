@@ -42,6 +42,7 @@ class Reporter:
         held_by_forks(self._lock, self._start)
 
     def _start(self) -> None:
+        """Reset the counters, also in a child process after a fork."""
         self._depth, self._watching, self._since, self._ended = 0, False, 0.0, -_PAUSE
 
     def begin(self) -> None:
@@ -62,6 +63,7 @@ class Reporter:
             self._ended = monotonic()
 
     def _watch(self) -> None:
+        """Print lines until the activity has ended."""
         said = False
         while True:
             sleep(_LOOK)
@@ -81,10 +83,12 @@ class Reporter:
 
 
 def _on_terminal() -> bool:
+    """Return whether standard error is a terminal."""
     return sys.stderr is not None and sys.stderr.isatty()
 
 
 def _say(text: str) -> None:
+    """Print a line on the terminal, or log it."""
     if _on_terminal():
         sys.stderr.write(_CLEAR + text)
         sys.stderr.flush()

@@ -53,6 +53,7 @@ class EpochShare(NamedTuple):
 
 @compiled
 def _share(n: int, local: int, parts: int, lanes: int) -> EpochShare:
+    # Return empty sums for n shared and `local` local unknowns, in `parts` blocks of lanes.
     return EpochShare(np.zeros((n, n)), np.zeros(n), np.zeros(1), np.zeros((parts, local * (n + local + 2), lanes)))
 
 

@@ -347,6 +347,7 @@ def roughly_principal(matrix: Array, vectors: Array) -> None:
 
 @compiled
 def _rotate_until(matrix: Array, vectors: Array, correlation: float) -> None:
+    # Rotate until the remaining squared correlations are small.
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0
@@ -366,6 +367,7 @@ def _rotate_until(matrix: Array, vectors: Array, correlation: float) -> None:
 
 @compiled
 def _rotate(matrix: Array, vectors: Array, p: int, q: int) -> None:
+    # Apply the Jacobi rotation that makes entry (p, q) zero.
     away = matrix[p, q]
     if away == 0.0:
         return

@@ -322,6 +322,7 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> CachedTables | None:
 
 
 def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> CachedTables | None:
+    """Return the tables of a problem, see `tables`, without the cache."""
     layout = problem.layout
     if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
         return None
@@ -355,6 +356,7 @@ class _TracedRows:
 
 
 def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
+    """Return the tables of traced blocks of rows."""
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])

@@ -92,6 +92,7 @@ class Recorder:
         return Symbol(self, self._simplify(operation, u, v))
 
     def _number(self, key: tuple[int, Any, Any]) -> int:
+        """Return the number of a node, which is added if it is new."""
         if key not in self.known:
             self.known[key] = len(self.nodes)
             self.nodes.append(key)
@@ -115,9 +116,11 @@ class Recorder:
         return self._number((operation, u, v))
 
     def _is(self, node: int, operation: int) -> bool:
+        """Return whether a node is a given operation."""
         return self.nodes[node][0] == operation
 
     def _add(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u + v, or None."""
         if self.constant(u) == 0.0:
             return v
         if self.constant(v) == 0.0:
@@ -130,6 +133,7 @@ class Recorder:
         return self._simplify(SUB, v, self.nodes[u][1]) if self._is(u, NEG) else None
 
     def _sub(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u - v, or None."""
         if self.constant(v) == 0.0:
             return u
         if self.constant(u) == 0.0:
@@ -137,6 +141,7 @@ class Recorder:
         return self._simplify(ADD, u, self.nodes[v][1]) if self._is(v, NEG) else None
 
     def _mul(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u v, or None."""
         for one, other in ((u, v), (v, u)):
             value = self.constant(one)
             # Zero times infinity or NaN becomes zero here: derivatives contain many zeros, and h is finite where it is
@@ -167,6 +172,7 @@ class Recorder:
         return self._simplify(MUL, a, self._simplify(DIV, self.node(power * top), self.nodes[v][2]))
 
     def _div(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u / v, or None."""
         if self.constant(v) == 1.0:
             return u
         if self._is(u, NEG):
@@ -175,6 +181,7 @@ class Recorder:
         return None
 
     def _neg(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of -u, or None."""
         operation, left, right = self.nodes[u]
         if operation == NEG:
             return int(left)
@@ -235,6 +242,7 @@ class Symbol:
         raise TypeError("a measurement function must not branch on its arguments")
 
     def _with(self, operation: int, left: Any, right: Any) -> Any:
+        """Return the symbol of an operation with a symbol or a number."""
         for one in (left, right):
             if not isinstance(one, Symbol | int | float | np.number):
                 return NotImplemented
@@ -242,6 +250,8 @@ class Symbol:
 
 
 def _function(operation: int) -> Callable[..., Symbol]:
+    """Return the function that records an operation."""
+
     def record(u: Any, v: Any = None) -> Symbol:
         owner = u if isinstance(u, Symbol) else v
         return owner.recorder.apply(operation, u, v)
@@ -324,6 +334,7 @@ def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
 
 
 def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict[int, int]:
+    """Return the last node that uses each node; outputs are used after all nodes."""
     last: dict[int, int] = {}
     for node in needed:
         operation, left, right = recorder.nodes[node]
@@ -390,6 +401,7 @@ def trace(problem: Problem, links: BlockLinks, given: frozenset[int], moved: fro
 
 
 def _trace(problem: Problem, model: Model, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
+    """Return the tape of a kind's function, see `trace`, without the cache."""
     recorder = Recorder()
     inputs: dict[int, Any] = {seed: recorder.input(seed) for seed in sorted(given | moved)}
     inputs |= {seed: Jet(inputs[seed], {seed: 1.0}) for seed in sorted(moved)}

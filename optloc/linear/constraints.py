@@ -167,10 +167,12 @@ def polygon(vertices: ArrayLike, *, target: int = 0) -> tuple[Polygon, ...]:
 
 
 def _number(value: Any) -> Array:
+    """Return a value as an array of floats."""
     return np.asarray(value, dtype=float)
 
 
 def _metres(value: Any, where: str) -> Array:
+    """Return a length in metres, from a number or a text with a unit."""
     return _number(in_si(value, "length", where, place=True))
 
 
@@ -352,6 +354,7 @@ def face_names(problem: Problem, face: Face) -> tuple[str, ...]:
 
 
 def _kind(problem: Problem, level: Level) -> str:
+    """Return the kind of surface of a level; the edges of polygons are planes."""
     constraint = problem.constraints[level.constraint]
     return constraint.kind if isinstance(constraint, Band) else "plane"
 
@@ -372,6 +375,7 @@ def needs_velocity(constraint: Band | Polygon) -> bool:
 
 
 def _sides(i: int, constraint: Band | Polygon) -> Iterator[Face]:
+    """Yield the finite bounds of a band, or the edges and corners of a polygon."""
     if isinstance(constraint, Band):
         if np.isfinite(constraint.lower).all():
             yield (Level(i, "lower"),)
@@ -417,6 +421,7 @@ def tangent_at(problem: Problem, face: Face, x: Array) -> Array:
 
 
 def _band(constraint: Band | Polygon, side: str | int) -> Band:
+    """Return the band of a level; the edge of a polygon becomes a plane."""
     if isinstance(constraint, Band):
         return constraint
     assert isinstance(side, int)
@@ -545,6 +550,7 @@ def bounded(
 
 
 def _horizontal(problem: Problem, target: int, x: Array) -> Array:
+    """Return the plan positions (N, 2) of a target in vectors x (N, size), metres."""
     slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
     return x[:, slot.start : slot.start + 2]
 

@@ -127,6 +127,7 @@ def _straight(states: list[Components], since: Any) -> Components:
 
 
 def _from_ecef(problem: Problem, ecef: Components) -> Components:
+    """Return ECEF components as a position in the problem's frame, metres."""
     turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
     if problem.frame.kind == "ecef":
         return ecef

@@ -113,6 +113,7 @@ class Equalities:
 
     @property
     def _epoch(self) -> Problem:
+        """Return the problem of one epoch."""
         assert self.single is not None  # callers check this
         return self.single
 
@@ -164,6 +165,7 @@ def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
 
 
 def _target(problem: Problem, constraint: int) -> int:
+    """Return the target of a constraint."""
     return problem.constraints[constraint].target
 
 

@@ -148,10 +148,12 @@ def block_links(problem: Problem) -> tuple[BlockLinks, ...]:
 
 
 def _links_of_all(problem: Problem) -> tuple[BlockLinks, ...]:
+    """Return the links of each block of rows, without the cache."""
     return tuple(_links_of(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True))
 
 
 def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
+    """Return the links of one block of rows, whose first row has the number `start`."""
     model = MODELS[block.kind]
     if (block.target < 0).any():
         where = f"{block.kind} row {int(np.argmax(block.target < 0))}"
@@ -163,6 +165,7 @@ def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
+    """Return the offsets, drifts and emission times of a block of rows."""
     parts = [_terms(problem, block, start, "adds")]
     for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)
@@ -172,6 +175,7 @@ def _adds(problem: Problem, block: Rows, start: int) -> Terms:
 
 
 def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
+    """Return the linear terms of the biases that enter a block of rows in the given way."""
     parts = [Terms(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
     for bias in _entering(problem, enters):
         inside = (bias.row >= start) & (bias.row < start + block.count)
@@ -189,12 +193,14 @@ def _entering(problem: Problem, enters: str) -> list[Bias]:
 
 
 def _append(parts: list[Terms]) -> Terms:
+    """Return several lists of terms as one."""
     return Terms(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "column", "coefficient"))
     )
 
 
 def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
+    """Return the contributions of the states of targets to positions and rates."""
     feeds, count = [], len(problem.motions)
     for i, motion in enumerate(problem.motions):
         if motion.known is not None or not np.any(block.target == i):
@@ -215,6 +221,7 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 
 def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
+    """Return the contributions of station errors to the positions and rates of stations."""
     # Errors of span "noise" are not unknowns: `optloc.linear.normal` adds them to the covariance of rows.
     d, feeds = problem.dimension, []
     for name, _, _ in problem.stations.errors if problem.stations.unknown_for else ():
@@ -231,6 +238,7 @@ def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 
 def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
+    """Return the contributions of mount errors to the rotation of axes."""
     feeds = []
     for bias in _entering(problem, "turns"):
         left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
@@ -386,6 +394,7 @@ def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> d
 
 
 def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
+    """Return the value of an input plus the contribution of an unknown."""
     column, gain = feed.table(count)
     part = gather(x, column)
     # Most unknowns have the factor one; a product with ones would cost as much as the rest.
@@ -527,6 +536,7 @@ def _stack(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
 
 
 def _joined(parts: list[Any]) -> Array:
+    """Return arrays (..., m) of blocks of rows as one array."""
     xp = library(parts[0])
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)

@@ -103,4 +103,5 @@ def whiteners(problem: Problem, x: Any) -> tuple[Whitener, ...] | None:
 
 
 def _equations(problem: Problem, x: Any, noise: tuple[Whitener, ...] | None) -> Normal:
+    """Return the normal equations with priors at vectors x (..., size)."""
     return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))

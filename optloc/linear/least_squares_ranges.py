@@ -217,6 +217,7 @@ def _patterns(present: Array) -> tuple[Array, Array]:
 
 
 def _stays(problem: Problem) -> bool:
+    """Return whether all targets are at rest for the run."""
     return all(motion.order == 0 and motion.span == "run" for motion in problem.motions)
 
 

@@ -132,6 +132,7 @@ def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
 
 
 def _signs(rows: Rows) -> tuple[int, int]:
+    """Return the coefficients of the ranges to both stations of rows; zeros if the kind has none."""
     return MODELS[rows.kind].ranges or (0, 0)
 
 
@@ -459,6 +460,7 @@ def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple
 
 
 def _damp(equations: Normal, damping: Array) -> Normal:
+    """Return normal equations with a damped diagonal; the local unknowns of walks are not damped."""
     local = _grow(equations.local, damping[..., None])
     if equations.link is None:
         return replace(equations, shared=_grow(equations.shared, damping), local=local)
@@ -573,6 +575,7 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
 
 
 def _block_diagonal(blocks: Array) -> Array:
+    """Return blocks (..., s, d, d) as block-diagonal matrices (..., s d, s d)."""
     s, d = blocks.shape[-3], blocks.shape[-1]
     apart = placed(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
     whole: Array = library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))
