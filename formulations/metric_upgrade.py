@@ -81,7 +81,7 @@ def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
-    """Return candidates for H and h."""
+    """Return the candidates (H, h), with H (d, d) and h (d,), from each side with enough points."""
     d, out = u.shape[1], []
     if len(u) >= unknowns(d):
         H, h = _quadric(u, alpha)

@@ -412,7 +412,7 @@ def _symbolic(ca: Any, matrix: Any, d: int, criterion: Criterion) -> Any:
 def _soft_maximum(ca: Any, values: Sequence[Any]) -> Any:
     """Return the log-sum-exp of values in units of the first.
 
-    It exceeds the maximum by at most log(count) / sharpness.
+    It exceeds the maximum by at most log(count) / sharpness times the first value.
     """
     size = ca.fabs(values[0]) + 1e-9
     return values[0] + size / _SHARP * ca.log(sum(ca.exp(_SHARP * (v - values[0]) / size) for v in values))

@@ -81,7 +81,7 @@ def _relaxation(backend: str) -> Relaxation:
 def lift(
     stations: Array, sign: Array, offset: Array, surface: Ellipsoid, near: Array, *, backend: str = "CLARABEL"
 ) -> LiftedHeights:
-    """Return the solution of the relaxation.
+    """Return the fix on the ellipsoid from the relaxation.
 
     Parameters
     ----------

@@ -183,7 +183,7 @@ def _least_squares(rows: Array, course: RegistrationCourse, bias: Array | None, 
 
 
 def _solve(matrix: Array, vector: Array, cut: float) -> Array:
-    """Return the solution of scaled normal equations, zero in directions with (almost) no information."""
+    """Return the solution (N, n) of scaled normal equations, zero in directions with (almost) no information."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]

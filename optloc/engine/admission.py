@@ -2,6 +2,8 @@
 
 Every constrained quantity is a tape with its gradient. A refinement steps along the exact surfaces, and its positions
 are projected back onto them. Bounds and lines of sight are checked after the refinement.
+
+Names in capitals, such as X or MOVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations

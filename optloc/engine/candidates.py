@@ -1,7 +1,8 @@
 """Candidates for starts if squared ranges have too few rows, for example the cheapest of many positions.
 
 A few candidates are refined, and the cheapest two at different minima are used. The second one replaces the mirror
-image of the fix.
+image of the fix. Names in capitals, such as X or FIX, are rows of the arrays of
+`optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@ Each function of this module is a placeholder for a kernel of the same name in a
 `optloc.engine.ranges` for rows that are sums of ranges without other unknowns, `optloc.engine.tapes` for rows of every
 kind. `evaluated_by` replaces the placeholders and compiles a kernel for one evaluator, so that the choice costs no
 time while the machine code runs.
+
+Names in capitals, such as X or SOLVABLE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@ The problems are computed in blocks of LANES problems, one problem in each lane.
 more steps, a mirror image whose refinement goes on, or a second measurement of the shape. These problems are collected
 and computed later in full blocks, so that no block waits for one of its lanes.
 
-A *rival* is another minimum whose cost is at most `LISTED` above the cost of the fix.
+A *rival* is another minimum whose cost is at most `LISTED` above the cost of the fix. Names in capitals, such as X or
+GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations

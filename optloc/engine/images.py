@@ -1,6 +1,7 @@
 """The refined mirror image of a fix in the best plane of the stations: the second minimum of flat networks.
 
-A refinement ends early if it cannot lead to a rival of the fix, see `watch`.
+A refinement ends early if it cannot lead to a rival of the fix, see `watch`. Names in capitals, such as X or GOOD, are
+rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -229,7 +230,7 @@ def watch(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> flo
 
 @compiled
 def confirm(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
-    """Keep only the lanes that reached a rival good, and return their number.
+    """Clear GOOD for lanes that did not reach a rival, and return the number of the others.
 
     The end of a damped refinement need not be a minimum. Therefore the undamped step must be short, and the curvature
     of the cost must be positive, including the second derivatives of the ranges.
@@ -262,7 +263,7 @@ def confirm(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
 
 @compiled
 def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
-    """Keep only the lanes good whose undamped step is short."""
+    """Clear GOOD for lanes whose undamped step is not short."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, move, length = vector.shape[1], vector[MOVE], scalar[SPARE]
     _require_positive(vector, matrix, scalar[GOOD], matrix[H])
@@ -282,7 +283,7 @@ def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def _require_positive(vector: Array, matrix: Array, good: Array, curvature: Array) -> None:
-    """Keep only the lanes good whose curvature is positive definite; its factor is written to LOWER and INVERSE."""
+    """Clear GOOD for lanes whose curvature is not positive definite; write the factor to LOWER and INVERSE."""
     d, diagonal, inverse = vector.shape[1], vector[DIAGONAL], vector[INVERSE]
     for i in range(d):
         for lane in range(LANES):

@@ -1,4 +1,7 @@
-"""The cost at infinity: the least cost over all directions, on a sphere so wide that wave fronts are flat."""
+"""The cost at infinity: the least cost over all directions, on a sphere so wide that wave fronts are flat.
+
+Names in capitals, such as X or BEYOND, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 

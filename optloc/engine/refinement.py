@@ -1,4 +1,7 @@
-"""Damped Gauss-Newton refinement of many problems in lanes, with the rules of `optloc.kernels.least_squares`."""
+"""Damped Gauss-Newton refinement of many problems in lanes, with the rules of `optloc.kernels.least_squares`.
+
+Names in capitals, such as X or ALIVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 

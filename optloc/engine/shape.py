@@ -2,6 +2,8 @@
 
 `kappa` is the greatest absolute logarithm of the cost rise at three sigma over the quadratic rise, in all probed
 directions. It is 0 for a Gaussian. It is measured in metres, and in inverse range about the mean of the stations.
+
+Names in capitals, such as X or MOVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The start of a fix: the exact minimiser of the squared ranges and the other linear rows."""
+"""The start of a fix: the exact minimiser of the squared ranges and the other linear rows.
+
+Names in capitals, such as X or GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Rows of every kind as tapes of h(x) and its derivatives, with all other unknowns.
 
-This evaluator serves all problems that `optloc.engine.ranges` does not. It refines all unknowns together.
+This evaluator serves all problems that `optloc.engine.ranges` does not. It refines all unknowns together. Names in
+capitals, such as X or COST, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class Entries:
 
     @classmethod
     def joined(cls, parts: list[Entries]) -> Entries:
-        """Return several parts as one."""
+        """Return the entries of several parts as one."""
         none = np.zeros(0, dtype=np.int64)
         parts = [cls(none, none, np.zeros(0), none), *parts]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))

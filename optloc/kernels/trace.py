@@ -321,7 +321,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
 
 
 def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
-    """Return the nodes that the wanted nodes need, in the order in which they were recorded."""
+    """Return the nodes that the wanted nodes depend on, in the order in which they were recorded."""
     found: set[int] = set()
     ahead = list(wanted)
     while ahead:

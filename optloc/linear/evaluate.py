@@ -165,7 +165,7 @@ def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
-    """Return the offsets, drifts and emission times of a block of rows."""
+    """Return the offsets, drifts and emission times of a block of rows, as linear terms."""
     parts = [_terms(problem, block, start, "adds")]
     for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)

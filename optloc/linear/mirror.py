@@ -18,7 +18,10 @@ from optloc.problem.problem import Problem
 
 
 def one_position(problem: Problem) -> bool:
-    """Return whether the start of a problem is a single position, with stations and target at rest or in one epoch."""
+    """Return whether the only unknown state is one position.
+
+    This holds for a single unknown target, if it and the stations are at rest, or if there is only one epoch.
+    """
     if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
         return False
     still = problem.stations.position.shape[-3] == 1 and problem.motions[0].order == 0
