@@ -44,7 +44,7 @@ _NOTHING = 1e-12
 _LEVEL = 1e-9
 
 
-class SimulatedBatch(NamedTuple):
+class PlanArrays(NamedTuple):
     """The stations of a plan (epoch and number, (2, s)), its maps to a start, and a function that returns its rows.
 
     `ranged` is True if all rows are sums of ranges.
@@ -56,7 +56,7 @@ class SimulatedBatch(NamedTuple):
     ranged: bool
 
 
-def draw_ranges(one: Problem, admission: Admission) -> SimulatedBatch | None:
+def draw_ranges(one: Problem, admission: Admission) -> PlanArrays | None:
     """Return the arrays of a plan whose rows are sums of ranges.
 
     The result is None if rows for a start are missing, or if no row links some stations.
@@ -78,10 +78,10 @@ def draw_ranges(one: Problem, admission: Admission) -> SimulatedBatch | None:
         assert one.stations.covariance is not None
         first = offset.reshape(-1, one.dimension)[node[1], 0]
         made = made._replace(wander=np.array(one.stations.covariance[node[1], 0, 0]), offset=first)
-    return SimulatedBatch(node, model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made, True)
+    return PlanArrays(node, model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made, True)
 
 
-def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch | None:
+def draw_tapes(one: Problem, admission: Admission, dof: int) -> PlanArrays | None:
     """Return the arrays of a plan whose rows are tapes, or None if the rows have no tapes or no start."""
     found = _find_ranges(one)
     node = _nodes(one, found)
@@ -99,7 +99,7 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch |
         model = model._replace(start=start, height=height)
     elif start == BY_PLACES:
         model = model._replace(start=start, limit=largest(dof, _POOR))
-    return SimulatedBatch(node, model, make, False)
+    return PlanArrays(node, model, make, False)
 
 
 def _find_ranges(one: Problem) -> Ranges | None:
