@@ -1,4 +1,4 @@
-r"""Small algebra on batches, which most problems of this package share.
+r"""Linear algebra of small matrices in batches, for most problems of this package.
 
 Every product is a fixed chain of elementwise operations: an item that is singular or not finite changes no bit of its
 neighbours, and problems of three or four unknowns cost no call per matrix. Two layouts occur. Geometry keeps the batch
@@ -20,16 +20,16 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
 
-# A polishing step longer than this share of the point is no correction of rounding errors (about 1e-8 where it is
-# needed most, at a double root) but leads to another point.
+# Greatest length of a polishing step, relative to the point. Corrections of rounding errors are shorter (about 1e-8 at
+# a double root); a longer step leads to another point.
 _CORRECTION = 1e-2
 
 
-# The batch in front.
+# The batch on the first axis.
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Inner products along the last axis.
+    """Return the inner products along the last axis.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def flatten(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> Array:
-    """Give a value one batch axis.
+    """Return a value with one batch axis.
 
     Parameters
     ----------
@@ -63,19 +63,19 @@ def flatten(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> A
 
 
 def span(when: Array, heard: Mask) -> tuple[Array, Array]:
-    """Middle and half length of the times heard: powers of what is left are of order one.
+    """Return the middle and the half length of the observed times, so that powers of scaled times are of order one.
 
     Parameters
     ----------
     when : Array, shape (N, k)
         Times.
     heard : Mask, shape (N, k)
-        Those that count.
+        Whether each time is observed.
 
     Returns
     -------
     middle, half : Array, shape (N, 1)
-        Zero and one where nothing is heard; a half length of one where all times are equal.
+        Zero and one if no time is observed; the half length is one if all times are equal.
     """
     first = np.min(np.where(heard, when, np.inf), axis=-1, keepdims=True)
     last = np.max(np.where(heard, when, -np.inf), axis=-1, keepdims=True)
@@ -85,19 +85,19 @@ def span(when: Array, heard: Mask) -> tuple[Array, Array]:
 
 
 def uncentre(c: Array, middle: Array, half: Array) -> Array:
-    """Coefficients in time from those in ``(time - middle) / half``.
+    """Return the coefficients of a polynomial in time from its coefficients in ``(time - middle) / half``.
 
     Parameters
     ----------
     c : Array, shape (N, order + 1, d)
         Coefficients, constant first.
     middle, half : Array, shape (N, 1)
-        As `span` gives them.
+        Results of `span`.
 
     Returns
     -------
     Array, shape (N, order + 1, d)
-        By the binomial theorem.
+        Coefficients in time, by the binomial theorem.
     """
     out = np.zeros_like(c)
     for j in range(c.shape[1]):
@@ -110,7 +110,7 @@ def uncentre(c: Array, middle: Array, half: Array) -> Array:
 
 
 def normal(B: Array, g: Array) -> tuple[Array, Array]:
-    """``B'B`` and ``B'g``.
+    """Return ``B'B`` and ``B'g``.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def normal(B: Array, g: Array) -> tuple[Array, Array]:
 
 
 def apply(matrix: Array, points: Array) -> Array:
-    """``matrix @ points`` for every item and slot.
+    """Return ``matrix @ points`` for every item and slot.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def apply(matrix: Array, points: Array) -> Array:
 
 
 def across(matrix: Array, vector: Array) -> Array:
-    """``matrix' @ vector`` for every item.
+    """Return ``matrix' @ vector`` for every item.
 
     Parameters
     ----------
@@ -174,12 +174,12 @@ def across(matrix: Array, vector: Array) -> Array:
 
 
 def eigen(S: Array) -> tuple[Array, Array]:
-    """Eigenpairs of symmetric matrices; an item that is not finite does not stop the others.
+    """Return the eigenpairs of symmetric matrices; an item that is not finite does not affect the others.
 
     Parameters
     ----------
     S : Array, shape (n, n, N)
-        Symmetric matrices; the identity takes the place of those that are not finite, for which LAPACK raises.
+        Symmetric matrices. The identity replaces matrices that are not finite, for which LAPACK raises an error.
 
     Returns
     -------
@@ -197,7 +197,7 @@ def eigen(S: Array) -> tuple[Array, Array]:
 
 
 def bordered(D: Array, q: Array, corner: float | Array, right: Array, last: Array) -> Array:
-    """Solve ``[diag D, q; q', corner] (v, .) = (right, last)`` for v, pivoting on one entry of D that may vanish.
+    """Return the solution v of ``[diag D, q; q', corner] (v, .) = (right, last)``, in which one entry of D may vanish.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def bordered(D: Array, q: Array, corner: float | Array, right: Array, last: Arra
     -----
     Nocedal and Wright (2006), section 16.1.
     """
-    # Eliminating entry by entry divides by D; the one of the largest q^2 / |D| is eliminated by the border instead.
+    # Elimination divides by the entries of D; the entry with the largest q^2 / |D| is eliminated by the border instead.
     pivot = np.argmax(q * q / np.abs(D), axis=0)[None]
     own, edge = np.take_along_axis(D, pivot, axis=0)[0], np.take_along_axis(q, pivot, axis=0)[0]
     share = q * own / D
@@ -229,7 +229,7 @@ def bordered(D: Array, q: Array, corner: float | Array, right: Array, last: Arra
 
 
 def correct(y: Array, move: Array) -> Array:
-    """Take a polishing step only where it is small: at a fold or the apex it means nothing.
+    """Return points after a polishing step; a large step, as at a fold or the apex, is not taken.
 
     Parameters
     ----------

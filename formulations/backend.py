@@ -1,6 +1,7 @@
-"""Which back end solves the programs of this package, and a count of what solving took.
+"""The choice of the back end that solves the programs of this package, and a count of its iterations.
 
-Both are context variables: threads and tasks may each have a choice of their own, and no formulation passes them on.
+Both are context variables: each thread and task can have a different choice, and no formulation passes them as
+arguments.
 """
 
 from __future__ import annotations
@@ -13,21 +14,21 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Kind = Literal["conic", "nonlinear"]
-"""What a back end solves."""
+"""Kind of the programs that a back end solves."""
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A back end in the place of a formulation's own.
+    """A back end that replaces the default of a formulation.
 
     Parameters
     ----------
     kind : "conic" or "nonlinear"
-        Which programs it takes: those of cvxpy, or those of CasADi.
+        Kind of programs: "conic" for cvxpy, "nonlinear" for CasADi.
     name : str
         Solver of cvxpy, for instance ``"SCS"``, or plugin of CasADi, for instance ``"sqpmethod"``.
     settings : Mapping[str, Any]
-        Its settings, by its own names.
+        Settings of the solver, by the solver's names.
     """
 
     kind: Kind
@@ -36,24 +37,24 @@ class Choice:
 
     @property
     def key(self) -> str:
-        """Return text that is equal for equal choices."""
+        """Return a text that is equal for equal choices."""
         return f"{self.kind}:{self.name}:{sorted(self.settings.items())!r}"
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How one solve of a back end ended.
+    """The result status of one solve of a back end.
 
     Parameters
     ----------
     backend : str
         Name of the back end.
     status : str
-        Its own word.
+        Status in the words of the back end.
     message : str
-        Its own sentence; empty where it has none.
+        Message of the back end; empty if there is none.
     found : bool
-        Whether it returned a point that is an answer.
+        Whether the returned point is a valid solution.
     """
 
     backend: str
@@ -62,27 +63,27 @@ class Ending:
     found: bool
 
     def __str__(self) -> str:
-        """Return back end and status, and the message where there is one."""
+        """Return back end and status, and the message if there is one."""
         return f"{self.backend}: {self.message or self.status}"
 
 
 class SolverError(ArithmeticError):
-    """A back end stopped with an error of its own on numbers that it was given."""
+    """A back end raised an error for the given numbers."""
 
 
 def hold_in_forks(lock: Any) -> None:
-    """Let nobody else hold a lock, or all locks behind it, while the process forks: in the child nobody would open it.
+    """Acquire a lock while the process forks: a lock held by another thread would never be released in the child.
 
     Parameters
     ----------
     lock : object
-        It has ``acquire`` and ``release``. Of several the one that was named last is taken first.
+        Object with ``acquire`` and ``release``. Of several locks, the one registered last is acquired first.
     """
-    if hasattr(os, "register_at_fork"):  # not where processes do not fork
+    if hasattr(os, "register_at_fork"):  # missing on systems without fork
         os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
 
 
-# Context variables, not globals: a choice inside `using` holds for its thread and task alone. Threads that are meant to
+# Context variables, not globals: a choice inside `using` is valid only in its thread and task. Threads that are to
 # share it start in a copy of the caller's context.
 _CHOICE: ContextVar[Choice | None] = ContextVar("choice", default=None)
 _TALLY: ContextVar[list[tuple[str, int]] | None] = ContextVar("tally", default=None)
@@ -90,14 +91,14 @@ _ENDINGS: ContextVar[list[Ending] | None] = ContextVar("endings", default=None)
 
 
 def choice_for(kind: Kind) -> Choice | None:
-    """Return the choice that holds for a kind of program, None for the formulation's own."""
+    """Return the choice that is valid for a kind of program, None for the default of the formulation."""
     choice = _CHOICE.get()
     return choice if choice is not None and choice.kind == kind else None
 
 
 @contextmanager
 def using(choice: Choice | None) -> Iterator[None]:
-    """Let a choice hold for everything inside."""
+    """Make a choice valid for all code inside the ``with`` block."""
     token = _CHOICE.set(choice)
     try:
         yield
@@ -107,7 +108,7 @@ def using(choice: Choice | None) -> Iterator[None]:
 
 @contextmanager
 def counting() -> Iterator[list[tuple[str, int]]]:
-    """Yield a list to which everything inside adds the name of the solver and its iterations, one pair a solve."""
+    """Yield a list to which each solve inside the block appends the name of the solver and its iterations."""
     tally: list[tuple[str, int]] = []
     token = _TALLY.set(tally)
     try:
@@ -118,7 +119,7 @@ def counting() -> Iterator[list[tuple[str, int]]]:
 
 @contextmanager
 def recording() -> Iterator[list[Ending]]:
-    """Yield a list to which every solve inside adds how it ended; a list outside gets the same entries afterwards."""
+    """Yield a list to which each solve inside the block appends its `Ending`; an outer list gets the same entries."""
     endings: list[Ending] = []
     outer = _ENDINGS.get()
     token = _ENDINGS.set(endings)
@@ -131,24 +132,24 @@ def recording() -> Iterator[list[Ending]]:
 
 
 def failures() -> tuple[Ending, ...]:
-    """Return the endings without an answer that the innermost `recording` holds so far."""
+    """Return the failed solves in the list of the innermost `recording`."""
     return tuple(ending for ending in _ENDINGS.get() or () if not ending.found)
 
 
 def record(ending: Ending) -> None:
-    """Add the ending of a solve to the list of `recording`, where there is one."""
+    """Append the ending of a solve to the list of `recording`, if there is one."""
     endings = _ENDINGS.get()  # one list for all threads of a caller: appending is atomic
     if endings is not None:
         endings.append(ending)
 
 
 def first_sentence(trouble: BaseException) -> str:
-    """Return the first line of an error, and its type where it has no text."""
+    """Return the first line of an error, or its type if it has no text."""
     return str(trouble).partition("\n")[0] or type(trouble).__name__
 
 
 def count(name: str, iterations: int) -> None:
-    """Add a solve to the tally, where one is kept."""
+    """Append a solve to the list of `counting`, if there is one."""
     tally = _TALLY.get()  # one list for all threads of a caller: appending is atomic
     if tally is not None:
         tally.append((name, iterations))

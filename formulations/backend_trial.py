@@ -1,7 +1,8 @@
-"""The trial of back ends in a process apart: ``python -m formulations.backend_trial SECONDS KIND:NAME...``.
+"""A test of back ends in a separate process: ``python -m formulations.backend_trial SECONDS KIND:NAME...``.
 
-Each solves programs of two unknowns whose solution is known, and others that have none. It prints one line for each. A
-solver that does not end in time ends the process: nothing else stops machine code.
+Each back end solves programs of two unknowns with a known solution, and programs without a solution. The process prints
+one line for each back end. If a solver does not end in time, the process ends, because machine code cannot be stopped
+otherwise.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ from formulations.algebra import Array
 from formulations.backend import Choice, SolverError, using
 
 PASSED, FAILED = "backend-passed", "backend-failed"
-"""How the lines begin that say what came of it: solvers print lines of their own."""
+"""Start of the lines with a result, since solvers print other lines."""
 
-# Three ranges to a place, one of which has to be left by the constraints.
+# Three ranges to a position, which the constraints of some programs exclude.
 _STATION = np.array([[0.0, 0.0], [1.0, 0.1], [0.2, 0.9]])
 _PLACE = np.array([0.6, 0.7])
 _RANGES = np.sqrt(((_PLACE - _STATION) ** 2).sum(1))
-# How near an answer has to be: first-order solvers stop at 1e-4.
+# Accepted error of a solution: first-order solvers stop at 1e-4.
 _NEAR = 1e-2
 
 
 def _conic(name: str) -> str:
-    """Return what is wrong with a conic solver; empty where nothing is."""
+    """Return the failure of a conic solver, or "" if it works."""
     from formulations.minimax_cone import common
     from formulations.squared_range import paraboloid
     from formulations.squared_range_conic import hull, shor
@@ -41,25 +42,25 @@ def _conic(name: str) -> str:
         found = [each(rows, right, paraboloid(2)) for each in (hull, shor)]
         solved = [one for one in found if np.isfinite(one.y).all()]
         if not solved:
-            return f"it solves no program of cones ({found[0].answer.message or found[0].answer.status})"
+            return f"it solves no conic program ({found[0].answer.message or found[0].answer.status})"
         if any(np.abs(one.y[:2] - _PLACE).max() > _NEAR for one in solved):
-            return "its answer is wrong"
-        # two stations that look away from each other: no point is in front of both
+            return "its solution is wrong"
+        # two stations with bearings away from each other: no point is in front of both
         apart = common(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 0.0], [1.0, 0.0]]), np.full(2, 0.1))
         if apart.meet:
-            return "it finds a common point of cones that have none"
+            return "it reports a common point of cones that do not meet"
     return ""
 
 
 def _nonlinear(name: str) -> str:
-    """Return what is wrong with a nonlinear solver; empty where nothing is."""
+    """Return the failure of a nonlinear solver, or "" if it works."""
     free, held = _solve(name), _solve(name, inequalities=lambda x, p: [0.5 - x[0]])
     if isinstance(free, str) or isinstance(held, str):
         return str(free if isinstance(free, str) else held)
     if not (free.success and held.success):
-        return f"it ends without an answer ({held.status if free.success else free.status})"
+        return f"it ends without a solution ({held.status if free.success else free.status})"
     if np.abs(free.x - _PLACE).max() > _NEAR or held.x[0] > 0.5 + _NEAR:
-        return "its answer is wrong"
+        return "its solution is wrong"
     hopeless: list[dict[str, Any]] = [
         {"equalities": lambda x, p: [x[0] ** 2 + 1.0]},
         {"inequalities": lambda x, p: [x[0] - 1.0, -x[0]]},
@@ -69,12 +70,12 @@ def _nonlinear(name: str) -> str:
     for each in hopeless:
         found = _solve(name, **each)
         if not isinstance(found, str) and found.success:
-            return "it calls a point a solution where there is none"
+            return "it reports success for a program without a solution"
     return ""
 
 
 def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **constraints: Callable[..., Any]) -> Any:
-    """Return the answer of a solver, or the sentence of its failure."""
+    """Return the solution of a solver, or the message of its failure."""
     import casadi as ca
 
     from formulations.nls import Program
@@ -90,27 +91,27 @@ def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **con
 
 
 def _tried(kind: str, name: str) -> str:
-    """Return what is wrong with a solver of a kind, "conic" or "nonlinear"; empty where nothing is."""
+    """Return the failure of a solver of a kind, "conic" or "nonlinear", or "" if it works."""
     try:
         return _conic(name) if kind == "conic" else _nonlinear(name)
-    except Exception as trouble:  # noqa: BLE001  (whatever a solver raises is what is wrong with it)
+    except Exception as trouble:  # noqa: BLE001  (any exception of a solver is its failure)
         return f"{type(trouble).__name__}: {trouble}".partition("\n")[0]
 
 
 def main(seconds: float, choices: list[str]) -> None:
-    """Try back ends one after the other, and print what is wrong with each.
+    """Test back ends one after the other, and print the failure of each.
 
     Parameters
     ----------
     seconds : float
-        Time that each has for all programs.
+        Time limit of each back end for all programs.
     choices : list of str
-        Kind and name of each, joined by a colon.
+        Kind and name of each back end, joined by a colon.
     """
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
 
     def say(word: str, name: str, fault: str) -> None:
-        # solvers print to the same place, perhaps half a line
+        # solvers print to the same stream, perhaps without a line end
         lines.write(f"\n{word} {name} {fault}\n")
         lines.flush()
 
@@ -119,7 +120,7 @@ def main(seconds: float, choices: list[str]) -> None:
         os._exit(0)
 
     for kind, _, name in (choice.partition(":") for choice in choices):
-        import_module("cvxpy" if kind == "conic" else "casadi")  # outside the time of the solver
+        import_module("cvxpy" if kind == "conic" else "casadi")  # not counted as time of the solver
         timer = Timer(seconds, stop, (name,))
         timer.daemon = True
         timer.start()

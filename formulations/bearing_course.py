@@ -13,7 +13,7 @@ with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E` (horizontal
 - *instrumental*: :math:`Z^\top W^2 (G c - b) = 0`, `Z` being `G` at the angles predicted by the weighted course. A run
   has many rays, and the noise in `G` is what biases the first two, more than it scatters them; `Z` does not share it.
 
-No epoch needs a fix of its own: one station that manoeuvres may do.
+No epoch needs enough rows for a separate fix: one station that manoeuvres may be enough.
 
 Source: K. Dogancay, "Bias compensation for the bearings-only pseudolinear target track estimator", IEEE Trans. Signal
 Process. 54 (2006), and "3D pseudolinear target motion analysis from angle measurements", IEEE Trans. Signal Process.
@@ -30,9 +30,9 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array, Mask, dot, span, uncentre
 from formulations.bearing_ls import BearingRays, lengths, look, rays
 
-# Singular value, over the largest one, of scaled rows that counts as zero: five decades above their rounding errors.
+# Singular value of scaled rows, relative to the largest, that counts as zero: five decades above rounding errors.
 _RANK = 1e-10
-_NEAR = 1e-6  # shortest range, over the size of the array, that a weight is computed from; as in `bearing_ls`
+_NEAR = 1e-6  # shortest range in a weight, relative to the size of the array, as in `bearing_ls`
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +42,11 @@ class BearingCourses:
     Parameters
     ----------
     plain, weighted, instrumental : Array, shape (N, order + 1, d)
-        Position, velocity, half the acceleration at time zero; NaN where the rows do not determine them.
+        Position, velocity, half the acceleration at time zero; NaN if the rows do not determine them.
     ok : Mask, shape (N,)
-        Where the instrumental course exists.
+        Whether the instrumental course exists.
     ahead : Mask, shape (N,)
-        Where it also lies in front of the stations at every bearing.
+        Whether it also is in front of the stations at every bearing.
     """
 
     plain: Array
@@ -58,7 +58,7 @@ class BearingCourses:
 
 @dataclass(frozen=True, slots=True)
 class _CourseRun:
-    """What was seen: stations (N, m, d), axes, times as powers (N, m, order + 1), rows and right sides."""
+    """The data of a fit: stations (N, m, d), axes, powers of the times (N, m, order + 1), rows and right sides."""
 
     station: Array
     axes: Array | None
@@ -78,7 +78,7 @@ class _CourseRun:
         return np.asarray(self.powers @ c - self.station)
 
     def own(self, c: Array) -> Array:
-        """Return the same in the axes of each station."""
+        """Return the lines of sight (N, m, d) to a course, in the axes of each station."""
         return self.line(c) if self.axes is None else np.einsum("nmij,nmj->nmi", self.axes, self.line(c))
 
 
@@ -94,20 +94,20 @@ def sight_courses(
     order: int = 1,
     passes: int = 2,
 ) -> BearingCourses:
-    """Fit a polynomial course to bearings without a guess.
+    """Return polynomial courses fitted to bearings, without an initial guess.
 
     Parameters
     ----------
     azimuth, elevation : array_like, shape (N, m)
-        Radians, in the axes given; elevations are needed where the stations are in space.
+        Radians, in the given axes; stations in space need elevations.
     station : array_like, shape (N, m, d)
-        Where each bearing was taken from, numbers of order one.
+        Position of the station of each bearing, numbers of order one.
     time : array_like, shape (m,)
-        When.
+        Time of each bearing.
     weight, elevation_weight : array_like, shape (N, m)
-        One over the standard deviation; zero where the angle is absent (its value is then not read).
+        One over the standard deviation; zero if the angle is absent (its value is then not read).
     axes : array_like, shape (N, m, d, d), optional
-        Rows are the unit vectors of each station's axes; None: those of the frame.
+        Rows are the unit vectors of each station's axes; None: the axes of the frame.
     order : int
         0: static, 1: constant velocity, 2: constant acceleration.
     passes : int
@@ -117,7 +117,7 @@ def sight_courses(
     Returns
     -------
     BearingCourses
-        Three courses per item and whether they exist.
+        Three courses for each item, and whether they exist.
 
     Notes
     -----
@@ -145,7 +145,7 @@ def sight_courses(
         own = run.own(c)
         instruments = run.design(look(own, axes).normals)
         final = _balance(instruments, G, run.right, W / lengths(own, run.least), order)
-        # a bearing and its opposite give the same row: only now does it count where the target stands
+        # a bearing and its opposite give the same row, so the side of the target is checked here
         front = dot(run.line(final), seen.ahead) > 0.0
         ok = np.asarray(np.isfinite(final).all(axis=(-2, -1)))
         three = [uncentre(each, middle, half) for each in (plain, c, final)]
@@ -153,22 +153,23 @@ def sight_courses(
 
 
 def _run(S: Array, axes: Array | None, powers: Array, seen: BearingRays, both: bool) -> _CourseRun:
+    """Return the data of a fit, with the least range in a weight."""
     normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
     size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)
-    # one station at the origin has no size: any positive length will do
+    # one station at the origin has no size: any positive length is valid
     return _CourseRun(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
-    """Solve ``Z' W^2 (G c - b) = 0``, shape (N, order + 1, d); NaN where it has no single solution."""
+    """Return the solution (N, order + 1, d) of ``Z' W^2 (G c - b) = 0``; NaN if it is not unique."""
     n = G.shape[-1]
-    # triangularised, not squared: an orthonormal base of the instruments' columns takes the place of Z' W
+    # triangularised, not squared: an orthonormal base of the instruments' columns replaces Z' W
     share = np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None]
     left, right = share * Z, np.concatenate([share * G, share * b[..., None]], axis=-1)
     good = np.isfinite(left).all(axis=(-2, -1)) & np.isfinite(right).all(axis=(-2, -1))
     left, right = (np.where(good[:, None, None], part, 0.0) for part in (left, right))
-    short = max(0, n - left.shape[1])  # rows of zeros where there are fewer than unknowns: the shapes below then hold
+    short = max(0, n - left.shape[1])  # zero rows if there are fewer rows than unknowns
     left, right = (np.pad(part, ((0, 0), (0, short), (0, 0))) for part in (left, right))
     sizes = np.sqrt((right[..., :n] ** 2).sum(axis=-2))
     good &= (sizes > 0.0).all(axis=-1)

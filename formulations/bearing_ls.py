@@ -27,26 +27,27 @@ from numpy.typing import ArrayLike
 
 from formulations.algebra import Array, Mask, dot
 
-# Determinant of a normal matrix, over the product of its row lengths, that counts as zero: some hundred roundings.
+# Determinant of a normal matrix, relative to the product of its row lengths, that counts as zero: some hundred
+# roundings.
 _FLAT = 1e-13
-# Shortest range, over the size of the array, that a weight is computed from: an intermediate fix may fall on a station,
-# and no real target is a millionth of the array away from one.
+# Shortest range in a weight, relative to the size of the array: an intermediate fix may be at a station, but no real
+# target is so near to a station.
 _NEAR = 1e-6
-_PARALLEL = 1e13  # condition number from which lines are parallel: less than three digits would be left
+_PARALLEL = 1e13  # condition number from which lines count as parallel: less than three digits would be left
 
 
 @dataclass(frozen=True, slots=True)
 class BearingRays:
-    """Directions of sight and the two tangents along which the angles grow, in the frame of the stations.
+    """Directions of sight, and the two tangents along which the angles increase, in the frame of the stations.
 
     Parameters
     ----------
     ahead : Array, shape (..., N, d)
-        Unit directions; level (no elevation) in the station's axes where `N` bearings have an azimuth only.
+        Unit directions; horizontal in the station's axes if the bearings are azimuths only.
     across : Array, shape (..., N, d)
-        Unit tangents of growing azimuth.
+        Unit tangents of increasing azimuth.
     upward : Array, shape (..., N, 3) or None
-        Unit tangents of growing elevation; None in the plane.
+        Unit tangents of increasing elevation; None in the plane.
     """
 
     ahead: Array
@@ -55,7 +56,7 @@ class BearingRays:
 
     @property
     def normals(self) -> Array:
-        """Rows ``g`` (up to sign), shape (..., N or 2 N, d): those of the azimuths, then those of the elevations."""
+        """Return the rows ``g`` (up to sign), shape (..., N or 2 N, d): azimuths, then elevations."""
         return self.across if self.upward is None else np.concatenate([self.across, self.upward], axis=-2)
 
 
@@ -66,11 +67,11 @@ class Sighted:
     Parameters
     ----------
     plain, weighted, instrumental : Array, shape (..., d)
-        The three fixes; NaN where the rows do not determine one.
+        The three fixes; NaN if the rows do not determine a fix.
     ok : Mask, shape (...)
-        Where the instrumental fix exists.
+        Whether the instrumental fix exists.
     ahead : Mask, shape (...)
-        Where it also lies in front of every station that has a bearing.
+        Whether it also is in front of every station that has a bearing.
     """
 
     plain: Array
@@ -81,16 +82,16 @@ class Sighted:
 
 
 def rays(azimuth: ArrayLike, elevation: ArrayLike | None = None, axes: ArrayLike | None = None) -> BearingRays:
-    """Turn angles into directions.
+    """Return the unit directions of angles.
 
     Parameters
     ----------
     azimuth : array_like, shape (..., N)
-        From the first axis towards the second, radians.
+        Angle from the first axis towards the second, radians.
     elevation : array_like, shape (..., N), optional
-        Above the plane of the first two axes; None for the plane problem.
+        Angle above the plane of the first two axes, radians; None for the plane problem.
     axes : array_like, shape (..., N, d, d), optional
-        Rows are the unit vectors of each station's axes; None: those of the frame.
+        Rows are the unit vectors of each station's axes; None: the axes of the frame.
 
     Returns
     -------
@@ -128,20 +129,20 @@ def sight(
     axes: ArrayLike | None = None,
     passes: int = 2,
 ) -> Sighted:
-    """Locate from bearings without a guess.
+    """Return fixes from bearings, without an initial guess.
 
     Parameters
     ----------
     azimuth, elevation : array_like, shape (..., N)
-        Radians, in the axes given. Without `elevation` the problem is plane if the stations are, else azimuths alone
-        (which leave the height open unless the axes differ).
+        Radians, in the given axes. Without `elevation`, the problem is plane if the stations are plane. Otherwise it
+        has only azimuths, which do not determine the height unless the axes differ.
     station : array_like, shape (..., N, d)
         Positions, numbers of order one.
     weight, elevation_weight : array_like, shape (..., N)
-        One over the standard deviation; zero where the angle is absent (its value is then not read). An elevation
+        One over the standard deviation; zero if the angle is absent (its value is then not read). An elevation
         needs the azimuth of the same station.
     axes : array_like, shape (..., N, d, d), optional
-        Rows are the unit vectors of each station's axes; None: those of the frame.
+        Rows are the unit vectors of each station's axes; None: the axes of the frame.
     passes : int
         Weighted passes before the instrumental one: the second moves fixes by some thousandths of their error, a third
         by nothing.
@@ -149,7 +150,7 @@ def sight(
     Returns
     -------
     Sighted
-        Three fixes per item and whether they exist.
+        Three fixes for each item, and whether they exist.
 
     Notes
     -----
@@ -166,7 +167,8 @@ def sight(
     turn = None if axes is None else np.asarray(axes, dtype=np.float64)
     with np.errstate(all="ignore"):
         seen = rays(A, E, turn)
-        # about the middle of the stations heard: far from the origin the products g'S lose the digits of the fix
+        # relative to the middle of the present stations: far from the origin the products g'S lose the digits of the
+        # fix
         share = np.where(use, 1.0, 0.0)[..., None]
         middle = (share * S).sum(axis=-2, keepdims=True) / share.sum(axis=-2, keepdims=True)
         S = S - middle
@@ -179,7 +181,7 @@ def sight(
             point = _balance(G, G, b, W / lengths(_local(point, S, turn), least))
         line = _local(point, S, turn)
         final = _balance(look(line, turn).normals, G, b, W / lengths(line, least))
-        # an azimuth and its opposite give the same row: only now does it count where the target stands
+        # an azimuth and its opposite give the same row, so the side of the target is checked here
         front = dot(final[..., None, :] - S, seen.ahead) > 0.0
     ok = np.asarray(np.isfinite(final).all(axis=-1))
     shift = middle[..., 0, :]
@@ -213,7 +215,7 @@ def predict(point: Array, station: Array, axes: ArrayLike | None = None) -> Arra
 
 
 def meeting(direction: Array, station: Array) -> Array:
-    """Return the point nearest to lines, in least squares weighted by one over the distance along them.
+    """Return the point nearest to lines in the least-squares sense, with weights of one over the distance along them.
 
     Parameters
     ----------
@@ -225,7 +227,7 @@ def meeting(direction: Array, station: Array) -> Array:
     Returns
     -------
     Array, shape (3,)
-        The point; NaN for parallel lines.
+        The point; NaN if the lines are parallel.
 
     Notes
     -----
@@ -243,14 +245,14 @@ def meeting(direction: Array, station: Array) -> Array:
 
 
 def look(line: Array, axes: ArrayLike | None = None) -> BearingRays:
-    """Turn lines of sight into directions.
+    """Return the unit directions of lines of sight.
 
     Parameters
     ----------
     line : Array, shape (..., N, d)
         From each station to the target, in the station's axes; with elevations in space.
     axes : array_like, shape (..., N, d, d), optional
-        Rows are the unit vectors of each station's axes; None: those of the frame.
+        Rows are the unit vectors of each station's axes; None: the axes of the frame.
 
     Returns
     -------
@@ -264,7 +266,7 @@ def look(line: Array, axes: ArrayLike | None = None) -> BearingRays:
 
 
 def lengths(line: Array, least: Array) -> Array:
-    """Return what turns an angle's error into a row's: horizontal ranges, then, in space, slant ranges.
+    """Return the factors from angle errors to row errors: horizontal ranges, then, in space, slant ranges.
 
     Parameters
     ----------
@@ -276,19 +278,20 @@ def lengths(line: Array, least: Array) -> Array:
     Returns
     -------
     Array, shape (..., N) or (..., 2 N)
-        One for each row.
+        One factor for each row.
     """
     flat = np.maximum(np.hypot(line[..., 0], line[..., 1]), least)
     return flat if line.shape[-1] == 2 else np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1)
 
 
 def _local(point: Array, S: Array, turn: Array | None) -> Array:
+    """Return the lines of sight to a point, in the axes of each station."""
     line = point[..., None, :] - S
     return line if turn is None else np.einsum("...ij,...j->...i", turn, line)
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
-    """Solve ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN where it has no single solution."""
+    """Return the solution of ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN if it is not unique."""
     left = Z * np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None] ** 2
     inverse = _inverse(np.einsum("...ki,...kj->...ij", left, G))
     point = np.zeros(inverse.shape[:-1])
@@ -300,7 +303,7 @@ def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
 
 
 def _inverse(M: Array) -> Array:
-    """Inverse of 2 x 2 or 3 x 3 matrices by cofactors; NaN where singular."""
+    """Return the inverse of 2 x 2 or 3 x 3 matrices by cofactors; NaN if singular."""
     if M.shape[-1] == 2:
         first, second = M[..., 0, :], M[..., 1, :]
         columns = np.stack(

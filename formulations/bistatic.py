@@ -29,8 +29,8 @@ from numpy.typing import ArrayLike
 
 from formulations.algebra import Array, Mask, dot, flatten, span, uncentre
 
-_PASSES = 2  # weights from half the path, then from the course that they gave; a start needs no third
-_RANK = 1e-11  # singular value of the whitened rows, over the largest one, that counts as zero: far above rounding
+_PASSES = 2  # weights from half the path, then from the resulting course; a start needs no third pass
+_RANK = 1e-11  # singular value of the whitened rows, relative to the largest, that counts as zero: far above rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +40,13 @@ class BistaticRanges:
     Parameters
     ----------
     range : Array, shape (...)
-        Ranges, NaN where not valid.
+        Ranges; NaN if not valid.
     slope : Array, shape (...)
         Change of the excess path with the range, from 0 (towards the illuminator) to 2 (away from it); NaN at 0/0.
     turn : Array, shape (..., 3)
         Change of the excess path with the direction, a vector normal to it.
     valid : Mask, shape (...)
-        False where the excess path is not positive, the input is not finite or the slope is below the least.
+        False if the excess path is not positive, the input is not finite or the slope is below the limit.
     """
 
     range: Array
@@ -55,7 +55,7 @@ class BistaticRanges:
     valid: Mask
 
     def deviation(self, excess: ArrayLike, direction: Array) -> Array:
-        """Bound of the standard deviation of the range of one epoch.
+        """Return a bound of the standard deviation of the range of one epoch.
 
         Parameters
         ----------
@@ -67,7 +67,7 @@ class BistaticRanges:
         Returns
         -------
         Array, shape (...)
-            Infinite where not valid.
+            The bound; infinite if not valid.
         """
         spread = np.einsum("...i,...ij,...j->...", self.turn, direction, self.turn)
         noise = np.sqrt(np.asarray(excess, dtype=np.float64) ** 2 + spread)
@@ -81,9 +81,9 @@ class BistaticCourse:
     Parameters
     ----------
     coefficients : Array, shape (..., order + 1, 3)
-        Position, velocity, half the acceleration, ... at time zero; NaN where not valid.
+        Position, velocity, half the acceleration, ... at time zero; NaN if not valid.
     valid : Mask, shape (...)
-        False where the epochs do not determine the course, or it is not ahead of the receiver at each of them.
+        False if the epochs do not determine the course, or if it is not in front of the receiver at each epoch.
     """
 
     coefficients: Array
@@ -91,7 +91,7 @@ class BistaticCourse:
 
 
 def triad(azimuth: ArrayLike, elevation: ArrayLike) -> Array:
-    """Axes of a direction: of growing azimuth, of growing elevation, and the direction.
+    """Return the axes of a direction: of increasing azimuth, of increasing elevation, and the direction.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def triad(azimuth: ArrayLike, elevation: ArrayLike) -> Array:
     Returns
     -------
     Array, shape (..., 3, 3)
-        Unit vectors as rows. Errors along the first are those of the azimuth times the cosine of the elevation.
+        Unit vectors as rows. Errors along the first are azimuth errors times the cosine of the elevation.
     """
     azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
@@ -110,7 +110,7 @@ def triad(azimuth: ArrayLike, elevation: ArrayLike) -> Array:
 
 
 def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: float = 1e-6) -> BistaticRanges:
-    """Range from excess path and direction, in closed form.
+    """Return the range from excess path and direction, in closed form.
 
     Parameters
     ----------
@@ -121,12 +121,12 @@ def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: 
     illuminator : Array, shape (..., 3)
         Position of the illuminator relative to the receiver.
     least : float
-        Least slope at which a range counts: here a metre of path is a thousand kilometres of range.
+        Least slope of a valid range: at the default, a metre of path is a thousand kilometres of range.
 
     Returns
     -------
     BistaticRanges
-        With the partials that bound its error.
+        Ranges with the partial derivatives that bound their errors.
 
     Notes
     -----
@@ -142,7 +142,7 @@ def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: 
         behind = np.where(along > 0.0, aside / (d + along), d - along)
         r = (0.5 * l * l + d * l) / (behind + l)
         reach = np.sqrt((r - along) ** 2 + aside)
-        # 1 + (r - u'A) / reach, without cancellation where the target lies before the illuminator
+        # 1 + (r - u'A) / reach, without cancellation if the target is in front of the illuminator
         slope = np.where(along > r, aside / (reach + (along - r)), reach + (r - along)) / reach
         turn = -off * (r / reach)[..., None]
         valid = (l > 0.0) & np.isfinite(r) & np.isfinite(slope) & (slope >= least)
@@ -152,7 +152,7 @@ def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: 
 def course(
     excess: Array, axes: Array, illuminator: Array, time: Array, sigma: Array, *, order: int = 1
 ) -> BistaticCourse:
-    """Fit a polynomial course to several epochs by weighted linear least squares.
+    """Return a polynomial course fitted to several epochs by weighted linear least squares.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def course(
 
     Notes
     -----
-    The weights need ranges: half the path in a first pass, those of its course in a second.
+    The weights need ranges: half the path in a first pass, the ranges of the resulting course in a second.
     """
     lead = np.broadcast_shapes(
         excess.shape, axes.shape[:-2], (*illuminator.shape[:-1], 1), time.shape, sigma.shape[:-1]
@@ -195,8 +195,8 @@ def course(
         normals = np.concatenate([e[:, :, :2], (e[:, :, 2] - A[:, None] / L[..., None])[:, :, None, :]], axis=2)
         normals = np.where(present[..., None], normals, 0.0)
         right = np.where(present, [0.0, 0.0, 1.0] * ((L * L - d * d) / (2.0 * L))[..., None], 0.0)
-        # An angle error shortens u'p by half its square: small, but not against a good path. Added is the root of the
-        # second moment of half the sum of two squared normal errors, (3 s1^4 + 3 s2^4 + 2 s1^2 s2^2) / 4.
+        # An angle error shortens u'p by half its square, which is not small compared with a good path. Added is the
+        # root of the second moment of half the sum of two squared normal errors, (3 s1^4 + 3 s2^4 + 2 s1^2 s2^2) / 4.
         square = np.where(present[..., :2], deviation[..., :2], 0.0) ** 2
         bend = 0.5 * np.sqrt(3.0 * (square**2).sum(axis=-1) + 2.0 * square.prod(axis=-1))
         far = across = 0.5 * L
@@ -212,14 +212,14 @@ def course(
 
 
 def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
-    """Weighted least squares, shape (N, order + 1, 3), and whether it has full rank."""
+    """Return the weighted least-squares solution (N, order + 1, 3), and whether the system has full rank."""
     count, order = len(right), powers.shape[-1]
     n = 3 * order
     B = powers[:, :, None, :, None] * (normals * weight[..., None])[:, :, :, None]
     rows = np.concatenate([B.reshape(count, -1, n), (right * weight).reshape(count, -1, 1)], axis=-1)
     good = np.isfinite(rows).all(axis=(-2, -1))
     rows = np.where(good[:, None, None], rows, 0.0)
-    # rows of zeros where there are fewer than unknowns: the triangle is square all the same
+    # zero rows are appended if there are fewer rows than unknowns, so that the triangle is square
     rows = np.pad(rows, ((0, 0), (0, max(0, n + 1 - rows.shape[1])), (0, 0)))
     triangle = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)[:, :n]
     U, size, V = np.linalg.svd(triangle[..., :n])

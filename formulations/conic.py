@@ -1,19 +1,19 @@
-r"""Parametrised conic problems, canonicalised once and re-solved on Clarabel's own data.
+r"""Parametrised conic problems, canonicalised once and solved again with Clarabel's data.
 
 A cvxpy problem that obeys the parameter rules (DPP) becomes
 
 .. math:: \min_x \tfrac12 x^\top P x + q^\top x + d \quad\text{subject to}\quad A x + s = b, \; s \in K,
 
 in which `P`, `q`, `d`, `A`, `b` are affine in the parameters. The affine maps are taken out of cvxpy once; a later
-solve is a few sparse products, an update of Clarabel's data and the bare solve. Its dual point `z`, projected on the
+solve needs only a few sparse products, an update of Clarabel's data and the solve. Its dual point `z`, projected on the
 dual cone, gives
 
 .. math:: \min \ge d - \tfrac12 x^\top P x - b^\top z - \rho \, |P x + q + A^\top z|
 
-for every minimiser with :math:`|x^*| \le \rho`, whatever the solver reports: the "optimal value" is never used as a
-bound.
+for every minimiser with :math:`|x^*| \le \rho`, independent of the solver's report: the "optimal value" is never used
+as a bound.
 
-Threads may share all of it: every thread feeds numbers of its own, and what needs cvxpy itself runs one at a time.
+Threads may share a relaxation: each thread has separate numbers, and calls of cvxpy run one at a time.
 
 Sources: A. Agrawal et al., "Differentiable convex optimization layers", NeurIPS 2019 (the affine maps); C. Jansson,
 D. Chaykin and C. Keil, "Rigorous error bounds for the optimal value in semidefinite programming", SIAM J. Numer.
@@ -39,36 +39,37 @@ from formulations.backend import Ending, SolverError, choice_for, count, first_s
 _Arguments = ParamSpec("_Arguments")
 _Built = TypeVar("_Built")
 
-# cvxpy counts its variables in a global that is read and written in two steps, and keeps the values of parameters in
-# the problem: two threads in it could number two variables alike, or solve each other's data.
+# cvxpy counts its variables in a global that is read and written in two steps, and stores the values of parameters in
+# the problem. Two threads could give two variables the same number, or solve each other's data.
 _CVXPY = threading.RLock()
 hold_in_forks(_CVXPY)
 
-# More sizes of one problem than a study mixes. Building takes 10 ms to 0.5 s, and what is built less than 2 MB (the
-# moments of seven ranges, eight directions), 20 MB for the registration of eight windows of a moving target.
+# Number of cached problems: more sizes of one problem than a study mixes. Building takes 10 ms to 0.5 s. A problem
+# takes less than 2 MB (moments of seven ranges, eight directions), or 20 MB (registration with eight windows, moving
+# target).
 _KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
 class ConicAnswer:
-    """What one conic solve gave.
+    """The result of one conic solve.
 
     Parameters
     ----------
     values : Mapping[str, Array]
-        Values of the variables by name; NaN where the solver ended without an answer.
+        Values of the variables by name; NaN if the solver ended without a solution.
     primal : float
-        Objective at the point found; NaN where there is none.
+        Objective at the solution; NaN if there is none.
     bound : float
-        Lower bound of the optimum, recomputed from the dual point; minus infinity where none is available.
+        Lower bound of the optimum, recomputed from the dual point; minus infinity if none is available.
     status : str
-        The solver's own word for how it ended.
+        Status in the solver's words.
     solved : bool
-        True where the solver met its full tolerances.
+        Whether the solver met its full tolerances.
     iterations : int
         Interior-point (or other) iterations.
     message : str
-        The solver's own sentence, for instance why it refused; empty where it gave none.
+        Message of the solver, for instance the reason of a failure; empty if there is none.
     """
 
     values: Mapping[str, Array]
@@ -89,17 +90,17 @@ class Relaxation:
         A minimisation that is DPP; parameters and variables carry unique names. Linear, second-order and
         semidefinite cones.
     backend : str
-        ``"CLARABEL"`` for the fast way; any other solver of cvxpy goes through ``problem.solve`` and yields no bound.
+        ``"CLARABEL"`` is fast; any other solver of cvxpy runs by ``problem.solve`` and gives no bound.
     settings : Mapping[str, Any], optional
         Settings of the back end.
     radius : float
-        Factor on ``1 + |x|`` of the solution found that is taken to hold every minimiser, for the bound. Two leaves
-        room for a solution that is off by its own length; where a rigorous length is known, `solve` takes it as reach.
+        For the bound, every minimiser is assumed to be no longer than this factor times ``1 + |x|`` of the solution. A
+        factor of two allows a solution whose error is its length. If a rigorous length is known, pass it as `reach`.
 
     Notes
     -----
-    Agrawal et al. (2019). Threads may share one: each works on numbers of its own, every solve starts afresh, and
-    Clarabel releases the interpreter lock. An answer therefore depends on its own data alone. Do not pickle.
+    Agrawal et al. (2019). Threads may share a relaxation: each has separate numbers, no solve uses earlier results, and
+    Clarabel releases the interpreter lock. So a result depends only on the data of its solve. Do not pickle.
     """
 
     def __init__(
@@ -118,7 +119,7 @@ class Relaxation:
 
     @property
     def _data(self) -> Data | None:
-        """The data of this thread."""
+        """Return the data of this thread."""
         if self._shared is None:
             return None
         if not hasattr(self._own, "data"):
@@ -127,7 +128,7 @@ class Relaxation:
         return own
 
     def solve(self, values: Mapping[str, Array], *, bound: bool = True, reach: float | None = None) -> ConicAnswer:
-        """Solve with new parameter values.
+        """Return the solution for new parameter values.
 
         Parameters
         ----------
@@ -136,13 +137,13 @@ class Relaxation:
         bound : bool
             Whether to recompute the lower bound from the dual; without it the bound is minus infinity.
         reach : float, optional
-            Length of the variables that no minimiser exceeds, where that is known: it makes the bound rigorous. In
-            the place of ``radius (1 + |x|)``.
+            Known greatest length of the variables at any minimiser. It replaces ``radius (1 + |x|)`` and makes the
+            bound rigorous.
 
         Returns
         -------
         ConicAnswer
-            Point, value, bound and status; failure is reported, not raised.
+            Point, value, bound and status; a failure is reported here, not raised.
         """
         if values.keys() != self.parameters.keys():
             raise ValueError(f"parameters {sorted(values)} given, {sorted(self.parameters)} expected")
@@ -166,21 +167,22 @@ class Relaxation:
         bound: bool,
         reach: float | None,
     ) -> ConicAnswer:
+        """Return the solution by Clarabel, without cvxpy."""
         data.feed(values)
         try:
             solution = _solver(data, settings).solve()
             if str(solution.status) == "NumericalError":
                 solution = _solver(data, {**_REGULAR, **settings}).solve()
-        except Exception as trouble:  # whatever stops a solver that was built
+        except Exception as trouble:  # any failure of a solver that was built
             record(Ending("CLARABEL", "error", first_sentence(trouble), found=False))
             raise SolverError(f"Clarabel failed: {trouble}") from trouble
         x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
         if not (np.isfinite(x).all() and np.isfinite(z).all()):
             x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)
         far = self.radius * (1.0 + float(np.sqrt(x @ x))) if reach is None else reach
-        # any dual point bounds the optimum, whatever the solver ended with
+        # any dual point bounds the optimum, for every status of the solver
         low = data.bound(x, z, far) if bound else -np.inf
-        # the last iterate of a solve that failed is no answer
+        # the last iterate of a failed solve is not a solution
         at = x if status in _MET else np.full(len(x), np.nan)
         quadratic = float(at @ data.square(at))
         primal = 0.5 * quadratic + float(data.q @ at) + data.d
@@ -195,8 +197,8 @@ class Relaxation:
         status, message = cvxpy.settings.SOLVER_ERROR, ""
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # an inaccurate solution is told by its status
-                # cvxpy would start from the answer of the solve before: answers would depend on their order
+                warnings.simplefilter("ignore")  # the status reports an inaccurate solution
+                # cvxpy would start from the previous solution, so that results would depend on their order
                 self.problem.solve(solver=backend, **{"warm_start": False, **settings})
         except cvxpy.error.SolverError as trouble:
             message = first_sentence(trouble)
@@ -217,19 +219,19 @@ class Relaxation:
         return ConicAnswer(point, primal, -np.inf, status, good and status == cvxpy.OPTIMAL, iterations, message)
 
 
-# How Clarabel ends with an answer: its tolerances are met, or its reduced ones (5e-5 of the gap, 1e-4 of feasibility),
-# which it also tries where it stops at a limit or makes no progress.
+# Statuses of Clarabel with a solution: its tolerances are met, or its reduced ones (5e-5 of the gap, 1e-4 of
+# feasibility), which it also checks if it stops at a limit or makes no progress.
 _MET = ("Solved", "AlmostSolved")
-# For a second try where the factorisation lost its digits: ten times the default of 1e-8. Relaxations of Doppler shifts
-# of satellites then meet the full tolerances, in a third more iterations.
+# For a second attempt if the factorisation lost its digits: ten times the default of 1e-8. Relaxations of Doppler
+# shifts of satellites then meet the full tolerances, with a third more iterations.
 _REGULAR = {"static_regularization_constant": 1e-7}
-# Back ends that call an answer inaccurate where reduced tolerances of theirs are met. Others, SCS for one, call the
-# last iterate so, wherever it is.
+# Back ends that report an inaccurate solution if their reduced tolerances are met. Others, for instance SCS, report any
+# last iterate as inaccurate.
 _REDUCED = ("ECOS", "QOCO")
 
 
 def _forget(problem: Any) -> None:
-    """Remove the values of the solve before from a cvxpy problem: one that fails would leave them in place."""
+    """Remove the values of the previous solve from a cvxpy problem, because a failed solve does not overwrite them."""
     for variable in problem.variables():
         variable.save_value(None)
     for constraint in problem.constraints:
@@ -241,16 +243,16 @@ def _solver(data: Data, settings: Mapping[str, Any]) -> Any:
     import clarabel
 
     own = clarabel.DefaultSettings()
-    # a presolve or a decomposition would return multipliers of another problem than the one that bounds are read from
+    # after a presolve or a decomposition, the multipliers would belong to another problem than the one used for bounds
     own.verbose, own.presolve_enable, own.chordal_decomposition_enable = False, False, False
-    own.max_threads = 1  # problems this small lose by threads; several of them run side by side instead
+    own.max_threads = 1  # threads make such small problems slower; several problems run in parallel instead
     for name, value in settings.items():
         setattr(own, name, value)
     return clarabel.DefaultSolver(data.P, data.q, data.A, data.b, data.cones, own)
 
 
 def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
-    """Build once for each set of arguments in each process, whichever thread asks first.
+    """Cache a function, so that it runs once for each set of arguments in each process, also with threads.
 
     Parameters
     ----------
@@ -260,14 +262,14 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
     Returns
     -------
     callable
-        The same function; the 64 latest used of what it built are kept.
+        The same function with a cache of its 64 most recently used results.
     """
 
     def alone(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
         with _CVXPY:
             return build(*args, **kwargs)
 
-    # A hit waits for builds of the same function only; without this lock two threads would build the same twice.
+    # A cached result waits only for builds of the same function. Without this lock two threads would build it twice.
     cached, lock = lru_cache(_KEPT)(alone), threading.Lock()
     hold_in_forks(lock)
 
@@ -280,14 +282,14 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
 
 
 def tight(backend: str, tolerance: float, **more: float) -> dict[str, float]:
-    """Return settings that have Clarabel stop at one relative tolerance; other back ends keep their own settings.
+    """Return settings with which Clarabel stops at one relative tolerance; other back ends keep their defaults.
 
     Parameters
     ----------
     backend : str
         Conic solver.
     tolerance : float
-        Of the gap, absolute and relative, and of feasibility. Clarabel's own is 1e-8.
+        Tolerance of the gap, absolute and relative, and of feasibility. The default of Clarabel is 1e-8.
     **more
         Further settings of Clarabel.
 
@@ -302,17 +304,17 @@ def tight(backend: str, tolerance: float, **more: float) -> dict[str, float]:
 
 
 def rank_ratio(lift: Array) -> float:
-    """Second over first eigenvalue of a lift: near zero where the relaxation is tight.
+    """Return the second over the first eigenvalue of a lift, which is near zero if the relaxation is tight.
 
     Parameters
     ----------
     lift : Array, shape (n, n)
-        Symmetric.
+        Symmetric matrix.
 
     Returns
     -------
     float
-        NaN where the solver gave no lift.
+        The ratio; NaN if the solver gave no lift.
     """
     if not np.isfinite(lift).all():
         return np.nan
@@ -320,7 +322,7 @@ def rank_ratio(lift: Array) -> float:
     return float(abs(values[-2]) / values[-1])
 
 
-# A cvxpy problem taken apart.
+# The data of a cvxpy problem.
 
 
 class Data:
@@ -333,7 +335,8 @@ class Data:
 
     Notes
     -----
-    Agrawal et al. (2019). `feed` writes into the arrays `P`, `q`, `d`, `A`, `b`: give each thread its own `twin`.
+    Agrawal et al. (2019). `feed` writes into the arrays `P`, `q`, `d`, `A`, `b`, so each thread needs a separate
+    `twin`.
     """
 
     def __init__(self, problem: Any) -> None:
@@ -353,12 +356,12 @@ class Data:
         self.slots = {p.name(): (columns[p.id], p.shape) for p in problem.parameters() if p.id in columns}
         if len(self.slots) != len(problem.parameters()):
             raise ValueError("parameters need unique names and no symmetric, diagonal or semidefinite attribute")
-        # all parameters in one vector; the one behind them carries the constants of the affine maps
+        # all parameters in one vector, followed by a one for the constants of the affine maps
         self.vector = np.zeros(self.program.total_param_size + 1)
         self.vector[-1] = 1.0
         n = self.program.x.size
         self._linear = _Product.of(self.program.q)
-        # cvxpy stores [A, b] as one matrix: the columns of A, then that of b, whose entries need not be all rows
+        # cvxpy stores [A, b] as one sparse matrix: the columns of A, then the column b
         self._matrix, pattern = _affine(self.program.reduced_A)
         m = pattern[2][0]
         self.q, self.d, self.b = np.zeros(n), 0.0, np.zeros(m)
@@ -378,12 +381,12 @@ class Data:
             self.P = sp.csc_array((np.zeros(len(row)), row, start), shape=(n, n))
         self.across, self.below = _Product.transposed(self.A), _Product.transposed(self.P)
         self.above = _Product(n, self.below.source, self.below.row, self.P.data)
-        # P x is the triangle times x and its transpose times x, less the diagonal that both hold
+        # P x is the triangle times x plus its transpose times x, less the diagonal, which both contain
         self._ridge = np.where(self.below.row == self.below.source, 0.0, 1.0)
         self._recover = _recovery(problem, chain, inverse, self.program.x.id, n)
 
     def feed(self, values: Mapping[str, Array]) -> None:
-        """Set the parameters.
+        """Write the data for new parameter values.
 
         Parameters
         ----------
@@ -406,7 +409,7 @@ class Data:
             self.P.data[:] = self._quadratic(self.vector)[self._upper]
 
     def twin(self) -> Data:
-        """Return the same problem with numbers of its own, for another thread."""
+        """Return the same problem with separate arrays, for another thread."""
         other = copy(self)
         other.vector, other.A = self.vector.copy(), self.A.copy()
         other.P = self.P.copy()
@@ -432,19 +435,19 @@ class Data:
         return self.below(x) + self.above(x, self._ridge)
 
     def bound(self, x: Array, z: Array, reach: float) -> float:
-        """Lower bound of the optimum from a dual point.
+        """Return a lower bound of the optimum from a dual point.
 
         Parameters
         ----------
         x, z : Array, shapes (n,) and (m,)
             Primal point (its quadratic term only) and dual point.
         reach : float
-            The minimiser is taken to be no longer than this.
+            Assumed greatest length of the minimiser.
 
         Returns
         -------
         float
-            The bound; minus infinity where the dual point is of no use.
+            The bound; minus infinity if the dual point gives none.
 
         Notes
         -----
@@ -475,7 +478,7 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class _Product:
-    """A sparse matrix as a product only: on problems of tens of entries scipy's own costs more than the solver."""
+    """Products with a sparse matrix; with tens of entries, products of scipy take longer than the solver."""
 
     size: int
     row: Index
@@ -484,12 +487,13 @@ class _Product:
 
     @classmethod
     def of(cls, matrix: Any) -> _Product:
+        """Return the product with a sparse matrix."""
         entries = matrix.tocoo()
         return cls(matrix.shape[0], entries.row.astype(np.int64), entries.col.astype(np.int64), entries.data)
 
     @classmethod
     def transposed(cls, matrix: Any) -> _Product:
-        """Transpose of a compressed-column matrix, sharing its entries."""
+        """Return the transpose of a compressed-column matrix, which shares its entries."""
         size = matrix.shape[1]
         column = np.repeat(np.arange(size), np.diff(matrix.indptr))
         return cls(size, column, matrix.indices.astype(np.int64), matrix.data)
@@ -500,7 +504,7 @@ class _Product:
 
 
 def _affine(reduced: Any) -> tuple[_Product, tuple[Index, Index, tuple[int, int]]]:
-    """Map from the parameter vector to the stored entries, and their compressed-column pattern."""
+    """Return the map from the parameter vector to the stored entries, and their compressed-column pattern."""
     reduced.cache()
     if reduced.problem_data_index is None:
         raise ValueError("the problem has no constraint")
@@ -508,7 +512,7 @@ def _affine(reduced: Any) -> tuple[_Product, tuple[Index, Index, tuple[int, int]
 
 
 def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list[tuple[str, Array, tuple[int, ...]]]:
-    """Matrices from the solver's x to each variable, read off by undoing the reductions on unit vectors."""
+    """Return matrices from the solver's x to each variable, computed by undoing the reductions on unit vectors."""
     from cvxpy.reductions.solution import Solution
 
     columns: dict[int, list[Array]] = {variable.id: [] for variable in problem.variables()}
@@ -523,11 +527,11 @@ def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list
     return [(v.name(), np.stack(columns[v.id], axis=1), v.shape) for v in problem.variables()]
 
 
-# Projection on the dual of a product of cones: what makes a solver's dual point an honest one.
+# Projection on the dual of a product of cones, which makes the dual point of a solver feasible.
 
 
 def dual_point(z: Array, dims: Any) -> Array:
-    """Project on the dual cone.
+    """Return the projection of a point on the dual cone.
 
     Parameters
     ----------
@@ -561,7 +565,7 @@ def dual_point(z: Array, dims: Any) -> Array:
 
 
 def _second_order(z: Array) -> Array:
-    """Projection on ``z_0 >= |z_1..|``."""
+    """Return the projection on ``z_0 >= |z_1..|``."""
     size = float(np.linalg.norm(z[1:]))
     if size <= z[0]:
         return z
@@ -572,7 +576,7 @@ def _second_order(z: Array) -> Array:
 
 
 def _semidefinite(z: Array, size: int) -> Array:
-    """Projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
+    """Return the projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
     if not np.isfinite(z).all():
         return z
     column, row, scale = _triangle(size)
@@ -583,7 +587,7 @@ def _semidefinite(z: Array, size: int) -> Array:
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(matrix)
     else:
-        # the usual case: an interior-point dual is strictly inside
+        # the usual case: the dual point of an interior-point method is strictly inside
         return z
     fixed = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(fixed[row, column] / scale)
@@ -591,6 +595,6 @@ def _semidefinite(z: Array, size: int) -> Array:
 
 @lru_cache(_KEPT)
 def _triangle(size: int) -> tuple[Index, Index, Array]:
-    """Columns and rows of a stored upper triangle, and what undoes the scale of its off-diagonal entries."""
+    """Return columns and rows of a stored upper triangle, and the inverse scale of its off-diagonal entries."""
     column, row = np.tril_indices(size)
     return column, row, np.where(row == column, 1.0, np.sqrt(0.5))

@@ -7,7 +7,7 @@ Station i at :math:`S_i` measured azimuth and elevation, that is a unit vector :
    \quad (S_j - S_i)^\top (v_i - v_j) \ge 0,
 
 the last two for every pair: two lines of sight lie in one plane, and they do not diverge (without this linear
-inequality, rays that meet behind the stations are taken at their word). All is quadratic in `v`; with :math:`v_i =
+inequality, rays that meet behind the stations would be accepted). All is quadratic in `v`; with :math:`v_i =
 F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y
 = (1, w)(1, w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
 
@@ -36,25 +36,25 @@ from formulations.algebra import Array
 from formulations.bearing_ls import meeting, predict, rays
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 
-# Least cosine by which an azimuth is weighed: within 0.06 degrees of the zenith it says next to nothing.
+# Least cosine in the weight of an azimuth: within 0.06 degrees of the zenith an azimuth has almost no information.
 _LEVEL = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Directed:
-    """What the relaxation says.
+    """The result of the relaxation.
 
     Parameters
     ----------
     point : Array, shape (3,)
-        Where the directions read off meet, in least squares.
+        Least-squares intersection of the directions.
     direction : Array, shape (N, 3)
         Unit directions of sight: the last column of the lift, normalised.
     value, bound : float
         Optimum of the relaxation, and its lower bound recomputed from the dual: of the chordal cost
         (`directions`) or of the angular ML cost (`angle_bound`).
     rank_ratio : float
-        Second over first eigenvalue of the lift in terms of v; near zero where tight.
+        Second over first eigenvalue of the lift in terms of v; near zero if tight.
     answer : ConicAnswer
         The solver's report.
     """
@@ -76,7 +76,7 @@ def directions(
     radial: float = 1.0,
     backend: str = "CLARABEL",
 ) -> Directed:
-    """Solve the chordal relaxation.
+    """Return the solution of the chordal relaxation.
 
     Parameters
     ----------
@@ -89,14 +89,14 @@ def directions(
     axes : array_like, shape (N, 3, 3), optional
         Rows are the unit vectors of each station's axes.
     radial : float
-        Radial weight over the smaller tangent weight; it removes the solution v = -u.
+        Radial weight relative to the smaller tangent weight; it removes the solution v = -u.
     backend : str
         Conic solver.
 
     Returns
     -------
     Directed
-        A start; its bound is not one of the ML cost.
+        A start; its bound is not a bound of the ML cost.
 
     Notes
     -----
@@ -119,14 +119,14 @@ def angle_bound(
     axes: ArrayLike | None = None,
     backend: str = "CLARABEL",
 ) -> Directed:
-    """Bound the ML cost ``sum (angle error / sigma)^2`` from below over all points, using a fix.
+    """Return a lower bound of the ML cost ``sum (angle error / sigma)^2`` over all points, by means of a fix.
 
     Parameters
     ----------
     angle, sigma, station, axes, backend
         As in `directions`.
     point : array_like, shape (3,)
-        A fix, best a refined one: the bound is valid for any, and can reach its cost only if it is stationary.
+        A fix. The bound is valid for every point, but reaches its cost only if the point is stationary (a refined fix).
 
     Returns
     -------
@@ -158,7 +158,7 @@ class Minorant:
     Parameters
     ----------
     constant : Array, shape (N,)
-        Cost of the fix itself; zero where nothing better than ``f >= 0`` is known.
+        Cost of the fix; zero if nothing better than ``f >= 0`` is known.
     linear, square : Array, shape (N, 3)
         Coefficients.
     reach : Array, shape (N,)
@@ -172,7 +172,7 @@ class Minorant:
 
 
 def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minorant:
-    r"""Build the touching quadratics of one fix.
+    r"""Return the touching quadratics of one fix.
 
     Parameters
     ----------
@@ -181,14 +181,14 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     sigma : Array, shape (N, 2)
         Standard deviations.
     elevation : Array, shape (N,)
-        Predicted by the fix.
+        Elevations predicted by the fix.
     cost : float
-        Total cost of the fix, the square of rho; only points at most as costly are bounded.
+        Total cost of the fix, the square of rho; the bound holds for points with at most this cost.
 
     Returns
     -------
     Minorant
-        One quadratic per direction.
+        One quadratic for each direction.
 
     Notes
     -----
@@ -231,13 +231,13 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     with np.errstate(all="ignore"):
         # |eta epsilon| is split so that both weights lose the same share
         mixed = np.abs(dA) * steep / (own * sA * sE)
-        # what the remainders leave of 1 / sigma^2
+        # 1 / sigma^2 less the remainders
         left_A = 1.0 / sA**2 - mixed * (sE / sA) ** 2 - np.abs(dA) * widest * turn / (3.0 * own * sA**2)
         left_A -= np.maximum(dE * np.sin(elevation), 0.0) * widest / sE**2
         left_E = 1.0 / sE**2 - mixed - np.abs(dE) * tilt / (3.0 * sE**2)
         # (e^'v)^2 <= epsilon^2 + spill eta^2
         spill = widest * steep * tilt + 0.5 * widest**2 * np.minimum(2.0, 0.5 * turn**2)
-        # all weight that both tangents can spare goes to the chord |v - v^|, what is left of one of them to its own
+        # the common part of both tangent weights goes to the chord |v - v^|, the rest of a weight to its tangent
         chord = np.minimum(left_E, left_A / (widest * own))
         rest = left_A - chord * widest * own
         up = np.minimum(left_E - chord, rest / spill)
@@ -285,7 +285,7 @@ def direction_problem(count: int) -> Any:
     unit, level = cp.Parameter(count, name="unit"), cp.Parameter(len(pairs), name="level")
     slope, turn = cp.Parameter((len(pairs), 6), name="slope"), cp.Parameter((len(pairs), 9), name="turn")
     start, order = cp.Parameter(len(pairs), name="start"), cp.Parameter((len(pairs), 6), name="order")
-    # three differences w to a direction, so six numbers and nine products to a pair
+    # three differences w for each direction, so six numbers and nine products for each pair
     w, diagonal = lift[0, 1:], cp.diag(lift)[1:]
     rules = [lift >> 0, lift[0, 0] == 1]
     rules += [2 * w[3 * i] + unit[i] * cp.sum(diagonal[3 * i : 3 * i + 3]) == 0 for i in range(count)]
@@ -299,14 +299,15 @@ def direction_problem(count: int) -> Any:
 
 @keep
 def _relaxation(count: int, backend: str) -> Relaxation:
-    # the equalities depend on each other at a solution: with Clarabel's own 1e-8 one solve in five stops early
+    """Return the relaxation, built once for each size and back end."""
+    # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in five stops early
     settings = tight(backend, 1e-9, static_regularization_constant=1e-7)
     return Relaxation(direction_problem(count), backend=backend, settings=settings)
 
 
 @dataclass(frozen=True, slots=True)
 class _Cost:
-    """Coefficients in ``v - v^``, and the largest sum of ``|v - v^|^2`` of any point that matters."""
+    """Coefficients in ``v - v^``, and the largest sum of ``|v - v^|^2`` of any relevant point."""
 
     constant: float
     linear: Array
@@ -315,14 +316,16 @@ class _Cost:
 
 
 def _frames(angle: Array, axes: ArrayLike | None) -> Array:
+    """Return the frames (N, 3, 3) of directions: direction, tangent of azimuth, tangent of elevation."""
     seen = rays(angle[:, 0], angle[:, 1], axes)
     assert seen.upward is not None
     return np.stack([seen.ahead, seen.across, seen.upward], axis=1)
 
 
 def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
+    """Return the solution of the relaxation for a quadratic cost."""
     count = len(S)
-    # w in units in which the largest tangent weight is one: a lift of errors of a milliradian would be lost otherwise
+    # w in units in which the largest tangent weight is one; otherwise the lift of errors of a milliradian would vanish
     size = float(cost.square[:, 1:].max()) or 1.0
     unit = 1.0 / np.sqrt(size)
     pairs = np.array(list(combinations(range(count), 2)))
@@ -343,13 +346,13 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
             "start": (near[:, 0] - far[:, 0]) / unit,
             "order": np.concatenate([near, -far], axis=1),
         },
-        # |Y| of every point that matters
+        # |Y| of every relevant point
         reach=1.0 + cost.reach / unit**2,
     )
     lift = answer.values["lift"]
     v, plain = np.full((count, 3), np.nan), lift
     if np.isfinite(lift).all():
-        # from (1, w) back to (1, v): the rank is told apart in the directions themselves, not in scaled differences
+        # from (1, w) back to (1, v): the rank is evaluated in the directions, not in scaled differences
         change = np.zeros_like(lift)
         change[0, 0] = 1.0
         for i in range(count):

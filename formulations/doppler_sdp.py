@@ -4,7 +4,7 @@ A node is a station at one epoch: place :math:`s_i`, velocity :math:`v_i`. Range
 
 .. math:: r_i = |x - s_i|, \qquad r_i\, q_i = -(x - s_i) \cdot v_i,
 
-and the rows say :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without `b` where one station hears its Doppler shift) or
+and the rows say :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without `b` if one station measures the Doppler shift) or
 :math:`z_l = R_l \cdot r + A_l \cdot b + n_l` with unknowns `b`, an offset of the emitter's frequency for instance. A
 row of rates times :math:`r_a` has no quotient left:
 
@@ -16,38 +16,38 @@ are known from the pass before,
 
 .. math:: \min_x \; |W \,\mathrm{diag}(1/\rho)\, L\, y|^2,
 
-is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with what holds for every
-source, the last two within their bounds:
+is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with rules that hold for
+every source (the last two only within their bounds):
 
 - ties: :math:`Y_{r_i r_i} = |x - s_i|^2`, :math:`Y_{\beta_j r_i} = w_{ji}`, and
   :math:`Y_{q_b r_b} = -(x - s_b) \cdot v_b` of a rate's own range;
 - products taken in two orders: :math:`w_{ji} r_n = w_{jn} r_i` and :math:`w_{ji} \beta_l = w_{li} \beta_j`, where the
   product of a rate with its own range is the linear form above;
-- Cauchy and Schwarz, :math:`r_i r_n \ge |(x - s_i) \cdot (x - s_n)|` (that is the triangle inequality),
+- Cauchy and Schwarz, :math:`r_i r_n \ge |(x - s_i) \cdot (x - s_n)|` (the triangle inequality),
   :math:`q_b^2 \le |v_b|^2`, and :math:`|x - s_i| \le r_i`;
 - where the height is known, :math:`(x - c)^\top E (x - c) = 1`, else :math:`|x| \le` `reach`; squared both are linear
   in `Y`, and the ellipsoid is a surface of constant height only nearly (`formulations.range_height.ellipsoid`);
-- so that `Y` stays bounded, `b` within ten speeds of the fastest node of what a fit of the rows by `b` alone says.
+- to keep `Y` bounded: `b` differs from its fit without the source by at most ten speeds of the fastest node.
 
-What it is worth: the value is a lower bound of that weighted cost for the last :math:`\rho`, not of the likelihood's
-(both agree at a point whose ranges are :math:`\rho`). It is not tight: where the first row of `Y` says a place, the
-rest says how far around it the relaxation cannot choose. A frequency offset leaves two places, one on each side of a
-satellite's track, of which `Y` is the mean: then its first moment lies between them, and the points
+Limits: the value is a lower bound of that weighted cost for the last :math:`\rho`, not of the likelihood's
+(both agree at a point whose ranges are :math:`\rho`). It is not tight: the first row of `Y` gives a position, and
+the rest the region around it in which the relaxation does not decide. A frequency offset leaves two places, one on each
+side of a satellite's track, of which `Y` is the mean. Then the first moment is between them, and the points
 
 .. math:: \bar x, \quad \bar x \pm \sqrt{\lambda_k}\, e_k, \qquad Y_{xx} - \bar x \bar x^\top = \sum_k \lambda_k e_k
    e_k^\top
 
-hold both (a mean of two points has one eigenvalue, and they are at plus and minus its root). They are starts for a
-local method and say nothing of uniqueness; differences of rates alone, of one pair, are where they miss most.
+contain both (a mean of two points has one eigenvalue, and they are at plus and minus its root). They are starts for a
+local method and prove no uniqueness; they are worst for differences of rates of a single pair.
 
-Many rows are too many: `normal_points` joins those that follow each other in time.
+The size is limited: `normal_points` averages rows that are adjacent in time.
 
 Sources: B. Song, W. Wen, Q. Zhang, B. Xu and L.-T. Hsu, "Certifiably optimal Doppler positioning using opportunistic
 LEO satellites", arXiv:2509.17198 (2025) (place, ranges, clock drift and its products with the ranges lifted, and
-weights from the ranges of the pass before: the programme for one station a row, without the products in two orders and
-the inequalities); G. Wang, Y. Li and N. Ansari, "A semidefinite relaxation method for source localization using TDOA
-and FDOA measurements", IEEE Trans. Veh. Technol. 62 (2013), p. 853 (range and rate of the reference as unknowns that
-are lifted with the source); H. D. Sherali and W. P. Adams, "A reformulation-linearization technique", Kluwer 1999
+weights from the ranges of the previous pass: the programme for one station a row, without the products in two orders
+and the inequalities); G. Wang, Y. Li and N. Ansari, "A semidefinite relaxation method for source localization using
+TDOA and FDOA measurements", IEEE Trans. Veh. Technol. 62 (2013), p. 853 (range and rate of the reference as unknowns
+that are lifted with the source); H. D. Sherali and W. P. Adams, "A reformulation-linearization technique", Kluwer 1999
 (products in two orders).
 """
 
@@ -69,26 +69,26 @@ SIZE = 24
 """Length of y beyond which rows should be joined. The time of the programme grows with its fourth power, and starts
 from 36 led to the best minimum in 47 of 48 runs of a pair or of satellites, from 24 in 48."""
 
-_PASSES = 2  # the second has the ranges that the first found; a third changed no start of 40
-_LIMIT = 10.0  # of unknowns that are not rates, in speeds of the fastest node: far beyond what a fit leaves of them
-_NEAREST = 1e-3  # of the unit of length: a weight at a station itself would be infinite
-_BEND = 2  # degree of the polynomial of a normal point: rates of a pass bend, over a block they hardly do more
+_PASSES = 2  # the second pass has the ranges of the first; a third pass changed no start of 40
+_LIMIT = 10.0  # limit of unknowns that are not rates, in speeds of the fastest node: far above their values after a fit
+_NEAREST = 1e-3  # least range in a weight, in units of length: at a station the weight would be infinite
+_BEND = 2  # degree of the polynomial of a normal point: within a block, rates of a satellite pass are nearly parabolas
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What the programme is built for.
+    """The structure of the programme.
 
     Parameters
     ----------
     dimension, nodes, unknowns : int
-        Of space, numbers of nodes and of linear unknowns b.
+        Dimension of space, number of nodes, number of linear unknowns b.
     second : tuple of int
-        Nodes whose range rate is an unknown: those subtracted in a row.
+        Nodes whose range rate is an unknown: the nodes subtracted in a row.
     product : tuple of (int, int)
         Unknown j of beta and node i of each product w.
     surface : bool
-        Whether the source lies on an ellipsoid; else within a reach.
+        Whether the source is on an ellipsoid; else it is within a reach.
     """
 
     dimension: int
@@ -100,14 +100,14 @@ class Shape:
 
     @property
     def places(self) -> tuple[int, int, int, int]:
-        """Return where beta, r and w begin in y, and how long y is."""
+        """Return the first indices of beta, r and w in y, and the length of y."""
         beta = 1 + self.dimension
         r = beta + self.unknowns + len(self.second)
         return beta, r, r + self.nodes, r + self.nodes + len(self.product)
 
     @property
     def rate_of(self) -> dict[int, int]:
-        """Return the node whose range rate each unknown of beta is, by the unknown."""
+        """Return the node of each range rate in beta, by the number of the unknown."""
         return {self.unknowns + i: node for i, node in enumerate(self.second)}
 
     def swaps(self) -> Index:
@@ -116,8 +116,8 @@ class Shape:
         Returns
         -------
         int array, shape (q, 4)
-            ``f, u, g, v``: f times entry u of y is g times entry v. Both f and g are entries of y, products w; but a
-            negative f stands for the range times the range rate of node ``-1 - f``.
+            ``f, u, g, v``: f times entry u of y equals g times entry v. Both f and g are entries of y, products w; but
+            a negative f means the range times the range rate of node ``-1 - f``.
         """
         beta, r, w, _ = self.places
         form = {(j, node): -1 - node for j, node in self.rate_of.items()}
@@ -128,34 +128,34 @@ class Shape:
                 found.append((f, r + other[1], g, r + one[1]))
             elif one[1] == other[1]:
                 found.append((f, beta + other[0], g, beta + one[0]))
-        # a rate has one node, and a node one rate: of two forms one at most is negative, and it comes first in `form`
+        # a rate has one node, and a node one rate: at most one of two forms is negative, and it is the first in `form`
         return np.array(found, dtype=np.int64).reshape(-1, 4)
 
 
 @dataclass(frozen=True, slots=True)
 class DopplerScene:
-    """The rows in units of their own size, see the module's text.
+    """The scaled rows, see the text of the module.
 
     Parameters
     ----------
     shape : Shape
-        What is multiplied with what.
+        Structure of the products.
     place, speed : Array, shape (M, d)
         Nodes.
     rows : Array, shape (m, n)
         L: every row as a form in y.
     pivot : int array, shape (m,)
-        Node whose range the error of a row is multiplied with; -1 for none.
+        Node whose range multiplies the error of a row; -1 for none.
     whiten : Array, shape (m, m)
         W.
     surface : Ellipsoid or None
-        In these units.
+        The ellipsoid in these units.
     origin : Array, shape (d,)
-        Where they begin.
+        Origin of the scaled coordinates.
     length, rate : float
         Units of length and speed.
     unit, mean : Array, shape (p,)
-        Units of b, and what they count from.
+        Units and offsets of b.
     """
 
     shape: Shape
@@ -183,9 +183,9 @@ class DopplerScene:
         design: Array,
         surface: Ellipsoid | None,
     ) -> DopplerScene:
-        """Scale, and choose what is lifted; arguments as in `doppler`."""
+        """Return the scaled rows with the structure of the lift; arguments as in `doppler`."""
         origin = place.mean(axis=0) if surface is None else surface.centre
-        # of an ellipsoid its mean radius, else the farthest node
+        # the mean radius of an ellipsoid, else the distance of the farthest node
         length = (
             float(np.sqrt(((place - origin) ** 2).sum(axis=1).max()))
             if surface is None
@@ -199,7 +199,7 @@ class DopplerScene:
         scaled = design / size[:, None]
         unit = 1.0 / np.maximum(np.abs(scaled).max(axis=0, initial=0.0), np.finfo(float).tiny)
         scaled = scaled * unit
-        # without what a fit by the unknowns alone explains they are numbers of order one
+        # after a fit by the unknowns b alone, the remainders are numbers of order one
         left = z / size
         mean = np.linalg.lstsq(scaled, left, rcond=None)[0] if scaled.size else np.zeros(design.shape[1])
         left = left - scaled @ mean
@@ -212,7 +212,7 @@ class DopplerScene:
         return cls(shape, place, speed, rows, first, whiten, own, origin, length, rate, unit, unit * mean)
 
     def parameters(self, far: Array, reach: float) -> tuple[dict[str, Array], float]:
-        """Parameters of the programme for the ranges of the pass before, and the unit of its cost."""
+        """Return the parameters of the programme for the ranges of the previous pass, and the unit of its cost."""
         form = self.whiten @ (self.rows / far[:, None])
         gram = form.T @ form
         size = float(np.abs(gram).max()) or 1.0
@@ -240,7 +240,7 @@ class DopplerScene:
         return values, size
 
     def longest(self, reach: float) -> float:
-        """Length of Y that no source within the reach exceeds."""
+        """Return the greatest length of Y for any source within the reach."""
         far = reach if self.surface is None else float(np.linalg.eigvalsh(self.surface.shape)[0]) ** -0.5
         r = far + np.sqrt((self.place**2).sum(axis=1))
         slow = np.sqrt((self.speed**2).sum(axis=1))
@@ -256,11 +256,11 @@ class DopplerStart:
     Parameters
     ----------
     point : Array, shape (1 + 2 d, d)
-        What the first row of Y says, then the points around it, the farthest first; NaN where the solver gave none.
+        Point of the first row of Y, then the points around it, the farthest first; NaN if the solver gave none.
     unknown : Array, shape (p,)
-        What it says of b.
+        Values of b.
     far : Array, shape (m,)
-        Ranges that the errors of rows of rates are divided by in the weighted cost; one for other rows.
+        Divisors of rows in the weighted cost: ranges for rows of rates, one for other rows.
     value, bound : float
         Optimum, and a lower bound of the weighted cost within the reach, recomputed from the dual.
     rank_ratio : float
@@ -291,37 +291,37 @@ def doppler(
     reach: float = 10.0,
     backend: str = "CLARABEL",
 ) -> DopplerStart:
-    """Start a source at rest from Doppler shifts, and range differences beside them.
+    """Return a start for a source at rest from Doppler shifts and, optionally, range differences.
 
     Parameters
     ----------
     place, speed : array_like, shape (M, d)
-        Nodes, stations at an epoch each: positions and velocities.
+        Positions and velocities of the nodes; a node is a station at one epoch.
     z : array_like, shape (m,)
         Measured values: range rates and differences of range rates, ranges and their differences or sums.
     whiten : array_like, shape (m, m)
         W, the whitening matrix of their errors.
     ranges, rates : array_like, shape (m, M)
-        What each row adds up of the nodes' ranges and range rates: a row of rates has one node with plus or minus one,
-        or two of opposite signs, and no ranges.
+        Coefficients of the nodes' ranges and range rates in each row. A row of rates has one node with plus or minus
+        one, or two nodes of opposite signs, and no ranges.
     design : array_like, shape (m, p), optional
-        A: what each linear unknown adds to the rows.
+        A: coefficients of the linear unknowns in the rows.
     surface : Ellipsoid, optional
-        Where the source lies.
+        Surface on which the source is.
     reach : float
-        Without a surface: how far from the nodes' centre it may be, in distances of the farthest node.
+        Without a surface: greatest distance from the nodes' centre, in units of the distance of the farthest node.
     backend : str
         Conic solver; only ``"CLARABEL"`` gives bounds.
 
     Returns
     -------
     DopplerStart
-        Points and bound; see the module's text for what they are worth. NaN where the data or the answer are.
+        Points and bound; the text of the module explains their limits. NaN if the data or the solution are NaN.
 
     Raises
     ------
     ValueError
-        For a row of rates of another form.
+        If a row of rates has another form.
 
     Notes
     -----
@@ -346,13 +346,14 @@ def doppler(
 
 
 def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer) -> DopplerStart:
+    """Return the start in the units of the caller from a solution of the relaxation."""
     lift, d = answer.values["lift"], scene.shape.dimension
     point, beta = lift[0, 1 : 1 + d], scene.shape.places[0]
     spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
     step = (np.sqrt(np.maximum(spread, 0.0)) * axes).T[::-1]
     points = point + np.concatenate([np.zeros((1, d)), np.stack([step, -step], axis=1).reshape(-1, d)])
     if scene.surface is not None:
-        # a mean of places on a surface lies below it: they are brought back along the line to its centre
+        # a mean of positions on a surface is below it: it is moved to the surface along the line to the centre
         points = points / np.sqrt(np.einsum("ij,jk,ik->i", points, scene.surface.shape, points))[:, None]
     unknown = scene.mean + scene.unit * lift[0, beta : beta + scene.shape.unknowns]
     return DopplerStart(
@@ -367,6 +368,7 @@ def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer)
 
 
 def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None) -> DopplerStart:
+    """Return a start of NaN."""
     rows, unknowns = design
     point, none = np.full((1 + 2 * dimension, dimension), np.nan), np.full(unknowns, np.nan)
     return DopplerStart(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
@@ -375,25 +377,26 @@ def _nothing(dimension: int, design: tuple[int, ...], answer: ConicAnswer | None
 def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
     """Return the node whose range multiplies a row, the node whose rate is an unknown, -1 for none, and the sign."""
     if (np.abs(rates).sum(axis=1) > 2.0).any() or (np.abs(rates.sum(axis=1)) > 1.0).any():
-        raise ValueError("a row of rates is one rate, or the difference of two")
-    # a rate that is zero by itself needs no unknown, and one that many rows share is better one unknown than many
+        raise ValueError("a row of rates must be one rate, or the difference of two")
+    # a rate that is always zero needs no unknown; a rate that many rows share should be only one unknown
     moving = (speed != 0.0).any(axis=1)
     often = np.where(moving, 1.0 + np.abs(rates).sum(axis=0), 0.0)
     held = np.where(rates != 0.0, often, np.inf)
     first = np.where(rates.any(axis=1), held.argmin(axis=1), -1)
     rest = np.where(np.arange(rates.shape[1]) == first[:, None], 0.0, np.abs(rates) * often)
     second = np.where(rest.any(axis=1), rest.argmax(axis=1), -1)
-    # of a moving and a resting station the moving one is multiplied
+    # if one station moves and the other rests, the row is multiplied by the range of the moving one
     still = (first >= 0) & (second >= 0) & ~moving[first]
     first, second = np.where(still, second, first), np.where(still, -1, second)
     return first, second, np.where(first < 0, 1.0, rates[np.arange(len(rates)), first])
 
 
 def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, rate: Mask, surface: bool) -> Shape:
+    """Return the structure of the programme for the given rows."""
     known = design.shape[1]
     others = tuple(int(node) for node in np.unique(second[second >= 0]))
     of = {node: known + i for i, node in enumerate(others)}
-    product: dict[tuple[int, int], None] = {}  # a dictionary keeps the order, and each pair once
+    product: dict[tuple[int, int], None] = {}  # a dictionary keeps the order, and contains each pair once
     for a, b, row in zip(first[rate], second[rate], design[rate], strict=True):
         product |= {(int(j), int(a)): None for j in np.flatnonzero(row)}
         product |= {(of[int(b)], int(a)): None} if b >= 0 else {}
@@ -403,7 +406,7 @@ def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, r
 def _forms(
     shape: Shape, place: Array, speed: Array, z: Array, ranges: Array, first: Array, second: Array, design: Array
 ) -> Array:
-    """Rows as forms in y: what is measured, less what they say."""
+    """Return the rows as linear forms in y: measured minus predicted values."""
     beta, r, w, size = shape.places
     at = {pair: w + k for k, pair in enumerate(shape.product)}
     of = {node: j for j, node in shape.rate_of.items()}
@@ -421,21 +424,21 @@ def _forms(
 
 
 def lifted_size(dimension: int, ranges: Array, rates: Array, design: Array) -> int:
-    """Length of y for rows whose nodes all move.
+    """Return the length of y for rows whose nodes all move.
 
     Parameters
     ----------
     dimension : int
-        Of space.
+        Dimension of space.
     ranges, rates : Array, shape (m, M)
-        What rows add up.
+        Coefficients of ranges and range rates in the rows.
     design : Array, shape (m, p)
-        What linear unknowns add.
+        Coefficients of the linear unknowns.
 
     Returns
     -------
     int
-        The programme takes seconds beyond `SIZE`.
+        The length; beyond `SIZE` the programme takes seconds.
     """
     first, second, _ = _ends(rates, np.ones((rates.shape[1], 1)))
     rate = np.asarray(rates.any(axis=1))
@@ -448,7 +451,7 @@ def doppler_problem(shape: Shape) -> Any:
     Parameters
     ----------
     shape : Shape
-        What is lifted.
+        Structure of the lift.
 
     Returns
     -------
@@ -457,7 +460,7 @@ def doppler_problem(shape: Shape) -> Any:
 
     Notes
     -----
-    Song et al. (2025), with the further rules of the module's text.
+    Song et al. (2025), with the further rules in the text of the module.
     """
     import cvxpy as cp
 
@@ -490,7 +493,7 @@ def doppler_problem(shape: Shape) -> Any:
 
 
 def _products(shape: Shape, lift: Any) -> list[Any]:
-    """Rules of the products: what they are, and that their order does not matter."""
+    """Return the constraints of the products: their definitions, and their symmetry in the order of factors."""
     import cvxpy as cp
 
     d, (beta, r, w, _) = shape.dimension, shape.places
@@ -515,19 +518,20 @@ def _products(shape: Shape, lift: Any) -> list[Any]:
 
 @keep
 def _relaxation(shape: Shape, backend: str) -> Relaxation:
-    # a decade below Clarabel's own: the errors of precise rows are 1e-5 of their rates
+    """Return the relaxation, built once for each structure and back end."""
+    # a decade below the default of Clarabel: the errors of precise rows are 1e-5 of their rates
     return Relaxation(doppler_problem(shape), backend=backend, settings=tight(backend, 1e-9))
 
 
 def blocks(time: ArrayLike, length: int) -> list[Index]:
-    """Cut rows in the order of time into blocks of nearly equal numbers.
+    """Return rows, sorted by time, in blocks of nearly equal size.
 
     Parameters
     ----------
     time : array_like, shape (m,)
-        When each row was measured.
+        Time of each row.
     length : int
-        Rows of a block at most, one or more.
+        Greatest number of rows of a block, at least one.
 
     Returns
     -------
@@ -539,15 +543,15 @@ def blocks(time: ArrayLike, length: int) -> list[Index]:
 
 
 def normal_points(time: ArrayLike, z: ArrayLike, sigma: ArrayLike, cut: Sequence[Index]) -> tuple[Index, Array, Array]:
-    """Join rows of the same instruments that follow each other in time.
+    """Return averages of rows of the same instruments that are adjacent in time.
 
-    A parabola through each block by least squares (a line or a mean through too few different times) says the value at
-    the time of its middle row.
+    The average of a block is the value of a least-squares parabola at the time of its middle row. With too few
+    different times, it is the value of a line or a mean.
 
     Parameters
     ----------
     time, z, sigma : array_like, shape (m,)
-        When, what, and standard deviations of independent errors.
+        Times, values, and standard deviations of independent errors.
     cut : sequence of q int arrays
         The rows of each block, see `blocks`.
 
@@ -556,7 +560,7 @@ def normal_points(time: ArrayLike, z: ArrayLike, sigma: ArrayLike, cut: Sequence
     row : int array, shape (q,)
         The middle row of each block.
     z, sigma : Array, shape (q,)
-        What stands in its place.
+        Averages and their standard deviations.
 
     Notes
     -----
@@ -567,7 +571,7 @@ def normal_points(time: ArrayLike, z: ArrayLike, sigma: ArrayLike, cut: Sequence
     out, error = np.zeros(len(row)), np.zeros(len(row))
     for k, (block, middle) in enumerate(zip(cut, row, strict=True)):
         since = t[block] - t[middle]
-        # two rows more than coefficients: a polynomial through all rows averages nothing
+        # two rows more than coefficients, since a polynomial through all rows does not average
         degree = min(_BEND, len(np.unique(since)) - 1, max(len(block) - 3, 0))
         power = (since / (np.abs(since).max() or 1.0))[:, None] ** np.arange(degree + 1)
         left = np.linalg.pinv(power / spread[block, None])[0] / spread[block]

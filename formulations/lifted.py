@@ -1,6 +1,6 @@
 r"""Lifted ranges, the textbook forms: **baselines of studies, never a default**.
 
-Ranges :math:`r_i = |x - s_i|` become unknowns of their own, so that rows linear in ranges are linear:
+Ranges :math:`r_i = |x - s_i|` become additional unknowns, so that rows linear in ranges are linear:
 
 .. math:: \min_{x, r \ge 0} \; |K r - z|^2 \quad\text{subject to}\quad r_i^2 = |x - s_i|^2, \quad i = 1..M,
 
@@ -36,14 +36,14 @@ from formulations.nls import Local, Program
 
 @dataclass(frozen=True, slots=True)
 class Lifted:
-    """What the order-one relaxation says.
+    """The result of the order-one relaxation.
 
     Parameters
     ----------
     point : Array, shape (d,)
         Position read off the first column.
     ranges : Array, shape (M,)
-        Ranges read off the first column; not the distances of `point` where the relaxation is loose.
+        Ranges read off the first column; they differ from the distances of `point` if the relaxation is not tight.
     value, bound : float
         Optimum, and a lower bound of the ML cost ``|K r(x) - z|^2`` recomputed from the dual.
     rank_ratio : float
@@ -100,14 +100,15 @@ def lifted_problem(count: int, dim: int) -> Any:
 
 @keep
 def _relaxation(count: int, dim: int, backend: str) -> Relaxation:
-    # a decade below Clarabel's own: the value that this baseline is there to show is near zero
+    """Return the relaxation, built once for each size and back end."""
+    # a decade below the default of Clarabel, because the value that this baseline demonstrates is near zero
     return Relaxation(lifted_problem(count, dim), backend=backend, settings=tight(backend, 1e-9))
 
 
 def lifted_ranges(
     rows: ArrayLike, right: ArrayLike, station: ArrayLike, *, reach: float = 10.0, backend: str = "CLARABEL"
 ) -> Lifted:
-    """Solve the order-one relaxation: a baseline, never a default.
+    """Return the solution of the order-one relaxation: a baseline, never a default.
 
     Parameters
     ----------
@@ -125,7 +126,7 @@ def lifted_ranges(
     Returns
     -------
     Lifted
-        Point and bound; see the module's text for what they are worth.
+        Point and bound; the text of the module explains their limits.
 
     Notes
     -----
@@ -137,7 +138,7 @@ def lifted_ranges(
     size = float(np.abs(K).max()) or 1.0  # whitened rows are large where noise is small
     relaxation = _relaxation(count, dim, backend)
     square = (S * S).sum(axis=1)
-    # |(1, x, r)|^2 of every point within the reach: what makes the bound rigorous
+    # |(1, x, r)|^2 of every point within the reach, which makes the bound rigorous
     longest = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
     values = {"gram": table.T @ table / size**2, "station": S, "square": square, "reach": np.array(reach**2)}
     answer = relaxation.solve(values, reach=longest)
@@ -149,7 +150,7 @@ def lifted_ranges(
 
 @keep
 def _program(count: int, dim: int, measured: int) -> Program:
-    """Program with unknowns (x, r) and parameters: the stations, then the rows K, both row by row."""
+    """Return a program with unknowns (x, r) and parameters: the stations, then the rows K, both row by row."""
 
     def residual(y: Any, p: Any, z: Any) -> list[Any]:
         at = count * dim
@@ -162,7 +163,7 @@ def _program(count: int, dim: int, measured: int) -> Program:
 
 
 def lifted_program(rows: ArrayLike, right: ArrayLike, station: ArrayLike, start: ArrayLike) -> Local:
-    """Solve the lifted problem locally with IPOPT: a baseline, never a default.
+    """Return a local solution of the lifted problem by IPOPT: a baseline, never a default.
 
     Parameters
     ----------

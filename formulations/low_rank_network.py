@@ -1,16 +1,16 @@
-r"""Low-rank network: arrivals of N pulses at M stations, neither of whose places is known, as one fit of small rank.
+r"""Low-rank network: arrivals of N pulses at M stations, all at unknown positions, as one fit of small rank.
 
 .. math:: z_{ij} = |a_i - y_j| + o_j + b_i \quad\Longrightarrow\quad
    (z_{ij} - b_i)^2 - 2 (z_{ij} - b_i) o_j = \alpha_i + \beta_j + u_i^\top v_j
 
 with :math:`u` any affine image of the stations, :math:`\alpha_i = |a_i|^2` and :math:`\beta_j = |y_j|^2 - o_j^2` up to
-what :math:`u` and :math:`v` exchange. For given :math:`\theta_i = (\alpha_i, u_i, b_i)` each pulse is a linear least
-squares problem in :math:`(\beta_j, v_j, o_j)` over its own rows, so that entries may be missing and the non-linear
-problem has :math:`M (d + 1)` unknowns however many pulses there are: it is solved by variable projection (Levenberg and
-Marquardt on :math:`\theta`, Kaufman's approximation of the derivative of a projector).
+an exchange between :math:`u` and :math:`v`. For given :math:`\theta_i = (\alpha_i, u_i, b_i)` each pulse is a linear
+least squares problem in :math:`(\beta_j, v_j, o_j)` over its own rows, so that entries may be missing and the
+non-linear problem has :math:`M (d + 1)` unknowns however many pulses there are: it is solved by variable projection
+(Levenberg and Marquardt on :math:`\theta`, Kaufman's approximation of the derivative of a projector).
 
-An error n of an arrival moves its equation by about :math:`2 |a_i - y_j| n`, so each is divided by that distance, as it
-is estimated in every step. Where the distance is nearly nothing, a share of the spread stands in its place.
+An error n of an arrival changes its equation by about :math:`2 |a_i - y_j| n`. So each equation is divided by this
+distance, as estimated in every step. A share of the spread replaces distances near zero.
 
 The values at the minimum give the network up to an affine map, which :mod:`formulations.metric_upgrade` finds.
 
@@ -29,34 +29,34 @@ import numpy as np
 
 from formulations.algebra import Array, Mask
 
-# Steps that a start takes at most: before equations are divided by distances, while they are, and with the last
-# distances. A random start knows no distances: of 12 x 20 networks in flat halls 60 % of the starts end at the best
-# fit, 5 % where all steps divide. The last steps minimise one function.
+# Greatest numbers of steps: before equations are divided by distances, while they are divided, and with fixed
+# distances. Distances at a random start are wrong: for 12 x 20 networks in flat halls 60 % of the starts end at the
+# best fit, but only 5 % if all steps divide. The last steps minimise one fixed function.
 _PLAIN, _WEIGHED, _FROZEN = 30, 55, 5
-# Relative change of the costs of all starts that ends a stage, and how many such steps in a row: costs are compared
-# by factors, and after five bad steps the damping is three thousand times as large.
+# Relative change of the costs of all starts that ends a stage, and the number of successive steps with this change.
+# Costs are compared by factors, and after five bad steps the damping is three thousand times as large.
 _SETTLED, _CALM = 1e-4, 5
-# Share of the spread that stands for a distance below it: a pulse beside a station must not rule the sum.
+# Least distance as a share of the spread: a pulse near a station must not dominate the sum.
 _NEAR = 0.05
-# Pivots below this share of the largest are columns that say nothing: eight digits are left of the sixteen.
+# Pivots below this share of the largest are columns without information: eight of sixteen digits are left.
 _DEPENDENT = 1e-8
-# Marquardt's damping: at first, and its factors after a good and a bad step.
+# Marquardt's damping: initial value, and factors after a good and a bad step.
 _DAMPING, _EASE, _STIFFEN = 1e-2, 0.3, 5.0
 _LEAST, _MOST = 1e-12, 1e8
 
 
 @dataclass(frozen=True, slots=True)
 class StationFactors:
-    """What is sought of the stations: S fits of M stations.
+    """The unknowns of the stations: S fits of M stations.
 
     Parameters
     ----------
     alpha : array (S, M)
-        Squared distance from some point, up to an affine function of `u`.
+        Squared distance from a fixed point, up to an affine function of `u`.
     u : array (S, M, d)
-        Affine image of the places.
+        Affine image of the positions.
     b : array (S, M)
-        Offsets of clocks; zeros where they are not sought.
+        Offsets of clocks; zeros if they are not unknowns.
     """
 
     alpha: Array
@@ -66,14 +66,14 @@ class StationFactors:
 
 @dataclass(frozen=True, slots=True)
 class Pulses:
-    """What follows for the pulses: S fits of N pulses.
+    """The unknowns of the pulses, which follow from the stations: S fits of N pulses.
 
     Parameters
     ----------
     beta : array (S, N)
         Squared distance less the squared offset, up to an affine function of `v`.
     v : array (S, N, d)
-        Affine image of the places.
+        Affine image of the positions.
     o : array (S, N)
         Offsets of emission.
     """
@@ -92,7 +92,7 @@ class LowRank:
     cost: Array
 
     def take(self, which: Any) -> LowRank:
-        """Return some of the fits."""
+        """Return the selected fits."""
         s, p = self.stations, self.pulses
         return LowRank(
             StationFactors(s.alpha[which], s.u[which], s.b[which]),
@@ -102,52 +102,52 @@ class LowRank:
 
 
 def random_stations(rng: np.random.Generator, count: int, m: int, d: int) -> StationFactors:
-    """Return random stations in a cube, half of them flattened, from which fits begin.
+    """Return random stations in a cube as starts of fits; every second start is flattened.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Source of numbers.
+        Random generator.
     count, m, d : int
-        Starts, stations and dimension.
+        Numbers of starts, of stations, and of dimensions.
 
     Returns
     -------
     StationFactors
-        Of spread one.
+        Stations with a spread of one.
     """
     u = rng.uniform(-0.5, 0.5, (count, m, d))
-    u[::2, :, -1] *= 0.3  # halls and networks are wider than high
+    u[::2, :, -1] *= 0.3  # halls and networks are wider than they are high
     return StationFactors(np.sum(u * u, axis=-1), u, np.zeros((count, m)))
 
 
 def fit_low_rank(z: Array, weight: Array, emission: Array, start: StationFactors, *, clocks: bool = False) -> LowRank:
-    """Fit stations and pulses to arrivals from each of several starts.
+    """Return fits of stations and pulses to arrivals from each of several starts.
 
     Parameters
     ----------
     z : array (N, M)
         Arrivals times the speed of propagation, of order one, near zero in each pulse.
     weight : array (N, M)
-        Relative inverse standard deviation of each; zero where there is none.
+        Relative inverse standard deviation of each arrival; zero if it is missing.
     emission : bool array (N,)
         Whether the time of emission of a pulse is unknown; else it is zero.
     start : StationFactors
-        Where to begin, S starts.
+        S starts.
     clocks : bool
-        Whether offsets of the stations' clocks are sought.
+        Whether offsets of the stations' clocks are unknowns.
 
     Returns
     -------
     LowRank
-        S fits, best or not.
+        S fits, in the order of the starts.
     """
     return _Fit(z, weight, emission, clocks).run(start)
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """The data of a fit; methods are one step of it for all starts at once."""
+    """The data of a fit; each method is a part of one step for all starts at once."""
 
     z: Array
     weight: Array
@@ -155,6 +155,7 @@ class _Fit:
     clocks: bool
 
     def run(self, at: StationFactors) -> LowRank:
+        """Return the fits from given starts."""
         count = at.alpha.shape[0]
         scale = np.broadcast_to(self.weight, (count, *self.z.shape))
         damping = np.full(count, _DAMPING)
@@ -177,17 +178,17 @@ class _Fit:
         return LowRank(at, here.pulses, here.cost)
 
     def distance(self, at: StationFactors, pulses: Pulses) -> Array:
-        """Return distances (S, N, M): the mean of what the arrival and what the fit say, kept off zero."""
+        """Return distances (S, N, M): the mean of the distances from the arrival and from the fit, above a minimum."""
         by_time = np.abs(self.z - at.b[:, None] - pulses.o[:, :, None])
         square = at.alpha[:, None] + (pulses.beta + pulses.o**2)[:, :, None] + pulses.v @ np.swapaxes(at.u, 1, 2)
         return np.maximum(0.5 * (by_time + np.sqrt(np.maximum(square, 0.0))), _NEAR)
 
     def project(self, at: StationFactors, scale: Array) -> _Projected:
-        """Return the residuals that no choice of the pulses can take away."""
+        """Return the residuals that remain for the best pulses."""
         shifted = self.z - at.b[:, None]
         u = np.broadcast_to(at.u[:, None], (*scale.shape, at.u.shape[-1]))
         ones = np.ones((*scale.shape, 1))
-        # the offset comes last: its column is zero where the emission is known, and so is its vector
+        # the offset is the last column; it is zero if the emission time is known, and so is its basis vector
         last = 2.0 * (shifted * self.emission[:, None])[..., None]
         a = scale[..., None] * np.concatenate([ones, u, last], axis=-1)
         q, r = orthonormal(a)
@@ -208,7 +209,7 @@ class _Fit:
             columns.append(2.0 * (self.z - at.b[:, None] - here.pulses.o[:, :, None])[..., None])
         c = here.scale[..., None] * np.concatenate(columns, axis=-1)
         p = c.shape[-1]
-        # sum over pulses of C'(I - QQ')C: one block for each station, less a product of what lies within Q
+        # sum over pulses of C'(I - QQ')C: one block for each station, less the product of the parts in the span of Q
         inner = np.einsum("snik,snia->snkia", here.q, c).reshape(count, -1, m * p)
         normal = -np.swapaxes(inner, 1, 2) @ inner
         blocks = normal.reshape(count, m, p, m, p)
@@ -224,7 +225,7 @@ class _Fit:
 
 @dataclass(frozen=True, slots=True)
 class _Projected:
-    """Pulses that fit best, the basis of what they can explain, residuals beyond it, and their squares."""
+    """The pulses that fit best, an orthonormal basis of their columns, the residuals, and the sum of their squares."""
 
     pulses: Pulses
     q: Array
@@ -233,7 +234,7 @@ class _Projected:
     cost: Array
 
     def replaced(self, mask: Mask, other: _Projected) -> _Projected:
-        """Return this with the other's fits where the mask says so."""
+        """Return this projection with the fits of `other` where the mask is True."""
         p, o = self.pulses, other.pulses
         pulses = Pulses(_where(mask, o.beta, p.beta), _where(mask, o.v, p.v), _where(mask, o.o, p.o))
         return replace(
@@ -246,22 +247,24 @@ class _Projected:
 
 
 def _where(mask: Mask, one: Array, other: Array) -> Array:
+    """Return items of `one` where the mask (S,) is True, else items of `other`."""
     return np.where(mask.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
 def _chosen(mask: Mask, one: StationFactors, other: StationFactors) -> StationFactors:
+    """Return stations of `one` where the mask (S,) is True, else of `other`."""
     return StationFactors(
         _where(mask, one.alpha, other.alpha), _where(mask, one.u, other.u), _where(mask, one.b, other.b)
     )
 
 
 def orthonormal(a: Array) -> tuple[Array, Array]:
-    """Return an orthonormal basis of columns and their coordinates, by Gram and Schmidt, each column twice.
+    """Return an orthonormal basis of columns and their coordinates, by the Gram-Schmidt method, each column twice.
 
     Parameters
     ----------
     a : array (..., m, k)
-        Columns; the last of those that depend on the ones before get a zero vector.
+        Columns; a column that depends on earlier columns gets a zero vector.
 
     Returns
     -------
@@ -287,7 +290,7 @@ def orthonormal(a: Array) -> tuple[Array, Array]:
 
 
 def _back(r: Array, part: Array) -> Array:
-    """Solve an upper triangle; zero where its pivot is infinite."""
+    """Return the solution of an upper triangular system; zero where its pivot is infinite."""
     out = np.zeros_like(part)
     for i in range(part.shape[-1] - 1, -1, -1):
         known = part[..., i] - np.einsum("...k,...k->...", r[..., i, i + 1 :], out[..., i + 1 :])

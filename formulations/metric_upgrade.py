@@ -1,6 +1,6 @@
 r"""Metric upgrade: the affine image of a network becomes the network, from the side of the stations or of the pulses.
 
-A fit of small rank (:mod:`formulations.low_rank_network`) knows :math:`\alpha_i + \beta_j + o_j^2 + u_i^\top v_j =
+A fit of small rank (:mod:`formulations.low_rank_network`) gives :math:`\alpha_i + \beta_j + o_j^2 + u_i^\top v_j =
 |a_i - y_j|^2`. With :math:`u` centred and white, :math:`a_i = T^\top u_i`, :math:`y_j = -T^{-1} (v_j + h)/2` and
 :math:`H = T T^\top`, :math:`K = H^{-1}`,
 
@@ -25,19 +25,19 @@ import numpy as np
 from formulations.algebra import Array
 from formulations.low_rank_network import LowRank
 
-# Least share of the largest eigenvalue: a network all but flat, one like a hall, and one like a cube.
+# Floors of eigenvalues as a share of the largest: for a nearly flat network, one like a hall, and one like a cube.
 _FLOORS = (1e-3, 5e-2, 0.3)
-# Singular values below this share of the largest are directions that the side leaves open.
+# Singular values below this share of the largest are undetermined directions.
 _OPEN = 1e-9
 
 
 def unknowns(d: int) -> int:
-    """Return how many stations, or pulses, a side needs: the entries of H, h and c in d dimensions."""
+    """Return the number of stations, or pulses, that a side needs: the entries of H, h and c in d dimensions."""
     return d * (d + 1) // 2 + d + 1
 
 
 def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
-    """Return places of stations and pulses of one dimensionless fit after another.
+    """Return candidate positions of stations and pulses for each of several fits, in the unit of the fit.
 
     Parameters
     ----------
@@ -47,11 +47,11 @@ def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
     Returns
     -------
     stations : array (C, M, d)
-        Candidates, from each side that has enough points and with each floor; centred.
+        Candidate positions, from each side with enough points and for each floor; centred.
     pulses : array (C, N, d)
-        Likewise.
+        Candidate positions of the pulses.
     which : int array (C,)
-        Fit that each comes from.
+        Number of the fit of each candidate.
     """
     found: list[tuple[Array, Array, int]] = []
     for s in range(len(fit.cost)):
@@ -70,7 +70,7 @@ def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
 
 
 def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
-    """Return centred and white stations, pulses that go with them, and what squares they have."""
+    """Return centred and white stations, the pulses for these stations, and their squares."""
     u, v = fit.stations.u[s], fit.pulses.v[s]
     middle = u.mean(axis=0)
     centred = u - middle
@@ -81,13 +81,13 @@ def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
-    """Return candidates for H and h."""
+    """Return the candidates (H, h), with H (d, d) and h (d,), from each side with enough points."""
     d, out = u.shape[1], []
     if len(u) >= unknowns(d):
         H, h = _quadric(u, alpha)
         out += [(positive, h) for positive in _positive(H)]
     if len(v) >= unknowns(d):
-        # 4 K and 2 K h of a quadric in v; pulses may be far: lengths of their own
+        # 4 K and 2 K h of a quadric in v; pulses may be far away, so they have another unit of length
         length = np.sqrt(np.mean(v * v))
         K, Kh = _quadric(v / length, square)
         K, Kh = 4.0 * K / length**2, 2.0 * Kh / length
@@ -98,7 +98,7 @@ def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array,
 
 
 def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
-    """Fit ``x'Qx + x'q + constant`` to values: Q (d, d) and q (d,)."""
+    """Return Q (d, d) and q (d,) of the fit ``x'Qx + x'q + constant`` to values."""
     d = x.shape[1]
     i, k = np.triu_indices(d)
     columns = np.concatenate([x[:, i] * x[:, k] * np.where(i == k, 1.0, 2.0), x, np.ones((len(x), 1))], axis=1)
@@ -109,7 +109,7 @@ def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
 
 
 def _positive(Q: Array) -> list[Array]:
-    """Return matrices with eigenvalues kept above each floor; one where none is below."""
+    """Return matrices with eigenvalues raised to each floor; only one matrix if no eigenvalue is below a floor."""
     width, axes = np.linalg.eigh(Q)
     largest = np.abs(width).max()
     if not np.isfinite(largest) or largest <= 0.0:

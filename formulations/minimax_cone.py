@@ -9,9 +9,10 @@ a second-order cone that no point behind the station satisfies. A ball of radius
 
 .. math:: \max_{p,\, r \le 1} \; r \quad\text{subject to these N cones},
 
-tells whether the cones meet (:math:`r \ge 0`), gives the centre of the largest inscribed ball, and otherwise, from
-its dual, multipliers that prove that they do not. With :math:`\theta_i = t \sigma_i` the set grows with t (the worst
-scaled angle is quasi-convex): bisection on t, helped by the angles really attained, finds the global minimax fix.
+decides whether the cones meet (:math:`r \ge 0`), gives the centre of the largest inscribed ball, and otherwise, from
+its dual, multipliers that prove that the cones do not meet. With :math:`\theta_i = t \sigma_i` the set grows with t
+(the worst scaled angle is quasi-convex). Bisection on t, accelerated by the attained angles, finds the global minimax
+fix.
 
 Sources: M. S. Lobo, L. Vandenberghe, S. Boyd and H. Lebret, "Applications of second-order cone programming", Linear
 Algebra Appl. 284 (1998); F. Kahl and R. Hartley, "Multiple-view geometry under the L-infinity norm", IEEE Trans.
@@ -29,11 +30,11 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, tight
 
-# Largest half-angle that is handled as a cone, radians: at pi/2 the cone is a half-space; here its tangent is 100.
+# Largest half-angle of a cone, radians: at pi/2 the cone is a half-space; here its tangent is 100.
 _WIDEST = 0.5 * np.pi - 0.01
-_RADIUS = 1e3  # distance, in the caller's units of order one, within which a proof of emptiness is asked for
-_EXACT = 1e-6  # level, in the caller's sigma, that counts as zero: bisection would halve it for ever
-# how Clarabel, and cvxpy for all others, say it; in small letters
+_RADIUS = 1e3  # radius of the region of a proof of emptiness, in the caller's units of order one
+_EXACT = 1e-6  # level, in the caller's sigma, that counts as zero, since bisection would halve it forever
+# statuses of infeasible problems in Clarabel, and in cvxpy for all others; in lower case
 _SOLVED = ("solved", "almostsolved", "optimal", "optimal_inaccurate")
 _UNBOUNDED = ("dualinfeasible", "almostdualinfeasible", "unbounded", "unbounded_inaccurate")
 
@@ -45,15 +46,15 @@ class Common:
     Parameters
     ----------
     point : Array, shape (d,)
-        Centre of the largest ball (of radius at most one) inside all cones; where they do not meet, the point that
+        Centre of the largest ball (of radius at most one) inside all cones; if they do not meet, the point that
         violates them least.
     margin : float
-        Radius of that ball; negative where the cones do not meet, then the largest (distance-like) violation.
+        Radius of this ball. If the cones do not meet, minus the largest violation, which is similar to a distance.
     most : float
         Upper bound of the margin, recomputed from the dual, over points within `_RADIUS` of the origin.
     meet : bool or None
-        True where `point` was checked to lie in every cone; False where `most` is negative, a proof that no point
-        does; None where neither could be shown.
+        True if a check shows that `point` is in every cone; False if `most` is negative, which proves that no point is;
+        None if neither could be shown.
     answer : ConicAnswer
         The solver's report.
     """
@@ -72,15 +73,15 @@ class Minimax:
     Parameters
     ----------
     point : Array, shape (d,)
-        The fix; NaN where no point is in front of all stations.
+        The fix; NaN if no point is in front of all stations.
     level : float
         Its worst ``angle_i / sigma_i``.
     least : float
-        No point within `_WIDEST` of every bearing has a smaller one: the largest level proven empty.
+        Proven lower bound: no point within `_WIDEST` of every bearing has a smaller level.
     meet : bool or None
         As in `Common`, at the widest level.
     solves : int
-        Cone programs solved.
+        Number of solved cone programs.
     """
 
     point: Array
@@ -91,7 +92,7 @@ class Minimax:
 
 
 def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backend: str = "CLARABEL") -> Common:
-    """Do the cones meet, and where is their middle?
+    """Return whether the cones meet, and the centre of their common points.
 
     Parameters
     ----------
@@ -100,9 +101,9 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
     station : array_like, shape (N, d)
         Positions, numbers of order one.
     bound : array_like, shape (N,)
-        Largest possible angle to the true direction, radians, positive and below pi/2; infinite drops a cone.
+        Largest possible angle to the true direction, radians, positive and below pi/2; an infinite value drops a cone.
     backend : str
-        Conic solver; other ones than Clarabel prove nothing.
+        Conic solver; only Clarabel gives proofs.
 
     Returns
     -------
@@ -111,7 +112,7 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
 
     Notes
     -----
-    The module's text.
+    See the text of the module.
     """
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
     relaxation = _relaxation("ball", u.shape[0], u.shape[1], backend)
@@ -125,20 +126,20 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
 def extent(
     direction: ArrayLike, station: ArrayLike, bound: ArrayLike, towards: ArrayLike, *, backend: str = "CLARABEL"
 ) -> Array:
-    """How far do the common points of the cones reach?
+    """Return the extent of the common points of the cones in given directions.
 
     Parameters
     ----------
     direction, station, bound, backend
         As in `common`.
     towards : array_like, shape (K, d)
-        Directions asked for.
+        Directions.
 
     Returns
     -------
     Array, shape (K,)
         Upper bounds of ``towards'p`` over the set, recomputed from the dual and attained up to the solver's accuracy;
-        infinite where the set is not bounded, NaN where it is empty or the solver failed.
+        infinite if the set is not bounded, NaN if it is empty or the solver failed.
 
     Notes
     -----
@@ -166,30 +167,30 @@ def minimax(
     most: int = 60,
     backend: str = "CLARABEL",
 ) -> Minimax:
-    """Find the point whose largest scaled angle to the bearings is least, over all points.
+    """Return the point whose largest scaled angle to the bearings is least, over all points.
 
     Parameters
     ----------
     direction, station, backend
         As in `common`.
     sigma : array_like, shape (N,)
-        Scale of each angle, radians; infinite drops a bearing.
+        Scale of each angle, radians; an infinite value drops a bearing.
     tolerance : float
-        Relative width of the bracket at which to stop: far below what bounds of errors are known to.
+        Relative width of the final bracket, far below the accuracy of error bounds.
     most : int
-        Largest number of cone programs; bisection to 1e-4 takes some 14.
+        Greatest number of cone programs; bisection to 1e-4 takes about 14.
 
     Returns
     -------
     Minimax
-        Fix, level, and the level proven empty.
+        Fix, level, and proven lower bound of the level.
 
     Notes
     -----
-    Kahl and Hartley (2008), bisection; a level is raised from below only by a proof.
+    Kahl and Hartley (2008), bisection; the lower end of the bracket is raised only by a proof.
     """
     u, S, scale = (np.asarray(part, dtype=np.float64) for part in (direction, station, sigma))
-    # the widest cones first: where they do not meet, no point is in front of all stations
+    # the widest cones first: if they do not meet, no point is in front of all stations
     level, low = _WIDEST / float(scale[np.isfinite(scale)].min()), 0.0
     found = _at(u, S, scale, level, backend)
     if not found.meet:
@@ -201,7 +202,7 @@ def minimax(
         middle = 0.5 * (low + level)
         found, solves = _at(u, S, scale, middle, backend), solves + 1
         if found.meet:
-            # the angles attained at the point found lie below the level asked for: faster than bisection alone
+            # the angles at the found point are below the requested level: faster than bisection alone
             point, level = found.point, float((angles(found.point, u, S) / scale).max())
         elif found.meet is False:
             low = middle
@@ -236,6 +237,7 @@ def angles(point: Array, direction: Array, station: Array) -> Array:
 
 
 def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
+    """Return the common points of cones whose half-angles are `level` times their scale."""
     theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
     return common(u, S, theta, backend=backend)
 
@@ -245,10 +247,11 @@ def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
 
 @keep
 def _relaxation(kind: str, count: int, dim: int, backend: str) -> Relaxation:
-    settings = tight(backend, 1e-10)  # margins are proven by their sign: two decades below Clarabel's own
+    """Return the cone program, built once for each kind, size and back end."""
+    settings = tight(backend, 1e-10)  # the sign of a margin is a proof: two decades below the default of Clarabel
     if kind == "edge":
         return Relaxation(edge_problem(count, dim), backend=backend, settings=settings)
-    # (p, 0) is feasible for every common point p: emptiness is proven for all p with |p| <= radius (1 + ..)
+    # (p, 0) is feasible for every common point p, so emptiness is proven for all p with |p| <= radius (1 + ..)
     return Relaxation(ball_problem(count, dim), backend=backend, settings=settings, radius=_RADIUS)
 
 
@@ -302,6 +305,7 @@ def edge_problem(count: int, dim: int) -> Any:
 
 
 def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
+    """Return the constraints of the cones, with new parameters."""
     import cvxpy as cp
 
     rows = dim - 1
@@ -314,9 +318,9 @@ def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
 
 
 def _cone_data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
-    """Parameters of both problems at half-angles (N,) below pi/2; an infinite one drops its cone.
+    """Return the parameters of both problems at half-angles (N,) below pi/2; an infinite angle drops its cone.
 
-    Each cone is multiplied by its cosine, so that wide ones keep small numbers.
+    Each cone is multiplied by the cosine of its half-angle, so that wide cones have small numbers.
     """
     _count, dim = u.shape
     held = np.isfinite(theta)

@@ -11,9 +11,10 @@ matrix, of size (d + 2) M, is positive semidefinite, so are :math:`E[(1 - t^2)\,
 of :math:`1 - s_k^2`; the first equality times every product of two errors and the others times 1, s and t vanish.
 Rows for :math:`\omega_i^2` would be combinations of these, by the second equalities.
 
-The cost sees differences of ranges only, so that the lift of (1, x, r) is never tight; products of errors and
-positions make the difference. The box matters too: without it the moments have no bound, and the relative tolerances
-of a solver hide what they violate. Every monomial is at most one here, which makes the bound from the dual rigorous.
+The cost depends on differences of ranges only, so that the lift of (1, x, r) is never tight; products of errors and
+positions make this relaxation tighter. The box is necessary too: without it the moments have no bound, and the relative
+tolerances of a solver hide violations. Every monomial is at most one here, which makes the bound from the dual
+rigorous.
 
 Source: J. B. Lasserre, "Global optimization with polynomials and the problem of moments", SIAM J. Optim. 11 (2001).
 """
@@ -42,9 +43,9 @@ class Moments:
     Parameters
     ----------
     count : int
-        How many monomials there are.
+        Number of monomials.
     table : Index, shape (p, p, M, M)
-        Number of each by its two places and its two errors.
+        Number of each monomial by its two places and its two errors.
     matrix : Index, shape (p M, p M)
         The moment matrix.
     cone : Index, shape (M (M + 1) / 2, p (p + 1) / 2)
@@ -63,9 +64,9 @@ class Moments:
     cost: Index
 
 
-@lru_cache(maxsize=32)  # arrays that nobody writes to: threads may share them
+@lru_cache(maxsize=32)  # the arrays are never written, so threads may share them
 def moments(stations: int, dimension: int) -> Moments:
-    """Return numbers of the monomials; pairs are upper triangles, row by row.
+    """Return the numbers of the monomials; pairs are upper triangles, row by row.
 
     Parameters
     ----------
@@ -99,18 +100,18 @@ def moments(stations: int, dimension: int) -> Moments:
 
 @dataclass(frozen=True, slots=True)
 class Bounded:
-    """What the relaxation says about the points of a box.
+    """The result of the relaxation for the points of a box.
 
     Parameters
     ----------
     point : Array, shape (d,)
-        First moments: the minimiser where `rank_ratio` is small.
+        First moments: the minimiser if `rank_ratio` is small.
     value : float
-        Optimum of the relaxation as the solver reports it.
+        Optimum of the relaxation, as reported by the solver.
     bound : float
-        No point of the box costs less: recomputed from the dual, and at most the `cost` that was given.
+        Lower bound of the cost in the box, recomputed from the dual, and at most the given `cost`.
     rank_ratio : float
-        Second over first eigenvalue of the moments of (1, s, t); near zero where tight.
+        Second over first eigenvalue of the moments of (1, s, t); near zero if tight.
     answer : ConicAnswer
         The solver's report.
     """
@@ -153,7 +154,7 @@ def moment_problem(stations: int, dimension: int) -> Any:
         return cp.reshape(y[index.ravel()], index.shape, order="C")
 
     errors = arrange(own.table[0, 0])
-    # the moment matrix, then those of (1 - t^2), (1 - s_k^2) times two errors; the rules times 1, s and t
+    # the moment matrix, the matrices of (1 - t^2), (1 - s_k^2) times two errors, and the rules times 1, s and t
     demands = [arrange(own.matrix) >> 0, y[0] == 1, arrange(own.cone) @ cone == 0]
     demands += [errors - arrange(own.table[k, k]) >> 0 for k in range(1, dimension + 2)]
     demands += [arrange(index) @ rule[i] == 0 for i, index in enumerate(own.rules)]
@@ -162,24 +163,25 @@ def moment_problem(stations: int, dimension: int) -> Any:
 
 @keep
 def _relaxation(stations: int, dimension: int, backend: str) -> Relaxation:
-    # the equalities depend on each other at a solution: with Clarabel's own 1e-8 one solve in four stops early
+    """Return the relaxation, built once for each size and back end."""
+    # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in four stops early
     settings = tight(backend, 1e-8, static_regularization_constant=1e-7)
     return Relaxation(moment_problem(stations, dimension), backend=backend, settings=settings)
 
 
 def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str = "CLARABEL") -> Bounded:
-    """Bound the maximum-likelihood cost from below over a box.
+    """Return a lower bound of the maximum-likelihood cost over a box.
 
     Parameters
     ----------
     ranged : Ranged
         The measurements, numbers of order one.
     box : EnclosingBox
-        Where to look; best `formulations.range_enclosure.enclosure` with the same cost.
+        The box, best from `formulations.range_enclosure.enclosure` with the same cost.
     cost : float
-        Costs above this need no bound: that of a fix, and a little more.
+        Greatest relevant cost: slightly above the cost of a fix.
     backend : str
-        Conic solver; other ones than Clarabel bound nothing.
+        Conic solver; only Clarabel gives bounds.
 
     Returns
     -------
@@ -192,7 +194,8 @@ def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str
     """
     M, d = ranged.station.shape
     own = moments(M, d)
-    # errors in units of the largest that a point of this cost can have: with the box, every monomial is at most one
+    # errors in units of the largest error of a point with this cost: together with the box, every monomial is at most
+    # one
     unit = np.sqrt(cost * np.diag(ranged.spread))
     cone, rule, form = _forms(ranged, box, unit)
     size = float(np.abs(form).max())
@@ -201,7 +204,7 @@ def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str
         "cone": _upper(cone / np.abs(cone).max()),
         "rule": rule / np.abs(rule).max(1, keepdims=True),
     }
-    # no monomial of a point that matters exceeds one
+    # no monomial of a relevant point exceeds one
     answer = _relaxation(M, d, backend).solve(values, reach=float(np.sqrt(own.count)))
     place = answer.values["y"][own.table[:, :, 0, 0]]
     point = box.centre + box.axes @ place[0, 1:-1]
@@ -209,7 +212,7 @@ def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str
 
 
 def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array, Array]:
-    """Quadratic form of the first equality, coefficients of the others, and the cost in terms of (1, t, w)."""
+    """Return the quadratic form of the first equality, coefficients of the others, and the cost in (1, t, w)."""
     from_first, other = box.centre - ranged.station[0], ranged.station[1:] - ranged.station[0]
     middle, half = 0.5 * (box.low + box.high), 0.5 * (box.high - box.low)
     side, d, D = ranged.side, ranged.excess, len(from_first)
@@ -235,16 +238,16 @@ def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array
 
 
 def _cost(ranged: Ranged, change: Array) -> Array:
-    """Matrix of the cost in the columns of a change of (1, r_1, w)."""
+    """Return the matrix of the cost after a change of the variables (1, r_1, w)."""
     if ranged.free:
         return np.asarray(change[2:].T @ np.linalg.solve(ranged.spread, change[2:]))
-    # What is measured less the middle of the box is small: subtracted before it is squared, as squares of ranges in
-    # standard deviations have eight digits more than the cost.
+    # The measurement minus the middle of the box is small. It is subtracted before squaring, because squares of ranges
+    # in standard deviations have eight digits more than the cost.
     error = -ranged.offset[0] * np.eye(1, len(change)) + change[1] + np.pad(change[2:], ((1, 0), (0, 0)))
     return np.asarray(error.T @ np.linalg.solve(ranged.covariance, error))
 
 
 def _upper(form: Array) -> Array:
-    """Coefficients of a quadratic form on the products of pairs: its upper triangle row by row, others doubled."""
+    """Return the coefficients of a quadratic form for products of pairs: the upper triangle, off-diagonal doubled."""
     row, column = np.triu_indices(len(form))
     return np.asarray(np.where(row == column, 1.0, 2.0) * form[row, column])

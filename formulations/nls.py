@@ -34,8 +34,8 @@ Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
 
 _QUIET = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, "calc_lam_p": False}
-# What keeps solvers of CasADi silent, and their inner solvers from failing. IPOPT's tolerance is two decades below its
-# own 1e-8: its answers are second opinions on those of a Gauss-Newton iteration.
+# Options that suppress output of CasADi's solvers and keep their inner solvers from failing. The tolerance of IPOPT is
+# two decades below its default of 1e-8, because its solutions verify those of a Gauss-Newton iteration.
 _SILENCE: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}},
     "sqpmethod": {
@@ -51,12 +51,12 @@ _SILENCE: dict[str, dict[str, Any]] = {
     "fatrop": {"fatrop": {"print_level": 0}},
     "uno": {"uno": {"logger": "SILENT"}},
 }
-# Violation of a constraint, in its own unit of order one, from which a point is no solution whatever a solver claims:
-# ten times the loosest tolerance, the 1e-4 of IPOPT.
+# Violation of a constraint, in its unit of order one, from which a point is not a solution, even if the solver reports
+# success: ten times the loosest tolerance, 1e-4 of IPOPT.
 _BROKEN = 1e-3
 
 _COMPILERS = ("cc", "gcc", "clang")
-_PATIENCE = 600.0  # seconds; some 10 for 200 rows, and large programs are long source
+_PATIENCE = 600.0  # time limit of the compiler, seconds; 200 rows take about 10, large programs longer
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Local:
     Parameters
     ----------
     x : Array, shape (n,)
-        The point; where `success` is False the last iterate, which is no solution.
+        The solution; if `success` is False, the last iterate.
     cost : float
         ``|We|^2`` plus the prior term.
     bounds : Array, shape (n,)
@@ -75,9 +75,9 @@ class Local:
     equalities, inequalities : Array
         Multipliers of ``c = 0`` and ``d >= 0``; the latter are at most zero.
     status : str
-        The solver's own word, and what contradicts it.
+        Status in the solver's words, and any contradiction to it.
     success : bool
-        True where the solver met its tolerances, the point meets the constraints and the cost has a gradient there.
+        True if the solver met its tolerances, the point satisfies the constraints and the cost has a gradient there.
     iterations : int
         Interior-point iterations.
     """
@@ -102,7 +102,7 @@ class Program:
     h : callable, optional
         ``h(x, p)`` on CasADi symbols (column vectors), giving m expressions as a list or a column.
     residual : callable, optional
-        ``residual(x, p, z)``, m expressions, in the place of ``z - h(x, p)``.
+        ``residual(x, p, z)``, m expressions, instead of ``z - h(x, p)``.
     equalities, inequalities : callable, optional
         ``c(x, p)`` and ``d(x, p)``, lists or columns of expressions.
     diagonal : bool
@@ -110,15 +110,15 @@ class Program:
     settings : Mapping[str, Any], optional
         IPOPT settings, for instance ``{"max_iter": 200}``.
     choice : Choice, optional
-        Another nonlinear solver of CasADi with its settings, in the place of IPOPT and `settings`.
+        Another nonlinear solver of CasADi with its settings, instead of IPOPT and `settings`.
     compiled : bool
-        Turn the functions into machine code with the C compiler of the system: a solve of 200 rows then takes half
-        the time, but the compiler some 10 s. The attribute of this name tells whether that was possible; where not,
-        CasADi interprets the functions, as it does by default.
+        Compile the functions to machine code with the C compiler of the system. A solve of 200 rows then takes half the
+        time, but the compiler takes about 10 s. The attribute of this name is True if the compilation succeeded. If
+        not, CasADi interprets the functions, as by default.
 
     Notes
     -----
-    Waechter and Biegler (2006). Threads may share one: they solve one after the other. Do not pickle.
+    Waechter and Biegler (2006). Threads may share a program: they solve one after the other. Do not pickle.
     """
 
     def __init__(
@@ -147,12 +147,13 @@ class Program:
         misfit = z - _column(h(x, given), m) if h is not None else _column(residual(x, given, z), m)  # type: ignore[misc]
         c = _column(equalities(x, given)) if equalities else ca.SX(0, 1)
         d = _column(inequalities(x, given)) if inequalities else ca.SX(0, 1)
-        # what rows share is computed once: of courses that follow the Earth derivatives then are a seventh as long
+        # common subexpressions are computed once: derivatives of courses over ground then have a seventh of the length
         misfit, c, d = ca.cse([misfit, c, d])
         white = weight * misfit if diagonal else weight @ misfit
         cost = ca.sumsqr(white) + ca.bilin(information, x - mean, x - mean)
         self._equal, self._more = c.shape[0], d.shape[0]
-        # everything that changes from solve to solve is one parameter vector: the program is built and compiled once
+        # one parameter vector contains all numbers that change between solves, so the program is built and compiled
+        # once
         data = ca.vertcat(given, z, ca.vec(weight), mean, ca.vec(information))
         program = {"x": x, "p": data, "f": cost, "g": ca.vertcat(c, d)}
         self._name = "ipopt" if choice is None else choice.name
@@ -162,8 +163,8 @@ class Program:
         faster = _compile(self._name, solver, options) if compiled else None
         self.compiled = faster is not None
         self._solver = solver if faster is None else faster
-        # CasADi releases the interpreter lock while it solves, and the solver has one memory, which threads at once
-        # corrupt, and one report, of its last solve
+        # CasADi releases the interpreter lock while it solves, and the solver has one memory, which simultaneous
+        # threads would corrupt, and one report, of its last solve
         self.lock = threading.Lock()
         _LOCKS.programs.add(self)
 
@@ -178,7 +179,7 @@ class Program:
         upper: ArrayLike | None = None,
         prior: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> Local:
-        """Solve with new data.
+        """Return a local solution for new data.
 
         Parameters
         ----------
@@ -198,7 +199,7 @@ class Program:
         Returns
         -------
         Local
-            A local minimiser, or the last iterate and why there is none.
+            A local minimiser, or the last iterate and the reason of the failure.
         """
         identity = np.ones(self.m) if self.diagonal else np.eye(self.m)
         mean, information = prior if prior is not None else (np.zeros(self.n), np.zeros((self.n, self.n)))
@@ -223,7 +224,7 @@ class Program:
             with self.lock:
                 found, stats = self._solver(**given), self._solver.stats()
             status = str(stats["return_status"])
-        except RuntimeError as trouble:  # CasADi has no other kind
+        except RuntimeError as trouble:  # CasADi raises no other type
             record(Ending(self._name, "error", first_sentence(trouble), found=False))
             raise SolverError(f"{self._name} failed: {trouble}") from trouble
         except KeyError as trouble:
@@ -248,31 +249,33 @@ class Program:
         )
 
     def _contradiction(self, x: Any, data: Array, status: str) -> str:
-        """Return what shows that a point is no solution although the solver claims success; empty where nothing does.
+        """Return why a point is not a solution although the solver reports success; "" if there is no contradiction.
 
-        Some solvers call the end of their time, or a start without a gradient, a success.
+        Some solvers report success at their time limit, or at a start without a gradient.
         """
         if "limit" in status.lower():
             return "it stopped at a limit"
         slope, broken = (_numbers(value) for value in self._check(x, data))
         if not np.isfinite(slope).all():
-            return "the cost has no gradient there"
+            return "the cost has no gradient at this point"
         return "" if np.abs(broken).max(initial=0.0) <= _BROKEN else "the constraints are not met"
 
 
 class _Locks:
-    """The locks of all programs as one; who forks waits until their solves have ended."""
+    """The locks of all programs as one lock; a fork waits until their solves have ended."""
 
     def __init__(self) -> None:
         self.programs: WeakSet[Program] = WeakSet()
         self.held: list[threading.Lock] = []
 
     def acquire(self) -> None:
+        """Acquire the locks of all programs."""
         self.held = [program.lock for program in self.programs]
         for lock in self.held:
             lock.acquire()
 
     def release(self) -> None:
+        """Release the locks of all programs."""
         for lock in self.held:
             lock.release()
 
@@ -282,7 +285,7 @@ hold_in_forks(_LOCKS)
 
 
 def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a CasADi solver; those of IPOPT itself live in a table of their own."""
+    """Return the options of a CasADi solver; the options of IPOPT are in a separate table."""
     name = "ipopt" if choice is None else choice.name
     own = dict(settings if choice is None else choice.settings)
     silent = _SILENCE.get(name, {})
@@ -292,7 +295,7 @@ def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, An
 
 
 def _column(expressions: Any, count: int | None = None) -> Any:
-    """Expressions as one CasADi column."""
+    """Return expressions as one CasADi column."""
     import casadi as ca
 
     listed = isinstance(expressions, Sequence)
@@ -303,6 +306,7 @@ def _column(expressions: Any, count: int | None = None) -> Any:
 
 
 def _check(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return a value as an array; raise ValueError if its shape is wrong."""
     array = np.asarray(value, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, {shape} expected")
@@ -310,11 +314,12 @@ def _check(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _numbers(value: Any) -> Array:
+    """Return values of CasADi as a vector."""
     return np.asarray(value.full(), dtype=np.float64).ravel()
 
 
 def _compile(name: str, solver: Any, options: dict[str, Any]) -> Any:
-    """Build a CasADi solver again with its functions as machine code; None where no compiler does it."""
+    """Return a CasADi solver with its functions compiled to machine code, or None if no compiler succeeds."""
     import casadi as ca
 
     compiler = next((found for found in map(shutil.which, _COMPILERS) if found), None)
@@ -327,11 +332,11 @@ def _compile(name: str, solver: Any, options: dict[str, Any]) -> Any:
     with tempfile.TemporaryDirectory(prefix="casadi", ignore_cleanup_errors=True) as folder:
         source, library = Path(folder) / "program.c", Path(folder) / "program.so"
         source.write_text(generator.dump(), encoding="utf-8")
-        # for 200 ranges -O2 compiled 2.4 times as long and solved no faster; -O0 solved at a third of the speed
+        # for 200 ranges, -O2 took 2.4 times as long to compile and was not faster; -O0 solved at a third of the speed
         command = [compiler, "-O1", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"]
         try:
             subprocess.run(command, check=True, capture_output=True, timeout=_PATIENCE)  # noqa: S603  (no shell)
-            # what is loaded stays when its file is gone
+            # loaded code stays in memory after its file is deleted
             return ca.nlpsol("nls", name, str(library), options)
         except (subprocess.SubprocessError, OSError, RuntimeError):
             return None

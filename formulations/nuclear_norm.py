@@ -11,15 +11,15 @@ sum of the singular values, its convex envelope on matrices of bounded norm, and
 .. math:: \min_o \; \|G(o)\|_* - \langle W, G(o) \rangle \quad\text{subject to}\quad o_j \le \min_i z_{ij}.
 
 *First pass*, :math:`W = 0`: the nuclear norm. It is **not tight**: distances that are too small make all of `G` small,
-so that the least nuclear norm lies between the true times and those of the nearest stations. Without the bounds on
-`o` it ends beyond them.
+so that the least nuclear norm is between the true times and the times at the nearest stations. Without the bounds on
+`o` the solution is beyond them.
 
 *Further passes*, :math:`W = U_d V_d^\top` of the pass before: the truncated nuclear norm, the sum of the singular
 values beyond the first d, decreased by linearising what is concave in it. It is zero at the true times without noise,
 and where the passes arrive there, they are exact; a local method from one start.
 
 Times of emission make the network affine by one singular value decomposition, and :mod:`formulations.metric_upgrade`
-gives the places. Stations without a common clock are outside: their term :math:`b \, o^\top` is not affine.
+gives the positions. Stations without a common clock are not supported: their term :math:`b \, o^\top` is not affine.
 
 Sources: M. Fazel, "Matrix rank minimization with applications", PhD thesis, Stanford University, 2002 (the nuclear norm
 for rank); F. Jiang, Y. Kuang and K. Astrom, "Time delay estimation for TDOA self-calibration using truncated nuclear
@@ -38,28 +38,28 @@ from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep
 from formulations.low_rank_network import LowRank, Pulses, StationFactors
 
-# Change of the times of emission, in units of the spread, below which passes have settled: far below any noise.
+# Change of the times of emission, in units of the spread, below which passes have converged: far below any noise.
 _SETTLED = 1e-7
 
 
 @dataclass(frozen=True, slots=True)
 class NuclearNorm:
-    """What the passes arrived at.
+    """The result of the passes.
 
     Parameters
     ----------
     offset : array (N,)
         Times of emission.
     value : float
-        Nuclear norm of G there.
+        Nuclear norm of G at these times.
     bound : float
         Lower bound of the nuclear norm over all times that the constraints allow, from the dual of the first pass.
     beyond : float
-        Share of the nuclear norm that the singular values beyond the first d have: zero for a network without noise.
+        Share of the singular values beyond the first d in the nuclear norm: zero for a network without noise.
     passes : int
-        How many were made.
+        Number of passes.
     answer : ConicAnswer
-        The solver's report on the last.
+        The solver's report on the last pass.
     """
 
     offset: Array
@@ -82,7 +82,7 @@ def nuclear_problem(stations: int, pulses: int) -> Any:
     -------
     cvxpy.Problem
         Variable ``offset`` (N,); parameters ``squares`` (M - 1, N - 1), the part of G without offsets, ``factor``
-        (M - 1, N), ``slope`` (N,), how the linearised part changes with the offsets, and ``most`` (N,).
+        (M - 1, N), ``slope`` (N,), the derivative of the linearised part by the offsets, and ``most`` (N,).
 
     Notes
     -----
@@ -100,6 +100,7 @@ def nuclear_problem(stations: int, pulses: int) -> Any:
 
 @keep
 def _relaxation(stations: int, pulses: int, backend: str) -> Relaxation:
+    """Return the relaxation, built once for each size and back end."""
     return Relaxation(nuclear_problem(stations, pulses), backend=backend)
 
 
@@ -119,7 +120,8 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
     d : int
         Dimension of space, 2 or 3.
     passes : int
-        At most; 1 is the nuclear norm itself. Without noise 12 x 20 settle after 4, 6 x 20 after 15 or more.
+        Greatest number of passes; 1 is the nuclear norm itself. Without noise, 12 x 20 networks converge after 4
+        passes, 6 x 20 after 15 or more.
     backend : str
         Conic solver.
 
@@ -155,7 +157,7 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
 
 
 def affine_network(z: ArrayLike, offset: ArrayLike, d: int) -> LowRank:
-    """Return the network of given times of emission up to an affine map, as one fit of rank d.
+    """Return the network for given times of emission, up to an affine map, as one fit of rank d.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-r"""Which sites to take: optimal experimental design with a proven gap.
+r"""The choice of sites: optimal experimental design with a proven gap.
 
 Site i adds rows :math:`G_{pi}` to the information at place p,
 :math:`M_p(w) = M^0_p + \sum_i w_i G_{pi}^\top G_{pi}` with :math:`w \in \{0, 1\}^n`, and the covariance of the position
@@ -39,8 +39,8 @@ from formulations.backend import SolverError, first_sentence
 
 Criterion = Literal["A", "D", "E"]
 
-# Sharpness of the smooth maximum over places or failures in the nonlinear programme, which needs derivatives: of two
-# equal values it is 7 % too large. The result is judged by the criterion itself.
+# Sharpness of the smooth maximum over positions or failures in the nonlinear programme, which needs derivatives. For
+# two equal values the smooth maximum is 7 % too large. The exact criterion evaluates the result.
 _SHARP = 10.0
 _QUIET: dict[str, Any] = {
     "print_time": False,
@@ -51,18 +51,18 @@ _QUIET: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """What is to be chosen from.
+    """The candidate sites and the positions of the target.
 
     Parameters
     ----------
     rows : Array, shape (P, r, m, n)
-        Whitened rows of each site at each place, zero where it is not heard; the position comes first in m.
+        Whitened rows of each site at each place, zero if the site does not measure it; the position is first in m.
     prior : Array, shape (P, m, m)
         Information without any site, positive definite.
     weight : Array, shape (P,)
-        Of the places, sum 1.
+        Weights of the places, sum 1.
     dimension : int
-        Of the position.
+        Dimension of the position.
     """
 
     rows: Array
@@ -78,7 +78,7 @@ def covariances(design: Design, w: Array) -> Array:
 
 
 def of_places(covariance: Array, criterion: Criterion) -> Array:
-    """Return f (...) of covariances (..., d, d)."""
+    """Return the criterion f (...) of covariances (..., d, d), m^2."""
     if criterion == "A":
         return np.asarray(np.trace(covariance, axis1=-2, axis2=-1))
     if criterion == "D":
@@ -87,9 +87,10 @@ def of_places(covariance: Array, criterion: Criterion) -> Array:
 
 
 def value(design: Design, w: Array, criterion: Criterion, *, worst: bool = False, fail: bool = False) -> Array:
-    """Return the criterion (...) of weights (..., n): the mean over places or the worst, with the worst loss or none.
+    """Return the criterion (...) of weights (..., n): the mean or maximum over places, optionally after a loss.
 
-    The loss is the maximum over all sites of the criterion without it: without one that was not taken nothing changes.
+    The criterion after the worst loss is the maximum of the criterion over all sites that may fail. The failure of a
+    site that was not chosen changes nothing.
     """
     w = np.asarray(w, dtype=float)
     if fail:
@@ -100,7 +101,7 @@ def value(design: Design, w: Array, criterion: Criterion, *, worst: bool = False
 
 
 def gradients(design: Design, w: Array, criterion: Criterion) -> tuple[Array, Array]:
-    """Return f (P,) and its gradients (P, n) at weights (n,); of a repeated eigenvalue a subgradient."""
+    """Return f (P,) and its gradients (P, n) at weights (n,); a subgradient for a repeated eigenvalue."""
     information = design.prior + np.einsum("prmn,n,prkn->pmk", design.rows, np.asarray(w, float), design.rows)
     inverse = np.linalg.inv(information)
     d = design.dimension
@@ -119,12 +120,12 @@ def gradients(design: Design, w: Array, criterion: Criterion) -> tuple[Array, Ar
 def semidefinite(
     design: Design, rules: Array, limits: Array, criterion: Criterion, *, worst: bool = False
 ) -> tuple[float, Array]:
-    """Return the least value over 0 <= w <= 1, rules @ w <= limits, and w (n,): an interior-point solution by Clarabel.
+    """Return the least value over 0 <= w <= 1, rules @ w <= limits, and w (n,), by Clarabel's interior-point method.
 
     Raises
     ------
     SolverError
-        Where the back end has no answer.
+        If the back end has no solution.
     """
     import cvxpy as cp
 
@@ -166,16 +167,16 @@ def semidefinite(
 
 @dataclass(frozen=True, slots=True)
 class Outer:
-    """What outer approximation found.
+    """The result of outer approximation.
 
     Parameters
     ----------
     chosen : Array, shape (n,)
-        The best set, 0 or 1; of NaN where the rules allow none.
+        The best set, 0 or 1; NaN if the rules allow no set.
     value, bound : float
-        Its criterion, and what no set that meets the rules is below.
+        Criterion of this set, and a lower bound for all sets that satisfy the rules.
     rounds : int
-        Mixed integer programmes that were solved.
+        Number of solved mixed integer programmes.
     """
 
     chosen: Array
@@ -195,7 +196,7 @@ def outer_approximation(
     close: Callable[[float, float], bool] = lambda bound, best: bound >= best,
     seconds: float = 60.0,
 ) -> Outer:
-    """Return the best set by outer approximation with HiGHS, whose dual bound is the bound.
+    """Return the best set by outer approximation with HiGHS, and its dual bound.
 
     Parameters
     ----------
@@ -206,11 +207,11 @@ def outer_approximation(
     criterion, worst
         As in `value`.
     start : Array, shape (n,), optional
-        A set that meets the rules.
+        A set that satisfies the rules.
     close : callable of (bound, value)
-        Whether that is close enough.
+        Returns whether the gap is small enough.
     seconds : float
-        After which no further round begins; a round is cut at what is left.
+        Time limit: no further round begins after it, and a round ends with it.
     """
     from scipy.optimize import Bounds, LinearConstraint, milp
 
@@ -222,6 +223,7 @@ def outer_approximation(
     levels: list[Array] = []
 
     def cut(at: Array) -> None:
+        """Add the tangents of the criterion at a point (n,)."""
         f, slope = gradients(design, at, criterion)
         column = np.zeros((places, 1)) if worst else -np.eye(places)
         cuts.append(np.hstack([slope, column - (1.0 if worst else 0.0)]))
@@ -234,11 +236,11 @@ def outer_approximation(
     fixed = LinearConstraint(np.hstack([rules, np.zeros((len(rules), columns))]), -np.inf, limits)
     box = Bounds(np.r_[np.zeros(n), np.full(columns, -np.inf)], np.r_[np.ones(n), np.full(columns, np.inf)])
     whole = np.r_[np.ones(n), np.zeros(columns)]
-    # nothing is close to a set that is not there yet, whatever infinities say of each other
+    # without a set the gap is infinite; a comparison of infinities would be misleading
     while not (np.isfinite(best) and close(bound, best)) and monotonic() - begun < seconds:
         left = max(0.1, seconds - (monotonic() - begun))
         tangents = LinearConstraint(np.vstack(cuts), -np.inf, np.concatenate(levels))
-        # Feasibility to 1e-9: a set that breaks a tangent by HiGHS's own 1e-6 would lower the bound.
+        # Feasibility to 1e-9: a set that violates a tangent by HiGHS's default of 1e-6 would lower the bound.
         found = milp(goal, integrality=whole, bounds=box, constraints=[fixed, tangents], options={"time_limit": left})
         rounds += 1
         if found.status == 2:  # the rules allow no set
@@ -259,14 +261,14 @@ def outer_approximation(
 
 @dataclass(frozen=True, slots=True)
 class PlacementGround:
-    """Height of the ground on a grid, between its nodes a cubic spline; level beyond the outermost nodes.
+    """Height of the ground on a grid, with a cubic spline between the nodes, and constant beyond the outermost nodes.
 
     Parameters
     ----------
     x, y : Array, shapes (nx,), (ny,)
-        Nodes, ascending, four at least.
+        Nodes, metres, ascending, at least four.
     height : Array, shape (nx, ny)
-        At the nodes.
+        Heights at the nodes, metres.
     """
 
     x: Array
@@ -274,7 +276,7 @@ class PlacementGround:
     height: Array
 
     def function(self) -> Any:
-        """Return it as a function of CasADi, from (2,) to a number."""
+        """Return the height as a function of CasADi, from (2,) to a number."""
         import casadi as ca
 
         return ca.interpolant("ground", "bspline", [self.x, self.y], self.height.ravel(order="F"))
@@ -288,14 +290,14 @@ class PlacementGround:
 
 @dataclass(frozen=True, slots=True)
 class PlacementRegion:
-    """A convex part of where sites may stand: edges @ x <= offsets in the plan, and low <= height above ground <= high.
+    """A convex region for sites: edges @ x <= offsets in the plan, and low <= height above ground <= high.
 
     Parameters
     ----------
     edges, offsets : Array, shapes (e, 2), (e,)
         Half-planes with unit normals.
     low, high : float
-        Heights above the ground, or, without one, third coordinates; not used in the plane.
+        Heights above the ground, or third coordinates without a ground; not used in the plane.
     """
 
     edges: Array
@@ -304,7 +306,7 @@ class PlacementRegion:
     high: float = 0.0
 
     def excess(self, place: Array, ground: PlacementGround | None) -> Array:
-        """Return by how much a place (d,) breaks each rule; none is positive inside."""
+        """Return the violation of each rule by a place (d,); no value is positive inside the region."""
         plan = self.edges @ place[:2] - self.offsets
         if len(place) == 2:
             return np.asarray(plan)
@@ -340,27 +342,28 @@ def refine(
 ) -> Array:
     """Return positions (k, d) of sites that are locally optimal, by IPOPT from a start (k, d).
 
-    The worst place, the worst failure and the largest eigenvalue are smoothed here.
+    The maximum over places, the maximum over failures and the largest eigenvalue are replaced by smooth functions.
 
     Parameters
     ----------
     information : callable
-        From a list of k symbols (d, 1), or None for a site that fails, to the matrices (m, m) of all places.
+        Returns the information matrices (m, m) of all places from a list of k symbols (d, 1), or None for a failed
+        site.
     start : Array, shape (k, d)
-        Where it begins.
+        Initial positions.
     regions : sequence of k PlacementRegion
-        Where each site may stand.
+        Region of each site.
     weight : Array, shape (P,)
-        Of the places.
+        Weights of the places.
     dimension, criterion, worst, fail
         As in `value`.
     ground : PlacementGround, optional
-        What heights are above.
+        Ground below the heights.
 
     Raises
     ------
     SolverError
-        Where IPOPT has no answer.
+        If IPOPT has no solution.
     """
     import casadi as ca
 
@@ -372,7 +375,7 @@ def refine(
         each = [_symbolic(ca, matrix, dimension, criterion) for matrix in information(one)]
         totals.append(_soft_maximum(ca, each) if worst else sum(w * f for w, f in zip(weight, each, strict=True)))
     goal = ca.Function("goal", [ca.vertcat(*symbols)], [_soft_maximum(ca, totals) if fail else totals[0]])
-    # the ground is a spline, which scalar symbols cannot hold
+    # the ground is a spline, which scalar symbols cannot represent
     x, surface = ca.MX.sym("x", k * d), None if ground is None else ground.function()
     rules = []
     for i, region in enumerate(regions):
@@ -391,19 +394,25 @@ def refine(
 
 
 def _symbolic(ca: Any, matrix: Any, d: int, criterion: Criterion) -> Any:
-    """Return the criterion of the covariance of an information matrix of symbols; of E a mean of a high power."""
+    """Return the criterion of the covariance of a symbolic information matrix.
+
+    For E, a root of the trace of a power.
+    """
     covariance = ca.inv(matrix)[:d, :d]
     if criterion == "A":
         return ca.trace(covariance)
     if criterion == "D":
         return ca.log(ca.det(covariance))
     product = covariance
-    for _ in range(3):  # the eighth power: its trace is within a factor d of that of the largest eigenvalue
+    for _ in range(3):  # the eighth power: its trace is at most d times the power of the largest eigenvalue
         product = ca.mtimes(product, product)
     return ca.trace(product) ** 0.125
 
 
 def _soft_maximum(ca: Any, values: Sequence[Any]) -> Any:
-    """Return log sum exp of values in units of the first: above the maximum by log(count) / sharpness of it."""
+    """Return the log-sum-exp of values in units of the first.
+
+    It exceeds the maximum by at most log(count) / sharpness times the first value.
+    """
     size = ca.fabs(values[0]) + 1e-9
     return values[0] + size / _SHARP * ca.log(sum(ca.exp(_SHARP * (v - values[0]) / size) for v in values))

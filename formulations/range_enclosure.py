@@ -1,4 +1,4 @@
-r"""A box that holds every point whose range residuals are small: what makes a bound over a box a bound over all space.
+r"""A box that contains every point with small range residuals, so that a bound over the box holds for all space.
 
 Ranges :math:`r_i = |x - s_i|` are measured up to one unknown, :math:`r_i = \sigma_i r_1 + d_i + w_i`, with errors `w`
 of covariance `R`. Squared, and with :math:`a_i = s_i - s_1`, :math:`x' = x - s_1`, :math:`r_1^2 = |x'|^2`,
@@ -23,12 +23,12 @@ import numpy as np
 
 from formulations.algebra import Array
 
-_FLAT = 1e-12  # relative singular value below which a system of squared ranges determines nothing: above rounding
-# Boxes are this much larger than the inequalities ask for: far more than rounding errors of numbers of order one, which
-# an ill-conditioned left inverse magnifies, and too little to loosen a bound.
+_FLAT = 1e-12  # relative singular value below which a system of squared ranges is singular: above rounding
+# Relative enlargement of boxes. It is far above rounding errors of numbers of order one, which an ill-conditioned left
+# inverse magnifies, and too small to weaken a bound.
 _ROUND = 1.0 + 1e-6
-_NEAR = 1e-6  # shortest distance that a row is weighed by: the point may be a station, and any weight gives a valid box
-_LONG = 1e-9  # share of the largest information below which an axis gets no longer: directions that the rows leave open
+_NEAR = 1e-6  # shortest distance in a weight: the point may be a station, and every weight gives a valid box
+_LONG = 1e-9  # share of the largest information below which an axis is not lengthened further: undetermined directions
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +40,13 @@ class Ranged:
     station : Array, shape (M, d)
         Positions, the reference first.
     sign : Array, shape (M,)
-        Free: 1 or -1, ``r_i = sign_i r_1 + offset_i + error_i``, the reference's own being 1. Not used otherwise.
+        If `free`: 1 or -1 in ``r_i = sign_i r_1 + offset_i + error_i``, with 1 for the reference. Not used otherwise.
     offset : Array, shape (M,)
-        As above, the reference's being zero; where nothing is free the measured ranges ``r_i - error_i``.
+        If `free`: as above, with zero for the reference. Otherwise the measured ranges ``r_i - error_i``.
     covariance : Array, shape (M, M)
-        Of the errors; the row and the column of the reference are not used where it is free.
+        Covariance of the errors; if `free`, the row and the column of the reference are not used.
     free : bool
-        Whether the range of the reference is unknown altogether.
+        Whether the range of the reference is unknown.
     """
 
     station: Array
@@ -57,17 +57,17 @@ class Ranged:
 
     @property
     def side(self) -> Array:
-        """The signs of all but the reference, shape (M - 1,)."""
+        """Return the signs of all stations except the reference, shape (M - 1,)."""
         return self.sign[1:] if self.free else np.ones(len(self.station) - 1)
 
     @property
     def excess(self) -> Array:
-        """The vector d, shape (M - 1,)."""
+        """Return the vector d, shape (M - 1,)."""
         return self.offset[1:] if self.free else self.offset[1:] - self.offset[0]
 
     @property
     def spread(self) -> Array:
-        """The covariance R of w, shape (M - 1, M - 1)."""
+        """Return the covariance R of w, shape (M - 1, M - 1)."""
         inner = self.covariance[1:, 1:]
         if self.free:
             return inner
@@ -75,7 +75,7 @@ class Ranged:
         return np.asarray(inner - cross[:, None] - cross + self.covariance[0, 0])
 
     def cost(self, point: Array) -> Array:
-        """Weighted squared misfit.
+        """Return the weighted squared misfit of these ranges.
 
         Parameters
         ----------
@@ -102,9 +102,9 @@ class EnclosingBox:
     Parameters
     ----------
     centre : Array, shape (d,)
-        Its middle.
+        Centre of the positions.
     axes : Array, shape (d, d)
-        Half-edges, one a column: ``x = centre + axes s`` with ``|s_k| <= 1``.
+        Half-edges as columns: ``x = centre + axes s`` with ``|s_k| <= 1``.
     low, high : float
         Least and greatest range of the reference.
     """
@@ -116,7 +116,7 @@ class EnclosingBox:
 
 
 def enclosure(ranged: Ranged, point: Array, cost: float) -> EnclosingBox | None:
-    """Find a box that holds every position with at most a given cost.
+    """Return a box that contains every position with at most a given cost.
 
     Parameters
     ----------
@@ -125,12 +125,13 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> EnclosingBox | None:
     point : Array, shape (d,)
         A position near the minimum, for the weights and the axes; any point gives a valid box.
     cost : float
-        Highest cost that matters.
+        Greatest relevant cost.
 
     Returns
     -------
     EnclosingBox or None
-        None where the rows do not enclose: too few of them, or the errors too large for the geometry.
+        None if the rows do not enclose a region: there are too few rows, or their errors are too large for the
+        geometry.
 
     Notes
     -----
@@ -144,7 +145,7 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> EnclosingBox | None:
     left = _left_inverse(system, away, root)
     error = _Error(rho, root, side, d, np.array(np.diag(ranged.spread)))
     if not ranged.free:
-        # the reference is measured itself: an unknown in an interval, not a column of the system
+        # the reference is measured: it is an unknown in an interval, not a column of the system
         slack = rho * float(np.sqrt(ranged.covariance[0, 0]))
         reach = max(0.0, ranged.offset[0] - slack), ranged.offset[0] + slack
         if left is None:
@@ -155,28 +156,28 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> EnclosingBox | None:
 
 
 def ball(ranged: Ranged, centre: Array, radius: float) -> EnclosingBox:
-    """Return the box around a ball of positions.
+    """Return a box that contains a ball of positions.
 
     Parameters
     ----------
     ranged : Ranged
         The measurements.
     centre : Array, shape (d,)
-        Its centre.
+        Centre of the ball.
     radius : float
-        Its radius.
+        Radius of the ball.
 
     Returns
     -------
     EnclosingBox
-        A cube, and the ranges that points of the ball have.
+        A cube, and the interval of reference ranges of points in the ball.
     """
     away = float(np.linalg.norm(centre - ranged.station[0]))
     return EnclosingBox(centre, radius * np.eye(len(centre)), max(0.0, away - radius), away + radius)
 
 
 def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
-    """Left inverse weighted for squared ranges, or None where the columns are not independent."""
+    """Return the left inverse weighted for squared ranges, or None if the columns are not independent."""
     rows, columns = system.shape
     if rows < columns:
         return None
@@ -186,13 +187,13 @@ def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
     values = np.linalg.svd(heavy / np.where(size > 0.0, size, 1.0), compute_uv=False)
     if not values[-1] > _FLAT * values[0]:
         return None
-    # no cut beside that: what is not flat is inverted as it is
+    # no other cut of singular values
     return np.asarray(np.linalg.pinv(heavy, rcond=1e-15) @ weight)
 
 
 @dataclass(frozen=True, slots=True)
 class _Error:
-    """How far the errors of the ranges move a linear function of the squared equations."""
+    """Bounds of the effect of range errors on linear functions of the squared equations."""
 
     rho: float
     root: Array
@@ -201,8 +202,8 @@ class _Error:
     variance: Array
 
     def reference(self, row: Array, middle: float) -> tuple[float, float] | None:
-        """Bound r_1 by the row of the left inverse that belongs to it."""
-        # r_1 <= middle + rest + slope r_1: where the slope reaches one, the errors grow with the range without end
+        """Return the interval of r_1 from its row of the left inverse, or None if the errors are too large."""
+        # r_1 <= middle + rest + slope r_1: if the slope reaches one, the errors grow with the range without bound
         slope = self._along(row * self.side)
         rest = self._along(row * self.excess) + self._square(row)
         if slope >= 1.0 or middle + rest < 0.0:
@@ -210,22 +211,27 @@ class _Error:
         return max(0.0, (middle - rest) / (1.0 + slope)), (middle + rest) / (1.0 - slope)
 
     def position(self, row: Array, low: float, high: float) -> float:
-        """Bound what the errors do to a coordinate."""
+        """Return a bound of the effect of the errors on a coordinate."""
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         both = self._along(row * (self.excess + self.side * middle)) + half * self._along(row * self.side)
         return both + self._square(row)
 
     def _along(self, row: Array) -> float:
+        """Return a bound of twice ``row' w`` for errors w with a cost of at most rho^2."""
         return 2.0 * self.rho * float(np.linalg.norm(self.root.T @ row))
 
     def _square(self, row: Array) -> float:
+        """Return a bound of ``row' w^2`` for errors w with a cost of at most rho^2."""
         return self.rho**2 * float(np.abs(row) @ self.variance)
 
 
 def _box(
     ranged: Ranged, point: Array, left: Array, right: Array, error: _Error, reach: tuple[float, float]
 ) -> EnclosingBox:
-    """Box of ``x' = left (right - phi)``, in principal axes; a measured reference range is an unknown of its own."""
+    """Return the box of ``x' = left (right - phi)`` in principal axes.
+
+    A measured reference range is an extra unknown.
+    """
     low, high = reach
     axes = _principal(ranged, point)
     rows = np.linalg.inv(axes) @ left
@@ -236,9 +242,9 @@ def _box(
 
 
 def _principal(ranged: Ranged, point: Array) -> Array:
-    """Principal axes of the errors of a fix, one standard deviation long, in columns."""
+    """Return the principal axes of the errors of a fix as columns, each one standard deviation long."""
     apart = point - ranged.station
-    # a point on a station sees it nowhere: no row there, not a division by zero
+    # at a station the direction is undefined: the row is left out, which avoids a division by zero
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
     if ranged.free:
         slope, matrix = unit[1:] - ranged.side[:, None] * unit[0], ranged.spread

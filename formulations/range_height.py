@@ -16,13 +16,13 @@ coordinate is a root of
 
 .. math:: Q(t)^2 - L(t)^2\, q(t) = 0,
 
-at most four real ones. Squaring also admits the sign-flipped problem, whose points have a negative range; they are
-dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`, which gives back the
+at most four real ones. Squaring also admits the problem with flipped signs, whose points have a negative range; they
+are dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`, which gives back the
 digits the squares lost and needs no rule for :math:`L = 0`.
 
-What is left on the far side is not seen. The polar plane of an outside point `s`, :math:`(x - c)^\top A (s - c) = 1`,
-touches the ellipsoid where the tangents from `s` do: it cuts off exactly the part that is seen from `s`. In numbers of
-order one (semi-axes as units) the form keeps all digits; in metres it loses eight of them.
+Points on the far side of the ellipsoid are not visible. The polar plane of an outside point `s`, :math:`(x - c)^\top A
+(s - c) = 1`, touches the ellipsoid where the tangents from `s` do: it cuts off exactly the part that is seen from `s`.
+In numbers of order one (semi-axes as units) the form keeps all digits; in metres it loses eight of them.
 
 Sources: K. C. Ho and Y. T. Chan, "Geolocation of a known altitude object from TDOA and FDOA measurements", IEEE Trans.
 Aerosp. Electron. Syst. 33 (1997), section III (the elimination, there for a sphere and iterated; here exact for the
@@ -39,18 +39,18 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array, Mask, dot, flatten
 
 _SLOTS = 4  # roots of a quartic
-# Sine of the angle at the first station below which three stations count as one line: the normal of their plane, a
-# difference of products, has half its digits there.
+# Sine of the angle at the first station below which three stations count as collinear: the normal of their plane, a
+# difference of products, has only half of its digits there.
 _THIN = 1e-7
-_AXIAL = 1e-12  # squared sine of the angle between a direction and the axis below which it is no direction off the axis
-_LEAD = 1e-14  # leading coefficient of the quartic, over the largest, that is rounding: a root at infinity
-# Relative miss of the two conics at which an iteration may still start: eigenvalues of the companion matrix are good to
-# 1e-8 at a double root, and a pair that has just left the real axis is off by the root of what moved it.
+_AXIAL = 1e-12  # squared sine of the angle between a direction and the axis below which they count as parallel
+_LEAD = 1e-14  # leading coefficient of the quartic, relative to the largest, that is rounding: a root at infinity
+# Greatest relative residual of the two conics at a start of the iteration: eigenvalues of the companion matrix are
+# accurate to 1e-8 at a double root, and a pair slightly off the real axis is off by the root of the perturbation.
 _NEAR = 1e-3
-_NEWTON = 30  # steps; quadratic at simple roots, one binary digit a step at double ones, which are found to 1e-8
-_RESTS = 1e-14  # relative step at which a slot rests
-_TOLERANCE = 1e-11  # of a range, relative, and of the ellipsoid's form: what Newton's iteration leaves, with room
-_SAME = 1e-7  # two points closer than this are one, found from both signs or from both halves of a double root
+_NEWTON = 30  # steps; quadratic convergence at simple roots; a bit per step at double roots, accurate to 1e-8
+_RESTS = 1e-14  # relative step at which a slot has converged
+_TOLERANCE = 1e-11  # relative residual of ranges and of the ellipsoid's form after Newton's iteration, with a margin
+_SAME = 1e-7  # two points closer than this are the same, found from both signs or from both parts of a double root
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Ellipsoid:
     centre: Array
 
     def polar(self, x: Array, s: Array) -> Array:
-        """Bilinear form ``(x - centre)' shape (s - centre)``.
+        """Return the bilinear form ``(x - centre)' shape (s - centre)``.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class Ellipsoid:
         Returns
         -------
         Array, shape (...)
-            Equal points: 1 on the surface, more outside.
+            The form; for equal points it is 1 on the surface, and greater outside.
         """
         left = np.einsum("...i,...ij->...j", x - self.centre, self.shape)
         return np.asarray(np.sum(left * (s - self.centre), axis=-1))
@@ -88,24 +88,26 @@ class Ellipsoid:
 def ellipsoid(
     axes: ArrayLike, height: ArrayLike = 0.0, *, origin: ArrayLike = 0.0, rotation: ArrayLike | None = None
 ) -> Ellipsoid:
-    """Ellipsoid with all semi-axes grown by a height: the surface of that height to about 1e-3 of the flattening.
+    """Return the ellipsoid with all semi-axes increased by a height.
+
+    It is the surface of this height to about 1e-3 of the flattening.
 
     Parameters
     ----------
     axes : array_like, shape (..., 3)
-        Semi-axes along the coordinates of the ellipsoid's own frame, for instance (a, a, b).
+        Semi-axes along the coordinates of the ellipsoid's frame, for instance (a, a, b).
     height : array_like, shape (...)
-        Added to each semi-axis.
+        Height that is added to each semi-axis.
     origin : array_like, shape (..., 3)
-        Origin of the frame wanted, in the ellipsoid's own frame.
+        Origin of the target frame, in the ellipsoid's frame.
     rotation : array_like, shape (..., 3, 3), optional
-        Rows are the axes of the frame wanted, in the ellipsoid's own frame: ``rotation @ (x - origin)`` are its
-        coordinates.
+        Rows are the axes of the target frame, in the ellipsoid's frame: ``rotation @ (x - origin)`` are coordinates in
+        the target frame.
 
     Returns
     -------
     Ellipsoid
-        In the frame wanted.
+        The ellipsoid in the target frame.
     """
     inverse = (np.asarray(axes, dtype=np.float64) + np.asarray(height, dtype=np.float64)[..., None]) ** -2
     R = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
@@ -114,7 +116,7 @@ def ellipsoid(
 
 
 def visible(x: Array, surface: Ellipsoid, s: Array) -> Mask:
-    """Whether a point of the ellipsoid is seen from a station: nothing of the ellipsoid lies between.
+    """Return whether a point of the ellipsoid is visible from a station: no part of the ellipsoid is in between.
 
     Parameters
     ----------
@@ -123,15 +125,15 @@ def visible(x: Array, surface: Ellipsoid, s: Array) -> Mask:
     surface : Ellipsoid
         Shape (..., 3, 3) and centre (..., 3) broadcast against the points.
     s : Array, shape (..., 3)
-        Stations. One inside the ellipsoid sees all of it.
+        Stations. From a station inside the ellipsoid every point is visible.
 
     Returns
     -------
     Mask, shape (...)
-        False where x or s is not finite.
+        The mask; False if x or s is not finite.
     """
     inside = surface.polar(s, s) <= 1.0
-    # a station of finite size sees the tangent points of its cone
+    # the tolerance includes the tangent points of the cone
     return np.asarray((surface.polar(x, s) >= 1.0) | (inside & np.isfinite(x).all(axis=-1)))
 
 
@@ -142,11 +144,11 @@ class HeightCandidates:
     Parameters
     ----------
     x : Array, shape (..., 4, 3)
-        Points, NaN where not valid.
+        Points; NaN if not valid.
     ranges : Array, shape (..., 4, s)
-        Their ranges to the s stations.
+        Ranges of the points to the s stations.
     valid : Mask, shape (..., 4)
-        True where a slot holds a point.
+        Whether a slot contains a point.
     """
 
     x: Array
@@ -157,25 +159,25 @@ class HeightCandidates:
 def locate(
     stations: Array, sign: ArrayLike, offset: Array, surface: Ellipsoid, *, positive: bool = True
 ) -> HeightCandidates:
-    """All points of the ellipsoid whose ranges to three stations are known up to one unknown.
+    """Return all points of the ellipsoid whose ranges to three stations are known up to one unknown.
 
     Parameters
     ----------
     stations : Array, shape (..., 3, 3)
-        Positions, one a row, numbers of order one.
+        Positions as rows, numbers of order one.
     sign : array_like, shape (..., 3)
         1 or -1: ranges are ``sign tau + offset``. Range differences to the first station: all 1. Sums: -1.
     offset : Array, shape (..., 3)
-        The known parts.
+        The known parts of the ranges.
     surface : Ellipsoid
         Shape (..., 3, 3) and centre (..., 3).
     positive : bool
-        Drop points with a negative range; False keeps the solutions of the sign-flipped problem.
+        Whether to drop points with a negative range; False keeps the solutions of the problem with flipped signs.
 
     Returns
     -------
     HeightCandidates
-        None where the stations lie on a line, the input is not finite or nothing real fits.
+        No valid point if the stations are collinear, the input is not finite or no real point fits.
 
     Notes
     -----
@@ -197,12 +199,12 @@ def locate(
 
 
 def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> HeightCandidates:
-    """All points of the ellipsoid with known ranges to two stations.
+    """Return all points of the ellipsoid with known ranges to two stations.
 
     Parameters
     ----------
     stations : Array, shape (..., 2, 3)
-        Positions, one a row, numbers of order one.
+        Positions as rows, numbers of order one.
     ranges : Array, shape (..., 2)
         Ranges.
     surface : Ellipsoid
@@ -211,11 +213,11 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Heig
     Returns
     -------
     HeightCandidates
-        None where the spheres do not meet, the input is not finite or nothing real fits.
+        No valid point if the spheres do not meet, the input is not finite or no real point fits.
 
     Notes
     -----
-    The circle of the two spheres in the place of Ho and Chan's conic.
+    The circle of the two spheres replaces Ho and Chan's conic.
     """
     lead = np.broadcast_shapes(
         np.shape(stations)[:-2], np.shape(ranges)[:-1], surface.shape.shape[:-2], surface.centre.shape[:-1]
@@ -231,13 +233,13 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Heig
 
 
 def _reshape(found: HeightCandidates, lead: tuple[int, ...]) -> HeightCandidates:
-    """Give the batch axis its shape back."""
+    """Return candidates with the batch axis reshaped to `lead`."""
     x, ranges = (v.reshape(*lead, *v.shape[1:]) for v in (found.x, found.ranges))
     return HeightCandidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
 
 
 def _meet(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, positive: bool) -> HeightCandidates:
-    """All points common to N curves and their ellipsoids."""
+    """Return all common points of N curves and their ellipsoids."""
     with np.errstate(all="ignore"):
         E, L, alpha = curve.on_ellipsoid(A, centre)
         t, mu = _starts(curve.square, E, L, alpha)
@@ -254,7 +256,7 @@ def _meet(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, posit
             valid &= (ranges >= 0.0).all(axis=-1)
         same = np.abs(t[:, :, None] - t[:, None]) + np.abs(mu[:, :, None] - mu[:, None])
     same = (same <= _SAME * size[:, :, None]) & valid[:, None]
-    # drop what an earlier slot holds already
+    # drop points that an earlier slot contains
     valid &= ~np.tril(same, -1).any(axis=-1)
     order = np.argsort(~valid, axis=-1, kind="stable")[:, :_SLOTS]
     valid = np.take_along_axis(valid, order, axis=1)
@@ -263,7 +265,7 @@ def _meet(curve: HeightCurve, stations: Array, A: Array, centre: Array, *, posit
     return HeightCandidates(x, ranges, valid)
 
 
-# Curves on which a point has measured ranges.
+# Curves of the points with given ranges.
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +281,7 @@ class HeightCurve:
     rate, offset : Array, shape (N, s)
         Ranges ``rate t + offset`` of the s stations.
     ok : Mask, shape (N,)
-        False where the stations fix no such curve; the other arrays are finite all the same.
+        False if the stations do not define a curve; the other arrays are finite nevertheless.
     """
 
     base: Array
@@ -291,7 +293,7 @@ class HeightCurve:
     ok: Mask
 
     def points(self, t: Array, mu: Array) -> Array:
-        """Points of the planes of the curves.
+        """Return points in the planes of the curves.
 
         Parameters
         ----------
@@ -308,7 +310,7 @@ class HeightCurve:
         )
 
     def on_ellipsoid(self, A: Array, centre: Array) -> tuple[Array, Array, Array]:
-        """Coefficients of the ellipsoid ``(x - centre)'A(x - centre) = 1`` on the planes of the curves.
+        """Return the coefficients of the ellipsoid ``(x - centre)'A(x - centre) = 1`` in the planes of the curves.
 
         Parameters
         ----------
@@ -334,7 +336,7 @@ class HeightCurve:
 
 
 def three_stations(stations: Array, sign: Array, offset: Array) -> HeightCurve:
-    """Curve of the points whose ranges to three stations are known up to one unknown.
+    """Return the curve of the points whose ranges to three stations are known up to one unknown.
 
     Parameters
     ----------
@@ -346,7 +348,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> HeightCurve:
     Returns
     -------
     HeightCurve
-        Not ok where the stations lie on a line.
+        The curve; not ok if the stations are collinear.
 
     Notes
     -----
@@ -385,7 +387,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> HeightCurve:
 
 
 def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
-    """Circle of the points with known ranges to two stations.
+    """Return the circle of the points with known ranges to two stations.
 
     Parameters
     ----------
@@ -394,12 +396,12 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
     ranges : Array, shape (N, 2)
         Ranges.
     towards : Array, shape (N, 3)
-        A point; mu grows towards it where it is off the line of the stations.
+        A point; mu increases towards it if it is off the line of the stations.
 
     Returns
     -------
     HeightCurve
-        The parameters (t, mu) lie on the unit circle. Not ok where the spheres do not meet.
+        The circle; its parameters (t, mu) are on the unit circle. Not ok if the spheres do not meet.
     """
     a = stations[:, 1] - stations[:, 0]
     length = np.sqrt(dot(a, a))
@@ -418,7 +420,7 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> HeightCurve:
 
 
 def _perpendicular(axis: Array, hint: Array) -> Array:
-    """Find the unit vector normal to the axis, towards the hint where that is off the axis."""
+    """Return the unit vector normal to the axis, towards the hint if the hint is off the axis."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     off = hint - axis * dot(axis, hint)[:, None]
     weak = dot(off, off) <= _AXIAL * dot(hint, hint)
@@ -426,11 +428,11 @@ def _perpendicular(axis: Array, hint: Array) -> Array:
     return np.asarray(off / np.sqrt(dot(off, off))[:, None])
 
 
-# Where a curve meets the ellipsoid.
+# Intersections of a curve with the ellipsoid.
 
 
 def quartic(square: Array, E: Array, L: Array, alpha: Array) -> Array:
-    """Coefficients of ``Q^2 - L^2 q``, the eliminant of the two conics.
+    """Return the coefficients of ``Q^2 - L^2 q``, the eliminant of the two conics.
 
     Parameters
     ----------
@@ -446,14 +448,14 @@ def quartic(square: Array, E: Array, L: Array, alpha: Array) -> Array:
     Returns
     -------
     Array, shape (N, 5)
-        Constant first.
+        Coefficients, constant first.
     """
     Q = E + alpha[:, None] * square
     return _times(Q, Q) - _times(_times(L, L), square)
 
 
 def _times(a: Array, b: Array) -> Array:
-    """Product of polynomials, constant first."""
+    """Return the product of polynomials; coefficients are constant first."""
     out = np.zeros((len(a), a.shape[1] + b.shape[1] - 1))
     for i in range(a.shape[1]):
         out[:, i : i + b.shape[1]] += a[:, i, None] * b
@@ -461,11 +463,11 @@ def _times(a: Array, b: Array) -> Array:
 
 
 def _roots(c: Array) -> Array:
-    """Find the four complex roots."""
+    """Return the four complex roots (N, 4) of quartics (N, 5)."""
     c = np.where(np.isfinite(c).all(axis=-1, keepdims=True), c, [1.0, 0.0, 0.0, 0.0, 1.0])
     size = np.max(np.abs(c), axis=-1)
     c = c / np.where(size > 0.0, size, 1.0)[:, None]
-    # a lost leading coefficient is a root at infinity
+    # a vanishing leading coefficient is a root at infinity
     lead = np.where(np.abs(c[:, 4]) > _LEAD, c[:, 4], _LEAD)
     companion = np.zeros((len(c), 4, 4))
     companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
@@ -474,10 +476,10 @@ def _roots(c: Array) -> Array:
 
 
 def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Find starts near every real intersection, two slots a root; NaN where there is nothing to start from."""
+    """Return starts near every real intersection, two slots for each root; NaN without a start."""
     roots = _roots(quartic(square, E, L, alpha))
     t = np.tile(roots.real, 2)
-    # a pair that has just left the real axis may be a double root
+    # a pair slightly off the real axis may be a double root
     real = np.abs(np.tile(roots.imag, 2)) <= _NEAR * (1.0 + np.abs(t))
     mu = np.sqrt(np.maximum(_value(square, t), 0.0)) * np.repeat([1.0, -1.0], _SLOTS)
     parts = np.stack([_value(E, t), (L[:, :1] + L[:, 1:] * t) * mu, alpha[:, None] * mu * mu])
@@ -486,7 +488,7 @@ def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Arr
 
 
 def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Newton's iteration on the two conics; slots that lead nowhere are caught by their residuals."""
+    """Return the results of Newton's iteration on the two conics; residuals reveal slots that did not converge."""
     go = np.isfinite(t)
     for _ in range(_NEWTON):
         one = mu * mu - _value(square, t)
@@ -499,7 +501,7 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
         move_mu = (one * two_t - two * one_t) / determinant
         go &= np.isfinite(move_t) & np.isfinite(move_mu)
         t, mu = np.where(go, t + move_t, t), np.where(go, mu + move_mu, mu)
-        # a slot that has settled rests: the length of the iteration depends on its neighbours
+        # a converged slot does not move any more, because the number of iterations depends on its neighbours
         go &= np.abs(move_t) + np.abs(move_mu) > _RESTS * (np.abs(t) + np.abs(mu))
         if not go.any():
             break
@@ -507,4 +509,5 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
 
 
 def _value(c: Array, t: Array) -> Array:
+    """Return the values of polynomials at t; coefficients are constant first."""
     return np.asarray(c[:, :1] + t * (c[:, 1:2] + t * c[:, 2:]))

@@ -33,7 +33,7 @@ class LiftedHeights:
     Parameters
     ----------
     x : Array, shape (3,)
-        Point read off the lift; on the ellipsoid only where tight. NaN where the solver gave none.
+        Point read off the lift; on the ellipsoid only if tight. NaN if the solver gave none.
     ranges : Array, shape (3,)
         Ranges read off the lift.
     bound : float
@@ -73,32 +73,33 @@ def lifted_problem() -> Any:
 
 @keep
 def _relaxation(backend: str) -> Relaxation:
-    # a tenth of a millimetre in Earth radii; a matrix of size three takes it
+    """Return the relaxation, built once for each back end."""
+    # a tenth of a millimetre in Earth radii; a matrix of size three allows this tolerance
     return Relaxation(lifted_problem(), backend=backend, settings=tight(backend, 1e-11))
 
 
 def lift(
     stations: Array, sign: Array, offset: Array, surface: Ellipsoid, near: Array, *, backend: str = "CLARABEL"
 ) -> LiftedHeights:
-    """Solve the relaxation.
+    """Return the fix on the ellipsoid from the relaxation.
 
     Parameters
     ----------
     stations : Array, shape (3, 3)
-        Positions, one a row, numbers of order one (Earth radii).
+        Positions as rows, numbers of order one (Earth radii).
     sign, offset : Array, shape (3,)
         Ranges ``sign tau + offset``, signs 1 or -1.
     surface : Ellipsoid
         Shape (3, 3) and centre (3,).
     near : Array, shape (3,)
-        The point that the fix is to be near to.
+        A point near the fix.
     backend : str
         Conic solver.
 
     Returns
     -------
     LiftedHeights
-        The fix where `rank_ratio` is small. The problem is built once per back end in each process.
+        The fix if `rank_ratio` is small. The problem is built once per back end in each process.
 
     Notes
     -----
@@ -110,7 +111,7 @@ def lift(
     if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
         nothing = ConicAnswer({}, np.nan, -np.inf, "not formulated", solved=False, iterations=0)
         return LiftedHeights(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
-    # each form divided by its largest entry: an equality may be, and the bound is multiplied back
+    # each form is divided by its largest entry, which an equality allows; the bound is multiplied by it again
     scale = float(np.abs(forms["objective"]).max())
     data = {name: form / np.abs(form).max() for name, form in forms.items()}
     answer = _relaxation(backend).solve(data, reach=_reach(curve, stations[0], surface, guess))
@@ -121,7 +122,7 @@ def lift(
 
 
 def _forms(curve: HeightCurve, surface: Ellipsoid, near: Array, guess: float) -> tuple[dict[str, Array], Array]:
-    """Quadratic forms in (1, t, mu), referred to the guess and in units of it, and what undoes that."""
+    """Return quadratic forms in (1, t, mu), relative to the guess and in its unit, and the inverse transformation."""
     E, L, alpha = (v[0] for v in curve.on_ellipsoid(surface.shape[None], surface.centre[None]))
     q, rate, offset = curve.square[0], curve.rate[0, 0], curve.offset[0, 0]
     on_surface = 0.5 * np.array([[2.0 * E[0], E[1], L[0]], [E[1], 2.0 * E[2], L[1]], [L[0], L[1], 2.0 * alpha]])
@@ -136,7 +137,7 @@ def _forms(curve: HeightCurve, surface: Ellipsoid, near: Array, guess: float) ->
 
 
 def _reach(curve: HeightCurve, station: Array, surface: Ellipsoid, guess: float) -> float:
-    """Length that the lift of no point of the ellipsoid exceeds: what makes the bound rigorous."""
+    """Return the greatest length of the lift of any point of the ellipsoid, which makes the bound rigorous."""
     size = 1.0 / float(np.sqrt(np.linalg.eigvalsh(surface.shape)[0]))
     t = (float(np.linalg.norm(station - surface.centre)) + size) / guess + 1.0
     mu = (abs(float(curve.across[0] @ (surface.centre - curve.base[0]))) + size) / guess

@@ -1,4 +1,4 @@
-r"""Registration without a guess: place, course and biases from range differences of moving stations, in closed form.
+r"""Registration in closed form: position, course and biases from range differences of moving stations, without a guess.
 
 At times :math:`t_k` stations :math:`s_i(k)` measure range offsets to a reference station 0,
 
@@ -17,9 +17,10 @@ with unknown biases :math:`\delta`. Squaring and subtracting :math:`r_0^2` leave
 
 linear in :math:`\theta` and the lifts :math:`\lambda` of :math:`|x(t)|^2`. For a fixed target the one lift is
 :math:`|x|^2`, and all stationary points of that problem with its quadratic constraint are found exactly. Stations in
-one plane leave the distance from it open; it follows from :math:`r_0` up to its sign, which gives two branches.
+one plane do not determine the distance from the plane; it follows from :math:`r_0` up to its sign, which gives two
+branches.
 
-Rows are divided by :math:`r_i`, so that their errors are those of the ranges. All lengths are in one unit in which
+Rows are divided by :math:`r_i`, so that their errors are range errors. All lengths are in one unit in which
 stations and target are of order one to a hundred.
 
 Sources: Y. T. Chan and K. C. Ho, "A simple and efficient estimator for hyperbolic location", IEEE Trans. Signal
@@ -37,20 +38,22 @@ import numpy as np
 from formulations.algebra import Array
 from formulations.squared_range import paraboloid, stationary
 
-# Measured on random runs of 30 epochs, five stations and errors of 1e-3 of their spread. A fixed target two spreads
-# away needs one pass; of one 30 spreads away the 90 % error falls from 7.3 to 0.4 by the second, and of a moving one
-# from 31 to 19 by the fourth.
+# Number of passes of stage 0, from random runs of 30 epochs, five stations and errors of 1e-3 of their spread. A fixed
+# target two spreads away needs one pass; of one 30 spreads away the 90 % error falls from 7.3 to 0.4 by the second, and
+# of a moving one from 31 to 19 by the fourth.
 _PASSES = 4
-# The same runs: the second pass takes a quarter off the 90 % error of far fixed targets; later ones change little.
+# Number of passes of stage 1 in the same runs: the second reduces the 90 % error of far fixed targets by a quarter;
+# later passes change little.
 _LIFTED_PASSES = 3
-# Eigenvalues of the scaled normal matrix, over the largest, that count as none. At 1e-6 the same runs lose weak
-# directions of far courses (90 % error 35 in the place of 19); from 1e-10 down little changes.
+# Eigenvalues of the scaled normal matrix, relative to the largest, that count as zero. At 1e-6 the same runs lose weak
+# directions of far courses (90 % error 35 instead of 19); below 1e-10 little changes.
 _CUT = 1e-10
-# Lower, for the lifts add columns that differ little from each other: anything from 1e-8 to 1e-16 gave the same.
+# Lower, because the lifts add columns that differ little from each other: values from 1e-8 to 1e-16 gave the same
+# result.
 _LIFTED_CUT = 1e-14
 
-# Ranges of the reference start at one, and squared ones may come out negative: what they are then taken to be, in units
-# of the stations' spread. No station is as near to its target.
+# Least reference range, in units of the stations' spread. Reference ranges start at one, and their squares may become
+# negative. No station is so near to its target.
 _NEAREST = 1e-3
 
 
@@ -61,17 +64,17 @@ class RegistrationCourse:
     Parameters
     ----------
     time : Array, shape (B,)
-        Times, of order one.
+        Times, numbers of order one.
     station : Array, shape (N or 1, B, S + 1, d)
         Stations, the reference first.
     offset : Array, shape (N, B, S)
-        c, range of each other station less ``sign`` times the range of the reference.
+        c, the range of each other station minus ``sign`` times the range of the reference.
     sign : Array, shape (S,)
-        +1, or -1 where ranges add up.
+        +1 for differences, -1 for sums of ranges.
     bias : Array, shape (N or 1, B, S, q)
-        E, what the biases add to the offsets.
+        E, coefficients of the biases in the offsets.
     whiten : Array, shape (N or 1, B or 1, S, S)
-        Whitening matrices of the offsets; zero rows where a station is silent.
+        Whitening matrices of the offsets; zero rows for stations without a measurement.
     mean, sigma : Array, shape (q,)
         Prior of the biases; infinite `sigma` for none.
     """
@@ -88,14 +91,14 @@ class RegistrationCourse:
 
 @dataclass(slots=True)
 class _Guess:
-    """What the passes hand on: biases (N, q) and ranges of the reference (N, B)."""
+    """The result of a pass: biases (N, q) and ranges of the reference (N, B)."""
 
     bias: Array
     reference: Array
 
 
 def candidates(course: RegistrationCourse, order: int = 0) -> tuple[Array, Array]:
-    """Return starting points of a registration.
+    """Return starts of a registration.
 
     Parameters
     ----------
@@ -107,9 +110,9 @@ def candidates(course: RegistrationCourse, order: int = 0) -> tuple[Array, Array
     Returns
     -------
     state : Array, shape (N, C, order + 1, d)
-        Candidates; NaN where there is none.
+        Candidates; NaN for an empty place.
     bias : Array, shape (N, q)
-        Biases that belong to them.
+        Biases for these candidates.
     """
     with np.errstate(all="ignore"):
         guess = _free_ranges(course, order)
@@ -126,7 +129,7 @@ def _powers(course: RegistrationCourse, count: int) -> Array:
 
 
 def _rows(course: RegistrationCourse, guess: _Guess) -> tuple[Array, Array, Array, Array]:
-    """Return ranges r, and of the rows over r the columns of x and of r_0 and the right side, each (N, B, S, ...)."""
+    """Return ranges r, and the rows divided by r: columns of x, columns of r_0, right side; each (N, B, S, ...)."""
     m = course.offset - (course.bias @ guess.bias[:, None, :, None])[..., 0]
     r = np.maximum(m + course.sign * guess.reference[..., None], _NEAREST)
     first, others = course.station[..., :1, :], course.station[..., 1:, :]
@@ -135,25 +138,25 @@ def _rows(course: RegistrationCourse, guess: _Guess) -> tuple[Array, Array, Arra
 
 
 def _course_columns(course: RegistrationCourse, columns: Array, order: int) -> Array:
-    """Return columns (N, B, S, d) of a place as columns (N, B, S, (order + 1) d) of a course."""
+    """Return columns (N, B, S, d) of a position as columns (N, B, S, (order + 1) d) of a course."""
     powers = _powers(course, order + 1)
     spread = powers[:, None, :, None] * columns[..., None, :]
     return spread.reshape(*spread.shape[:-2], -1)
 
 
 def _free_ranges(course: RegistrationCourse, order: int) -> _Guess:
-    """Return biases and smoothed reference ranges of stage 0."""
+    """Return the biases and the smoothed reference ranges of stage 0."""
     size, q = len(course.offset), course.bias.shape[-1]
     guess = _Guess(np.zeros((size, q)) + course.mean, np.ones(course.offset.shape[:2]))
     for turn in range(_PASSES):
         r, place, gain, right = _rows(course, guess)
-        if turn == 0:  # no ranges are known yet: all rows weigh alike, and biases stay at their prior means
+        if turn == 0:  # no ranges are known yet: all rows have equal weight, and biases keep their prior means
             place, gain, right = place * r[..., None], gain * r, right * r
         columns = [_course_columns(course, place, order)]
         if turn:
             columns.append(np.broadcast_to(-course.bias, (*right.shape, q)))
         seen = course.whiten @ np.concatenate([*columns, gain[..., None], right[..., None]], axis=-1)
-        # the column of the free reference range is projected out of every epoch, row by whitened row
+        # the column of the free reference range is projected out of the whitened rows of every epoch
         free = seen[..., -2]
         norm = (free**2).sum(-1, keepdims=True)
         unit = free / np.sqrt(np.where(norm > 0.0, norm, 1.0))
@@ -180,7 +183,7 @@ def _least_squares(rows: Array, course: RegistrationCourse, bias: Array | None, 
 
 
 def _solve(matrix: Array, vector: Array, cut: float) -> Array:
-    """Return the solution of scaled normal equations without their directions of (almost) no information."""
+    """Return the solution (N, n) of scaled normal equations, zero in directions with (almost) no information."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
@@ -193,23 +196,23 @@ def _solve(matrix: Array, vector: Array, cut: float) -> Array:
 
 
 def _smooth(course: RegistrationCourse, reference: Array, order: int) -> Array:
-    """Return reference ranges whose squares are those of some course: r^2 - |s|^2 = lifts(t) - 2 s' x(t)."""
+    """Return reference ranges whose squares fit a course: r^2 - |s|^2 = lifts(t) - 2 s' x(t)."""
     first = course.station[..., 0, :]
     lifts = _powers(course, 2 * order + 1)
     along = _course_columns(course, first[..., None, :], order)[..., 0, :]
     basis = np.concatenate([np.broadcast_to(lifts, (*along.shape[:-1], lifts.shape[-1])), along], axis=-1)
     known = (first**2).sum(-1)
     square = (reference**2 - known)[..., None]
-    # singular values, where the cut above is of their squares; many lifts and few times leave some undetermined
+    # singular values, while the cut above is for their squares; many lifts and few times leave some undetermined
     fitted = basis @ (np.linalg.pinv(basis, rcond=1e-9) @ square)
     return np.asarray(np.sqrt(np.maximum(fitted[..., 0] + known, _NEAREST**2)))
 
 
 def _tie_ranges(course: RegistrationCourse, guess: _Guess, order: int) -> tuple[Array, _Guess]:
-    """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best."""
+    """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best candidate."""
     q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
     _, place, gain, right = _rows(course, guess)
-    # rows in (bias, course, lifts): the reference range is replaced by its tangent parabola at the guess
+    # rows in (bias, course, lifts): the tangent parabola at the guess replaces the reference range
     first, r = course.station[..., :1, :], guess.reference[..., None]
     square = (first**2).sum(-1)
     lifts = (gain / (2.0 * r))[..., None] * _powers(course, 2 * order + 1)[:, None, :]
@@ -233,7 +236,10 @@ def _tie_ranges(course: RegistrationCourse, guess: _Guess, order: int) -> tuple[
 
 
 def _add_prior(rows: Array, course: RegistrationCourse, bias: Array) -> Array:
-    """Return rows (N, R, q + n + 1) with those of the prior of the biases, whose columns are the first."""
+    """Return rows (N, R, q + n + 1), with the rows of the prior of the biases appended.
+
+    Biases are the first columns.
+    """
     q = bias.shape[1]
     prior = np.zeros((len(rows), q, rows.shape[-1]))
     index = np.arange(q)
@@ -243,11 +249,12 @@ def _add_prior(rows: Array, course: RegistrationCourse, bias: Array) -> Array:
 
 
 def _solve_constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
-    """Return biases, place and its square (N, q + d + 1), and all places (N, C, d), of rows [E | x | |x|^2 | right].
+    """Return biases, position and its square (N, q + d + 1), and all positions (N, C, d).
 
-    The biases are free and leave the problem by a triangular factor; what is left is a squared-range problem.
+    The rows are [E | x | |x|^2 | right side]. The biases are free. A triangular factor eliminates them, and the
+    remainder is a squared-range problem.
     """
-    # biases in units in which their columns are one long: they are small, and the triangular factor would not see them
+    # biases in units in which their columns have length one: the triangular factor would neglect small columns
     usable = np.asarray(np.isfinite(rows).all((-1, -2)))
     scale = np.ones((len(rows), rows.shape[-1]))
     norm = np.sqrt((rows[..., :q] ** 2).sum(1))
@@ -270,9 +277,10 @@ def _reference(course: RegistrationCourse, theta: Array, lifts: Array, order: in
 
 
 def _branches(course: RegistrationCourse, state: Array, reference: Array) -> Array:
-    """Return two courses (N, 2, order + 1, d) on either side of the plane that the stations spread in most."""
+    """Return two courses (N, 2, order + 1, d), one on each side of the plane in which the stations spread most."""
     first = course.station[..., 0, :]
-    # the normal is the direction in which the stations spread least; beside it the distance from the plane follows
+    # the normal is the direction in which the stations spread least; the reference range gives the distance from the
+    # plane
     apart = course.station[..., 1:, :] - first[..., None, :]
     apart = apart.reshape(len(apart), -1, apart.shape[-1])
     _, vectors = np.linalg.eigh(np.swapaxes(apart, -1, -2) @ apart)

@@ -6,7 +6,7 @@ for a fixed one), biases :math:`\delta` common to all windows,
 .. math:: z_i(k) = r_i(k) - r_1(k) + (E \delta)_i + n_i(k), \quad r_i = |p_k - s_i(k)|, \quad W_k n(k) \sim N(0, I),
    \quad \delta \sim N(\mu, \operatorname{diag} \sigma^2).
 
-With :math:`f_i = z_i - (E\mu)_i - (r_i - r_1)`, what the geometry leaves over, everything is quadratic in :math:`y =
+With the remainders :math:`f_i = z_i - (E\mu)_i - (r_i - r_1)`, everything is quadratic in :math:`y =
 (1, p, v, r_1(k), f_i(k))`: the cost once the biases are eliminated, :math:`f^\top M f`, and the definitions of the
 ranges,
 
@@ -15,32 +15,33 @@ ranges,
 The lift :math:`Y = y y^\top` is relaxed to :math:`Y \succeq 0` and solved with the price :math:`\eta \,
 \operatorname{mean}_k |p_k|^2`, read off the lift.
 
-It is never formed. With the biases in the lift the cost is a sum over the windows, and so are the definitions: of `Y`
-only the blocks of :math:`u_k = (1, p, v, \delta, r_1(k), f_i(k))` are asked for, which share those of :math:`(1, p, v,
-\delta)` and nothing else. Blocks that are semidefinite one by one and agree in what they share are those of a
-semidefinite matrix, for the graph of such a pattern is chordal; and the best moments of the biases give :math:`f^\top M
-f` back. So `K` blocks of a dozen rows are the same relaxation as the lift of all windows, whose time grows with the
-sixth power of them.
+The lift is never formed. With the biases in the lift the cost is a sum over the windows, and so are the definitions: of
+`Y` only the blocks of :math:`u_k = (1, p, v, \delta, r_1(k), f_i(k))` occur, which have the block of :math:`(1, p, v,
+\delta)` in common. If all blocks are semidefinite and agree in their common part, they are the blocks of a semidefinite
+matrix, because the graph of this pattern is chordal. The best moments of the biases give :math:`f^\top M f` again. So
+`K` blocks of a dozen rows are the same relaxation as the lift of all windows, whose time grows with the sixth power of
+them.
 
-Small unknowns are lifted in small units: the leftovers, not the
-ranges :math:`r_i`, whose squares would hide them from an interior-point method.
+Small unknowns are lifted in small units: the lift contains the remainders, not the
+ranges :math:`r_i`, compared with whose squares they would be rounding for an interior-point method.
 
 Both the price and the prior are needed. A misfit `m` of the second equality can be absorbed in the moments alone,
 :math:`2 \operatorname{cov}(r_1, f) = m`, for which :math:`\operatorname{var}(r_1) \operatorname{var}(f) \ge m^2 / 4`
-suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without end and every target has
-cost zero in the limit; with it misfits cost about :math:`\sqrt{\eta \sum M_{ff} m^2}`. Without the prior, `M` is
-blind to leftovers common to all windows, so that such misfits cost nothing again and the price draws the target into
-the array. The relaxation is not tight (at the best price its misfit is about a twentieth of what noise leaves): it
+suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without bound and every target
+has cost zero in the limit; with it misfits cost about :math:`\sqrt{\eta \sum M_{ff} m^2}`. Without the prior, `M` is
+zero for remainders common to all windows, so that these misfits cost nothing again and the price moves the target into
+the array. The relaxation is not tight (at the best price its misfit is about a twentieth of the misfit by noise): it
 gives starts, not bounds.
 
-The best price depends on the unknown distance: too high, and it draws the target in; too low, and the slack throws it
-out. So a ladder of prices is solved, and the answers are ranked by the cost of the data at their targets.
+The best price depends on the unknown distance. A price that is too high moves the target into the array; with a price
+that is too low, the slack moves it far away. So the problem is solved for several prices, and the solutions are ranked
+by the cost of the data at their targets.
 
 Sources: R. Grone, C. R. Johnson, E. M. Sa and H. Wolkowicz, "Positive definite completions of partial Hermitian
 matrices", Linear Algebra Appl. 58 (1984), theorem 7 (the blocks); N. Z. Shor, "Quadratic optimization problems", Sov.
 J. Comput. Syst. Sci. 25 (1987) (the lift); K. W. K. Lui, W.-K. Ma, H. C. So and F. K. W. Chan, "Semi-definite
 programming algorithms for sensor network node localization with uncertainties in anchor positions and/or propagation
-speed", IEEE Trans. Signal Process. 57 (2009) (nuisance parameters in the lift); the leftovers, the price and its
+speed", IEEE Trans. Signal Process. 57 (2009) (nuisance parameters in the lift); the remainders, the price and its
 reason are this project's.
 """
 
@@ -55,15 +56,15 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio
 
-# Two to a decade. In random plane arrays the best one (median of twelve) is 30 for targets within one extent, 3 at two
-# extents, 0.3 at three, 0.1 at five and 0.03 at ten.
+# Two prices per decade. In random plane arrays the best price (median of twelve) is 30 for targets within one extent, 3
+# at two extents, 0.3 at three, 0.1 at five and 0.03 at ten.
 PRICES = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
 """Prices eta of the squared distance from the array's centre, in units of its mean squared extent."""
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationStart:
-    """One answer of the relaxation.
+    """One solution of the relaxation.
 
     Parameters
     ----------
@@ -74,13 +75,13 @@ class RegistrationStart:
     cost : float
         Cost of the windows at target and bias, ``sum |W (z - h - E bias)|^2 + sum ((bias - mean) / sigma)^2``.
     price : float
-        The price that led here.
+        The price of this solution.
     misfit : float
-        The same cost as the relaxation sees it; far below what noise leaves.
+        The same cost in the relaxation; far below the cost of noise.
     slack : float
         Mean over the windows of the lifted ``|p_k|^2`` less its value at the target, length squared.
     rank_ratio : float
-        Second over first eigenvalue in its own units, of the block in which it is largest; near zero would mean tight.
+        Second over first eigenvalue in its own units, of the block in which it is largest; near zero if tight.
     answer : ConicAnswer
         The solver's report.
     """
@@ -107,7 +108,7 @@ def registration(
     prices: tuple[float, ...] = PRICES,
     backend: str = "CLARABEL",
 ) -> tuple[RegistrationStart, ...]:
-    """Solve the relaxation for a ladder of prices.
+    """Return the solutions of the relaxation for several prices.
 
     Parameters
     ----------
@@ -120,11 +121,11 @@ def registration(
     sigma : array_like, shape (b,)
         Prior standard deviations of the biases, positive and finite.
     design : array_like, shape (S - 1, b), optional
-        E; one bias for each row if not given.
+        E; by default one bias for each row.
     mean : array_like, shape (b,) or ()
         Prior means.
     time : array_like, shape (K,), optional
-        Times of the windows, for a uniformly moving target; without them it is fixed.
+        Times of the windows, for a uniformly moving target; without times the target is fixed.
     prices : tuple of float
         Prices eta, in units of the inverse mean squared distance of the stations from their mean over all windows.
     backend : str
@@ -133,19 +134,19 @@ def registration(
     Returns
     -------
     tuple of RegistrationStart
-        One for each price that was solved, lowest cost first: starts to be refined. Of a moving target refine all:
-        it has several minima, and the order says little about which of them a start leads to. Empty where the data
-        are not finite, a moving target is seen at one time only, or the solver gave none.
+        One start for each solved price, lowest cost first; refine them. For a moving target refine all of them: it has
+        several minima, and the order hardly predicts the minimum that a start leads to. Empty if the data are not
+        finite, if a moving target has only one time, or if the solver gave no solution.
 
     Raises
     ------
     ValueError
-        A prior standard deviation is not positive and finite: without one there is no start.
+        If a prior standard deviation is not positive and finite: without a prior there is no start.
 
     Notes
     -----
-    The module's text. Shifted and scaled inside, so the answer does not depend on origin or unit. Built once per
-    shape and back end in each process.
+    See the text of the module. The data are shifted and scaled, so the result does not depend on origin or unit. Built
+    once per shape and back end in each process.
     """
     run = RegistrationWindows.of(station, z, whiten, sigma, design, mean, time)
     if not run.finite:
@@ -164,28 +165,28 @@ def registration(
 
 @dataclass(frozen=True, slots=True)
 class RegistrationWindows:
-    """Data of K windows about the stations' mean, in units of the stations' extent.
+    """Data of K windows, relative to the stations' mean, in units of the stations' extent.
 
     Parameters
     ----------
     station : Array, shape (K, S, d)
         Positions, the reference first.
     z : Array, shape (K, S - 1)
-        Range differences less the biases' prior means.
+        Range differences minus the prior means of the biases.
     gram : Array, shape (K, S - 1, S - 1)
         Inverse covariance of the rows, in the fine unit.
     design : Array, shape (S - 1, b)
-        Biases to rows.
+        Coefficients of the biases in the rows.
     prior : Array, shape (b,)
         Inverse prior variances of the biases, in the fine unit.
     mean : Array, shape (b,)
-        Prior means as given.
+        Prior means in the units of the caller.
     power : Array, shape (K, 1) or (K, 2)
-        Powers of time that carry the target's unknowns, time about its middle in half spans.
+        Powers of time that multiply the target's unknowns; time is relative to its middle, in half spans.
     unit : float
-        The fine unit, of biases and what the geometry leaves over.
+        The fine unit, for biases and remainders.
     origin, scale, clock
-        The shift, the unit of length, and middle and half span of time.
+        Origin, unit of length, and middle and half span of time.
     """
 
     station: Array
@@ -211,7 +212,7 @@ class RegistrationWindows:
         mean: ArrayLike,
         time: ArrayLike | None,
     ) -> RegistrationWindows:
-        """Shift and scale; arguments as in `formulations.registration_sdp.registration`."""
+        """Return the shifted and scaled data; arguments as in `formulations.registration_sdp.registration`."""
         s, rows, W, spread = (np.asarray(a, dtype=np.float64) for a in (station, z, whiten, sigma))
         if not (np.isfinite(spread) & (spread > 0)).all():
             raise ValueError("every bias needs a prior standard deviation that is positive and finite")
@@ -221,7 +222,7 @@ class RegistrationWindows:
         gram = np.broadcast_to(np.swapaxes(W, -1, -2) @ W, (K, C, C))
         origin = s.mean(axis=(0, 1))
         scale = float(np.sqrt(((s - origin) ** 2).sum(axis=-1).mean()))
-        # the fine unit: what biases and noise leave over, against lengths of the size of the array
+        # a small unit for biases and noise, which are small compared with the size of the array
         noise = 1.0 / np.einsum("kii->ki", gram).mean()
         fine = float(np.sqrt(((E * spread) ** 2).sum(axis=1).mean() + noise))
         clock, power = (0.0, 1.0), np.ones((K, 1))
@@ -234,11 +235,11 @@ class RegistrationWindows:
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers are finite and the times, where they count, differ."""
+        """Return whether all numbers are finite and, for a moving target, the times differ."""
         return all(np.isfinite(part).all() for part in (self.station, self.z, self.gram, self.power))
 
     def cost(self, target: Array) -> tuple[float, Array]:
-        """Return the cost at a scaled target (n,), and the shifts (b,) of the biases from their means that fit best."""
+        """Return the cost at a scaled target (n,), and the best shifts (b,) of the biases from their means."""
         away = np.linalg.norm((self.power @ target.reshape(-1, len(self.origin)))[:, None] - self.station, axis=-1)
         left = (self.z - away[:, 1:] + away[:, :1]) / self.unit
         shift = np.linalg.solve(self.total, self.design.T @ np.einsum("kij,kj->i", self.gram, left))
@@ -248,7 +249,7 @@ class RegistrationWindows:
     def place(self, target: Array) -> Array:
         """Return position at time zero, and velocity of a moving target, (1 or 2, d) as given."""
         found = self.scale * target.reshape(-1, len(self.origin))
-        if len(found) == 2:  # back from time about its middle in half spans
+        if len(found) == 2:  # back from time relative to its middle, in half spans
             found[1] /= self.clock[1]
             found[0] -= self.clock[0] * found[1]
         found[0] += self.origin
@@ -256,7 +257,7 @@ class RegistrationWindows:
 
     @property
     def total(self) -> Array:
-        """Return the information of the biases (b, b) in the fine unit, prior included."""
+        """Return the information of the biases (b, b) in the fine unit, including the prior."""
         return np.asarray(self.design.T @ self.gram.sum(axis=0) @ self.design + np.diag(self.prior))
 
 
@@ -276,12 +277,12 @@ def registration_problem(windows: int, stations: int, dimension: int, order: int
     -------
     cvxpy.Problem
         Variables ``shared`` of size 1 + n + b, n = d (order + 1), the lift of (1, p, v, delta), and for each window k
-        ``across k`` (1 + n + b, S) and ``own k`` (S, S), those of it with (r_1, f), and of (r_1, f). Parameters
-        ``gram k`` and ``tie k``, the inverse covariance G of the rows and G E, ``bias`` (b, b), the sum of E'G E and
-        the prior, ``price`` (n, n), ``moment`` (K, order + 1, order + 1) flattened to (K, ...), whose entries weigh
-        the inner products of p and v in ``|p_k|^2``; of ``r_1^2 = |p_k|^2 + near'(1, p, v)`` the rows ``near`` (K, n
-        + 1); of ``unit f^2 - 2 r_1 f + level'(1, p, v) + ahead r_1 - turn f = 0`` the rows ``level`` (K (S - 1), n +
-        1), ``ahead`` and ``turn`` (K (S - 1),), and the scalar ``unit``.
+        ``across k`` (1 + n + b, S) and ``own k`` (S, S), the lifts of its products with (r_1, f), and of (r_1, f).
+        Parameters ``gram k`` and ``tie k``, the inverse covariance G of the rows and G E, ``bias`` (b, b), the sum of
+        E'G E and the prior, ``price`` (n, n), ``moment`` (K, order + 1, order + 1) flattened to (K, ...), whose entries
+        weigh the inner products of p and v in ``|p_k|^2``; of ``r_1^2 = |p_k|^2 + near'(1, p, v)`` the rows ``near``
+        (K, n + 1); of ``unit f^2 - 2 r_1 f + level'(1, p, v) + ahead r_1 - turn f = 0`` the rows ``level`` (K (S - 1),
+        n + 1), ``ahead`` and ``turn`` (K (S - 1),), and the scalar ``unit``.
 
     Notes
     -----
@@ -318,11 +319,12 @@ def registration_problem(windows: int, stations: int, dimension: int, order: int
 
 @keep
 def _relaxation(windows: int, stations: int, dimension: int, order: int, biases: int, backend: str) -> Relaxation:
+    """Return the relaxation, built once for each shape and back end."""
     return Relaxation(registration_problem(windows, stations, dimension, order, biases), backend=backend)
 
 
 def _parameters(run: RegistrationWindows) -> dict[str, Array]:
-    """Coefficients of the lifted equalities, those of the second kind divided by the unit of the leftovers."""
+    """Return the coefficients of the lifted equalities; the second kind is divided by the unit of the remainders."""
     K, S, _ = run.station.shape
     power, first, other = run.power, run.station[:, 0], run.station[:, 1:]
     size = (run.station**2).sum(axis=-1)
@@ -344,10 +346,11 @@ def _parameters(run: RegistrationWindows) -> dict[str, Array]:
 
 
 def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: ConicAnswer) -> RegistrationStart:
+    """Return the start in the units of the caller from a solution of the relaxation."""
     shared, inside = answer.values["shared"], slice(1, 1 + len(weight))
     target = shared[0, inside]
     cost, shift = run.cost(target)
-    # what the lift says |p|^2 is: more than the square of what it says p is, by the slack
+    # |p|^2 in the lift exceeds the square of p in the lift by the slack
     square = float((weight * shared[inside, inside]).sum())
     return RegistrationStart(
         run.place(target),
@@ -362,5 +365,6 @@ def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: Con
 
 
 def _block(answer: ConicAnswer, window: int) -> Array:
+    """Return the block of a window from a solution of the relaxation."""
     across = answer.values[f"across {window}"]
     return np.block([[answer.values["shared"], across], [across.T, answer.values[f"own {window}"]]])

@@ -8,11 +8,11 @@ convex where it exists, and
 
 .. math:: k(t) = T(t)^{-1/2} - (\kappa + \sigma t)^{-1/2}
 
-is concave in every interval. Newton's iteration on `k`, started where `k <= 0` beside a pole, therefore climbs
-monotonically to the first root on that side of the pole or meets `k' <= 0`, which proves there is none. Every
+is concave in every interval. Newton's iteration on `k`, started near a pole where `k <= 0`, therefore climbs
+monotonically to the first root on that side of the pole, or reaches `k' <= 0`, which proves that no root exists. Every
 interval holds at most two roots, one per end, so the two sides of all poles, and for ``sigma > 0`` the zero of the
-right side, list all real roots without a polynomial and without a bracket. Each root is held as its distance from its
-own pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
+right side, list all real roots without a polynomial and without a bracket. Each root is stored as the distance from its
+pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
 
 Sources: J. J. More and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4 (1983), section 3
 (the concave form on the last interval); the use on every interval is the same inequality.
@@ -27,8 +27,8 @@ import numpy as np
 from formulations.algebra import Array, Mask
 
 _EPS = float(np.finfo(np.float64).eps)
-# Random problems of up to four unknowns, their columns scaled over twelve decades, took at most 52 steps; most of them
-# are spent far from the root, where the concave form grows the distance from the pole by a constant factor only.
+# Limit of Newton steps. Random problems of up to four unknowns, with columns scaled over twelve decades, took at most
+# 52 steps. Most steps are far from the root, where the distance from the pole grows only by a constant factor.
 _STEPS = 80
 
 
@@ -39,7 +39,7 @@ class Secular:
     Parameters
     ----------
     gap : Array, shape (d, d, N)
-        Differences of poles ``gap[k, j] = p_j - p_k``, given apart because they may be known better than the poles.
+        Differences of poles ``gap[k, j] = p_j - p_k``, which may be more accurate than the poles.
     pole : Array, shape (d, N)
         Poles in ascending order.
     weight : Array, shape (d, N)
@@ -57,7 +57,7 @@ class Secular:
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """Roots on a batch of secular equations, one per slot.
+    """Roots of a batch of secular equations, one in each slot.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Roots:
     apart : Array, shape (d, K, N)
         ``t - p_j`` with full relative accuracy.
     found : Mask, shape (K, N)
-        True where the slot holds a root; the other arrays are meaningless elsewhere.
+        Whether the slot contains a root; otherwise the other arrays have no meaning.
     """
 
     t: Array
@@ -75,7 +75,7 @@ class Roots:
 
 
 def largest(equation: Secular) -> Roots:
-    """Root above the last pole; it is unique, and exists whenever the right side grows or is positive.
+    """Return the root above the last pole; it is unique, and exists if the right side grows or is positive.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def largest(equation: Secular) -> Roots:
 
 
 def everything(equation: Secular) -> Roots:
-    """All real roots.
+    """Return all real roots.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ def everything(equation: Secular) -> Roots:
     Returns
     -------
     Roots
-        Slots: d to the left of each pole, d to the right, and one beside the zero of the right side (K = 2d + 1).
+        Slots: d to the left of each pole, d to the right, and one next to the zero of the right side (K = 2d + 1).
 
     Notes
     -----
-    See the module's first lines; each interval between poles holds at most two roots.
+    See the text of the module: each interval between poles contains at most two roots.
     """
     d = len(equation.pole)
     left, left_free = _start(equation, equation.pole, equation.weight, -1.0)
@@ -119,7 +119,7 @@ def everything(equation: Secular) -> Roots:
     sign = np.concatenate([-np.ones((d, 1)), np.ones((d + 1, 1))])
     slope = np.where(equation.slope > 0.0, equation.slope, 1.0)
     zero = -equation.level / slope
-    # below all poles the left side grows: from the zero of the right side on, no root comes before left side / slope
+    # below all poles the left side grows: after the zero of the right side, no root comes before left side / slope
     apart = zero - equation.pole
     tail = np.sum(equation.weight / apart**2, axis=0) / slope
     gap = np.concatenate([equation.gap, equation.gap, apart[:, None]], axis=1)
@@ -131,7 +131,7 @@ def everything(equation: Secular) -> Roots:
 
 
 def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[Array, Mask]:
-    """Distances from the poles that cannot lie beyond the first root, and whether a root is possible at all."""
+    """Return distances from the poles that are not beyond the first root, and whether a root is possible."""
     level, slope = equation.level + equation.slope * pole, equation.slope
     positive = level > 0.0
     safe = np.where(positive, level, 1.0)
@@ -141,8 +141,8 @@ def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[
     if not grows.any():
         return np.sqrt(weight / safe), positive
     rate = np.where(grows, slope, 1.0)
-    # The other poles only add to the left side. Where the own one alone exceeds twice each of the two terms of the
-    # right side, the first root has not been reached. Where the level is negative the
+    # The other poles only add to the left side. If this pole alone exceeds twice each of the two terms of the
+    # right side, the first root has not been reached. If the level is negative, the
     # root lies beyond the zero of the right side, by b say, and (away + b)^2 <= 4 max(away, b)^2 gives the quarters.
     cube = np.where(grows, np.cbrt(0.25 * weight / rate), np.inf)
     above = np.minimum(np.sqrt(0.5 * weight / safe), cube)
@@ -152,7 +152,7 @@ def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[
 
 
 def _climb(equation: Secular, origin: Array, gap: Array, sign: Array, start: Array, free: Mask) -> Roots:
-    """Newton's monotone iteration from every start; ``gap[k, i]`` is the distance of origin i from pole k."""
+    """Return the results of Newton's monotone iteration; ``gap[k, i]`` is the distance of origin i from pole k."""
     weight = equation.weight[:, None]
     level = equation.level + equation.slope * origin
     slope = equation.slope * sign
@@ -169,7 +169,7 @@ def _climb(equation: Secular, origin: Array, gap: Array, sign: Array, start: Arr
             step = -value / change
             # a level too high for the interval: no root, k' changes sign first
             todo &= (change > 0.0) & np.isfinite(step)
-            # a step of a few roundings of the distance itself: the iteration stands
+            # a step of a few roundings of the distance: the iteration has converged
             done = todo & (step <= 4.0 * _EPS * away)
             found |= done
             todo &= ~done
@@ -177,6 +177,6 @@ def _climb(equation: Secular, origin: Array, gap: Array, sign: Array, start: Arr
                 break
             away = np.where(todo, away + step, away)
     apart = gap + sign * away
-    # a Newton step may jump over the next pole when the interval holds no root
+    # a Newton step may jump over the next pole if the interval contains no root
     found &= np.all((apart * gap > 0.0) | (gap == 0.0), axis=0) & np.all((gap != 0.0) | (apart * sign > 0.0), axis=0)
     return Roots(origin + sign * away, apart, found)

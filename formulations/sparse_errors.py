@@ -1,22 +1,24 @@
-r"""Linear rows of which a few are grossly wrong, with the position in second-order cones.
+r"""Linear rows of which a few have gross errors, with the position in second-order cones.
 
 .. math::
     \min_{y, e} \; \tfrac12 |B y - g - e|^2 + \sum_g \lambda_g |e_g| \quad\text{subject to}\quad
     |M_k (y, 1)| \le m_k^\top (y, 1), \; k = 1, \dots, K
 
-The rows are whitened; `e` are gross errors in sigmas, zero in all rows but a few; :math:`e_g` are those of one group of
-rows (one row by default, or all rows of one station). The penalty is the convex hull of counting the groups in error,
-so the programme is convex: without cones it is the regression with Huber's loss of threshold :math:`\lambda`, and
+The rows are whitened; `e` are gross errors in sigmas, zero in all rows but a few; :math:`e_g` are the errors of one
+group of rows (one row by default, or all rows of one station). The penalty is the convex hull of counting the groups in
+error, so the programme is convex: without cones it is the regression with Huber's loss of threshold :math:`\lambda`,
+and
 
 .. math:: e_g = (1 - \lambda_g / |r_g|)_+ \, r_g, \quad r = B y - g
 
-at every optimum. Groups with :math:`e_g \ne 0` are the *support*. What is relaxed: the count of wrong groups becomes
-the sum of their sizes, which pulls every one of them towards zero by :math:`\lambda_g`; and the quadrics on which
-squared ranges lie become the cones that they bound. The answer is therefore a start and a guess of the support, to be
-refined and tested without the rows of the support; it is no estimate.
+at every optimum. Groups with :math:`e_g \ne 0` are the *support*. The relaxation: the count of wrong groups becomes
+the sum of their sizes, which shrinks each of them towards zero by :math:`\lambda_g`. The quadrics of squared ranges
+become the cones that they bound. So the solution is not an estimate. It is a start and a guess of the support, to be
+refined and tested without the rows of the support.
 
 The threshold is the universal one, :math:`\lambda = \sqrt{2 \ln m}` of m rows, which the largest of m normal errors
-exceeds with a probability that goes to zero; a group of p rows has the threshold that :math:`\chi_p` exceeds as seldom.
+exceeds with a probability that goes to zero. A group of p rows has the threshold that :math:`\chi_p` exceeds with the
+same probability.
 
 Sources: D. L. Donoho and I. M. Johnstone, "Ideal spatial adaptation by wavelet shrinkage", Biometrika 81 (1994) (the
 universal threshold); M. Yuan and Y. Lin, "Model selection and estimation in regression with grouped variables", J. R.
@@ -39,25 +41,25 @@ from formulations.conic import ConicAnswer, Relaxation, keep, tight
 
 Groups = NDArray[np.intp]
 
-_RANK = 1e-10  # singular value of the rows, over the largest one, from which a direction of y counts as open
+_RANK = 1e-10  # singular value of the rows, relative to the largest, below which a direction of y is undetermined
 
 
 @dataclass(frozen=True, slots=True)
 class SparseFit:
-    """Answer of a fit with gross errors.
+    """The result of a fit with gross errors.
 
     Parameters
     ----------
     y : Array, shape (n,)
-        Unknowns; NaN where the programme has no answer or the rows leave a direction of y open.
+        Unknowns; NaN if the programme has no solution or the rows leave a direction of y undetermined.
     errors : Array, shape (m,)
         Gross error of each row in sigmas, exactly zero outside the support.
     value : float
         Cost at `y` and `errors`.
     bound : float
-        Lower bound of the cost, recomputed from the dual; minus infinity where none was asked for.
+        Lower bound of the cost, recomputed from the dual; minus infinity if it was not requested.
     answer : ConicAnswer, optional
-        The solver's report; None where the rows leave a direction open.
+        The solver's report; None if the rows leave a direction undetermined.
     """
 
     y: Array
@@ -68,17 +70,18 @@ class SparseFit:
 
 
 def thresholds(sizes: Groups) -> Array:
-    """Universal threshold of each group of rows.
+    """Return the universal threshold of each group of rows.
 
     Parameters
     ----------
     sizes : int array, shape (G,)
-        Rows of each group; an empty group has the threshold of one row.
+        Number of rows of each group; an empty group has the threshold of one row.
 
     Returns
     -------
     Array, shape (G,)
-        In sigmas: ``sqrt(2 ln G)`` for single rows, for more the value that ``chi`` exceeds with the same probability.
+        Thresholds in sigmas: ``sqrt(2 ln G)`` for single rows; for larger groups the value that ``chi`` exceeds with
+        the same probability.
 
     Notes
     -----
@@ -105,7 +108,7 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
     -------
     cvxpy.Problem
         Parameters ``rows`` (m, n), ``right`` (m,), ``price`` (G,) and one ``cone k`` (length + 1, n + 1) for each cone:
-        the vector's rows, then that of its bound; variables ``y``, ``error``.
+        the rows of the vector, then the row of its bound; variables ``y``, ``error``.
 
     Notes
     -----
@@ -117,7 +120,7 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
     rows, right = cp.Parameter((m, n), name="rows"), cp.Parameter(m, name="right")
     price = cp.Parameter(int(member.max(initial=-1)) + 1, nonneg=True, name="price")
     y, error = cp.Variable(n, name="y"), cp.Variable(m, name="error")
-    # single rows as absolute values: linear inequalities are cheaper than as many cones of length two
+    # single rows as absolute values: linear inequalities are cheaper than cones of length two
     if len(set(groups)) == m:
         size = price[member] @ cp.abs(error)
     else:
@@ -132,7 +135,8 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
 
 @keep
 def _relaxation(n: int, groups: tuple[int, ...], cones: tuple[int, ...], backend: str) -> Relaxation:
-    # errors within a threshold are told from exact zeros by their size: two decades below Clarabel's own tolerance
+    """Return the relaxation, built once for each structure and back end."""
+    # the size distinguishes errors within a threshold from exact zeros: two decades below Clarabel's default tolerance
     return Relaxation(sparse_problem(n, groups, cones), backend=backend, settings=tight(backend, 1e-10))
 
 
@@ -146,7 +150,7 @@ def sparse_fit(
     backend: str = "CLARABEL",
     bound: bool = False,
 ) -> SparseFit:
-    """Fit linear rows of which a few are grossly wrong.
+    """Return a fit of linear rows of which a few have gross errors.
 
     Parameters
     ----------
@@ -155,11 +159,11 @@ def sparse_fit(
     g : Array, shape (m,)
         Right sides.
     groups : int array, shape (m,), optional
-        Group of each row, counted from zero; each row its own by default.
+        Group of each row, counted from zero; by default each row is a group.
     price : Array, shape (G,), optional
-        Threshold of each group in sigmas; `thresholds` of the rows that are present by default.
+        Threshold of each group in sigmas; by default `thresholds` of the present rows.
     cones : sequence of Array, shape (p + 1, n + 1)
-        The first p rows times ``(y, 1)`` are a vector that is no longer than the last row times ``(y, 1)``.
+        Constraint: the vector of the first p rows times ``(y, 1)`` is no longer than the last row times ``(y, 1)``.
     backend : str
         Conic solver.
     bound : bool
@@ -168,17 +172,17 @@ def sparse_fit(
     Returns
     -------
     SparseFit
-        The programme is built once for each structure and back end in each process.
+        The fit. The programme is built once for each structure and back end in each process.
 
     Raises
     ------
     ValueError
-        Where the shapes do not fit each other.
+        If the shapes do not fit each other.
 
     Notes
     -----
     Solved in the coordinates ``z = S V' y`` of the singular value decomposition ``B = U S V'`` less the least-squares
-    fit: numbers are sigmas, however small the noise is against the distances.
+    fit: all numbers are in sigmas, even if the noise is very small compared with the distances.
     """
     B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
     m, n = B.shape
@@ -205,7 +209,7 @@ def sparse_fit(
     if not np.isfinite(answer.primal):
         return SparseFit(np.full(n, np.nan), np.zeros(m), np.nan, answer.bound * scale**2, answer)
     y = centre + back @ (scale * answer.values["y"])
-    # in closed form at the y found: exact zeros, where the solver's own errors are only small
+    # in closed form at the solution y: exact zeros, while the errors in the solver's solution are only small
     errors = shrink(B @ y - g, member, price)
     rest = B @ y - g - errors
     value = 0.5 * float(rest @ rest) + float(price @ group_sizes(errors, member, len(price)))
@@ -213,7 +217,7 @@ def sparse_fit(
 
 
 def group_sizes(values: Array, groups: Groups, count: int) -> Array:
-    """Euclidean length of the values of each group.
+    """Return the Euclidean length of the values of each group.
 
     Parameters
     ----------
@@ -225,13 +229,13 @@ def group_sizes(values: Array, groups: Groups, count: int) -> Array:
     Returns
     -------
     Array, shape (G,)
-        Zero of an empty group.
+        The lengths; zero for an empty group.
     """
     return np.sqrt(np.bincount(groups, weights=values * values, minlength=count))
 
 
 def shrink(residual: Array, groups: Groups, price: Array) -> Array:
-    """Gross errors that cost least at given residuals.
+    """Return the gross errors with the least cost at given residuals.
 
     Parameters
     ----------
@@ -245,7 +249,7 @@ def shrink(residual: Array, groups: Groups, price: Array) -> Array:
     Returns
     -------
     Array, shape (m,)
-        Residuals drawn towards zero by the threshold of their group; exactly zero where the group is within it.
+        Residuals shrunk by the threshold of their group; exactly zero if the group is within its threshold.
 
     Notes
     -----
@@ -257,7 +261,7 @@ def shrink(residual: Array, groups: Groups, price: Array) -> Array:
 
 
 def range_cone(apex: Array, n: int, column: int) -> Array:
-    """Cone ``|x - apex| <= y[column]``: a range is not shorter than the way.
+    """Return the cone ``|x - apex| <= y[column]``: a range is at least the distance.
 
     Parameters
     ----------
@@ -266,12 +270,12 @@ def range_cone(apex: Array, n: int, column: int) -> Array:
     n : int
         Length of y, whose first d entries are x.
     column : int
-        Entry of y that holds the range.
+        Entry of y that contains the range.
 
     Returns
     -------
     Array, shape (d + 1, n + 1)
-        One of `cones`; the convex hull of ``|x - apex| = y[column]``.
+        An element of `cones`: the convex hull of ``|x - apex| = y[column]``.
     """
     d = len(apex)
     cone = np.zeros((d + 1, n + 1))
@@ -280,7 +284,7 @@ def range_cone(apex: Array, n: int, column: int) -> Array:
 
 
 def square_cone(d: int, n: int, column: int) -> Array:
-    """Cone ``|x|^2 <= y[column]``, as ``|(2 x, y[column] - 1)| <= y[column] + 1``.
+    """Return the cone ``|x|^2 <= y[column]``, as ``|(2 x, y[column] - 1)| <= y[column] + 1``.
 
     Parameters
     ----------
@@ -289,12 +293,12 @@ def square_cone(d: int, n: int, column: int) -> Array:
     n : int
         Length of y, whose first d entries are x.
     column : int
-        Entry of y that holds the square.
+        Entry of y that contains the square.
 
     Returns
     -------
     Array, shape (d + 2, n + 1)
-        One of `cones`; the convex hull of ``|x|^2 = y[column]``.
+        An element of `cones`: the convex hull of ``|x|^2 = y[column]``.
     """
     cone = np.zeros((d + 2, n + 1))
     cone[np.arange(d), np.arange(d)] = 2.0

@@ -6,7 +6,7 @@ for two quadrics. The *cone*, :math:`y = (x, r)`, `C = diag(1, .., 1, -1)`, `h =
 point and `r` is its distance (range differences, arrival times, range sums, bearings). The *paraboloid*, :math:`y =
 (x, w)`, `C = diag(1, .., 1, 0)`, `h = (0, .., 0, -1/2)`: `w` is :math:`|x|^2` (ranges, ratios of ranges, bearings).
 
-A multiplier :math:`\lambda` makes every stationary point but the apex of the cone a solution of
+A multiplier :math:`\lambda` makes every stationary point, except the apex of the cone, a solution of
 :math:`(B^\top B + \lambda C) y = B^\top g - \lambda h`. Both cases become :math:`\sum_j c_j^2/(t - p_j)^2 = \kappa +
 \sigma t` (:mod:`formulations.secular`), with d poles:
 
@@ -16,7 +16,7 @@ A multiplier :math:`\lambda` makes every stationary point but the apex of the co
 - paraboloid: `w` is eliminated by its own (linear) equation and :math:`t = \lambda`.
 
 The global minimiser is the root above the last pole, where :math:`B^\top B + \lambda C` is positive semidefinite (no
-gap). A singular `A` is the hard case: a root sits on a pole, and both _line_points of the solution line with the
+gap). A singular `A` is the hard case: a root is on a pole, and both intersections of the solution line with the
 quadric appear.
 
 Sources: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), section 3; A.
@@ -40,28 +40,29 @@ from formulations.secular import Roots, Secular, everything, largest
 
 Finder = Callable[[Secular], Roots]
 
-# Problems of which each operation takes at a time: 100 000 fits in space took 47 ms in parts of 2048, 30 ms in parts of
-# 8192, and 47 ms at once, where numpy's calls no longer matter and the caches do.
+# Number of problems that are computed at a time: 100 000 fits in space took 47 ms in parts of 2048, 30 ms in parts of
+# 8192, and 47 ms at once. For small parts numpy's calls take the time, for large parts the memory does.
 _CHUNK = 8192
 
-# Newton on the multiplier. Of random problems in space with errors of 1 % of their size 94 % settle within three steps
-# and 99.97 % within five; with 10 %, 96-98 % within five, and the secular equation is the better tool for the others.
+# Newton's method on the multiplier. Of random problems in space with errors of 1 % of their size, 94 % converge within
+# three steps and 99.97 % within five. With errors of 10 %, 96-98 % converge within five; for the others the secular
+# equation is better.
 _STEPS = 5
-_WEAK = 1e-7  # a pivot below this share of the largest entry has lost half its digits: left to the secular equation
-_SETTLED = 1e-7  # relative change of y below which the last, polishing step squares the error away
+_WEAK = 1e-7  # a pivot below this share of the largest entry has lost half of its digits: the secular equation is used
+_SETTLED = 1e-7  # relative change of y below which the last step reduces the error to its square
 
 # The secular equation.
-_SEMIDEFINITE = 1e-8  # a Cholesky pivot below this share of the largest entry (root of the precision) wants a shift
-_LIFT = 1e-9  # added to such matrices to find the shift: above their rounding errors, below the pivots that count
+_SEMIDEFINITE = 1e-8  # a Cholesky pivot below this share of the largest entry (root of the precision) needs a shift
+_LIFT = 1e-9  # added to such matrices to find the shift: above their rounding errors, below valid pivots
 _FLAT = 1e-13  # eigenvalues of the scaled normal matrix below this, some hundred roundings, are zero
-_FLOOR = 1e-15  # relative floor of the roots of secular weights: some roundings, so that no pole is lost
-_LEAST = 1e-200  # the same where all weights vanish: a square far above the smallest number
-# Relative distance from the cone at which a point is no point. Of 50 000 problems, a third of them with columns scaled
-# over eight decades, 99 % of the points are within 3e-16 and all but 2e-4 of them within this.
+_FLOOR = 1e-15  # relative floor of the roots of secular weights: some roundings, so that no pole vanishes
+_LEAST = 1e-200  # the floor if all weights vanish: a square far above the smallest number
+# Relative distance from the cone above which a point is invalid. Of 50 000 problems, a third of them with columns
+# scaled over eight decades, 99 % of the points are within 3e-16, and all except 2e-4 of them are within this value.
 _OFF = 1e-6
 
-# The line of solutions: singular values below this share of the largest are missing ranks; one decade above what the
-# normal matrix, which holds their squares, can tell from zero.
+# The line of solutions: singular values below this share of the largest count as zero; one decade above the rounding of
+# the normal matrix, which contains their squares.
 _DEPENDENT = 1e-7
 
 
@@ -82,20 +83,20 @@ class Quadric:
 
     @property
     def square(self) -> Array:
-        """Diagonal of C, shape (size,)."""
+        """Return the diagonal of C, shape (size,)."""
         out = np.ones(self.size)
         out[-1] = -1.0 if self.shape == "cone" else 0.0
         return out
 
     @property
     def linear(self) -> Array:
-        """The vector h, shape (size,)."""
+        """Return the vector h, shape (size,)."""
         out = np.zeros(self.size)
         out[-1] = 0.0 if self.shape == "cone" else -0.5
         return out
 
     def value(self, y: Array) -> Array:
-        """``y'Cy + 2h'y``.
+        """Return ``y'Cy + 2h'y``.
 
         Parameters
         ----------
@@ -105,13 +106,13 @@ class Quadric:
         Returns
         -------
         Array, shape (...)
-            Zero on the quadric.
+            The value; zero on the quadric.
         """
         return np.asarray(np.sum(self.square * y * y + 2.0 * self.linear * y, axis=-1))
 
 
 def cone(d: int) -> Quadric:
-    """Quadric ``|x|^2 = r^2`` with ``x`` of dimension `d`.
+    """Return the quadric ``|x|^2 = r^2`` with ``x`` of dimension `d`.
 
     Parameters
     ----------
@@ -127,7 +128,7 @@ def cone(d: int) -> Quadric:
 
 
 def paraboloid(d: int) -> Quadric:
-    """Quadric ``|x|^2 = w`` with ``x`` of dimension `d`.
+    """Return the quadric ``|x|^2 = w`` with ``x`` of dimension `d`.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def paraboloid(d: int) -> Quadric:
 
 
 def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -> tuple[Array, Mask]:
-    """Global minimiser of ``|By - g|^2`` on the quadric.
+    """Return the global minimiser of ``|By - g|^2`` on the quadric.
 
     Parameters
     ----------
@@ -154,14 +155,14 @@ def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -
     quadric : Quadric
         The constraint, of size n.
     positive : bool
-        Minimise over the half ``y[-1] >= 0``; matters for the cone only.
+        Whether to minimise over the half ``y[-1] >= 0``; relevant for the cone only.
 
     Returns
     -------
     y : Array, shape (..., n)
-        The minimiser, NaN where `ok` is False. Where ``B'B`` has rank n - 1 it may be one of two.
+        The minimiser; NaN if `ok` is False. If ``B'B`` has rank n - 1, there may be a second one.
     ok : Mask, shape (...)
-        False where the input is not finite or ``B'B`` lacks two or more ranks.
+        False if the input is not finite or the rank of ``B'B`` is less than n - 1.
 
     Notes
     -----
@@ -173,7 +174,7 @@ def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -
         for part, b, h, _ in _parts(rows, right):
             points, ok[part] = _descend(b, h, quadric.square, quadric.linear)
             y[part] = points.T
-    # what does not settle is gathered over all chunks: small batches are dear
+    # problems that do not converge are collected over all parts, because small batches are slow
     hard = np.flatnonzero(~ok)
     if hard.size:
         points, _, valid = _points(rows[hard], right[hard], quadric, largest)
@@ -186,7 +187,7 @@ def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -
 
 
 def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -> tuple[Array, Array, Mask]:
-    """All real stationary points of ``|By - g|^2`` on the quadric, the cheapest first.
+    """Return all real stationary points of ``|By - g|^2`` on the quadric, the cheapest first.
 
     Parameters
     ----------
@@ -197,22 +198,22 @@ def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) 
     quadric : Quadric
         The constraint, of size n.
     positive : bool
-        Drop points with ``y[-1] < 0`` (a negative range).
+        Whether to drop points with ``y[-1] < 0`` (a negative range).
 
     Returns
     -------
     y : Array, shape (..., K, n)
-        Points, NaN where not valid; K = 2n - 1. The cone has at most 2(n - 1) with a multiplier, and its apex
+        Points, NaN if not valid; K = 2n - 1. The cone has at most 2(n - 1) with a multiplier, and its apex
         ``y = 0``, where the gradient of the constraint vanishes. The paraboloid has at most 2n - 1.
     cost : Array, shape (..., K)
-        ``|By - g|^2``, ascending, infinite where not valid.
+        ``|By - g|^2``, ascending; infinite if not valid.
     valid : Mask, shape (..., K)
-        Nothing is valid where the input is not finite or ``B'B`` lacks two or more ranks.
+        Whether each point is valid; all False if the input is not finite or the rank of ``B'B`` is less than n - 1.
 
     Notes
     -----
-    Real roots of the numerator of the secular equation, without forming it. Where ``B'B`` has rank n - 1, both
-    intersections of the line of least-squares solutions with the quadric are among them.
+    The points are the real roots of the secular equation's numerator, which is not formed. If ``B'B`` has rank n - 1,
+    both intersections of the line of least-squares solutions with the quadric are among them.
     """
     rows, right, shape = _one_batch(B, g, quadric)
     y, cost, valid = _points(rows, right, quadric, everything)
@@ -227,7 +228,7 @@ def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) 
 
 
 def _one_batch(B: Array, g: Array, quadric: Quadric) -> tuple[Array, Array, tuple[int, ...]]:
-    """Give inputs one batch axis, and the leading axes they had."""
+    """Return inputs with one batch axis, and their original leading axes."""
     B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
     if B.ndim < 2 or g.ndim < 1 or B.shape[-1] != quadric.size or B.shape[-2] != g.shape[-1]:
         raise ValueError(f"rows {B.shape} and right sides {g.shape} do not fit a quadric of size {quadric.size}")
@@ -238,7 +239,10 @@ def _one_batch(B: Array, g: Array, quadric: Quadric) -> tuple[Array, Array, tupl
 
 
 def _parts(rows: Array, right: Array) -> Iterator[tuple[slice, Array, Array, Mask]]:
-    """Yield parts that fit the cache, the batch on the last axis; items that are not finite are zeroed and named."""
+    """Yield parts that fit the cache, with the batch on the last axis.
+
+    Items that are not finite become zero, and are marked.
+    """
     for i in range(0, len(rows), _CHUNK):
         part = slice(i, i + _CHUNK)
         b, h = np.moveaxis(rows[part], 0, -1).copy(), right[part].T.copy()
@@ -248,7 +252,7 @@ def _parts(rows: Array, right: Array) -> Iterator[tuple[slice, Array, Array, Mas
 
 
 def _points(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[Array, Array, Mask]:
-    """Points, costs and validity of every slot by the secular equation."""
+    """Return points, costs and validity of every slot by the secular equation."""
     slots = 1 if find is largest else 2 * quadric.size - 1
     count, n = len(rows), quadric.size
     y, cost = np.empty((count, slots, n)), np.empty((count, slots))
@@ -261,7 +265,7 @@ def _points(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[
             left = apply(b, points) - h[:, None]
             y[part], valid[part], cost[part] = points.transpose(2, 1, 0), found.T, (left * left).sum(axis=0).T
             usable[part] = ~bad
-        # the apex, in the last slot of the cone, is no sign that the multiplier was found
+        # the apex, in the last slot of the cone, is always found, also without a multiplier
         roots = slots - 1 if quadric.shape == "cone" and slots > 1 else slots
         lost = np.flatnonzero(usable & ~valid[:, :roots].any(axis=1))
         if lost.size:
@@ -283,7 +287,7 @@ def _points(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[
 
 
 def _descend(B: Array, g: Array, square: Array, linear: Array) -> tuple[Array, Mask]:
-    """Global minimisers y (n, N), and which items (N,) settled; y is meaningless elsewhere.
+    """Return global minimisers y (n, N), and whether each item (N,) converged; otherwise y has no meaning.
 
     B (q, n, N) and g (q, N) are finite; `square` and `linear` (n,) are the diagonal of C and the vector h.
     """
@@ -315,7 +319,7 @@ def _descend(B: Array, g: Array, square: Array, linear: Array) -> tuple[Array, M
 
 
 def _factor(A: Array, multiplier: Array, square: Array) -> tuple[list[list[Array]], list[Array]]:
-    """Find the unit lower factor and pivots of ``A + multiplier diag(square)``."""
+    """Return the unit lower factor and pivots of ``A + multiplier diag(square)``."""
     lower: list[list[Array]] = []
     pivots: list[Array] = []
     for i in range(len(A)):
@@ -335,7 +339,7 @@ def _factor(A: Array, multiplier: Array, square: Array) -> tuple[list[list[Array
 
 
 def _substitute(lower: list[list[Array]], pivots: list[Array], right: Array) -> Array:
-    """Solve with a factorisation: shape (n, N)."""
+    """Return the solution (n, N) with a factorisation."""
     n = len(pivots)
     out = np.empty_like(right)
     for i in range(n):
@@ -351,7 +355,7 @@ def _substitute(lower: list[list[Array]], pivots: list[Array], right: Array) -> 
 
 
 def _inner(a: Array, b: Array) -> Array:
-    """Inner products, shape (N,)."""
+    """Return the inner products, shape (N,)."""
     total = a[0] * b[0]
     for i in range(1, len(a)):
         total = total + a[i] * b[i]
@@ -370,7 +374,7 @@ def _inner(a: Array, b: Array) -> Array:
 
 
 def _cone_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
-    """Stationary points (n, K, N) on ``|x| = |r|``, and which slots hold one (K, N).
+    """Return stationary points (n, K, N) on ``|x| = |r|``, and whether each slot contains one (K, N).
 
     B (q, n, N) and g (q, N) are finite. `find` is `largest` (one slot) or `everything` (K = 2n - 1 slots, the last one
     the apex).
@@ -390,7 +394,7 @@ def _cone_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
     first = np.copysign(np.sqrt(level), f[0])
     inner = np.concatenate([(roots.t * first)[None], roots.t * (heavy[:, None] / roots.apart)])
     y = apply(V, inner)
-    # polish: the step of Newton's method on the optimality conditions, whose matrix in the basis V is bordered by q
+    # polish: one Newton step on the optimality conditions, whose matrix in the basis V is bordered by q
     D = np.concatenate([1.0 / roots.t[None], tall[:, None] * roots.apart / roots.t])
     multiplier = (1.0 / roots.t - 1.0) / gamma[0] + shift
     sign = np.ones((n, 1, 1))
@@ -406,14 +410,17 @@ def _cone_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
 
 
 def _pencil(A: Array) -> tuple[Array, Array, Array, Mask]:
-    """Eigenpairs of ``C v = gamma (A + shift C) v``, ``v'(A + shift C)v = 1``, the shift, and rank A >= n - 1."""
+    """Return eigenpairs of ``C v = gamma (A + shift C) v``, the shift, and whether the rank of A is at least n - 1.
+
+    The eigenvectors are normalised to ``v'(A + shift C)v = 1``.
+    """
     n, _, count = A.shape
     signs = np.ones((n, 1))
     signs[-1] = -1.0
     shift, known = np.zeros(count), np.ones(count, dtype=np.bool_)
     X, weak = _inverse_factor(A)
     if weak.any():
-        # the middle of the interval where A + shift C is definite, from a slightly lifted A
+        # the middle of the interval where A + shift C is definite, from A plus a small multiple of the unit matrix
         poor = np.ascontiguousarray(A[..., weak])
         size = np.einsum("iiN->iN", poor)
         known[weak] = _rank(poor, size) >= n - 1
@@ -426,7 +433,7 @@ def _pencil(A: Array) -> tuple[Array, Array, Array, Mask]:
 
 
 def _inverse_factor(A: Array) -> tuple[Array, Mask]:
-    """Inverse Cholesky factor, and where a pivot is so small that it says nothing (there the factor is not used)."""
+    """Return the inverse Cholesky factor, and whether a pivot is too small (then the factor is not used)."""
     n, _, count = A.shape
     L, X, weak = np.zeros_like(A), np.zeros_like(A), np.zeros(count, dtype=np.bool_)
     least = _SEMIDEFINITE * np.einsum("iiN->iN", A).max(axis=0)
@@ -442,7 +449,7 @@ def _inverse_factor(A: Array) -> tuple[Array, Mask]:
 
 
 def _congruent(X: Array, signs: Array) -> Array:
-    """``X diag(signs) X'``."""
+    """Return ``X diag(signs) X'``."""
     n = len(X)
     M = np.empty_like(X)
     for i in range(n):
@@ -452,7 +459,7 @@ def _congruent(X: Array, signs: Array) -> Array:
 
 
 def _rank(A: Array, size: Array) -> NDArray[np.int64]:
-    """Rank of positive semidefinite matrices with their columns scaled."""
+    """Return the rank of positive semidefinite matrices after scaling their columns."""
     most = size.max(axis=0)
     scale = 1.0 / np.sqrt(np.where(size > _FLAT**2 * most, size, np.where(most > 0.0, most, 1.0)))
     values = eigen(A * scale[:, None] * scale)[0]
@@ -468,7 +475,7 @@ def _rank(A: Array, size: Array) -> NDArray[np.int64]:
 
 
 def _paraboloid_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
-    """Stationary points (n, K, N) on ``|x|^2 = w``, and which slots hold one (K, N); arguments as of the cone."""
+    """Return stationary points (n, K, N) on ``|x|^2 = w``, and whether each slot contains one (K, N)."""
     A, b = normal(B, g)
     d = A.shape[0] - 1
     trace = np.einsum("iiN->N", A[:d, :d])
@@ -497,17 +504,18 @@ def _paraboloid_points(B: Array, g: Array, find: Finder) -> tuple[Array, Mask]:
     return np.concatenate([x, (x * x).sum(axis=0)[None]]), roots.found & (missing < 2)
 
 
-# A line of least-squares solutions met with the quadric.
+# The intersection of a line of least-squares solutions with the quadric.
 #
 # Where B has rank n - 1 (or its weakest direction is noise) the minimisers of |B y - g|^2 are the line y_0 + t v, and
-# the constraint is a quadratic in t. This serves the few problems whose v lies almost on the cone: there no multiplier
+# the constraint is a quadratic in t. This is for the few problems whose v is almost on the cone: there no multiplier
 # separates the two solutions from one at infinity.
 
 
 def _line_points(B: Array, g: Array, square: Array, linear: Array) -> tuple[Array, Mask]:
-    """Both points (N, 2, n) of the solution line on the quadric, and which exist (N, 2): the batch is in front here.
+    """Return both points (N, 2, n) of the solution line on the quadric, and whether they exist (N, 2).
 
-    The stable form of the quadratic formula; a vanishing leading coefficient leaves one point.
+    The batch is the first axis here. The function uses the stable form of the quadratic formula; a vanishing leading
+    coefficient leaves one point.
     """
     n = B.shape[-1]
     with np.errstate(all="ignore"):

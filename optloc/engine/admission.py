@@ -1,7 +1,9 @@
-"""Which positions are admitted: surfaces on which fixes are held exactly, bounds, and lines of sight.
+"""The admitted positions: surfaces that hold fixes exactly, bounds, and lines of sight.
 
-Every bounded quantity is a tape with its gradient. A refinement steps along the exact surfaces and is put back onto
-them; bounds and sight are looked at once it has ended.
+Every constrained quantity is a tape with its gradient. A refinement steps along the exact surfaces, and its positions
+are projected back onto them. Bounds and lines of sight are checked after the refinement.
+
+Names in capitals, such as X or MOVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -44,15 +46,15 @@ from optloc.linear.constraints import TOLERANCE, bounded, is_exact
 from optloc.models.primitives import WGS84_A, WGS84_F, Jet
 from optloc.problem.problem import Problem
 
-# Steps that put a position back: Newton's squares a small relative distance, so that three are enough from 1 % off.
+# Newton steps that project a position: each step squares a small relative distance, so three are enough from 1 % off.
 _BACK = 8
-# Share of a level by which a position may miss it: rounding of coordinates of the Earth's size.
+# Relative error of a level that counts as zero: rounding of coordinates as large as the Earth.
 _ON = 1e-15
 
 
 @compiled
 def _measure(a: Admission, room: EngineWorkspace, shift: int, last: int) -> None:
-    """Write the first quantities at row X, or at TRIAL with shift 1, and their gradients."""
+    """Write the first `last` quantities at row X, or at TRIAL if `shift` is 1, and their gradients."""
     d, r, x, origin, table = room.d, room.registers, room.vector[X + shift], room.vector[ORIGIN], a.tapes.table
     for k in range(last):
         for i in range(table[k, INPUT], table[k + 1, INPUT]):
@@ -71,7 +73,7 @@ def _measure(a: Admission, room: EngineWorkspace, shift: int, last: int) -> None
 
 @compiled
 def restore(model: EngineModel, room: EngineWorkspace, shift: int) -> None:
-    """Put row X, or TRIAL with shift 1, back onto the exact surfaces, along the shortest way."""
+    """Project row X, or TRIAL if `shift` is 1, onto the exact surfaces, along the shortest way."""
     a, d = model.admission, room.d
     if room.scalar[RADIUS, 0] > 0.0:
         _restore_radius(room, shift)
@@ -99,7 +101,7 @@ def restore(model: EngineModel, room: EngineWorkspace, shift: int) -> None:
 
 @compiled
 def _restore_radius(room: EngineWorkspace, shift: int) -> None:
-    """Put row X, or TRIAL with shift 1, at its distance from CENTRE."""
+    """Move row X, or TRIAL if `shift` is 1, to the distance RADIUS from CENTRE."""
     x, centre, far = room.vector[X + shift], room.vector[CENTRE], room.scalar[SPARE]
     for lane in range(LANES):
         far[lane] = 0.0
@@ -115,7 +117,7 @@ def _restore_radius(room: EngineWorkspace, shift: int) -> None:
 
 @compiled
 def _square(left: Array, right: Array, room: EngineWorkspace, d: int) -> None:
-    """Factor the products (c, c, W) of gradients (c, d, W) with vectors (c, d, W)."""
+    """Write the factor of the products (c, c, W) of gradients (c, d, W) and vectors (c, d, W) to `room.small`."""
     small, pivot, diagonal = room.small, room.pivot[0], room.pivot[1]
     for k in range(len(small[0])):
         for m in range(k + 1):
@@ -131,10 +133,11 @@ def _square(left: Array, right: Array, room: EngineWorkspace, d: int) -> None:
 
 @compiled
 def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -> None:
-    """Write information, right side and cost at row X, or at TRIAL with shift 1.
+    """Write information, right side and cost at row X, or at TRIAL if `shift` is 1.
 
-    On exact surfaces the information across them is enlarged to the size of that along them: what is held to them
-    (`hold`) does not depend on it, and the matrix is regular where the rows alone leave a direction open.
+    On exact surfaces, the information across the surface is enlarged to the size of the information along it. The steps
+    that `hold` leaves do not depend on this term. The matrix becomes regular if the rows leave a direction
+    undetermined.
     """
     equations(rows, room, shift)
     a, d, matrix, spare = model.admission, room.d, room.matrix[H + shift], room.scalar[SPARE]
@@ -161,7 +164,7 @@ def evaluate(model: EngineModel, rows: Any, room: EngineWorkspace, shift: int) -
 
 @compiled
 def _point_out(room: EngineWorkspace, shift: int, out: Array) -> None:
-    """Write the direction (d, W) away from CENTRE."""
+    """Write the direction (d, W) away from CENTRE, not normalised."""
     for j in range(room.d):
         for lane in range(LANES):
             out[j, lane] = room.vector[X + shift, j, lane] - room.vector[CENTRE, j, lane]
@@ -169,7 +172,7 @@ def _point_out(room: EngineWorkspace, shift: int, out: Array) -> None:
 
 @compiled
 def coarsen(model: EngineModel, room: EngineWorkspace) -> None:
-    """Let the rounding of residuals be no less than what putting back onto a surface around the Earth does to them."""
+    """Raise the rounding error of the residuals to the error that projection onto a surface around the Earth causes."""
     a, blur = model.admission, room.scalar[BLUR]
     if a.exact == 0 or not a.earth:
         return
@@ -182,7 +185,7 @@ def coarsen(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def project_step(model: EngineModel, room: EngineWorkspace) -> None:
-    """Take from the step in MOVE what leads off the exact surfaces; the information is factored in LOWER."""
+    """Remove the part of the step MOVE that leaves the exact surfaces; LOWER contains the factor of the information."""
     a, d, move = model.admission, room.d, room.vector[MOVE]
     if a.exact == 0:
         return
@@ -197,7 +200,7 @@ def project_step(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def _keep_off(room: EngineWorkspace, move: Array, p: int) -> None:
-    """Take from a vector (p, W) the combination of `room.push` that makes it lie along the surfaces."""
+    """Subtract the combination of `room.push` from a vector (p, W) that makes the vector tangent to the surfaces."""
     face, push, part, d = room.face[0], room.push, room.part, room.d
     _square(face, push, room, d)
     for k in range(len(push)):
@@ -215,7 +218,7 @@ def _keep_off(room: EngineWorkspace, move: Array, p: int) -> None:
 
 @compiled
 def project_covariance(model: EngineModel, room: EngineWorkspace) -> None:
-    """Make the covariance in the lower half of H_TRIAL that along the exact surfaces."""
+    """Replace the covariance in the lower half of H_TRIAL by the covariance along the exact surfaces."""
     a, d, cov, column = model.admission, room.d, room.matrix[H_TRIAL], room.vector[MOVE]
     if a.exact == 0:
         return
@@ -239,13 +242,13 @@ def project_covariance(model: EngineModel, room: EngineWorkspace) -> None:
         _keep_off(room, column, p)
         for j in range(i, p):
             for lane in range(LANES):
-                # what is held has no variance: rounding may leave it a little negative
+                # the variance of a held coordinate is zero, which rounding may make slightly negative
                 cov[j, i, lane] = column[j, lane] if j > i else max(column[j, lane], 0.0)
 
 
 @compiled
 def find_multipliers(model: EngineModel, room: EngineWorkspace) -> None:
-    """Write to `room.part` what balances the gradient of the cost at row X."""
+    """Write the Lagrange multipliers (c, W) of the exact constraints at row X to `room.part`."""
     a, d, part, face = model.admission, room.d, room.part, room.face[0]
     if a.exact == 0:
         return
@@ -254,7 +257,7 @@ def find_multipliers(model: EngineModel, room: EngineWorkspace) -> None:
         for lane in range(LANES):
             part[k, lane] = 0.0
         for j in range(d):
-            # the normal equations have half the gradient
+            # the right side of the normal equations is half the negative gradient
             for lane in range(LANES):
                 part[k, lane] += 2.0 * face[k, j, lane] * room.vector[G, j, lane]
     solve_plain(room.small[1], room.pivot[0], part)
@@ -262,7 +265,7 @@ def find_multipliers(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def check_constraints(model: EngineModel, room: EngineWorkspace, out: Array) -> None:
-    """Write 0.0 to `out` (W,) where row X breaks a constraint, or where the Earth hides it from a used station."""
+    """Write 0.0 to `out` (W,) if row X violates a constraint, or if the Earth hides it from a station with a row."""
     a = model.admission
     sides = room.side.shape[1]
     if sides:
@@ -279,15 +282,18 @@ def check_constraints(model: EngineModel, room: EngineWorkspace, out: Array) -> 
 
 
 SATELLITE = 1.0 + 100e3 / WGS84_A
-"""Height above which a station is a satellite, Earth radii: above all aircraft, below all orbits."""
+"""Distance from the centre above which a station is a satellite, Earth radii: above all aircraft, below all orbits."""
 GRAZE, GROUND = 1.0 - 5e3 / WGS84_A, 1.0 - 50e3 / WGS84_A
-"""How deep a line of sight may dip: 5 km to a satellite, for refraction and for targets below the ellipsoid or badly
-measured; 50 km from the ground to a target in space: only what is clearly on the other side of the Earth is hidden."""
+"""Least distance of a line of sight from the centre, Earth radii.
+
+GRAZE allows 5 km of depth for a line to a satellite: for refraction, and for targets below the ellipsoid or with large
+errors. GROUND allows 50 km for a line from the ground to a target in space: only targets that are clearly on the other
+side of the Earth count as hidden."""
 
 
 @compiled
 def _is_hidden(model: EngineModel, room: EngineWorkspace, lane: int) -> bool:
-    """Return whether the Earth hides row X of a lane from a station with a row of it: `optloc.solvers.inequalities`."""
+    """Return whether the Earth hides row X of a lane from a station with a row (as `optloc.solvers.inequalities`)."""
     a, origin, base = model.admission, room.vector[ORIGIN], room.axes[BASE]
     high = 0.0
     for i in range(3):
@@ -312,7 +318,7 @@ def _is_hidden(model: EngineModel, room: EngineWorkspace, lane: int) -> bool:
         satellite = far > SATELLITE * SATELLITE
         if not (satellite or model.station[SEEN, s] != 0.0 or high > SATELLITE * SATELLITE):
             continue
-        # the point of the segment next to the centre; at its ends nothing is in between
+        # the point of the segment nearest to the centre; at the ends of the segment the Earth is not in between
         share = min(along / long, 1.0)
         nearest = 0.0
         for i in range(3):
@@ -323,20 +329,20 @@ def _is_hidden(model: EngineModel, room: EngineWorkspace, lane: int) -> bool:
     return False
 
 
-# Along the axis the ellipsoid is stretched to the unit sphere; lines stay lines.
+# Stretching along the axis maps the ellipsoid to the unit sphere, and lines to lines.
 _STRETCH = (1.0 / WGS84_A, 1.0 / WGS84_A, 1.0 / WGS84_A / (1.0 - WGS84_F))
 
 
-# How it is made.
+# How the data are made.
 
 
 def admission_of(problem: Problem) -> Admission | None:
-    """Return the constraints of one problem as tapes, or None where a constraint has no tape.
+    """Return the constraints of one problem as tapes, or None if a constraint has no tape.
 
     Parameters
     ----------
     problem : Problem
-        Without batch axes but for the levels of its constraints, which are left out.
+        Problem without batch axes. Only the levels of its constraints may have them; they are not used.
     """
     d, bands = problem.dimension, list(problem.constraints)
     if not all(isinstance(band, Band) and band.coefficients.ndim == 1 for band in bands):
@@ -379,12 +385,12 @@ def levels_of(problem: Problem) -> Array:
 
 
 def _trace(problem: Problem, band: Band) -> tuple[Tape, tuple[int, ...]] | None:
-    """Return the tape of a bounded quantity and its derivatives, and of which coordinates they are."""
+    """Return the tape of a constrained quantity with its derivatives, and the coordinates of these derivatives."""
     recorder, d = Recorder(), problem.dimension
     state = tuple(Jet(recorder.input(i), {i: 1.0}) for i in range(d))
     try:
         value = bounded(problem, band, [state], tuple(float(c) for c in band.coefficients), None)
         partials = {seed: p for seed, p in value.partials.items() if recorder.constant(recorder.node(p)) != 0.0}
         return tape(recorder, [value.value, *partials.values()]), tuple(partials)
-    except (TypeError, AttributeError, ValueError, AssertionError, IndexError):  # of a velocity, or untraceable
+    except (TypeError, AttributeError, ValueError, AssertionError, IndexError):  # a velocity, or untraceable
         return None

@@ -1,6 +1,8 @@
-"""Candidates for starts, where squared ranges have too few rows: the cheapest of many places, or others.
+"""Candidates for starts if squared ranges have too few rows, for example the cheapest of many positions.
 
-A few candidates are refined. The cheapest two at different minima go on: the second takes the place of a mirror image.
+A few candidates are refined, and the cheapest two at different minima are used. The second one replaces the mirror
+image of the fix. Names in capitals, such as X or FIX, are rows of the arrays of
+`optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -37,27 +39,27 @@ from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES
 
 CANDIDATES = 4
-"""Of a fix: roots of a quartic, or sectors of places."""
+"""Number of candidates of a fix: roots of a quartic, or sectors of positions."""
 
-# Of the refinement of candidates: a hundredth of a standard deviation separates minima, and a candidate that has not
-# arrived after these steps is on its way to infinity.
+# Tolerance and steps of the refinement of candidates. A hundredth of a standard deviation separates minima. A candidate
+# that has not converged after these steps diverges to infinity.
 _TOLERANCE, _STEPS = 1e-2, 40
 
 
 @compiled
 def refine_candidates(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array) -> None:
-    """Refine candidates, and write the best to row X, and to row OTHER another minimum where there is one.
+    """Refine candidates; write the best one to row X, and another minimum, if there is one, to row OTHER.
 
     Parameters
     ----------
     model : EngineModel
-        How measurements become a start.
+        Maps from measurements to a start.
     rows : named tuple
-        Of the evaluator.
+        Rows of the evaluator.
     room : EngineWorkspace
-        Of the block; lanes without a candidate that is admitted are not good.
+        Workspace of the block; lanes without an admitted candidate become not good.
     spot : array (CANDIDATES, d + 1, W)
-        Candidates from the origin, NaN for an empty place; their costs are written behind the coordinates.
+        Candidates relative to the origin, metres; NaN if absent. The costs are written after the coordinates.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
@@ -80,7 +82,7 @@ def refine_candidates(model: EngineModel, rows: Any, room: EngineWorkspace, spot
 
 @compiled
 def _keep(room: EngineWorkspace, spot: Array) -> None:
-    """Write where the refinement of a candidate ended, and keep the best so far, with its information, as FIX."""
+    """Write the refined candidate and its cost to `spot` (d + 1, W), and store the best candidate so far in FIX."""
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
         good = scalar[GOOD, lane] != 0.0
@@ -98,10 +100,10 @@ def _keep(room: EngineWorkspace, spot: Array) -> None:
 
 @compiled
 def _choose(model: EngineModel, room: EngineWorkspace, spot: Array) -> None:
-    """Write the best candidate to row X, and the cheapest of those at other minima to row OTHER.
+    """Write the best candidate to row X, and the cheapest candidate at another minimum to row OTHER.
 
-    A lane is not good if a third minimum is as good as a rival. Nor is it if the best one is poor: places in between
-    may hold a better minimum.
+    A lane is not good if a third minimum is a rival too. It is not good either if the best candidate fits poorly, since
+    a position between the candidates may be a better minimum.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     for lane in range(LANES):
@@ -125,7 +127,7 @@ def _choose(model: EngineModel, room: EngineWorkspace, spot: Array) -> None:
 
 @compiled
 def _is_apart(room: EngineWorkspace, spot: Array, row: int, lane: int) -> bool:
-    """Return whether a candidate of a lane is more than three standard deviations of FIX from a row of vectors."""
+    """Return whether a candidate is more than three standard deviations of FIX from the given row of `vector`."""
     apart = 0.0
     for i in range(room.d):
         for j in range(room.d):
@@ -135,19 +137,19 @@ def _is_apart(room: EngineWorkspace, spot: Array, row: int, lane: int) -> bool:
     return bool(apart > NEAR)
 
 
-# The cheapest of many places.
+# The cheapest of many positions.
 
-# Distances of places in spreads of the stations: from among them to where wave fronts are nearly flat.
+# Distances of positions in spreads of the stations: from between the stations to where wave fronts are nearly flat.
 _RADII = (0.4, 1.0, 2.5, 8.0)
 RINGS = len(_RADII)
-"""Rings of places."""
+"""Number of rings of positions."""
 
 
 @compiled
 def look_around(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array, rings: int) -> None:
-    """Write the cheapest place of each sector about the stations to `spot`, see `refine_candidates`.
+    """Write the cheapest position of each sector about the stations, and its cost, to `spot`, see `refine_candidates`.
 
-    The rings count from the nearest; a surface makes one of all.
+    The `rings` nearest rings are used. Each position is first projected onto the exact surfaces.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     each = len(model.ahead) // CANDIDATES
@@ -172,18 +174,18 @@ def look_around(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Arra
                         spot[k, j, lane] = vector[TRIAL, j, lane]
 
 
-# Directions of a sector.
+# Number of directions in a sector, by dimension.
 _FAN = {2: 4, 3: 12}
 
 
 def directions(d: int) -> Array:
-    """Return unit vectors (n, d), sector by sector, as even as can be."""
+    """Return unit vectors (n, d), sorted by sector and spread as evenly as possible."""
     count = CANDIDATES * _FAN[d]
     number = np.arange(count) + 0.5
     if d == 2:
         turn = 2.0 * np.pi * number / count
         return np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    # a spiral: equal steps of height, and of the golden angle
+    # a spiral with equal steps of height and of the golden angle
     up, turn = 1.0 - 2.0 * number / count, number * np.pi * (3.0 - np.sqrt(5.0))
     level = np.sqrt(1.0 - up * up)
     ahead = np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)

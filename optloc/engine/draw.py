@@ -1,4 +1,4 @@
-"""How a plan is drawn: one problem's structure as the arrays that the steps of the engine follow."""
+"""The arrays of a plan, from the structure of one problem."""
 
 from __future__ import annotations
 
@@ -38,14 +38,17 @@ from optloc.problem.forms import form_of
 from optloc.problem.noise import variances, whiten, whiten_rows
 from optloc.problem.problem import Problem
 
-# Share of the largest weight below which a combination of rows is rounding: four digits above it.
+# Share of the largest weight below which a combination of rows is rounding: four digits above rounding itself.
 _NOTHING = 1e-12
-# Share of a combination of ranges that their common part may have left by rounding: differences have none of it.
+# Share of a combination of ranges up to which its common part is rounding; exact differences have no common part.
 _LEVEL = 1e-9
 
 
-class SimulatedBatch(NamedTuple):
-    """The places of a plan, how its measurements become a start, and its rows."""
+class PlanArrays(NamedTuple):
+    """The stations of a plan (epoch and number, (2, s)), its maps to a start, and a function that returns its rows.
+
+    `ranged` is True if all rows are sums of ranges.
+    """
 
     node: Array
     model: EngineModel
@@ -53,14 +56,17 @@ class SimulatedBatch(NamedTuple):
     ranged: bool
 
 
-def draw_ranges(one: Problem, admission: Admission) -> SimulatedBatch | None:
-    """Return rows that are sums of ranges; None where they lack rows for a start, or links between stations."""
+def draw_ranges(one: Problem, admission: Admission) -> PlanArrays | None:
+    """Return the arrays of a plan whose rows are sums of ranges.
+
+    The result is None if rows for a start are missing, or if no row links some stations.
+    """
     offset = None
-    if one.stations.unknown_for:  # along the lines to the target, they are noise
+    if one.stations.unknown_for:  # errors along the lines to the target are noise
         offset = columns(one.layout, "stations", np.zeros(1, dtype=int))[0]
         one = replace(one, stations=one.stations.with_noise())
     found = _find_ranges(one)
-    # Stations that no row links would have ranges that nothing relates.
+    # If no row links two stations, their ranges are not related.
     if found is None or len(found.groups[0]) != 1:
         return None
     node = _nodes(one, found)
@@ -72,11 +78,11 @@ def draw_ranges(one: Problem, admission: Admission) -> SimulatedBatch | None:
         assert one.stations.covariance is not None
         first = offset.reshape(-1, one.dimension)[node[1], 0]
         made = made._replace(wander=np.array(one.stations.covariance[node[1], 0, 0]), offset=first)
-    return SimulatedBatch(node, model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made, True)
+    return PlanArrays(node, model._replace(linear=np.concatenate([model.linear, turned])), lambda _: made, True)
 
 
-def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch | None:
-    """Return rows as tapes; None where they have none, or no start."""
+def draw_tapes(one: Problem, admission: Admission, dof: int) -> PlanArrays | None:
+    """Return the arrays of a plan whose rows are tapes, or None if the rows have no tapes or no start."""
     found = _find_ranges(one)
     node = _nodes(one, found)
     model = _model(one, found, node, admission)
@@ -93,24 +99,25 @@ def draw_tapes(one: Problem, admission: Admission, dof: int) -> SimulatedBatch |
         model = model._replace(start=start, height=height)
     elif start == BY_PLACES:
         model = model._replace(start=start, limit=largest(dof, _POOR))
-    return SimulatedBatch(node, model, make, False)
+    return PlanArrays(node, model, make, False)
 
 
 def _find_ranges(one: Problem) -> Ranges | None:
-    """Return the least-squares ranges of one problem as maps: of measurements that are unit vectors."""
-    return ranges(with_station_noise(_probe(problem_at_rest(one.flat()))))
+    """Return the least-squares ranges of one problem as linear maps: the ranges of unit vectors of measurements."""
+    return ranges(with_station_noise(_unit_measurements(problem_at_rest(one.flat()))))
 
 
-# Probability of the chi-square test below which a better place is looked for, as `optloc.solvers.policy.P_SUSPECT`.
+# Probability of the chi-square test below which the general solver searches for a better position, as
+# `optloc.solvers.policy.P_SUSPECT`.
 _POOR = 1e-3
-# Ranges that are known up to one unknown, with a height: they determine a position.
+# Number of ranges known up to one unknown that determine a position together with a height.
 _THREE = 3
 
 
 def _start_of(one: Problem, found: Ranges | None, admission: Admission, lifted: int) -> int | None:
-    """Return the way fixes start, see `EngineModel.start`; None for rows without a start.
+    """Return the way in which fixes start, see `EngineModel.start`; None if the rows give no start.
 
-    Squared ranges need a linear row for each coordinate; the quadric gives the last unknown.
+    Squared ranges need one linear row for each coordinate; the quadric determines the last unknown.
     """
     known = 0 if found is None else int(found.inside[0].sum())
     if lifted + known == 0:
@@ -121,12 +128,12 @@ def _start_of(one: Problem, found: Ranges | None, admission: Admission, lifted: 
     if known == _THREE and on_cone and not lifted and admission.earth and _height_of(one) is not None:
         return BY_HEIGHT
     moving = one.stations.position.shape[-3] > 1
-    spare = degrees_of_freedom(one.flat())[0] > 0  # without, any place would fit
+    spare = degrees_of_freedom(one.flat())[0] > 0  # without redundancy every position fits
     return BY_PLACES if moving and one.epochs > 1 and spare else BY_SQUARES
 
 
 def _height_of(one: Problem) -> int | None:
-    """Return the source of the height of the target, see `EngineModel.height`."""
+    """Return the source of the height of the target, see `EngineModel.height`; None if the height is not known."""
     held = [band for band in one.constraints if is_exact(band)]
     for i, band in enumerate(held):
         if isinstance(band, Band) and band.kind == "height":
@@ -137,16 +144,16 @@ def _height_of(one: Problem) -> int | None:
     return None
 
 
-def _probe(problem: Problem) -> Problem:
-    """Return one problem for each row, whose measurement is one and all others zero."""
-    # A linear map is known by its images of the unit vectors.
+def _unit_measurements(problem: Problem) -> Problem:
+    """Return one problem for each row, whose measurement is one in this row and zero in all others."""
+    # The images of the unit vectors define a linear map.
     parts = np.split(np.eye(problem.count), problem.starts[1:], axis=1)
     rows = tuple(replace(r, z=part, correction=np.zeros(r.count)) for r, part in zip(problem.rows, parts, strict=True))
     return replace(problem, rows=rows, stations=replace(problem.stations, velocity=None, axes=None))
 
 
 def _nodes(one: Problem, found: Ranges | None) -> Array:
-    """Return epoch and station (2, s) of the places that take part: first those whose ranges are known."""
+    """Return epoch and number (2, s) of the stations that have rows, first those whose ranges are known."""
     moving = one.stations.position.shape[-3] > 1
     known = _known(found)
     first = [] if found is None else list(zip(found.epoch[known].tolist(), found.station[known].tolist(), strict=True))
@@ -160,17 +167,17 @@ def _nodes(one: Problem, found: Ranges | None) -> Array:
 
 
 def _known(found: Ranges | None) -> Array:
-    """Return the stations with ranges."""
+    """Return the numbers of the stations whose ranges are known."""
     return np.zeros(0, dtype=np.int64) if found is None else np.flatnonzero(found.inside[0])
 
 
 def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission) -> EngineModel | None:
-    """Return the maps from measurements of one problem to a start by squares; None where noise is singular."""
+    """Return the maps from measurements of one problem to a start by squares; None if the noise is singular."""
     count, s, flat, known = one.count, node.shape[1], one.flat(), _known(found)
     white = np.eye(s)
     if found is not None:
         white[: len(known), : len(known)] = whitening(found.covariance[0, known[:, None], known])
-    # The compiled core takes triangular matrices only: a covariance that is singular has none.
+    # The compiled core needs triangular whitening matrices, which a singular covariance does not have.
     if np.triu(white, 1).any():
         return None
     added, gain = np.zeros(count), np.zeros(count)
@@ -185,14 +192,14 @@ def _model(one: Problem, found: Ranges | None, node: Array, admission: Admission
         linear[: len(known)] = found.offset[:, known].T
         station[SIGN, : len(known)], station[RANGED, : len(known)] = found.sign[0, known], 1.0
         reference = int(np.searchsorted(known, found.reference[0])) if found.free.all() else -1
-    station[HEARD], station[SEEN] = _hearing(one, node)
+    station[HEARD], station[SEEN] = _observed_stations(one, node)
     row = np.stack([one.correction + added, precision, 1.0 / (1.0 + gain)])
     anchor, ahead = _anchors(one)[0], directions(one.dimension)
     return EngineModel(row, anchor, linear, station, reference, white, admission, BY_SQUARES, -1, ahead, np.inf)
 
 
-def _hearing(one: Problem, node: Array) -> tuple[Array, Array]:
-    """Return 1.0 for the places (s,) that a row is of, and for those that an angle is of."""
+def _observed_stations(one: Problem, node: Array) -> tuple[Array, Array]:
+    """Return two arrays (s,): 1.0 for stations that have a row, and 1.0 for stations that have an angle."""
     moving = one.stations.position.shape[-3] > 1
     heard, seen = np.zeros(node.shape[1]), np.zeros(node.shape[1])
     for rows in one.rows:
@@ -206,7 +213,7 @@ def _hearing(one: Problem, node: Array) -> tuple[Array, Array]:
 
 
 def _anchors(one: Problem) -> tuple[Array, Array]:
-    """Return the row from which the emission time of each row (m,) and of each epoch (k,) is counted, or -1."""
+    """Return the row that the emission time of each row (m,) and of each epoch (k,) is relative to, or -1."""
     anchor, start = np.full(one.count, -1), np.full(one.epochs if one.layout.n_local else 0, -1)
     for rows, first in zip(one.rows, one.starts, strict=True):
         if MODELS[rows.kind].emission:
@@ -218,17 +225,17 @@ def _anchors(one: Problem) -> tuple[Array, Array]:
 
 
 def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
-    """Return the maps to whitened rows, emission times and loops; and the rows over the ranges to stations (s,)."""
+    """Return the maps to whitened rows, emission times and loops; and the rows over the ranges to `station` (s,)."""
     design, emitted = _design(one, station)
     alone = whiten_rows(whiten(one.noise, one.weight), np.eye(one.count))
     times = alone @ emitted
-    # Emission times projected out: what is left of the rows depends on ranges alone.
+    # After the projection that removes emission times, the rows depend on ranges only.
     bare = project_out(times, alone)
     basis, upper = np.linalg.qr(bare @ design, mode="complete")
     inside = min(upper.shape)
     turned = basis.T @ bare
     loops = turned[inside:]
-    # Combinations of rows that no range moves: their cost is the misfit of loops.
+    # Combinations of rows that no range changes: their cost is the misfit of loops.
     loops = loops[np.abs(loops).max(-1, initial=0.0) > _NOTHING * np.abs(alone).max()]
     emission = np.linalg.pinv(times) @ alone
     share = upper[:inside]
@@ -246,7 +253,7 @@ def _range_rows(one: Problem, station: Array) -> tuple[Array, RangeRows]:
 
 
 def _design(one: Problem, station: Array) -> tuple[Array, Array]:
-    """Return the rows over ranges (m, s) and emission times (m, k)."""
+    """Return the coefficients of the ranges (m, s) and of the emission times (m, k) in the rows."""
     design, emitted = np.zeros((one.count, len(station))), np.zeros((one.count, len(_anchors(one)[1])))
     place = {int(s): i for i, s in enumerate(station)}
     for rows, first in zip(one.rows, one.starts, strict=True):
@@ -261,7 +268,7 @@ def _design(one: Problem, station: Array) -> tuple[Array, Array]:
 
 
 def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, problem: Problem) -> TapeRows | None:
-    """Return the rows of problems as tapes, or None where they have none."""
+    """Return the rows of problems as tapes, or None if a row has no tape."""
     bare = problem.with_rows(z=np.zeros(problem.count))
     found = pack(bare, whiten(with_station_noise(bare).noise, bare.weight))
     scaled = any(form_of(bias).enters == "scales" for bias in problem.biases)
@@ -269,9 +276,10 @@ def _tape_rows(correction: Array, base: Array, lifts: Lifts, bounded: bool, prob
 
 
 def _is_bounded(one: Problem) -> bool:
-    """Return whether some row, or a prior, costs without bound wherever a target goes far away.
+    """Return whether a row or a prior makes the cost grow without bound when the target moves far away.
 
-    Ranges that add up do, but for a scale or an offset without a prior; so do heights, and a prior on the position.
+    Ranges that add up do so, unless a scale or an offset without a prior absorbs them. Heights and a prior on the
+    position do so too.
     """
     free = {bias.name for bias in one.biases if bias.sigma is None or form_of(bias).enters == "scales"}
     touched = np.zeros(one.count, dtype=bool)

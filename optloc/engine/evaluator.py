@@ -1,8 +1,11 @@
-"""The interface between the steps of the engine and the rows of a problem; `evaluated_by` fills it in.
+"""The interface between the steps of the engine and the rows of a problem.
 
-There are two: `optloc.engine.ranges` for rows that are sums of ranges and nothing else unknown, `optloc.engine.tapes`
-for rows of every kind. Each has kernels of these names. Machine code is made for each form, so that nothing is chosen
-while it runs.
+Each function of this module is a placeholder for a kernel of the same name in a module of rows, an *evaluator*:
+`optloc.engine.ranges` for rows that are sums of ranges without other unknowns, `optloc.engine.tapes` for rows of every
+kind. `evaluated_by` replaces the placeholders and compiles a kernel for one evaluator, so that the choice costs no
+time while the machine code runs.
+
+Names in capitals, such as X or SOLVABLE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -20,7 +23,10 @@ _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
 @compiled
 def count_unknowns(rows: Any, d: int, size: int) -> int:
-    """Return the number of unknowns that are refined together, for d coordinates and parameter vectors of a size."""
+    """Return the number of unknowns that are refined together.
+
+    `d` is the number of coordinates, `size` the length of a parameter vector.
+    """
     raise NotImplementedError
 
 
@@ -32,55 +38,62 @@ def count_lifted(rows: Any) -> int:
 
 @compiled
 def keep(model: EngineModel, rows: Any, stations: int, d: int, size: int) -> Any:
-    """Return the rows with the memory that an evaluator keeps for a block: what the kernels below take."""
+    """Return the rows together with the memory that the evaluator needs for a block of problems."""
     raise NotImplementedError
 
 
 @compiled
 def load(rows: Any, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Take measurements (N, m) of a block, whose stations are new ones or not."""
+    """Load the measurements z (N, m) of a block; `anew` is True if the positions of its stations have changed."""
     raise NotImplementedError
 
 
 @compiled
 def minimise_start(model: EngineModel, rows: Any, room: EngineWorkspace, first: bool) -> None:
-    """Write the minimiser of the weighed squared-range rows to `room.y`, and to SOLVABLE whether it is one."""
+    """Write the minimiser of the weighted squared-range rows to `room.y`, and to SOLVABLE whether it is unique."""
     raise NotImplementedError
 
 
 @compiled
 def scout(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
-    """Write starts that squared ranges do not give to row X, and second ones to row OTHER, see `EngineModel.start`."""
+    """Write starts that do not come from squared ranges to row X, and second starts to row OTHER.
+
+    See `EngineModel.start`.
+    """
     raise NotImplementedError
 
 
 @compiled
 def complete(rows: Any, room: EngineWorkspace) -> None:
-    """Write the start of the other unknowns, after the position, to row X."""
+    """Write starts of the unknowns other than the position to row X."""
     raise NotImplementedError
 
 
 @compiled
 def equations(rows: Any, room: EngineWorkspace, shift: int) -> None:
-    """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
+    """Write information (lower half), right side and cost at row X, or at TRIAL if `shift` is 1."""
     raise NotImplementedError
 
 
 @compiled
 def costs(rows: Any, room: EngineWorkspace) -> None:
-    """Write to COST_TRIAL the cost at TRIAL, the least over the other unknowns."""
+    """Write the cost at the position TRIAL, minimised over the other unknowns, to COST_TRIAL."""
     raise NotImplementedError
 
 
 @compiled
 def bow_of(rows: Any, room: EngineWorkspace) -> float:
-    """Return the curvature b of the rows: over a step D at range r all residuals change by up to b D^2 / r more."""
+    """Return a bound b of the curvature of the rows, 1/metres.
+
+    After a step of length D at range r, all residuals together differ from their linear prediction by at most
+    ``b D^2 / r``.
+    """
     raise NotImplementedError
 
 
 @compiled
 def note_nearest(rows: Any, room: EngineWorkspace, least: Array) -> None:
-    """Write the range to the nearest station (W,) where the equations were written last."""
+    """Write the range (W,) to the nearest station, metres, at the position of the last `equations`."""
     raise NotImplementedError
 
 
@@ -92,19 +105,22 @@ def bend(rows: Any, room: EngineWorkspace) -> None:
 
 @compiled
 def measure_infinity(rows: Any, room: EngineWorkspace) -> None:
-    """Write to BEYOND what infinity costs, see `optloc.engine.memory.Answer.infinity`."""
+    """Write the least cost at infinity to BEYOND, see `optloc.engine.memory.Answer.infinity`."""
     raise NotImplementedError
 
 
 @compiled
 def search_infinity(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
-    """Write the same by whatever means; row X and its information stay as they are."""
+    """Write the least cost at infinity to BEYOND, if necessary by a search; row X and its information do not change."""
     raise NotImplementedError
 
 
 @compiled
 def finish(rows: Any, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Write the unknowns that are not refined of the first lanes, or of those that are marked, to x (N, size)."""
+    """Write the unknowns that are not refined to x (N, size), for the first `size` lanes.
+
+    If `marked` is True, only the lanes with a nonzero `mark` are written.
+    """
     raise NotImplementedError
 
 
@@ -128,18 +144,18 @@ _INTERFACE = (
 
 
 def evaluated_by(kernel: _Kernel, rows: ModuleType, mark: str, **constants: Any) -> _Kernel:
-    """Return a kernel whose rows are evaluated by the kernels of a module, with other values of some constants.
+    """Return a kernel that evaluates rows with the kernels of a module, and with other values of some constants.
 
     Parameters
     ----------
     kernel : callable
-        Calls kernels of this module, at whatever depth.
+        Kernel that calls kernels of this module, directly or through other kernels.
     rows : module
-        Has one of each name.
+        Evaluator: it defines a kernel of each name in `_INTERFACE`.
     mark : str
-        Distinguishes the names of machine code.
+        Suffix that distinguishes the names of the machine code.
     constants : object
-        As of `optloc.kernels.jit.specialise`.
+        Constants to replace, as for `optloc.kernels.jit.specialise`.
     """
     own = {kernel: getattr(rows, kernel.__name__) for kernel in _INTERFACE}
     return specialise(kernel, mark, own, **constants)

@@ -1,8 +1,11 @@
-"""Fixes in one compiled call: start, refinement, covariance, shape of the cost and rivals.
+"""Fixes of N problems in one compiled call: start, refinement, covariance, shape of the cost and rival minima.
 
-Problems go through in blocks of lanes. Some things few problems need: more steps, a mirror image that leads on, another
-look at the shape. Those that do are collected and go through again in full blocks, so that no block waits for one of
-its lanes.
+The problems are computed in blocks of LANES problems, one problem in each lane. Only a few problems need more work:
+more steps, a mirror image whose refinement goes on, or a second measurement of the shape. These problems are collected
+and computed later in full blocks, so that no block waits for one of its lanes.
+
+A *rival* is another minimum whose cost is at most `LISTED` above the cost of the fix. Names in capitals, such as X or
+GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -77,18 +80,20 @@ from optloc.kernels.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES, factor_plain, solve_plain
 
-# Steps after which the problems of a block that still move wait for each other: fixes near their stations take two to
-# five.
+# Steps of the first pass. Problems that need more steps are collected into full blocks. Fixes near their stations
+# take two to five steps.
 _FEW = 6
-# A tenfold margin to the share below which a direction counts as open (1e-12): between them the long way decides.
+# Tenfold margin above the share (1e-12) at which a direction counts as undetermined. Problems between the two shares
+# are left to the general solver.
 _WEAK = 1e-11
-# A fourfold margin to the spreads of the stations from which on a fix is doubted.
+# Distance in spreads of the stations above which a fix is left to the general solver: a fourfold margin to its limit.
 _FAR = 2.5e3
-# Share of costs that rounding, and the tolerance of a refinement, leave (`optloc.solvers.policy.equal_cost`).
+# Relative difference of costs that rounding and the tolerance of a refinement explain
+# (`optloc.solvers.policy.equal_cost`).
 _TIED = 1e-6
-# Difference of logarithms of distances that is rounding, as of `optloc.solvers.verdict.minima.likelihood_of`.
+# Difference of logarithms of distances that counts as rounding, as in `optloc.solvers.verdict.minima.likelihood_of`.
 _SAME_DISTANCE = 1e-6
-# Fewest lanes for which a block goes on: collecting problems again costs a start and half a step.
+# Fewest active lanes for which a block continues: to collect the problems again costs a start and half a step.
 _WORTH = LANES // 2
 
 
@@ -96,25 +101,25 @@ _WORTH = LANES // 2
 def fixes(
     model: EngineModel, rows: Any, z: Array, station: Array, tolerance: float, most: int, given: bool, answer: Answer
 ) -> int:
-    """Fix N positions, each from measurements alone, and return the greatest number of steps.
+    """Fix N positions, each from the measurements of one problem, and return the greatest number of steps.
 
     Parameters
     ----------
     model : EngineModel
-        How measurements become a start.
+        Maps from measurements to a start.
     rows : named tuple
-        Of the evaluator.
+        Rows of the evaluator (`RangeRows` or `TapeRows`).
     z : array (N, m)
         Measurements, metres.
     station : array (N or 1, s, d)
-        Stations, metres: those that take part, all of which have rows. Their mean is the centre of the chart.
+        Positions of the stations that have rows, metres. Their mean is the centre of the coordinates in inverse range.
     tolerance, most : float, int
-        Tolerance and limit of `optloc.engine.refinement.refine`.
+        Tolerance and greatest number of steps of `optloc.engine.refinement.refine`.
     given : bool
-        Whether the answer has starts that were found elsewhere, mostly because another position fits the squared ranges
-        as well. Every mirror image of them is refined.
+        Whether the answer contains starts from elsewhere, mostly because another position fits the squared ranges as
+        well. Then the mirror image of every fix is refined to its end.
     answer : Answer
-        Written.
+        Written: fixes, rivals and their numbers.
     """
     count = len(z)
     s, d, size = station.shape[1], station.shape[2], answer.x.shape[1]
@@ -130,7 +135,7 @@ def fixes(
             _resume(model, answer.x, room)
         else:
             begin(model, block, room)
-        # what is no full block has nothing to wait for
+        # a block that is not full has no other block to wait for
         limit = min(_FEW, most) if size == LANES else most
         steps = max(steps, _refine(model, block, z, room, size, tolerance, limit, answer))
         for lane in range(size):
@@ -159,7 +164,10 @@ def fixes(
 
 @compiled
 def _take(item: Array, order: Array | None, first: int, count: int) -> int:
-    """Write the problems of a block, in an order or as they come; return how many there are: the last fills it up."""
+    """Write the problem number of each lane to `item`, and return the number of problems in the block.
+
+    The problems are those from `first` on, in the given order or as stored. The last problem fills up the block.
+    """
     size = min(LANES, count - first)
     for lane in range(LANES):
         at = first + min(lane, size - 1)
@@ -169,7 +177,7 @@ def _take(item: Array, order: Array | None, first: int, count: int) -> int:
 
 @compiled
 def _see(model: EngineModel, rows: Any, z: Array, station: Array, room: EngineWorkspace, begins: bool) -> None:
-    """Take measurements and stations of a block; stations that all problems share are taken when a call begins."""
+    """Load measurements, bounds and stations of a block; shared stations are loaded only at the begin of a call."""
     scalar, vector, anew = room.scalar, room.vector, len(station) > 1 or begins
     level = model.admission.level
     for k in range(level.shape[1]):
@@ -205,7 +213,7 @@ def _refine(
     limit: int,
     answer: Answer,
 ) -> int:
-    """Refine the unknowns of a block and write them; return the greatest number of steps."""
+    """Refine the unknowns of a block, write them to the answer, and return the greatest number of steps."""
     refine(model, rows, room, tolerance, limit)
     _write_fixes(model, rows, z, room, size, answer)
     steps = 0
@@ -216,7 +224,7 @@ def _refine(
 
 @compiled
 def _write_fixes(model: EngineModel, rows: Any, z: Array, room: EngineWorkspace, size: int, answer: Answer) -> None:
-    """Write unknowns, covariances and costs of the first lanes, and to FIX_GOOD which are settled."""
+    """Write unknowns, covariances and costs of the first `size` lanes, and to FIX_GOOD whether each fix is settled."""
     scalar = room.scalar
     _invert(room)
     project_covariance(model, room)
@@ -245,7 +253,10 @@ def _write_fixes(model: EngineModel, rows: Any, z: Array, room: EngineWorkspace,
 
 @compiled
 def _place(vector: Array, item: Array, x: Array, mark: Array, marked: bool, size: int) -> None:
-    """Write the unknowns that are refined of the first lanes to their problems, or of those that are marked."""
+    """Write the refined positions of the first `size` lanes to x (N, size), metres.
+
+    If `marked` is True, only the lanes with a nonzero `mark` are written.
+    """
     d = vector.shape[1]
     for lane in range(size):
         if marked and mark[lane] == 0.0:
@@ -270,9 +281,10 @@ def _examine(
     images: int,
     course: Array,
 ) -> int:
-    """Measure shape and infinity of the settled fixes of a block, and refine their mirror images.
+    """Measure shape and cost at infinity of the settled fixes of a block, and refine their mirror images.
 
-    Fixes whose shape needs a closer look are marked, mirror images on their way wait; returns how many wait by now.
+    Fixes whose shape needs a second measurement are marked in `look`. Mirror images that need more steps are added to
+    `hidden`. Returns the number of mirror images in `hidden`.
     """
     scalar = room.scalar
     settled = scalar[FIX_GOOD]
@@ -287,7 +299,7 @@ def _examine(
         look[i] = good and (kappa[lane] > STRAIGHT or even[lane] != 0.0)
         closer += 1 if look[i] else 0
         turned = turned or even[lane] != 0.0
-    if room.side.shape[1]:  # bounds limit, or bar, the way there
+    if room.side.shape[1]:  # bounds may exclude the positions far away
         for lane in range(LANES):
             scalar[BEYOND, lane] = np.nan
     else:
@@ -313,7 +325,11 @@ def _examine(
 def _measure_closely(
     model: EngineModel, rows: Any, room: EngineWorkspace, size: int, answer: Answer, look: Array, turned: bool
 ) -> None:
-    """Measure the shape in metres along turned axes as well, if asked, and in inverse range where it is poor there."""
+    """Measure the shape again for the fixes of a block.
+
+    If `turned` is True, the shape in metres is measured also along turned axes. Where kappa in metres is above
+    STRAIGHT, kappa in inverse range is measured as well.
+    """
     kappa, item, number, far = room.vector[ROW, 0], room.item, answer.number, 0
     if turned:
         measure_shape(model, rows, room, False, True, kappa)
@@ -323,7 +339,7 @@ def _measure_closely(
             look[i] = False
             number[i, KAPPA] = kappa[lane] if turned else number[i, KAPPA]
             far += 1 if number[i, KAPPA] > STRAIGHT else 0
-    if far and model.admission.exact:  # the chart knows of no surface
+    if far and model.admission.exact:  # coordinates in inverse range cannot follow a surface
         for lane in range(size):
             if number[item[lane], SETTLED] != 0.0:
                 number[item[lane], KAPPA_FAR] = np.inf
@@ -339,7 +355,7 @@ def _measure_closely(
 
 @compiled
 def _look_beyond(model: EngineModel, rows: Any, room: EngineWorkspace, size: int, answer: Answer) -> None:
-    """Search infinity for the fixes that are bent."""
+    """Write the least cost at infinity of the fixes whose kappa exceeds STRAIGHT."""
     number = answer.number
     search_infinity(model, rows, room)
     for lane in range(size):
@@ -363,7 +379,7 @@ def _pursue(
     images: int,
     course: Array,
 ) -> None:
-    """Refine the mirror images that are on their way, again and again in full blocks, until none is."""
+    """Refine the mirror images that need more steps in full blocks, until all refinements have ended."""
     scalar, item = room.scalar, room.item
     while images:
         waiting = images
@@ -382,7 +398,7 @@ def _pursue(
                 scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
                 scalar[STEPS, lane] = course[2, i]
             refine_images(model, rows, room, tolerance, _WORTH if size == LANES else 1, given)
-            # waiting problems are written before the blocks that follow
+            # Problems of this block are read before `hidden` is overwritten for the blocks that follow.
             images = _end_images(model, rows, z, room, size, answer, look, hidden, images, course)
 
 
@@ -399,7 +415,7 @@ def _end_images(
     images: int,
     course: Array,
 ) -> int:
-    """Write the rivals that mirror images arrived at, put those on their way to wait, and return how many do."""
+    """Write the rivals that mirror images have reached, and return the number of mirror images that need more steps."""
     scalar, item = room.scalar, room.item
     before = images
     for lane in range(size):
@@ -421,13 +437,13 @@ def _end_images(
             i = item[lane]
             rival, cost = scalar[COST, lane], number[i, COST_OF_FIX]
             number[i, COST_OF_RIVAL] = rival
-            # of two that cost the same the likelier by its place, whatever rounding says
+            # If both minima have the same cost, the position decides, so that rounding does not.
             tied = abs(rival - cost) <= _TIED * (1.0 + cost)
             if _is_likelier(room, lane) if tied else rival < cost:
                 _exchange(answer, i)
                 look[i] = True
                 if number[i, COST_OF_RIVAL] == np.inf:
-                    # much cheaper: the start was in a wrong place, and its mirror image may lead on
+                    # the old fix is dropped, so the start was wrong; the mirror image of the new fix may be a rival
                     _reflect_lane(room.vector, lane, answer.rival[i])
                     course[0, i], course[1, i], course[2, i] = FIRST_DAMPING, FIRST_GROWTH, 0.0
                     hidden[images] = i
@@ -437,9 +453,10 @@ def _end_images(
 
 @compiled
 def _is_likelier(room: EngineWorkspace, lane: int) -> bool:
-    """Return whether row X is the likelier of two minima of one cost: nearer to the stations than FIX, or upper.
+    """Return whether, of two minima of equal cost, row X is likelier than row FIX.
 
-    Distances that differ in the seventh digit of their logarithm differ by rounding.
+    The minimum nearer to the centre of the stations is likelier. If the logarithms of both distances differ by rounding
+    only, the minimum with the greater last coordinate is likelier.
     """
     vector, last = room.vector, room.d - 1
     near, far = 0.0, 0.0
@@ -454,7 +471,7 @@ def _is_likelier(room: EngineWorkspace, lane: int) -> bool:
 
 @compiled
 def _reflect_lane(vector: Array, lane: int, out: Array) -> None:
-    """Write the mirror image of the position of a lane."""
+    """Write the mirror image of the position of a lane in the plane of the stations to `out` (d,), metres."""
     height = 0.0
     for j in range(vector.shape[1]):
         height += (vector[X, j, lane] - vector[CENTRE, j, lane]) * vector[NORMAL, j, lane]
@@ -465,7 +482,10 @@ def _reflect_lane(vector: Array, lane: int, out: Array) -> None:
 
 @compiled
 def _exchange(answer: Answer, i: int) -> None:
-    """Make the rival the fix, and the fix the rival where it still counts as one."""
+    """Exchange fix and rival of problem i.
+
+    If the cost of the old fix is more than `LISTED` above the cost of the new one, it is no rival.
+    """
     x, rival, number = answer.x, answer.rival, answer.number
     for j in range(x.shape[1]):
         x[i, j], rival[i, j] = rival[i, j], x[i, j]
@@ -477,7 +497,7 @@ def _exchange(answer: Answer, i: int) -> None:
 def _look_again(
     model: EngineModel, rows: Any, z: Array, room: EngineWorkspace, size: int, answer: Answer, look: Array
 ) -> None:
-    """Write covariance and shape of fixes in row X again."""
+    """Write covariance and shape again for the fixes in row X."""
     evaluate(model, rows, room, 0)
     for lane in range(LANES):
         room.scalar[ALIVE, lane] = 0.0
@@ -487,7 +507,7 @@ def _look_again(
 
 @compiled
 def _resume(model: EngineModel, x: Array, room: EngineWorkspace) -> None:
-    """Go on from the positions reached so far."""
+    """Set row X to the positions x (N, d), metres, reached so far, projected onto the exact surfaces."""
     item, vector = room.item, room.vector
     for j in range(vector.shape[1]):
         for lane in range(LANES):
@@ -499,7 +519,10 @@ def _resume(model: EngineModel, x: Array, room: EngineWorkspace) -> None:
 
 @compiled
 def _invert(room: EngineWorkspace) -> None:
-    """Write the lower half of the covariance over H_TRIAL, and whether it is regular and the fix near to SOLVABLE."""
+    """Write the lower half of the covariance to H_TRIAL.
+
+    SOLVABLE becomes 1.0 if the information matrix is regular and the fix is not far away, else 0.0.
+    """
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     p = vector.shape[1]
     diagonal, inverse, move, fine, away = (
@@ -519,7 +542,7 @@ def _invert(room: EngineWorkspace) -> None:
         for lane in range(LANES):
             diagonal[i, lane] = matrix[H, i, i, lane]
     for lane in range(LANES):
-        # Far away the cost hardly depends on the distance: verdicts there need the stages of the long way.
+        # Far away the cost hardly depends on the distance: these fixes are left to the general solver.
         fine[lane] = 1.0 if away[lane] <= _FAR * _FAR else 0.0
     factor_plain(matrix[H], diagonal, matrix[LOWER], inverse)
     for j in range(p):
@@ -536,8 +559,8 @@ def _invert(room: EngineWorkspace) -> None:
 
 fix_ranges = evaluated_by(fixes, ranges, "ranges")
 fix_tapes = evaluated_by(fixes, tapes, "tapes")
-# A block works out all of its lanes, empty or not: one problem takes twice as long in 64 lanes as in one.
-# A block of one lane waits for no other, so it takes all steps at once: a thousand is more than any refinement may.
+# A block computes all of its lanes, used or not: one problem takes twice as long in 64 lanes as in one lane.
+# A block of one lane takes all steps in the first pass: 1000 steps are more than any refinement may take.
 _ONE: dict[str, int] = {"LANES": 1, "_WORTH": 1, "_FEW": 1000}
 fix_one_by_ranges = evaluated_by(fixes, ranges, "one_by_ranges", **_ONE)
 fix_one_by_tapes = evaluated_by(fixes, tapes, "one_by_tapes", **_ONE)

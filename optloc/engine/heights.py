@@ -1,6 +1,6 @@
-"""Where ranges known up to one unknown meet the ellipsoid of a known height: a quartic, for one lane after the other.
+"""The points where ranges known up to one unknown meet the ellipsoid of a known height: a quartic, one lane at a time.
 
-`formulations.range_height` has the mathematics.
+`formulations.range_height` explains the mathematics.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from optloc.kernels.polynomial import real_roots
 from optloc.kernels.systems import LANES
 from optloc.models.primitives import WGS84_A, WGS84_F
 
-# Vectors of scratch for one lane: the names of the rows are below.
+# Number of scratch vectors for one lane; the constants below name them.
 VECTORS = 12
-# Sine of the angle at a station below which three stations count as one line, as in `formulations.range_height`.
+# Sine of the angle at a station below which three stations count as collinear, as in `formulations.range_height`.
 _THIN = 1e-7
-# Share by which a root may miss the two conics: double roots are good to half of the digits.
+# Relative error with which a root may miss the two conics: double roots have only half of the digits.
 _NEARLY = 1e-3
-# Miss that is rounding: the forms are of order one.
+# Absolute error that counts as rounding: the forms are of order one.
 _ROUNDING = 1e-13
-# Squared distance, in Earth radii, below which two candidates are one.
+# Squared distance, in Earth radii, below which two candidates are the same.
 _SAME = 1e-14
 
 _S, _A, _B, _N, _FIRST, _ALONG, _BASE, _EDGE = 0, 3, 4, 5, 6, 7, 8, 9
-_RANGE = _N  # behind the coordinates of two rows: how the ranges to the other stations follow from the first
+_RANGE = _N  # two rows also hold sign and offset of the ranges to the other stations
 
 
 @compiled
 def meet_ellipsoid(model: EngineModel, room: EngineWorkspace, w: Array, spot: Array) -> None:
-    """Write where the ranges to the first three stations meet the ellipsoid of a known height to `spot`.
+    """Write the points where the ranges to the first three stations meet the ellipsoid of a known height to `spot`.
 
     Parameters
     ----------
     model : EngineModel
-        With the source of the height.
+        Contains the source of the height.
     room : EngineWorkspace
-        Of the block.
+        Workspace of the block.
     w : array (VECTORS, DEGREE + 2)
         Scratch.
     spot : array (CANDIDATES, d + 1, W)
-        As of `refine_candidates`.
+        Written: candidates as for `refine_candidates`.
     """
     for lane in range(LANES):
         for k in range(CANDIDATES):
@@ -57,7 +57,7 @@ def meet_ellipsoid(model: EngineModel, room: EngineWorkspace, w: Array, spot: Ar
 
 @compiled
 def _place_stations(model: EngineModel, room: EngineWorkspace, w: Array, lane: int) -> None:
-    """Write the first three stations, Earth-centred in radii, to the first rows of w."""
+    """Write the first three stations, Earth-centred and in Earth radii, to the first rows of `w`."""
     globe, origin = model.admission.globe, room.vector[ORIGIN]
     for s in range(3):
         for i in range(3):
@@ -69,12 +69,13 @@ def _place_stations(model: EngineModel, room: EngineWorkspace, w: Array, lane: i
 
 @compiled
 def _dot(w: Array, a: int, b: int) -> float:
+    # Return the inner product of two rows of `w`.
     return float(w[a, 0] * w[b, 0] + w[a, 1] * w[b, 1] + w[a, 2] * w[b, 2])
 
 
 @compiled
 def _cross(w: Array, a: int, b: int, out: int) -> None:
-    """Write the vector product of two rows to a third."""
+    """Write the vector product of two rows of `w` to a third row."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         w[out, i] = w[a, j] * w[b, k] - w[a, k] * w[b, j]
@@ -82,9 +83,9 @@ def _cross(w: Array, a: int, b: int, out: int) -> None:
 
 @compiled
 def _meet(model: EngineModel, room: EngineWorkspace, w: Array, height: float, lane: int, spot: Array) -> None:
-    """Write the points of one lane.
+    """Write the candidates of one lane to `spot`; `height` is in Earth radii.
 
-    On the plane curve ``base + along t + n mu`` with ``mu^2 = q(t)`` all ranges are right. On the ellipsoid
+    On the plane curve ``base + along t + n mu`` with ``mu^2 = q(t)`` all ranges are satisfied. The ellipsoid requires
     ``E(t) + L(t) mu + alpha mu^2 = 0``. So t is a root of ``(E + alpha q)^2 - L^2 q``.
     """
     turn, gap = model.station[SIGN, 0], room.value[0, lane] / WGS84_A
@@ -95,7 +96,7 @@ def _meet(model: EngineModel, room: EngineWorkspace, w: Array, height: float, la
     size = _dot(w, _N, _N)
     if not size > _THIN * _THIN * _dot(w, _A, _A) * _dot(w, _B, _B):
         return
-    # the reciprocal basis of the stations' plane takes what two differences of squares say
+    # two differences of squared ranges fix two components; the reciprocal basis of the stations' plane applies them
     _cross(w, _B, _N, _FIRST)
     for i in range(3):
         w[_BASE, i], w[_ALONG, i] = 0.0, 0.0
@@ -109,7 +110,7 @@ def _meet(model: EngineModel, room: EngineWorkspace, w: Array, height: float, la
         for i in range(3):
             w[_BASE, i] += fixed * w[_FIRST, i] / size
             w[_ALONG, i] -= sign * off * w[_FIRST, i] / size
-    # the range to the first station is t / scale + shift, so that the curve's vectors are of order one
+    # the range to the first station is t / scale + shift, so that the vectors of the curve are of order one
     long = max(_dot(w, _ALONG, _ALONG), 1.0)
     shift, scale = -_dot(w, _BASE, _ALONG) / long, 1.0 / np.sqrt(long)
     for i in range(3):
@@ -126,7 +127,7 @@ def _meet(model: EngineModel, room: EngineWorkspace, w: Array, height: float, la
 
 @compiled
 def _form(w: Array, a: int, b: int, height: float) -> float:
-    """Return the ellipsoid's bilinear form of two rows."""
+    """Return the bilinear form of the ellipsoid at `height` (Earth radii) for two rows of `w`."""
     wide, high = 1.0 / (1.0 + height), 1.0 / (1.0 - WGS84_F + height)
     return float((w[a, 0] * w[b, 0] + w[a, 1] * w[b, 1]) * wide * wide + w[a, 2] * w[b, 2] * high * high)
 
@@ -135,7 +136,7 @@ def _form(w: Array, a: int, b: int, height: float) -> float:
 def _cut(
     room: EngineWorkspace, model: EngineModel, w: Array, height: float, lane: int, spot: Array, curve: Any
 ) -> None:
-    """Write the points of a curve on the ellipsoid."""
+    """Write the points of a curve on the ellipsoid to `spot`."""
     q0, q1, q2, scale, shift = curve
     alpha = _form(w, _N, _N, height)
     e0, e1 = _form(w, _BASE, _BASE, height) - 1.0 + alpha * q0, 2.0 * _form(w, _BASE, _ALONG, height) + alpha * q1
@@ -147,14 +148,14 @@ def _cut(
     c[2] = e1 * e1 + 2.0 * e0 * e2 - l1 * l1 * q0 - 2.0 * l0 * l1 * q1 - l0 * l0 * q2
     c[3] = 2.0 * e1 * e2 - l1 * l1 * q1 - 2.0 * l0 * l1 * q2
     c[4] = e2 * e2 - l1 * l1 * q2
-    # what is on the Earth is no farther from a station than the station from the centre, and a radius more
+    # the range to a point on the Earth is at most the station's distance from the centre plus one radius and the height
     most = np.sqrt(_dot(w, _S, _S)) + 1.0 + abs(height)
     found, count = real_roots(c, -shift / scale, (most - shift) / scale, w[_EDGE + 1 :], root), 0
     for i in range(found):
         t = root[i]
         middle, slope = e0 + (e1 + e2 * t) * t, l0 + l1 * t
         mu, first = np.sqrt(max(q0 + (q1 + q2 * t) * t, 0.0)), scale * t + shift
-        behind = False  # a range and its negative have one square
+        behind = False  # a range and its negative have the same square
         for s in range(2):
             behind = behind or w[_RANGE + s, 3] * first + w[_RANGE + s, 4] < 0.0
         for side in range(2):
@@ -168,7 +169,7 @@ def _cut(
 def _put(
     room: EngineWorkspace, model: EngineModel, w: Array, t: float, across: float, lane: int, spot: Array, count: int
 ) -> int:
-    """Write a point of the curve as the next candidate unless it is there, and return whether it was written."""
+    """Write a point of the curve as the next candidate unless it exists already; return 1 if it was written, else 0."""
     globe, origin, point = model.admission.globe, room.vector[ORIGIN], w[_FIRST]
     for i in range(3):
         point[i] = w[_BASE, i] + w[_ALONG, i] * t + w[_N, i] * across

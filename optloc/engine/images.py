@@ -1,6 +1,7 @@
-"""The mirror image of a fix in the stations' best plane, refined: where flat networks have their second minimum.
+"""The refined mirror image of a fix in the best plane of the stations: the second minimum of flat networks.
 
-A refinement is given up where it cannot lead to a rival of the fix: see `watch`.
+A refinement ends early if it cannot lead to a rival of the fix, see `watch`. Names in capitals, such as X or GOOD, are
+rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
 """
 
 from __future__ import annotations
@@ -50,23 +51,23 @@ from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES, factor_plain, principal_axes, solve_plain
 
 LISTED = 25.0
-"""Cost above the fix up to which a rival counts (`optloc.solvers.policy.LISTED_GAP`)."""
+"""Greatest cost of a rival above the cost of the fix (`optloc.solvers.policy.LISTED_GAP`)."""
 SAME = 1e-2
-"""Squared distance in standard deviations below which two minima are one (`optloc.solvers.policy.SAME_PLACE`)."""
+"""Squared distance in standard deviations below which two minima are the same (`optloc.solvers.policy.SAME_PLACE`)."""
 
-# Share of the fix's height above the plane: the ball about the image in which a rival is looked for. Among 1 760 rivals
-# in flat networks (heights of 30, 100 and 300 m, range differences and ranges) none was lost with a fifth.
+# Radius of the ball about the image that is searched for a rival, as a share of the fix's height above the plane. With
+# a fifth, none of 1 760 rivals in flat networks was lost (heights of 30, 100 and 300 m, range differences and ranges).
 _BALL = 0.2
-# Damping up to which the least of the linear prediction is one of all directions: along a short, damped step it says
-# too little of rivals farther off, some of which are behind a ridge.
+# Greatest damping at which the minimum of the linear prediction is used. A damped, short step predicts too little about
+# rivals farther away, some of which are behind a ridge.
 _FREE = 1e-5
-# Steps of a mirror image: half of the rivals in flat networks are reached in seven, nine of ten in fifteen, the last
-# in fifty.
+# Greatest number of steps of a mirror image: in flat networks half of the rivals are reached in seven steps, nine of
+# ten in fifteen, the last in fifty.
 _MOST = 60
-# Squared standard deviations about the fix in which a point belongs to it, if its cost has at least this share of the
-# rise that the fix's own curvature says: another minimum would be cheaper.
+# A point belongs to the fix if two conditions hold: its squared distance is below NEAR (squared standard deviations),
+# and its cost has risen by at least the share RISEN of the quadratic rise. Another minimum would be cheaper.
 NEAR, RISEN = 9.0, 0.5
-# Squared length of the undamped step, in standard deviations, below which a refinement has arrived: a hundredth of one.
+# Squared length of the undamped step, in standard deviations, below which a refinement has converged: 0.01 squared.
 _ARRIVED = 1e-4
 # Share of its diagonal that a pivot must keep: below it the curvature is rounding.
 _WEAK = 1e-11
@@ -74,7 +75,7 @@ _WEAK = 1e-11
 
 @compiled
 def find_plane(room: EngineWorkspace) -> None:
-    """Write the direction in which the stations spread least to row NORMAL."""
+    """Write the unit vector in whose direction the stations spread least to row NORMAL."""
     s, d = room.place.shape[:2]
     normal, least, spare = room.vector[NORMAL], room.scalar[LOW], room.scalar[SPARE]
     work, axes = room.axes[EIGEN], room.axes[AXES]
@@ -100,7 +101,7 @@ def find_plane(room: EngineWorkspace) -> None:
 
 @compiled
 def keep_fix(room: EngineWorkspace) -> None:
-    """Keep position and information of the fix, and its height above the stations' plane."""
+    """Store position and information of the fix in FIX and FIX_H, and its height above the stations' plane."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     for lane in range(LANES):
         scalar[HEIGHT, lane] = 0.0
@@ -117,10 +118,13 @@ def keep_fix(room: EngineWorkspace) -> None:
 
 @compiled
 def reflect(model: EngineModel, room: EngineWorkspace) -> None:
-    """Start the refinement of mirror images of kept fixes, or of second starts; what is not good has none."""
+    """Set row X to the mirror image of the stored fix, or to its second start, and reset the refinement.
+
+    Lanes that are not good are not refined.
+    """
     vector, scalar, d = room.vector, room.scalar, room.d
     for i in range(vector.shape[1]):
-        # the other unknowns begin where they are: their share of the normal is zero
+        # the other unknowns keep their values: their entries of the normal are zero
         for lane in range(LANES):
             image = vector[FIX, i, lane] - 2.0 * scalar[HEIGHT, lane] * vector[NORMAL, i, lane]
             vector[X, i, lane] = vector[OTHER, i, lane] if i < d and scalar[SECOND, lane] != 0.0 else image
@@ -134,23 +138,23 @@ def reflect(model: EngineModel, room: EngineWorkspace) -> None:
 def refine_images(
     model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: float, fewest: int, every: bool
 ) -> None:
-    """Refine the unknowns of lanes that are alive, until fewer of them are left than are worth a block.
+    """Refine the unknowns of active lanes, until fewer than `fewest` lanes are active.
 
     Parameters
     ----------
     model : EngineModel
-        With the constraints that hold fixes.
+        Contains the constraints that hold fixes.
     rows : named tuple
-        Of the evaluator.
+        Rows of the evaluator.
     room : EngineWorkspace
-        Unknowns, damping, steps, and what `keep_fix` wrote in. Lanes that arrived somewhere stay good and are no longer
-        alive; those that are given up are not good.
+        In: unknowns, damping, steps, and the results of `keep_fix`. Out: lanes that converged are good and not ALIVE;
+        lanes that were abandoned are not good.
     tolerance : float
-        As of `optloc.engine.refinement.refine`.
+        Tolerance of `optloc.engine.refinement.refine`.
     fewest : int
-        Lanes for which it goes on.
+        Least number of active lanes to continue.
     every : bool
-        As of `watch`.
+        As for `watch`.
     """
     nearest = room.scalar[SHARE]
     evaluate(model, rows, room, 0)
@@ -170,7 +174,7 @@ def refine_images(
 
 @compiled
 def _note_nearest(rows: Any, room: EngineWorkspace, nearest: Array, every: bool) -> None:
-    """Write the range to the nearest station, where the last step was kept."""
+    """Write the range (W,) to the nearest station, metres, for lanes whose last step was kept, or for every lane."""
     kept, least = room.scalar[SPARE], room.scalar[LOW]
     note_nearest(rows, room, least)
     for lane in range(LANES):
@@ -179,23 +183,23 @@ def _note_nearest(rows: Any, room: EngineWorkspace, nearest: Array, every: bool)
 
 @compiled
 def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool) -> float:
-    """Give up refinements that lead to no rival, and return how many lanes are alive.
+    """Abandon refinements that cannot lead to a rival, and return the number of active lanes.
 
-    Two reasons end one. Within a ball of radius D about it no position costs as little as a rival. Over a step of
-    length D all residuals together are off their linear prediction by no more than ``bow D^2 / r``. Or the refinement
-    is back at the fix: within three standard deviations of it, where the cost has risen as the curvature of the fix
-    says.
+    A refinement ends for one of two reasons. First: no position in a ball of radius D about it has a cost as low as a
+    rival's. (After a step of length D, all residuals together differ from their linear prediction by at most
+    ``bow D^2 / r``.) Second: it has returned to the fix. That is, it is within three standard deviations, and the cost
+    has risen as the curvature at the fix predicts.
 
     Parameters
     ----------
     bow : float
-        Of `optloc.engine.evaluator.bow_of`.
+        Result of `optloc.engine.evaluator.bow_of`, 1/metres.
     room : EngineWorkspace
-        Proposed steps, and what `keep_fix` wrote in; ALIVE and GOOD are written.
+        Proposed steps, and the results of `keep_fix`; ALIVE and GOOD are written.
     nearest : array (W,)
         Ranges to the nearest stations, metres.
     every : bool
-        Whether no image is given up for the first reason: rivals of a start that is one of two are farther away.
+        Whether to ignore the first reason: if a fix has two starts, its rivals are farther away.
     """
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, spare, trace = vector.shape[1], scalar[SPARE], scalar[LOW]
@@ -213,7 +217,8 @@ def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool
     alive = 0.0
     for lane in range(LANES):
         ball = _BALL * _BALL * scalar[HEIGHT, lane] * scalar[HEIGHT, lane]
-        # the gain belongs to the damped step: within the ball the damping is worth no more than this
+        # the gain is that of the damped step: within the ball, the damping changes the cost by no more than the last
+        # term
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
         near = spare[lane] < NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > RISEN * spare[lane]
@@ -227,10 +232,10 @@ def stop_hopeless(bow: float, room: EngineWorkspace, nearest: Array, every: bool
 
 @compiled
 def confirm_rivals(model: EngineModel, rows: Any, room: EngineWorkspace) -> float:
-    """Leave good only the lanes that arrived at a rival, and return how many did.
+    """Clear GOOD for lanes that did not reach a rival, and return the number of the others.
 
-    Where a damped refinement ends is no minimum yet: the undamped step must be short there, too, and the curvature of
-    the cost, second derivatives of the ranges included, positive.
+    The end of a damped refinement need not be a minimum. Therefore the undamped step must be short, and the curvature
+    of the cost must be positive, including the second derivatives of the ranges.
     """
     vector, matrix, scalar, spare = room.vector, room.matrix, room.scalar, room.scalar[SPARE]
     d, found = vector.shape[1], 0.0
@@ -260,7 +265,7 @@ def confirm_rivals(model: EngineModel, rows: Any, room: EngineWorkspace) -> floa
 
 @compiled
 def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
-    """Keep the lanes whose undamped step is short."""
+    """Clear GOOD for lanes whose undamped step is not short."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, move, length = vector.shape[1], vector[MOVE], scalar[SPARE]
     _require_positive(vector, matrix, scalar[GOOD], matrix[H])
@@ -280,7 +285,7 @@ def _require_rest(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def _require_positive(vector: Array, matrix: Array, good: Array, curvature: Array) -> None:
-    """Keep the lanes whose curvature is positive definite; its factor is left in LOWER and INVERSE."""
+    """Clear GOOD for lanes whose curvature is not positive definite; write the factor to LOWER and INVERSE."""
     d, diagonal, inverse = vector.shape[1], vector[DIAGONAL], vector[INVERSE]
     for i in range(d):
         for lane in range(LANES):

@@ -1,4 +1,7 @@
-"""The cost of infinity: the least of all directions, on a sphere so wide that wave fronts are flat."""
+"""The cost at infinity: the least cost over all directions, on a sphere so wide that wave fronts are flat.
+
+Names in capitals, such as X or BEYOND, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 
@@ -27,18 +30,18 @@ from optloc.engine.refinement import refine
 from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES
 
-# Distance in the place of infinity, spreads of the stations: wave fronts bend by 5e-8 of the spread there, and rounding
-# of a difference of ranges is 1e-9 of it.
+# Radius of the sphere that represents infinity, in spreads of the stations. Wave fronts there bend by 5e-8 of the
+# spread, and the rounding error of a difference of ranges is 1e-9 of the spread.
 _INFINITE = 1e7
-# Of the refinement of directions: their costs are compared with gaps of several.
+# Tolerance and steps of the refinement of directions: their costs are compared with gaps of several units.
 _TOLERANCE, _STEPS = 1e-2, 12
 
 
 @compiled
 def search_sphere(model: EngineModel, rows: Any, room: EngineWorkspace, spot: Array) -> None:
-    """Write the least cost of infinity to BEYOND; row X and its information stay as they are.
+    """Write the least cost at infinity to BEYOND; row X and its information do not change.
 
-    The direction of the fix is refined, and the cheapest of each sector.
+    The search refines the direction of the fix, and the cheapest direction of each sector.
     """
     scalar, vector, d = room.scalar, room.vector, room.d
     keep_fix(room)

@@ -1,7 +1,8 @@
-"""Rows that are linear in the position and one more coordinate: angles and gain ratios.
+"""Rows of angles and gain ratios that are linear in the position and one more coordinate.
 
 The coordinates are ``y = ((x - origin) / scale, last)``. The last coordinate is the range to a reference station, or
-the squared distance from the origin. Each row is written once, elementwise: for arrays, and as a tape for machine code.
+the squared distance from the origin. The start of a fix solves these rows together with the squared ranges. Each row
+has one elementwise formula, which serves arrays and is recorded as a tape for machine code.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from optloc.problem.problem import Problem
 
 
 class LiftEntry(NamedTuple):
-    """A row ``x . position + last y_last = right``.
+    """One linear row ``x . position + last y_last = right``.
 
     Parameters
     ----------
@@ -34,7 +35,7 @@ class LiftEntry(NamedTuple):
     last, right : number
         Coefficient of the last coordinate, and the right side.
     factor : callable
-        Maps the scaled position to the row's error for one unit of error of the measurement; its sign says nothing.
+        Maps the scaled position to the error of the row per unit of measurement error. The sign has no meaning.
     """
 
     x: Components
@@ -44,16 +45,17 @@ class LiftEntry(NamedTuple):
 
 
 class KnownLift(NamedTuple):
-    """A range ``offset + sign t`` that takes the place of one in a row; t is the last coordinate."""
+    """A known range ``offset + sign t`` that replaces an unknown range in a row; t is the last coordinate."""
 
     offset: Any
     sign: Any
 
 
 def pair_elevation(m: Any, azimuth: Any, a: Point) -> LiftEntry:
-    """Return [sin E cos A, sin E sin A, -cos E] . (x - s) = 0 in the station's axes; its error is range times n_E.
+    """Return the linear row of an elevation E with its azimuth A: ``[sin E cos A, sin E sin A, -cos E] . (x - s) = 0``.
 
-    The normal of the cone of elevation E in the measured azimuth A is at right angles to the line of sight.
+    The vector in brackets is in the axes of the station. It is the normal of the cone of elevation E at the measured
+    azimuth A, and is perpendicular to the line of sight. The error of the row is the range times the error of E.
     """
     xp = namespace(m)
     own = (xp.sin(m) * xp.cos(azimuth), xp.sin(m) * xp.sin(azimuth), -1.0 * xp.cos(m))
@@ -63,18 +65,18 @@ def pair_elevation(m: Any, azimuth: Any, a: Point) -> LiftEntry:
 
 
 def enter(model: Model, m: Any, a: Point, b: Point, known: tuple[KnownLift, KnownLift] | None) -> LiftEntry | None:
-    """Return the row of a measured value, or None where it is not linear.
+    """Return the linear row of a measured value, or None if the row is not linear.
 
     Parameters
     ----------
     model : Model
-        Its kind.
+        Kind of the row.
     m : number or array
-        Value, SI units or radians.
+        Measured value, SI units or radians.
     a, b : Point
-        Its stations, scaled.
+        Stations of the row, scaled.
     known : tuple of two KnownLift, optional
-        Ranges that take the place of those to a and b; None where ranges are not known, nor up to a common unknown.
+        Ranges that replace the ranges to a and b. None if these ranges are unknown, even up to a common unknown.
     """
     lifted = lifted_row(model, m, a, b)
     if lifted is None:
@@ -91,23 +93,25 @@ def enter(model: Model, m: Any, a: Point, b: Point, known: tuple[KnownLift, Know
         return LiftEntry(x, last, right, lambda t: lifted.factor(t, a, b))
     if lifted.x is not None:
         return None
-    # ra r_a = -rb r_b, so p r_a^2 = q r_b^2: exact, as both sides are positive; p = q is a plane
+    # ra r_a = -rb r_b, so p r_a^2 = q r_b^2. Squaring is exact, because both sides are positive. If p = q, the row is a
+    # plane.
     p, q, root = lifted.ra * lifted.ra, lifted.rb * lifted.rb, lifted.rb
     squared = tuple(-2.0 * (p * u - q * v) for u, v in zip(a.position, b.position, strict=True))
     right = q * dot(b.position, b.position) - p * dot(a.position, a.position)
-    # d(p r_a^2 - q r_b^2) = (sqrt p r_a + sqrt q r_b) d(...), and both terms are equal at the place
+    # d(p r_a^2 - q r_b^2) = (sqrt p r_a + sqrt q r_b) d(...); both terms are equal at the position
     return LiftEntry(squared, p - q, right, lambda t: 2.0 * root * distance(t, b) * lifted.factor(t, a, b))
 
 
 def _vanishes(value: Any) -> bool:
-    """Return whether a coefficient is zero whatever is measured."""
+    """Return whether a coefficient is zero for every measurement."""
     return not isinstance(value, Symbol) and not np.any(value != 0.0)
 
 
 def azimuths_beside(problem: Problem, rows: Rows) -> Array | None:
-    """Return the global number (m,) of the azimuth of the same station, target and epoch as each elevation, or None.
+    """Return the row number (m,) in the problem of the azimuth that belongs to each elevation, or None.
 
-    None if any has no such row.
+    An azimuth belongs to an elevation if station, target and epoch are the same. The result is None if any elevation
+    has no azimuth.
     """
     for other, start in zip(problem.rows, problem.starts, strict=True):
         if other.kind != "azimuth":
@@ -120,10 +124,10 @@ def azimuths_beside(problem: Problem, rows: Rows) -> Array | None:
     return None
 
 
-# The same rows for machine code: a tape for each block of rows, and where each of its inputs comes from.
+# The same rows for machine code: one tape for each block of rows, and the source of each input of the tape.
 
-# Sorts of inputs: a number of the structure, a measurement, a coordinate of a station, a least-squares range, or a
-# coordinate of the place where the error of the row is taken.
+# Sources of an input: a constant of the structure, a measurement, a coordinate of a station, a least-squares range, or
+# a coordinate of the position at which the row is evaluated.
 NUMBER, SEEN, STATION, OFFSET, POINT = range(5)
 
 
@@ -133,17 +137,17 @@ class Lifts(NamedTuple):
     Parameters
     ----------
     flat : bool
-        Whether no row has the last coordinate.
+        Whether the coefficient of the last coordinate is zero in all rows.
     tapes : TapeTable
-        Of each block; outputs are the d + 1 coefficients, the right side and the factor.
+        Tape of each block; its outputs are the d + 1 coefficients, the right side and the factor.
     first : int64 array (b + 1,)
         First row of each block.
     source : int64 array (l, i, 2)
-        Of every input of every row: what it is, and which.
+        For each input of each row: its source (NUMBER to POINT), and the index within this source.
     number : array (m,)
-        Numbers of the structure.
+        Constants of the structure.
     sigma : array (l,)
-        Standard deviation of each row's measurement.
+        Standard deviation of the measurement of each row.
     """
 
     flat: bool
@@ -154,7 +158,7 @@ class Lifts(NamedTuple):
     sigma: Array
 
 
-# Seeds of the inputs of a tape; axes come last, row by row.
+# Seeds of the inputs of a tape. The axes have the last seeds, row by row.
 _M, _AZIMUTH, _KNOWN_A, _SIGN_A, _KNOWN_B, _SIGN_B = range(6)
 _A, _B, _T, _AXES = 10, 20, 30, 40
 
@@ -163,7 +167,7 @@ _TAPES = Cache["Tape | None"](64)
 
 
 def _tape_of(model: Model, d: int, turned: bool, paired: bool, known: bool) -> Tape | None:
-    """Return the tape of a kind's rows: coefficients, right side, factor; None where it has none."""
+    """Return the tape of the rows of a kind (coefficients, right side, factor), or None if they are not linear."""
     recorder = Recorder()
 
     def point(first: int, axes: bool) -> Point:
@@ -183,13 +187,13 @@ def _tape_of(model: Model, d: int, turned: bool, paired: bool, known: bool) -> T
         if entry is None:
             return None
         return tape(recorder, [*entry.x, entry.last, entry.right, entry.factor(point(_T, False))])
-    except (TypeError, AttributeError, ValueError):  # it needs more than the elementary functions
+    except (TypeError, AttributeError, ValueError):  # the formula uses more than the elementary functions
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Rows of one kind: their tape, what each input of each row is, and standard deviations of the measurements."""
+    """The rows of one kind: the tape, the sources of the inputs of each row, and the sigmas of the measurements."""
 
     tape: Tape
     source: list[list[tuple[int, int]]]
@@ -197,8 +201,8 @@ class _Block:
 
 
 @dataclass(slots=True)
-class _Scene:
-    """One problem, its least-squares ranges, the place of each station, and the numbers of the structure so far."""
+class _LiftedProblem:
+    """One problem, its least-squares ranges, the index of each station, and the constants collected so far."""
 
     problem: Problem
     found: Ranges | None
@@ -207,11 +211,11 @@ class _Scene:
     number: list[float]
 
     def block(self, rows: Rows, start: int) -> _Block | None:
-        """Return the block of rows of one kind, or None where they are not linear."""
+        """Return the block of the rows of one kind, or None if the rows are not linear."""
         problem, model = self.problem, MODELS[rows.kind]
         beside = azimuths_beside(problem, rows) if rows.kind == "elevation" else None
         present, whole = rows.weight > 0.0, problem.weight > 0.0
-        # without ranges the paired form is the only linear one; with some, only where every elevation has its azimuth
+        # Without ranges, only the paired form is linear. With ranges, use it only if every elevation has its azimuth.
         if beside is not None and self.found is not None and not (whole[beside] | ~present).all():
             beside = None
         present = present if beside is None else present & whole[beside]
@@ -223,14 +227,14 @@ class _Scene:
         for i in np.flatnonzero(present).tolist():
             own = [self._source(seed, rows, i, start, beside) for seed, _ in made.inputs]
             if not all(which >= 0 for _, which in own):
-                return None  # a range stays unknown
+                return None  # a range is unknown
             out.source.append(own)
-            # a row of weight w counts as one of variance sigma^2 / w
+            # a row of weight w counts as a row of variance sigma^2 / w
             out.sigma.append(float(sigma[start + i] / np.sqrt(rows.weight[i])))
         return out
 
     def _source(self, seed: int, rows: Rows, i: int, start: int, beside: Array | None) -> tuple[int, int]:
-        """Return sort and number of an input of the tape of a row; number -1 where it does not exist."""
+        """Return source and index of an input of the tape of a row; the index is -1 if the input does not exist."""
         if seed in (_M, _AZIMUTH):
             return SEEN, int(start + i if beside is None or seed == _M else beside[i])
         if seed >= _T:
@@ -250,30 +254,32 @@ class _Scene:
         return NUMBER, self._keep(float(self.found.sign[0, known.argmax()]) if self.on_cone else 0.0)
 
     def _axis(self, rows: Rows, i: int, cell: int) -> float:
+        """Return a component of the axes of the station of a row; `cell` numbers the components row by row."""
         axes, d = self.problem.stations.axes, self.problem.dimension
         assert axes is not None
         return float(axes[int(rows.epoch[i]) if len(axes) > 1 else 0, rows.a[i], cell // d, cell % d])
 
     def _keep(self, value: float) -> int:
+        """Append a constant of the structure, and return its index."""
         self.number.append(value)
         return len(self.number) - 1
 
 
 def lift(problem: Problem, found: Ranges | None, node: dict[tuple[int, int], int], on_cone: bool) -> Lifts:
-    """Return the rows of one problem that are linear in these coordinates.
+    """Return the rows of one problem that are linear in the coordinates of this module.
 
     Parameters
     ----------
     problem : Problem
-        One problem of a static target, nothing else unknown; measurements do not matter.
+        One problem of a static target without other unknowns. Its measurements are not used.
     found : Ranges, optional
-        Its least-squares ranges, which replace unknown ranges.
+        Least-squares ranges of the problem, which replace unknown ranges.
     node : dict
-        Place of each (station, epoch) among the stations; the epoch is 0 where stations stay.
+        Index of each (station, epoch) among the stations; the epoch is 0 if stations do not move.
     on_cone : bool
         Whether the last coordinate is a range.
     """
-    scene = _Scene(problem, found, node, on_cone, [])
+    scene = _LiftedProblem(problem, found, node, on_cone, [])
     lifted = [
         scene.block(rows, start)
         for rows, start in zip(problem.rows, problem.starts, strict=True)

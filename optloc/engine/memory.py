@@ -1,4 +1,8 @@
-"""Data that all problems of a plan share, the memory of a block of problems, and answers."""
+"""The data that all problems of a plan share, the workspace of a block of problems, and the arrays of the answers.
+
+A block has W = LANES problems, one in each lane; the last axis of every array of a block is the lane. The integer
+constants name rows of these arrays.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +17,20 @@ from optloc.kernels.systems import LANES
 from optloc.kernels.tape_table import TapeTable
 
 ROUNDING = 4.0 * 2.220446049250313e-16
-"""Share of a measurement that is rounding: four of a double lie between it and its residual."""
+"""Rounding error as a share of a measurement: four roundings of a double occur between a measurement and its
+residual."""
 
-# Rows of `Room.vector`: current and tried values of a refinement, each followed by its trial; FIX and
-# NORMAL are the fix whose mirror image is refined, and the direction in which the stations spread least; OTHER is a
-# second start, where SECOND is 1.
+# Rows of `EngineWorkspace.vector`. X and G (right side) are each followed by their values at a trial step. FIX and
+# NORMAL are the fix whose mirror image is refined, and the direction in which the stations spread least. OTHER is a
+# second start, valid if SECOND is 1.
 X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE, FIX, NORMAL, OTHER = range(13)
-# Rows of `Room.matrix`: information and factor; FIX_H is the information at the fix, MARGIN the information about
-# the position alone, and REST the same at a trial.
+# Rows of `EngineWorkspace.matrix`: information H and its factor LOWER. FIX_H is the information at the fix, MARGIN the
+# information about the position alone, and REST the same at a trial step.
 H, H_TRIAL, LOWER, FIX_H, MARGIN, REST = range(6)
-# Rows of `Room.axes`: BASE spans a chart, AXES are principal axes, EIGEN is the matrix that they make diagonal.
+# Rows of `EngineWorkspace.axes`: BASE spans coordinates in inverse range, AXES are principal axes, EIGEN is the matrix
+# that these axes diagonalise.
 BASE, AXES, EIGEN = range(3)
-# Rows of `Room.scalar`.
+# Rows of `EngineWorkspace.scalar`.
 COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
 FIX_COST, FIX_GOOD, HEIGHT, HIGH, LOW, SHARE, BEYOND, SECOND, RADIUS = range(14, 23)
 
@@ -34,20 +40,20 @@ LOWER_BOUND, UPPER_BOUND, BOUNDED = range(3)
 
 
 class Admission(NamedTuple):
-    """Quantities of a position that are held or bounded, as tapes, and the Earth.
+    """Constraints of a position as tapes, with their bounds, and the frame of the Earth.
 
     Parameters
     ----------
     exact : int
-        Number of held quantities; they come first.
+        Number of exact constraints; they come first.
     tapes : TapeTable
-        Value and derivatives of each; inputs are coordinates.
+        Value and derivatives of each constrained quantity; the inputs are coordinates.
     level : array (N or 1, k, 2)
         Lower and upper bounds.
     earth : bool
-        Whether there is an Earth.
+        Whether the frame is geodetic, so that the Earth can hide a position from a station.
     globe : array (4, 3)
-        Earth-centred positions are ``globe[:3] x + globe[3]`` then.
+        If `earth` is True, the Earth-centred position of x is ``globe[:3] x + globe[3]``, metres.
     """
 
     exact: int
@@ -58,42 +64,47 @@ class Admission(NamedTuple):
 
 
 SIGN, RANGED, HEARD, SEEN = range(4)
-"""Rows of `EngineModel.station`: how the unknown range t enters, zeros where the ranges are determined; 1.0 for the
-stations whose range is known, up to t; 1.0 for those with a row, and for those with an angle."""
+"""Rows of `EngineModel.station`.
+
+SIGN: factor of the unknown range t, 0 if the ranges are determined. RANGED: 1.0 for stations whose range is known up
+to t. HEARD: 1.0 for stations with a row. SEEN: 1.0 for stations with an angle."""
 
 
 BY_SQUARES, BY_HEIGHT, BY_PLACES = range(3)
-"""How a fix starts: squared ranges and linear rows; where ranges meet a known height; the cheapest of many places."""
+"""How a fix starts.
+
+BY_SQUARES: from squared ranges and other linear rows. BY_HEIGHT: from the points where ranges meet a known height.
+BY_PLACES: from the cheapest of many positions."""
 
 
 class EngineModel(NamedTuple):
-    """How measurements z become a start: linear maps to ranges to s stations, and what the rows are corrected by.
+    """The maps from measurements z to a start: linear maps to the ranges of s stations, and corrections of the rows.
 
     Parameters
     ----------
     row : array (3, m)
-        Known amount by which each measurement exceeds the model; one over its variance, 0 where absent; and what it is
-        multiplied with then.
+        For each row: the known amount by which the measurement exceeds the model; one over its variance (0 if absent);
+        and the factor that multiplies the corrected measurement.
     anchor : int64 array (m,)
-        Row whose measurement is subtracted first, -1 for none: emission times count from it.
+        Row whose measurement is subtracted first, because emission times are relative to it; -1 for none.
     linear : array (s + v, m)
-        Maps to the least-squares ranges c, known up to sign * t, and to v more values that an evaluator wants.
+        Maps to the least-squares ranges c, known up to sign * t, and to v more values that an evaluator needs.
     station : array (4, s)
-        See the names of its rows.
+        Rows SIGN, RANGED, HEARD, SEEN.
     reference : int
-        Station whose range is t; -1 where the ranges are determined.
+        Station whose range is t; -1 if the ranges are determined.
     white : array (s, s)
-        Lower triangular whitening matrix of c.
+        Lower triangular whitening matrix of c, 1/metres.
     admission : Admission
-        Which positions are admitted.
+        Constraints of the position.
     start : int
-        One of the ways above.
+        BY_SQUARES, BY_HEIGHT or BY_PLACES.
     height : int
-        Source of the height: the number of a held quantity, or -1 less the number of a row.
+        Source of the height: the number of an exact constraint, or -1 minus the number of a row.
     ahead : array (n, d)
-        Directions that are tried from the mean of the stations.
+        Directions from the mean of the stations in which candidates are placed.
     limit : float
-        Cost above which another place may hold a better minimum.
+        Cost above which the best candidate fits poorly, so that another position may be a better minimum.
     """
 
     row: Array
@@ -110,7 +121,7 @@ class EngineModel(NamedTuple):
 
 
 class EngineResult(NamedTuple):
-    """One line of `Answer.number`; `Answer` has the columns by the same names."""
+    """One row of `Answer.number`; `Answer` has the columns under the same names."""
 
     cost: float
     rival_cost: float
@@ -127,21 +138,22 @@ MULTIPLIER, VALUE, GRADIENT = range(3)
 
 
 class Answer(NamedTuple):
-    """Answers to N problems, in arrays that are written.
+    """Answers to N problems, in arrays that the kernels write.
 
     Parameters
     ----------
     x : array (N, size)
         Parameter vectors, the position first.
     covariance : array (N, n, n)
-        Of the first n unknowns.
+        Covariance of the first n unknowns.
     rival : array (N, size)
-        Another minimum that the mirror image of the fix leads to, and which costs no more than `LISTED` more; NaN.
+        Parameters of the rival: another minimum, reached from the mirror image of the fix, whose cost is at most
+        `LISTED` above the cost of the fix. NaN without a rival.
     number : array (N, 6)
-        See `EngineResult`.
+        Columns of `EngineResult`.
     side : array (N, k, 2 + d)
-        Of each held or bounded quantity its multiplier, where it is held: the gradient of the cost and all gradients
-        times their multipliers add up to nothing; its value, and its gradient.
+        For each constrained quantity: its multiplier (exact constraints only), its value and its gradient. The gradient
+        of the cost plus the sum of multipliers times gradients is zero.
     """
 
     x: Array
@@ -157,77 +169,82 @@ class Answer(NamedTuple):
 
     @property
     def rival_cost(self) -> Array:
-        """Costs (N,) of the rivals; infinite without one."""
+        """Costs (N,) of the rivals; infinite without a rival."""
         return self.number[:, COST_OF_RIVAL]
 
     @property
     def settled(self) -> Array:
-        """Whether a fix (N,) is good.
+        """Whether each fix (N,) is settled.
 
-        A good fix has a finite input, an exact start, a finished refinement, a regular covariance and a place that is
-        not far away. The others need a closer look, and their other numbers mean nothing.
+        A settled fix has finite measurements, an exact start, a converged refinement, a regular covariance, and a
+        position that is not far away. The other fixes need the general solver; their other numbers have no meaning.
         """
         return np.asarray(self.number[:, SETTLED] != 0.0)
 
     @property
     def infinity(self) -> Array:
-        """Least costs (N,) at infinity, exact where less than `BEYOND_DOUBT` above the fix, else a lower bound.
+        """Least costs (N,) at infinity.
 
-        Infinite where the cost grows without bound, NaN where not measured.
+        Exact if less than `BEYOND_DOUBT` above the cost of the fix, else a lower bound. Infinite if the cost grows
+        without bound; NaN if not measured.
         """
         return self.number[:, AT_INFINITY]
 
     @property
     def kappa(self) -> Array:
-        """How far costs are from squares of distances, in metres and in inverse range, (N, 2); NaN: not measured."""
+        """Return the deviation (N, 2) of the costs from a quadratic function, in metres and in inverse range.
+
+        The value is NaN if it was not measured.
+        """
         return self.number[:, KAPPA:]
 
     @property
     def multiplier(self) -> Array:
-        """Multipliers (N, k) of quantities that are held."""
+        """Multipliers (N, k) of the exact constraints."""
         return self.side[..., MULTIPLIER]
 
     @property
     def quantity(self) -> Array:
-        """Values (N, k) of what is held or bounded."""
+        """Values (N, k) of the constrained quantities."""
         return self.side[..., VALUE]
 
     @property
     def normal(self) -> Array:
-        """Gradients (N, k, d) of what is held or bounded."""
+        """Gradients (N, k, d) of the constrained quantities."""
         return self.side[..., GRADIENT:]
 
 
 class EngineWorkspace(NamedTuple):
-    """Memory of a block of W problems of p unknowns, the first d of which are the position, and of s stations.
+    """Workspace of a block of W problems with p unknowns, the first d of which are the position, and with s stations.
 
     Parameters
     ----------
     d : int
-        Coordinates of a position.
+        Number of coordinates of a position.
     item : int64 array (W,)
         Problem of each lane.
     seen : array (m, W)
         Measurements.
     value : array (s + v, W)
-        Their images under `EngineModel.linear`.
+        The maps `EngineModel.linear` applied to the measurements.
     place : array (s, d, W)
-        Stations from the origin, metres.
+        Stations relative to the origin, metres.
     squared, rows : array (s, d + 2, W), (s + l, d + 2, W)
-        Squared-range rows as they are; and weighed, behind them the l linear rows of other kinds.
+        Squared-range rows without weights; and weighted, followed by the l linear rows of other kinds.
     y, second, work : array (d + 1, W), (d + 1, W), (n, W)
-        Squared-range answers, second ones, and scratch of `optloc.kernels.gtrs.minimise`.
+        Squared-range solutions, second solutions, and scratch of `optloc.kernels.gtrs.minimise`.
     vector, matrix, axes, scalar : array (13, p, W), (6, p, p, W), (3, d, d, W), (23, W)
-        See the names of their rows. Positions count from the origin, row ORIGIN. Where RADIUS is not zero, they are
-        held at this distance from CENTRE.
+        The constants of this module name the rows. Positions are relative to the origin, row ORIGIN. If RADIUS is not
+        zero, positions are held at this distance from CENTRE.
     face, push : array (2, k, d, W), (c, p, W)
-        Gradients of quantities at rows X and TRIAL; of those that are held, their products with an inverse.
+        Gradients of the constrained quantities at rows X and TRIAL; for the c exact ones, their products with the
+        inverse of the information.
     small, part, pivot : array (2, c, c, W), (c, W), (2, c, W)
-        Products of these with each other, and scratch.
+        Products of `face` and `push`, and scratch.
     side : array (3, k, W)
-        Lower and upper bounds, and what they bound.
+        Lower and upper bounds, and the constrained quantities.
     registers : array (r, W)
-        Scratch.
+        Registers of the constraint tapes.
     """
 
     d: int
@@ -255,7 +272,7 @@ class EngineWorkspace(NamedTuple):
 
 @compiled
 def make_room(model: EngineModel, stations: int, d: int, unknowns: int, others: int) -> EngineWorkspace:
-    """Return the memory of a block of problems, for numbers of stations, coordinates, unknowns and linear rows."""
+    """Return the workspace of a block, for numbers of stations, coordinates, unknowns and other linear rows."""
     s, p, m = stations, unknowns, model.row.shape[1]
     c, k = model.admission.exact, model.admission.level.shape[1]
     return EngineWorkspace(

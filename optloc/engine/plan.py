@@ -1,7 +1,8 @@
-"""Plans: a problem structure as arrays, made once and kept; measurements and station positions are arguments of a run.
+"""Plans: the structure of a problem as arrays for the compiled engine.
 
-A plan serves one target at rest, for all kinds of rows and of other unknowns. The problems of a batch may differ in
-measurements, and in positions and velocities of stations.
+A plan is made once and cached; measurements and station positions are arguments of a run. A plan serves one target at
+rest, with rows of every kind and with other unknowns. The problems of a batch may differ in measurements, and in
+positions and velocities of stations.
 """
 
 from __future__ import annotations
@@ -35,43 +36,44 @@ from optloc.models import MODELS
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
-# Rows, and epochs with emission times, up to which dense maps pay: their cost grows with the square.
+# Greatest number of rows, and of epochs with emission times, for which dense maps are fast: their cost grows with the
+# square.
 MOST = 64
-# Unknowns up to which systems are solved side by side in lanes.
+# Greatest number of unknowns for which systems are solved in lanes.
 _UNKNOWNS = 40
 
 TOLERANCE, LIMIT = 1e-7, 100
-"""Of the refinement of the method "lsr"."""
+"""Tolerance and greatest number of steps of the refinement of the method "lsr"."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Everything that fixes of one structure need, except measurements and stations.
+    """All data that fixes of one structure need, except measurements and stations.
 
     Parameters
     ----------
     layout : Layout
-        Unknowns; the position is the first.
+        Layout of the unknowns; the position is the first.
     frame : Frame
-        Of the positions.
+        Frame of the positions.
     weight : array (m,)
-        Row weights.
+        Weights of the rows.
     dof : int
         Degrees of freedom.
     node : int array (2, s)
-        Epoch and station of each place that takes part; the epoch is 0 where stations stay.
+        Epoch and station number of each station position that has rows; the epoch is 0 if stations do not move.
     model : EngineModel
-        How measurements become a start.
+        Maps from measurements to a start.
     rows : callable
-        Maps problems without batch axes, or a flat batch, to the rows as an evaluator takes them.
+        Returns the rows for the evaluator, from one problem without batch axes or from a flat batch.
     ranged : bool
-        Whether all rows are sums of ranges, and nothing else is unknown but emission times.
+        Whether all rows are sums of ranges, and emission times are the only other unknowns.
     size, shared : int
-        Numbers of all unknowns, and of those that all epochs share.
+        Number of all unknowns, and of the unknowns that all epochs share.
     widths : tuple of int
-        As of `blank_answer`.
+        Arguments of `blank_answer` after the number of problems.
     held : tuple of str
-        Names of the constraints that hold fixes.
+        Names of the exact constraints.
     """
 
     layout: Layout
@@ -88,36 +90,39 @@ class Plan:
     held: tuple[str, ...]
 
     def load(self, problem: Problem) -> Load:
-        """Return the data of problems of this structure: a problem without batch axes, or a flat batch."""
+        """Return the data of problems of this structure: of one problem without batch axes, or of a flat batch."""
         model, admission = self.model, self.model.admission
         if admission.level.shape[1]:
             model = model._replace(admission=admission._replace(level=levels_of(problem)))
         return Load(model, self.rows(problem), self._places(problem))
 
     def _places(self, problem: Problem) -> Array:
+        """Return the positions (N or 1, s, d) of the stations with rows, metres."""
         position = problem.stations.position
         flat = position.reshape(-1, *position.shape[-3:])
-        # Usually all stations take part, and their positions need no copy.
+        # Usually all stations have rows, and their positions need no copy.
         if flat.shape[1] == 1 and np.array_equal(self.node[1], np.arange(flat.shape[2])):
             return flat[:, 0]
         return flat[:, self.node[0], self.node[1]]
 
     def kernel(self, count: int, *, often: bool = False) -> Callable[..., int]:
-        """Return the machine code for a number of problems: narrow blocks for few, unless only wide blocks are loaded.
+        """Return the machine code for a number of problems: narrow blocks for few problems, else wide blocks.
+
+        Few problems use wide blocks too if only wide blocks are loaded.
 
         Parameters
         ----------
         count : int
-            Problems of one call.
+            Number of problems of one call.
         often : bool
-            Whether such a call comes again and again, and is worth loading what serves it best.
+            Whether such calls are frequent, so that the best machine code is worth loading.
         """
         few, many, most = _BY_RANGES if self.ranged else _BY_TAPES
         narrow = count <= most and (is_in_use(few) or ((often or not is_in_use(many)) and may_use_code(few, count)))
         return few if narrow else many
 
     def at_hand(self, count: int) -> bool:
-        """Return whether a number of problems may be run: machine code exists, or they may wait for it."""
+        """Return whether `count` problems can run: their machine code exists or may be compiled now."""
         return may_use_code(self.kernel(count, often=True), count)
 
     def run(self, load: Load, z: Array, threads: int | None = None, start: Array | None = None) -> tuple[Answer, int]:
@@ -126,13 +131,13 @@ class Plan:
         Parameters
         ----------
         load : Load
-            Of the problems.
+            Data of the problems.
         z : array (N, m)
-            Measurements.
+            Measurements, SI units or radians.
         threads : int, optional
-            Greatest number of threads; `optloc.base.threads.thread_count` by default.
+            Greatest number of threads; default `optloc.base.threads.thread_count`.
         start : array (N, size), optional
-            Where refinements begin; starts are found where none are given.
+            Starts of the refinements; by default the engine finds starts.
         """
         kernel, count = self.kernel(len(z)), len(z)
         answer, given = (
@@ -156,11 +161,11 @@ class Load(NamedTuple):
     Parameters
     ----------
     model : EngineModel
-        With the levels of constraints.
+        Maps to a start, with the levels of constraints.
     rows : named tuple
-        Of the evaluator.
+        Rows of the evaluator.
     place : array (N or 1, s, d)
-        Places that take part, metres.
+        Positions of the stations with rows, metres.
     """
 
     model: EngineModel
@@ -168,7 +173,7 @@ class Load(NamedTuple):
     place: Array
 
     def take(self, part: slice | Array) -> Load:
-        """Return the load of some of the problems."""
+        """Return the data of the selected problems."""
         model, rows, place = self
         level = model.admission.level
         if len(level) > 1:
@@ -181,17 +186,18 @@ class Load(NamedTuple):
         return Load(model, rows, place[part] if len(place) > 1 else place)
 
 
-# Problems that a thread takes at a time: some milliseconds, against which handing them out is nothing. From 1 000 to
-# 16 000 no difference was measured.
+# Number of problems that a thread computes at a time: some milliseconds, much more than the cost of handing them out.
+# From 1 000 to 16 000 no difference was measured.
 _CHUNK = 4096
-# Narrow and wide blocks, and problems up to which narrow ones are quicker: one of ranges takes a fifth of a wide block.
-# Narrow blocks have one lane. Four lanes would fix eight problems in half of the time, but more code would be made.
+# Machine code for narrow blocks and for wide blocks, and the greatest number of problems for which narrow blocks are
+# faster: one problem of ranges takes a fifth of the time of a wide block. Narrow blocks have one lane. Four lanes would
+# fix eight problems in half of the time, but would need more code.
 _BY_RANGES = (fix_one_by_ranges, fix_ranges, 5)
 _BY_TAPES = (fix_one_by_tapes, fix_tapes, 4)
 
 
 def blank_answer(count: int, d: int, size: int, shared: int, sides: int) -> Answer:
-    """Return arrays for answers, for numbers of problems, coordinates, unknowns and constraints."""
+    """Return empty arrays for answers: numbers of problems, coordinates, unknowns, shared unknowns, constraints."""
     return Answer(
         np.empty((count, size)),
         np.empty((count, shared, shared)),
@@ -202,23 +208,23 @@ def blank_answer(count: int, d: int, size: int, shared: int, sides: int) -> Answ
 
 
 def _owned(values: Array) -> Array:
-    """Return values as the type of array that machine code takes: float, C order, writable."""
+    """Return values as the array type that machine code takes: float, C order, writable."""
     return np.require(values, dtype=float, requirements=["C", "W"])
 
 
-# Which structures have a plan.
+# Structures that have a plan.
 
-# The plan of 64 rows takes 100 kB, of six rows 2 kB.
+# A plan of 64 rows takes 100 kB, a plan of six rows 2 kB.
 _KEPT = Cache["Plan | None"](256)
 
 
 def plan_of(problem: Problem) -> Plan | None:
-    """Return the plan of problems, or None where they have no plan; plans are kept per structure.
+    """Return the cached plan of problems, or None if their structure has no plan.
 
     Parameters
     ----------
     problem : Problem
-        Batch of problems; their measurements are not looked at.
+        Batch of problems; its measurements are not used.
     """
     if not (is_planned(problem) and enabled()):
         return None
@@ -226,8 +232,8 @@ def plan_of(problem: Problem) -> Plan | None:
 
 
 def key_of(problem: Problem) -> tuple[Hashable, ...]:
-    """Return a key of all that the plan of a problem is made of."""
-    # Not structure, yet what a plan is made of: they are part of the key by their bytes.
+    """Return a cache key of everything that determines the plan of a problem."""
+    # These numbers are not part of the structure, but determine the plan. The key contains their bytes.
     numbers = [array for r in problem.rows for array in (r.weight, r.correction)]
     numbers += [block.covariance for block in problem.noise.blocks]
     numbers += [covariance for _, _, covariance in problem.stations.errors]
@@ -242,7 +248,7 @@ def key_of(problem: Problem) -> tuple[Hashable, ...]:
 
 
 def is_planned(problem: Problem) -> bool:
-    """Return whether the structure, and what the batch shares, are such that a plan exists and pays."""
+    """Return whether a plan exists for the structure and for the data that a batch shares, and saves time."""
     stations, motion = problem.stations, problem.motions[0]
     shared = [(array, 1) for r in problem.rows for array in (r.weight, r.correction)]
     shared += [(block.covariance, 3) for block in problem.noise.blocks]
@@ -266,9 +272,10 @@ def is_planned(problem: Problem) -> bool:
 
 
 def _is_ranged(problem: Problem) -> bool:
-    """Return whether all rows are sums of ranges to stations that stay, and nothing else is unknown."""
+    """Return whether all rows are sums of ranges to fixed stations, and only emission times are unknown besides."""
     stations = problem.stations
-    # Isotropic errors of an epoch are noise of ranges. Errors of the run are not: a fix has their covariance.
+    # Isotropic station errors of one epoch are noise of ranges. Errors that last for the run are unknowns with a
+    # covariance.
     alone = stations.unknown_for == "epoch" and problem.epochs == 1
     return (
         not (problem.biases or problem.priors)
@@ -279,7 +286,7 @@ def _is_ranged(problem: Problem) -> bool:
 
 
 def _is_taped(problem: Problem) -> bool:
-    """Return whether rows have tapes, and unknowns of epochs are few."""
+    """Return whether the rows have tapes, and the unknowns of epochs are few."""
     layout = problem.layout
     several = layout.n_local > 0 and problem.epochs > 1
     return problem.medium is None and not several and layout.size <= _UNKNOWNS and not walks(problem)
@@ -289,6 +296,7 @@ def _is_taped(problem: Problem) -> bool:
 
 
 def _make(problem: Problem) -> Plan | None:
+    """Return the plan of problems, or None if they have no degrees of freedom, no tapes or no start."""
     one = _bare(problem)
     dof = int(degrees_of_freedom(one.flat())[0])
     if dof < 0 or problem.layout.find("position")[0].start:
@@ -311,12 +319,12 @@ def _make(problem: Problem) -> Plan | None:
 
 
 def _bare(problem: Problem) -> Problem:
-    """Return one of some problems, without measurements."""
+    """Return one problem of a batch, without measurements."""
     stations = problem.stations
     place = stations.position.reshape(-1, *stations.position.shape[-3:])[0]
     rates = stations.velocity
     rates = None if rates is None else rates.reshape(-1, *rates.shape[-3:])[0]
-    # Levels are arguments of a run. A band that is exact in some problems of a batch only is not exact.
+    # Levels are arguments of a run. A band that is exact only in some problems of a batch counts as not exact.
     bands = tuple(
         replace(band, lower=np.array(0.0), upper=np.array(0.0 if is_exact(band) else 1.0))
         if isinstance(band, Band)

@@ -1,4 +1,4 @@
-"""Rows that are sums of ranges, and nothing else unknown but emission times: a linear map of the ranges, and loops."""
+"""Rows that are sums of ranges, with emission times as the only other unknowns: a linear map of ranges, and loops."""
 
 from __future__ import annotations
 
@@ -38,28 +38,27 @@ from optloc.kernels.systems import LANES, principal_axes
 
 
 class RangeRows(NamedTuple):
-    """Whitened rows over ranges r: the cost is ``|u - K r|^2`` plus the cost of loops, which no range changes.
+    """Whitened rows over ranges r: the cost is ``|u - K r|^2`` plus the cost of *loops* (sums that no range changes).
 
     Parameters
     ----------
     correction : array (m,)
         Known amount by which each measurement exceeds the model, metres.
     K : array (q, s)
-        Whitened rows, 1/metres. In `EngineModel.linear` the maps to u follow the maps to ranges; then come the maps to
+        Whitened rows, 1/metres. In `EngineModel.linear` the maps to u follow the maps to ranges, then come the maps to
         emission times for zero ranges, and to loops.
     travel : array (e, s)
-        How the ranges reduce the emission times.
+        Coefficients with which the ranges reduce the emission times.
     start : int64 array (e,)
-        Row that each emission time counts from, or -1.
+        Row that each emission time is relative to, or -1.
     norm : float
-        Greatest singular value of K.
+        Greatest singular value of K, 1/metres.
     level : bool
-        Whether K takes no notice of what all ranges have in common: then the cost has limits at infinity.
+        Whether a common change of all ranges has no effect on K r. Then the cost has limits at infinity.
     wander : array (s,)
-        Variances of isotropic errors of station positions, square metres: they are part of the noise, for the nearest
-        place from which a range is another lies on the line to the target.
+        Variances of isotropic station errors, m^2: noise, as the cheapest change of a range is along the line of sight.
     offset : int64 array (s,)
-        Where the errors of each station begin in parameter vectors; -1 where they are no unknowns.
+        First index of the errors of each station in parameter vectors; -1 if they are not unknowns.
     """
 
     correction: Array
@@ -80,15 +79,15 @@ class RangeBlock(NamedTuple):
     rows : RangeRows
         Rows of all problems.
     r, unit : array (s, W), (s, d, W)
-        Ranges, and unit vectors from the stations.
+        Ranges in metres, and unit vectors from the stations.
     residual : array (q, W)
         Whitened residuals.
     sent : array (e, W)
-        Emission times.
+        Emission times, metres.
     flat : array (q, d, W)
-        How the whitened rows fall with the direction of a remote emitter, along principal axes.
+        Map from the direction of an infinitely remote emitter to the whitened residuals, along principal axes.
     stiff : array (d, W)
-        Eigenvalues of that map's square.
+        Squared singular values of this map.
     """
 
     rows: RangeRows
@@ -108,7 +107,7 @@ def count_unknowns(rows: RangeRows, d: int, size: int) -> int:
 
 @compiled
 def count_lifted(rows: RangeRows) -> int:
-    """Return the number of rows of other kinds: none."""
+    """Return the number of linear rows of other kinds: zero."""
     return 0
 
 
@@ -129,7 +128,7 @@ def keep(model: EngineModel, rows: RangeRows, stations: int, d: int, size: int) 
 
 @compiled
 def load(block: RangeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Write the cost of the loops; of new stations what they say of infinity."""
+    """Write the cost of the loops; for new stations also the map from directions at infinity."""
     first, loop = len(room.place) + len(block.rows.K) + len(block.rows.start), room.scalar[LOOP]
     for lane in range(LANES):
         loop[lane] = 0.0
@@ -142,23 +141,23 @@ def load(block: RangeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None
 
 @compiled
 def minimise_start(model: EngineModel, block: RangeBlock, room: EngineWorkspace, first: bool) -> None:
-    """Write the minimiser of the weighed squared-range rows."""
+    """Write the minimiser of the weighted squared-range rows to `room.y`, and to SOLVABLE whether it is unique."""
     minimise(room.rows, model.reference >= 0, room.y, room.scalar[SOLVABLE], room.work)
 
 
 @compiled
 def scout(model: EngineModel, block: RangeBlock, room: EngineWorkspace) -> None:
-    """Do nothing: sums of ranges that lack rows are run as tapes."""
+    """Do nothing: problems with too few rows of ranges use tapes instead."""
 
 
 @compiled
 def complete(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Do nothing: the position is all that is refined."""
+    """Do nothing: only the position is refined."""
 
 
 @compiled
 def equations(block: RangeBlock, room: EngineWorkspace, shift: int) -> None:
-    """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
+    """Write information (lower half), right side and cost at row X, or at TRIAL if `shift` is 1."""
     s, vector, scalar = len(room.place), room.vector, room.scalar
     _equations(
         block.rows.K,
@@ -186,17 +185,17 @@ def costs(block: RangeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def bow_of(block: RangeBlock, room: EngineWorkspace) -> float:
-    """Return the curvature b of all residuals: over a step D at range r they change by up to b D^2 / r more.
+    """Return a bound b of the curvature of all residuals, 1/metres: over a step D at range r they differ by b D^2 / r.
 
-    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``. All residuals together are off by
-    ``norm(K) sqrt(s) D^2 / 2 r`` at most. Where a common error of all ranges has no effect, half of it is the limit.
+    A range exceeds its linear prediction by 0 to ``D^2 / 2 r``, and all residuals together theirs by at most
+    ``norm(K) sqrt(s) D^2 / 2 r``. If a common error of all ranges has no effect, half of this bound is valid.
     """
     return float(block.rows.norm * np.sqrt(len(block.r)) * (0.25 if block.rows.level else 0.5))
 
 
 @compiled
 def note_nearest(block: RangeBlock, room: EngineWorkspace, least: Array) -> None:
-    """Write the range to the nearest station (W,)."""
+    """Write the range (W,) to the nearest station, metres."""
     r = block.r
     for lane in range(LANES):
         least[lane] = np.inf
@@ -207,13 +206,13 @@ def note_nearest(block: RangeBlock, room: EngineWorkspace, least: Array) -> None
 
 @compiled
 def search_infinity(model: EngineModel, block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write what infinity costs: that is known in closed form."""
+    """Write the least cost at infinity to BEYOND: a closed form exists, so no search is necessary."""
     measure_infinity(block, room)
 
 
 @compiled
 def finish(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Write emission times and station errors at row X."""
+    """Write emission times and station errors at row X to the parameter vectors x (N, size), metres."""
     if not len(block.rows.start) and not len(block.rows.wander):
         return
     ranges(room.place, room.vector[X], block.r, block.unit, room.scalar[SPARE])
@@ -227,7 +226,7 @@ def finish(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: 
 
 @compiled
 def _emit(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: Array, marked: bool, x: Array) -> None:
-    """Write the emission times: less the ranges' share, plus the measurement that they count from."""
+    """Write the emission times, metres: their linear map less the share of the ranges, plus their reference."""
     item, r, sent, start, d = room.item, block.r, block.sent, block.rows.start, room.d
     first = len(room.place) + len(block.rows.K)
     for j in range(len(start)):
@@ -246,7 +245,7 @@ def _emit(block: RangeBlock, z: Array, room: EngineWorkspace, size: int, mark: A
 
 @compiled
 def _write_residuals(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write the whitened residuals of ranges that are at hand."""
+    """Write the whitened residuals of the ranges in `block.r`."""
     K, residual, r, s = block.rows.K, block.residual, block.r, len(room.place)
     for k in range(len(K)):
         for lane in range(LANES):
@@ -262,7 +261,7 @@ def _write_residuals(block: RangeBlock, room: EngineWorkspace) -> None:
 def _shift(
     block: RangeBlock, room: EngineWorkspace, station: int, size: int, mark: Array, marked: bool, x: Array
 ) -> None:
-    """Write the error of a station: along the line to the target, by what the residuals say of its range."""
+    """Write the position error of a station, metres: along the line to the target, proportional to its residual."""
     K, residual, unit, first = block.rows.K, block.residual, block.unit, block.rows.offset[station]
     for lane in range(size):
         if not marked or mark[lane] != 0.0:
@@ -270,7 +269,7 @@ def _shift(
             for k in range(len(K)):
                 longer += K[k, station] * residual[k, lane]
             for j in range(room.d):
-                # a step towards the target makes the range shorter
+                # an error towards the target makes the range shorter
                 x[room.item[lane], first + j] = -block.rows.wander[station] * longer * unit[station, j, lane]
 
 
@@ -289,7 +288,7 @@ def _equations(
     right: Array,
     cost: Array,
 ) -> None:
-    """Find information (lower half), right-hand side and cost at positions x (d, W); `row` and `left` are scratch."""
+    """Write information (lower half), right side and cost at positions x (d, W); `row` and `left` are scratch."""
     d = len(x)
     ranges(place, x, r, unit, left)
     for lane in range(LANES):
@@ -314,7 +313,7 @@ def _equations(
 
 @compiled
 def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Array) -> None:
-    """Find one whitened row (d, W) of the Jacobian and its residual (W,): what is seen less shares of the ranges."""
+    """Write one whitened row (d, W) of the Jacobian, and its residual (W,): `seen` less the weighted ranges."""
     s, d = unit.shape[:2]
     for lane in range(LANES):
         left[lane] = seen[lane]
@@ -323,7 +322,7 @@ def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Arr
             row[j, lane] = 0.0
     for i in range(s):
         part = share[i]
-        # Pairs of stations: of a row over all ranges two entries are not zero.
+        # For differences between two stations, only two entries of a row are not zero.
         if part != 0.0:
             for lane in range(LANES):
                 left[lane] -= part * r[i, lane]
@@ -334,7 +333,7 @@ def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Arr
 
 @compiled
 def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
-    """Find ranges (s, W) and unit vectors (s, d, W) from the stations at positions x (d, W)."""
+    """Write ranges (s, W), metres, and unit vectors (s, d, W) from the stations to positions x (d, W)."""
     s, d = place.shape[:2]
     for i in range(s):
         for lane in range(LANES):
@@ -354,7 +353,7 @@ def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
 
 @compiled
 def _costs(K: Array, u: Array, place: Array, x: Array, r: Array, left: Array, loop: Array, cost: Array) -> None:
-    """Find the cost alone at positions x (d, W): a third of the work of `equations`; `r` and `left` are scratch."""
+    """Write the cost (W,) at positions x (d, W): a third of the work of `equations`; `r` and `left` are scratch."""
     s, d = place.shape[:2]
     for i in range(s):
         for lane in range(LANES):
@@ -381,7 +380,7 @@ def _costs(K: Array, u: Array, place: Array, x: Array, r: Array, left: Array, lo
 
 @compiled
 def bend(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write half the second derivatives of the cost to H_TRIAL: the information, less what bent fronts do to it."""
+    """Write half the second derivatives of the cost (information less curvature of the wave fronts) to H_TRIAL."""
     vector, matrix, scalar, K = room.vector, room.matrix, room.scalar, block.rows.K
     s, d = room.place.shape[:2]
     left, pull = scalar[SPARE], scalar[HIGH]
@@ -411,17 +410,17 @@ def bend(block: RangeBlock, room: EngineWorkspace) -> None:
 # The cost at infinity.
 
 BEYOND_DOUBT = 16.0
-"""Cost above a fix from which on infinity is far outside every region that is reported."""
+"""Cost above a fix from which on infinity is far outside every reported region."""
 
-# Newton's steps on the secular equation: three to six from the start that is taken here.
+# Limit of Newton's steps on the secular equation; three to six are enough from this start.
 _STEPS = 20
-# Share by which the direction may differ from unit length: the cost hangs on its square.
+# Tolerance of the length of a direction, relative to one: the cost depends on the square of the length.
 _UNIT = 1e-12
 
 
 @compiled
 def _see_far(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write the map from directions to whitened rows, turned to its principal axes, and its squared singular values."""
+    """Write the map from directions at infinity to whitened residuals, and its squared singular values."""
     s, d = room.place.shape[:2]
     flat = block.flat
     for k in range(len(flat)):
@@ -438,7 +437,7 @@ def _see_far(block: RangeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def _turn_to_axes(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Turn the map to the principal axes of its square."""
+    """Rotate the map from directions to the principal axes of its square."""
     flat, stiff, row = block.flat, block.stiff, room.vector[MOVE]
     work, axes, d = room.axes[EIGEN], room.axes[AXES], room.d
     for i in range(d):
@@ -466,14 +465,14 @@ def _turn_to_axes(block: RangeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
-    """Write the least cost at infinity to BEYOND: exact where it is within `BEYOND_DOUBT` of FIX_COST, else a bound.
+    """Write the least cost at infinity to BEYOND: exact if within `BEYOND_DOUBT` of FIX_COST, else a lower bound.
 
     Parameters
     ----------
     block : RangeBlock
         Rows and memory.
     room : EngineWorkspace
-        LOOP, FIX_COST and what `_see_far` wrote in; rows of scratch are overwritten.
+        In: LOOP, FIX_COST and the results of `_see_far`. Scratch rows are overwritten.
     """
     scalar, vector = room.scalar, room.vector
     out = scalar[BEYOND]
@@ -498,7 +497,7 @@ def measure_infinity(block: RangeBlock, room: EngineWorkspace) -> None:
         y = vector[INVERSE]
         for j in range(d):
             for lane in range(LANES):
-                # a direction of no pull along an axis of no stiffness stays zero: what length is missing comes below
+                # a component without gradient and stiffness stays zero; `_lengthen` adds the missing length
                 y[j, lane] = g[j, lane] / (gap[j, lane] + more[lane]) if g[j, lane] != 0.0 else 0.0
         _lengthen(y, gap, scalar[SPARE])
         _weigh(u, block, room, y, scalar[SPARE], scalar[HIGH])
@@ -512,8 +511,8 @@ def _begin(
 ) -> None:
     """Write g, gaps of the eigenvalues, the cost without ranges, the least eigenvalue, and the first multiplier.
 
-    Multipliers are counted from minus the least eigenvalue: there nothing cancels. The first is as large as the longest
-    part of the direction allows: the direction is not shorter than one, and Newton's steps come from that side.
+    Multipliers are relative to minus the least eigenvalue, where no digits cancel. The first is the largest for which
+    one component alone has length one: the direction is not shorter there, and Newton's steps converge from this side.
     """
     q, d = len(u), len(g)
     for lane in range(LANES):
@@ -538,7 +537,10 @@ def _begin(
 def _step(
     scalar: Array, g: Array, gap: Array, total: Array, least: Array, more: Array, low: Array, todo: Array
 ) -> bool:
-    """Write the lower bounds at the multipliers, and move those that could matter; return whether one moved."""
+    """Write the lower bounds at the multipliers, take Newton steps if the bound is low.
+
+    Return whether any was taken.
+    """
     d, square, cube = len(g), scalar[SPARE], todo
     for lane in range(LANES):
         low[lane], square[lane], cube[lane] = total[lane] + least[lane] - more[lane], 0.0, 0.0
@@ -552,9 +554,9 @@ def _step(
     moving = 0.0
     for lane in range(LANES):
         length = np.sqrt(square[lane])
-        # a direction that is too short even here is the mean of two of the same cost: the hard case; the bound holds
+        # a direction that is too short even here is the hard case: two directions of equal cost; the bound is valid
         left = length > 1.0 + _UNIT and low[lane] <= scalar[FIX_COST, lane] + BEYOND_DOUBT
-        # Newton's step for 1 / length = 1, which is nearly straight
+        # Newton's step for 1 / length = 1, which is nearly linear
         more[lane] += square[lane] * (length - 1.0) / cube[lane] if left else 0.0
         moving += 1.0 if left else 0.0
     return moving > 0.0
@@ -562,7 +564,7 @@ def _step(
 
 @compiled
 def _lengthen(y: Array, gap: Array, spare: Array) -> None:
-    """Make directions unit vectors: too short ones by a part along the axis of the least eigenvalue."""
+    """Scale directions (d, W) to length one; shorter ones get a component along the axis of the least eigenvalue."""
     d = len(y)
     for lane in range(LANES):
         spare[lane] = 0.0
@@ -583,7 +585,7 @@ def _lengthen(y: Array, gap: Array, spare: Array) -> None:
 
 @compiled
 def _weigh(u: Array, block: RangeBlock, room: EngineWorkspace, y: Array, left: Array, cost: Array) -> None:
-    """Write the cost of remote emitters in directions y (d, W): from residuals, which cancel less than the bound."""
+    """Write the cost (W,) of emitters at infinity in directions y (d, W), more accurate than the bound."""
     for lane in range(LANES):
         cost[lane] = room.scalar[LOOP, lane]
     for k in range(len(u)):

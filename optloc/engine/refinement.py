@@ -1,4 +1,7 @@
-"""Damped Gauss-Newton of many problems side by side: the rules of `optloc.kernels.least_squares`, lane by lane."""
+"""Damped Gauss-Newton refinement of many problems in lanes, with the rules of `optloc.kernels.least_squares`.
+
+Names in capitals, such as X or ALIVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 
@@ -40,21 +43,21 @@ from optloc.kernels.systems import LANES, factor_plain, solve_plain
 
 @compiled
 def refine(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: float, limit: int) -> None:
-    """Refine the unknowns of the lanes that are good; those that do not finish in time stay alive.
+    """Refine the unknowns of the lanes that are good; lanes that do not converge within `limit` steps stay ALIVE.
 
     Parameters
     ----------
     model : EngineModel
-        With the constraints that hold fixes.
+        Contains the constraints that hold fixes.
     rows : named tuple
-        Of the evaluator.
+        Rows of the evaluator.
     room : EngineWorkspace
-        Unknowns in row X, rounding error and which lanes are good in; unknowns, right sides, information (lower half),
-        costs, steps, which are alive and which good out.
+        In: unknowns in row X, rounding error, and GOOD. Out: unknowns, right sides, information (lower half), costs,
+        steps, ALIVE and GOOD.
     tolerance : float
-        A fix is finished when its next step is shorter than this number of standard deviations.
+        A fix has converged if its next step is shorter than this number of standard deviations.
     limit : int
-        Steps tried at most.
+        Greatest number of steps tried.
 
     Notes
     -----
@@ -69,7 +72,7 @@ def refine(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: floa
         scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
         scalar[ALIVE, lane] = scalar[GOOD, lane]
         scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
-    # All lanes step until none is alive: a lane that is finished takes no more steps that count.
+    # All lanes step until none is ALIVE: further steps of a converged lane are discarded.
     for _ in range(limit):
         propose(model, room)
         evaluate(model, rows, room, 1)
@@ -79,7 +82,7 @@ def refine(model: EngineModel, rows: Any, room: EngineWorkspace, tolerance: floa
 
 @compiled
 def propose(model: EngineModel, room: EngineWorkspace) -> None:
-    """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
+    """Write the damped step, its squared length in standard deviations to GAIN, and to SOLVABLE whether it exists."""
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d = vector.shape[1]
     diagonal, inverse, move, right, damping = (
@@ -104,8 +107,8 @@ def propose(model: EngineModel, room: EngineWorkspace) -> None:
         for lane in range(LANES):
             gain[lane] += move[i, lane] * right[i, lane]
             trial[i, lane] = x[i, lane] + move[i, lane]
-            # One over the share of its diagonal that a pivot keeps: at least one, infinite or negative where there is
-            # no pivot.
+            # One over the share of its diagonal that a pivot keeps: at least one. It is infinite or negative without a
+            # pivot.
             share = inverse[i, lane] * diagonal[i, lane]
             solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / PIVOT else 0.0
     restore(model, room, 1)
@@ -113,10 +116,10 @@ def propose(model: EngineModel, room: EngineWorkspace) -> None:
 
 @compiled
 def decide(room: EngineWorkspace, tolerance: float) -> bool:
-    """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
+    """Keep steps that lower the cost, update the damping, end converged lanes; return whether any lane is ALIVE."""
     vector, matrix, scalar, face = room.vector, room.matrix, room.scalar, room.face
     d = vector.shape[1]
-    # Lanes that are finished go through the rule too, and are left as they are: their step counts as unsolvable.
+    # Converged lanes run through the same rule without effect: their step counts as unsolvable.
     kept, alive = scalar[SPARE], scalar[ALIVE]
     for lane in range(LANES):
         better, small, stuck, scalar[DAMPING, lane], scalar[GROWTH, lane] = judge_lane(
@@ -137,7 +140,7 @@ def decide(room: EngineWorkspace, tolerance: float) -> bool:
         kept[lane] = 1.0 if better else 0.0
     for i in range(d):
         for lane in range(LANES):
-            # Selections instead of branches: lanes that keep and lanes that refuse go through one instruction.
+            # Selections instead of branches: all lanes run the same instructions, whether they keep their step or not.
             vector[X, i, lane] = vector[TRIAL, i, lane] if kept[lane] != 0.0 else vector[X, i, lane]
             vector[G, i, lane] = vector[G_TRIAL, i, lane] if kept[lane] != 0.0 else vector[G, i, lane]
         for j in range(i + 1):

@@ -1,4 +1,10 @@
-"""The shape of the likelihood about fixes: how far it is Gaussian, and in which chart."""
+"""The shape of the likelihood around a fix: how far it differs from a Gaussian.
+
+`kappa` is the greatest absolute logarithm of the cost rise at three sigma over the quadratic rise, in all probed
+directions. It is 0 for a Gaussian. It is measured in metres, and in inverse range about the mean of the stations.
+
+Names in capitals, such as X or MOVE, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 
@@ -36,17 +42,17 @@ from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES, eliminate_last, principal_axes
 
 STRAIGHT = 0.3
-"""Greatest kappa of a Gaussian that covers: the cost at three sigma is between 6.67 and 12.15 instead of 9."""
+"""Greatest kappa at which the covariance region is valid: the cost at three sigma is between 6.67 and 12.15, not 9."""
 
-# Where costs are compared, in standard deviations: far enough to see skewness, near enough to hold 99 %.
+# Distance of the probes in standard deviations: far enough to show skewness, near enough to contain 99 %.
 _REACH = 3.0
-# Share of the quadratic cost below which a rise counts as none: its logarithm is 20, far beyond any threshold.
+# Least rise as a share of the quadratic rise. Its logarithm is about -20, far beyond any threshold.
 _NONE = 1e-9
-# Share by which eigenvalues may differ and still be equal: the axes between them are then any axes.
+# Relative difference up to which two eigenvalues count as equal; then the axes between them are arbitrary.
 _EQUAL = 0.05
-# Share of the largest variance below which one is rounding.
+# Share of the largest variance below which a variance is rounding.
 _EXACT = 1e-14
-# Least inverse range, relative to the fix: a step ends a million times as far away, where fronts are flat.
+# Least inverse range relative to the fix: a probe ends at most a million times as far away, where wave fronts are flat.
 _HORIZON = 1e-6
 
 
@@ -54,22 +60,22 @@ _HORIZON = 1e-6
 def measure_shape(
     model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool, turned: bool, out: Array
 ) -> None:
-    """Find kappa of fixes in row X, with their information and costs.
+    """Write kappa of the fixes in row X.
 
     Parameters
     ----------
     model : EngineModel
-        With the constraints that hold fixes.
+        Contains the constraints that hold fixes.
     rows : named tuple
-        Of the evaluator.
+        Rows of the evaluator.
     room : EngineWorkspace
-        Unknowns, information, covariance in H_TRIAL, and costs; rows of scratch are overwritten.
+        Unknowns, information, covariance in H_TRIAL, and costs; scratch rows are overwritten.
     inverse : bool
-        In inverse range about the mean of the stations that take part, instead of in metres.
+        Whether to measure in inverse range about the mean of the stations, instead of in metres.
     turned : bool
-        Whether axes between equal eigenvalues are turned by 45 degrees as well.
+        Whether to probe also along axes turned by 45 degrees between equal eigenvalues.
     out : array (W,)
-        Written: kappa; infinite at the centre of the chart.
+        Written: kappa; infinite if the fix is at the centre of the coordinates.
     """
     vector, scalar, d = room.vector, room.scalar, room.d
     high, low, spare = scalar[HIGH], scalar[LOW], scalar[SPARE]
@@ -98,7 +104,10 @@ def measure_shape(
 
 @compiled
 def _leave_position(room: EngineWorkspace) -> None:
-    """Eliminate the other unknowns: write the information about the position, and how they follow it, to MARGIN."""
+    """Eliminate the other unknowns, and write the result to MARGIN.
+
+    MARGIN then has the information about the position, and the coefficients with which the other unknowns follow it.
+    """
     p, left, right = room.vector.shape[1], room.matrix[MARGIN], room.vector[MOVE]
     for i in range(p):
         for lane in range(LANES):
@@ -111,7 +120,7 @@ def _leave_position(room: EngineWorkspace) -> None:
 
 @compiled
 def find_even(eigen: Array, out: Array) -> None:
-    """Write 1.0 where two eigenvalues, on a diagonal (d, d, W), are equal within the share that counts, else 0.0."""
+    """Write 1.0 to `out` (W,) if two eigenvalues on a diagonal (d, d, W) are equal up to `_EQUAL`, else 0.0."""
     for lane in range(LANES):
         out[lane] = 0.0
     for i in range(1, len(eigen)):
@@ -122,6 +131,7 @@ def find_even(eigen: Array, out: Array) -> None:
 
 @compiled
 def _even(eigen: Array, i: int, j: int, lane: int) -> float:
+    # Return 1.0 if two eigenvalues of a lane are equal up to `_EQUAL`, else 0.0.
     first, second = eigen[i, i, lane], eigen[j, j, lane]
     most = max(first, second)
     return 1.0 if abs(first - second) <= _EQUAL * most and most > 0.0 else 0.0
@@ -129,7 +139,7 @@ def _even(eigen: Array, i: int, j: int, lane: int) -> float:
 
 @compiled
 def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -> None:
-    """Go along the diagonals between axes of equal eigenvalues, and note them where they are equal."""
+    """Probe along the diagonals between two axes, and keep the rises of the lanes with equal eigenvalues."""
     vector, axes, scalar = room.vector, room.axes, room.scalar
     d, share = room.d, scalar[SHARE]
     even = room.vector[ROW, 0]
@@ -150,7 +160,7 @@ def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -
                         vector[MOVE, i, lane] = along + second * axes[AXES, i, k, lane]
                 _probe(model, rows, room, inverse)
                 for lane in range(LANES):
-                    # a quadratic rise takes the place of other axes
+                    # lanes with different eigenvalues get the quadratic rise, which changes nothing
                     rise = scalar[COST, lane] + 1.0 / share[lane]
                     scalar[COST_TRIAL, lane] = scalar[COST_TRIAL, lane] if even[lane] != 0.0 else rise
                 _note(scalar, scalar[HIGH], scalar[LOW])
@@ -158,9 +168,10 @@ def _turn(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -
 
 @compiled
 def _span(vector: Array, base: Array, r: Array) -> None:
-    """Write the derivatives of positions by (p, w) at the fix, ``[r B, -r u0]``, to the columns of a base (d, d, W).
+    """Write the derivatives of positions by (p, w) at the fix, ``[r B, -r u0]``, to the columns of `base` (d, d, W).
 
-    B as in T. Duff et al., "Building an orthonormal basis, revisited", J. Computer Graphics Techniques 6 (2017).
+    (p, w) are the coordinates in inverse range; r and u0 are range and direction of the fix from the centre. B is
+    from T. Duff et al., "Building an orthonormal basis, revisited", J. Computer Graphics Techniques 6 (2017).
     """
     d = len(base)
     for lane in range(LANES):
@@ -187,7 +198,11 @@ def _span(vector: Array, base: Array, r: Array) -> None:
 
 @compiled
 def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> None:
-    """Write the principal axes of the position's information, or of it in the chart, one sigma long, to AXES."""
+    """Write the principal axes of the position's information, each one sigma long, to AXES.
+
+    If `inverse` is True, the information is expressed in inverse range. If `held` is True, the axes come from the
+    covariance.
+    """
     d, base, work, axes = room.d, room.axes[BASE], room.axes[EIGEN], room.axes[AXES]
     source = room.matrix[H_TRIAL if held else MARGIN if room.vector.shape[1] > d else H]
     for i in range(d):
@@ -219,7 +234,7 @@ def _axes(room: EngineWorkspace, inverse: bool, held: bool, spare: Array) -> Non
 
 @compiled
 def _drop_exact(variance: Array, most: Array) -> None:
-    """Make variances on a diagonal (d, d, W) zero that are rounding relative to the largest."""
+    """Set variances on a diagonal (d, d, W) to zero if they are rounding relative to the largest."""
     d = len(variance)
     for lane in range(LANES):
         most[lane] = 0.0
@@ -234,7 +249,10 @@ def _drop_exact(variance: Array, most: Array) -> None:
 
 @compiled
 def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) -> None:
-    """Find the cost a step MOVE away, and one over the rise of a quadratic one; a step past the horizon ends there."""
+    """Write the cost after a step MOVE from the fix, and one over the rise of a quadratic cost there to SHARE.
+
+    In inverse range, a step beyond `_HORIZON` is shortened.
+    """
     vector, scalar, base = room.vector, room.scalar, room.axes[BASE]
     d, move, trial, share, w = room.d, vector[MOVE], vector[TRIAL], scalar[SHARE], scalar[SPARE]
     if inverse:
@@ -271,7 +289,7 @@ def _probe(model: EngineModel, rows: Any, room: EngineWorkspace, inverse: bool) 
 
 @compiled
 def _spare_still(room: EngineWorkspace, axis: int) -> None:
-    """Let the cost rise like a Gaussian's where an axis has no length: surfaces hold fixes across it."""
+    """Set the rise of the cost to that of a Gaussian along axes of length zero, where a surface holds the fix."""
     scalar = room.scalar
     for lane in range(LANES):
         if room.axes[EIGEN, axis, axis, lane] == 0.0:
@@ -280,10 +298,10 @@ def _spare_still(room: EngineWorkspace, axis: int) -> None:
 
 @compiled
 def _note(scalar: Array, high: Array, low: Array) -> None:
-    """Keep the greatest and the least rise of the cost, relative to a quadratic cost."""
+    """Update the greatest and the least rise of the cost (W,), relative to a quadratic cost."""
     for lane in range(LANES):
         rise = (scalar[COST_TRIAL, lane] - scalar[COST, lane]) * scalar[SHARE, lane]
-        # what is no number is far from quadratic, and comparisons with it fail
+        # NaN means far from quadratic, and every comparison with NaN is false
         number, lower = rise < np.inf, rise < low[lane]
         rise = rise if number else np.inf
         high[lane] = max(high[lane], rise)

@@ -1,4 +1,7 @@
-"""The start of a fix: squared ranges and other linear rows, minimised exactly."""
+"""The start of a fix: the exact minimiser of the squared ranges and the other linear rows.
+
+Names in capitals, such as X or GOOD, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +33,17 @@ from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES
 
 NEAR = 1e-3
-"""Least distance from a station that weighs a row, in units of the stations' spread: at the station itself a squared
-range has no first-order error, and its weight would be infinite."""
+"""Least distance from a station in the weight of a row, in units of the stations' spread. At the station a squared
+range has no first-order error, so that its weight would be infinite."""
 
 
 @compiled
 def begin(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
-    """Find starts: squared ranges weighed as equal first, then by the ranges of that answer; or in other ways."""
+    """Write the starts of a block to row X.
+
+    Squared ranges are solved twice: with weights for equal ranges, then with the ranges of the first solution. Problems
+    with another `EngineModel.start` use `scout`.
+    """
     scalar, s = room.scalar, len(room.place)
     if model.start != BY_SQUARES:
         scout(model, rows, room)
@@ -51,7 +58,7 @@ def begin(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
         room.squared,
         scalar[SPARE],
     )
-    # near to maximum likelihood, and no guess
+    # the second pass is close to maximum likelihood and needs no initial guess
     for turn in range(2):
         weigh_rows(room.squared, room.place, room.y, scalar[SCALE], model.white, turn == 0, room.rows, scalar[SPARE])
         minimise_start(model, rows, room, turn == 0)
@@ -68,7 +75,7 @@ def begin(model: EngineModel, rows: Any, room: EngineWorkspace) -> None:
 def load_measurements(
     z: Array, item: Array, row: Array, anchor: Array, linear: Array, out: Array, value: Array, blur: Array, good: Array
 ) -> None:
-    """Take the measurements of a block of problems, and everything that is linear in them.
+    """Load the measurements of a block of problems, and compute everything that is linear in them.
 
     Parameters
     ----------
@@ -77,26 +84,26 @@ def load_measurements(
     item : int64 array (W,)
         Problem of each lane.
     row : array (3, m)
-        Of each row: known amount by which the measurement exceeds the model; one over its variance, 0 where absent; and
-        what the measurement is multiplied with then.
+        For each row: the known amount by which the measurement exceeds the model; one over its variance (0 if absent);
+        and the factor that multiplies the corrected measurement.
     anchor : int64 array (m,)
-        Row that is subtracted from each before anything is added up, -1 for none.
+        Row whose measurement is subtracted before the sums; -1 for none.
     linear : array (p, m)
         Linear maps of the measurements.
     out : array (m, W)
-        Written: measurements less corrections and anchors; zero where absent.
+        Written: measurements less corrections and anchors; zero if absent.
     value : array (p, W)
-        Written: their images.
+        Written: the linear maps applied to `out`.
     blur : array (W,)
         Written: rounding error of the whitened residuals.
     good : array (W,)
-        Written: 1.0 where all rows that are present are finite, else 0.0.
+        Written: 1.0 if all present rows are finite, else 0.0.
     """
     m = len(out)
     for lane in range(LANES):
         blur[lane], good[lane] = 0.0, 1.0
     for j in range(m):
-        # An absent row may hold NaN, which no share of zero would remove.
+        # An absent row may contain NaN, and zero times NaN is NaN.
         if row[1, j] == 0.0:
             for lane in range(LANES):
                 out[j, lane] = 0.0
@@ -109,7 +116,7 @@ def load_measurements(
             out[j, lane] *= row[2, j]
     for lane in range(LANES):
         blur[lane] = ROUNDING * np.sqrt(blur[lane])
-    for j in range(m - 1, -1, -1):  # an anchor is the first of its rows: it goes last
+    for j in range(m - 1, -1, -1):  # an anchor is the first of its rows, so it is subtracted last
         if anchor[j] >= 0:
             for lane in range(LANES):
                 out[j, lane] -= out[anchor[j], lane]
@@ -127,7 +134,7 @@ def load_measurements(
 def load_stations(
     station: Array, item: Array, reference: int, place: Array, origin: Array, centre: Array, spread: Array, spare: Array
 ) -> None:
-    """Take the stations of a block of problems.
+    """Load the stations of a block of problems.
 
     Parameters
     ----------
@@ -136,11 +143,11 @@ def load_stations(
     item : int64 array (W,)
         Problem of each lane.
     reference : int
-        Station that becomes the origin; -1: their mean does.
+        Station that becomes the origin; with -1, the mean of the stations is the origin.
     place : array (s, d, W)
-        Written: positions from the origin.
+        Written: positions relative to the origin.
     origin, centre : array (d, W)
-        Written: the origin, and the mean of the stations from there.
+        Written: the origin, and the mean of the stations relative to the origin.
     spread : array (W,)
         Written: greatest distance of a station from the mean.
     spare : array (W,)
@@ -156,7 +163,7 @@ def load_stations(
                 place[i, j, lane] = station[0 if shared else item[lane], i, j]
                 centre[j, lane] += place[i, j, lane] / s
         for lane in range(LANES):
-            # Where the range to one station is unknown it is the apex of the cone: |x| = t holds about it.
+            # If the range t to one station is unknown, this station is the apex of the cone |x| = t.
             origin[j, lane] = place[reference, j, lane] if reference >= 0 else centre[j, lane]
             centre[j, lane] -= origin[j, lane]
     for lane in range(LANES):
@@ -184,22 +191,22 @@ def square_ranges(
     rows: Array,
     spare: Array,
 ) -> None:
-    """Square the ranges ``r = c + sign t``: linear in (x, t) with t from the cone, or in (x, |x|^2).
+    """Write the squares of the ranges ``r = c + sign t`` as linear rows in (x, t), t from the cone, or in (x, |x|^2).
 
     Parameters
     ----------
     c : array (s, W)
         Least-squares ranges, metres.
     station : array (4, s)
-        Of `optloc.engine.memory.EngineModel`.
+        `EngineModel.station`.
     reference : int
-        Station whose range is t; -1 where ranges are determined.
+        Station whose range is t; -1 if all ranges are determined.
     place, spread : array (s, d, W), (W,)
-        Of `stand`.
+        Results of `stand`.
     scale : array (W,)
-        Written: unit of length.
+        Written: unit of length, metres.
     rows : array (s, d + 2, W)
-        Written: coefficients of x and of the last entry, and the right side; scaled.
+        Written: coefficients of x and of the last coordinate, and the right side; scaled.
     spare : array (W,)
         Scratch.
     """
@@ -216,11 +223,11 @@ def square_ranges(
         scale[lane] = scale[lane] if scale[lane] > 0.0 else 1.0
         spare[lane] = 1.0 / scale[lane]
     for i in range(s):
-        # The reference's own row would read 0 = 0.
+        # The row of the reference station is 0 = 0.
         sign = station[SIGN, i]
         used = 0.0 if free and (i == reference or sign == 0.0) else station[RANGED, i]
         for lane in range(LANES):
-            # r_i = c_i + s_i t squared, less |x|^2 = t^2: linear in x and t.
+            # The square of r_i = c_i + s_i t, less |x|^2 = t^2, is linear in x and t.
             known = used * c[i, lane] * spare[lane]
             rows[i, d + 1, lane] = known * known
             rows[i, d, lane] = 2.0 * sign * known if free else used
@@ -243,15 +250,15 @@ def weigh_rows(
     Parameters
     ----------
     rows, place, scale : array (s, d + 2, W), (s, d, W), (W,)
-        Of `square` and `stand`.
+        Results of `square` and `stand`.
     y : array (d + 1, W)
-        Where the ranges are taken, scaled.
+        Point at which the ranges are computed, scaled.
     white : array (s, s)
         Lower triangular whitening matrix of the ranges, 1/metres.
     equal : bool
-        Take all ranges as equal instead.
+        Whether all ranges count as equal, independent of `y`.
     out : array (s, d + 2, W)
-        Written.
+        Written: the weighted rows.
     spare : array (W,)
         Scratch.
     """
@@ -268,7 +275,7 @@ def weigh_rows(
         for j in range(d + 2):
             for lane in range(LANES):
                 out[i, j, lane] = spare[lane] * rows[i, j, lane]
-    # From the last row up: each row needs the rows above it unchanged.
+    # From the last row upwards: each row needs the unchanged rows above it.
     for i in range(s - 1, -1, -1):
         for j in range(d + 2):
             for lane in range(LANES):
@@ -283,7 +290,10 @@ def weigh_rows(
 
 @compiled
 def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> None:
-    """Take positions from squared-range answers; those that are not settled, or behind the stations, are not good."""
+    """Write the positions of squared-range solutions to x (d, W), metres, and clear `good` of invalid ones.
+
+    A solution is invalid if it is not settled, or if its last coordinate is negative (behind the stations).
+    """
     d = len(y) - 1
     for lane in range(LANES):
         good[lane] = good[lane] * settled[lane] if y[d, lane] >= 0.0 else 0.0

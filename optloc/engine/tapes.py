@@ -1,4 +1,8 @@
-"""Rows of every kind as tapes of h(x) and its derivatives, with all other unknowns."""
+"""Rows of every kind as tapes of h(x) and its derivatives, with all other unknowns.
+
+This evaluator serves all problems that `optloc.engine.ranges` does not. It refines all unknowns together. Names in
+capitals, such as X or COST, are rows of the arrays of `optloc.engine.memory.EngineWorkspace`.
+"""
 
 from __future__ import annotations
 
@@ -57,19 +61,20 @@ class TapeRows(NamedTuple):
     Parameters
     ----------
     tables : Tables
-        Indices.
+        Indices of rows, inputs and unknowns.
     numbers : Numbers
-        Shared numbers, and the numbers of each problem, except measurements.
+        Shared numbers, and the numbers of each problem except measurements.
     correction : array (m,)
-        Known amount by which each measurement exceeds the model.
+        Known amount by which each measurement exceeds the model, in the unit of the measurement.
     base : array (p,)
-        Start of the other unknowns.
+        Start of the unknowns other than the position.
     lifts : Lifts
         Linear rows of other kinds than ranges.
     bounded : bool
         Whether the cost grows without bound at infinity.
     scaled : bool
-        Whether unknown factors multiply rows: their columns are as long as ranges, and no search ends far away.
+        Whether unknown scale factors multiply rows. Their derivatives are as large as ranges, so that a search far away
+        does not converge.
     """
 
     tables: Tables
@@ -89,11 +94,11 @@ class TapeBlock(NamedTuple):
     rows : TapeRows
         Rows of all problems.
     at, m : LaneCells, array
-        Addresses in the memory of lanes, and this memory.
+        Memory of the lanes (m), and addresses in this memory (at).
     r : array
-        Registers.
+        Registers of the tapes.
     spot, w : array
-        Candidates, and scratch for them.
+        Candidates for starts, and scratch for them.
     """
 
     rows: TapeRows
@@ -129,7 +134,7 @@ def keep(model: EngineModel, rows: TapeRows, stations: int, d: int, size: int) -
 
 @compiled
 def load(block: TapeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
-    """Bring the numbers of a block into its lanes."""
+    """Copy the numbers and measurements z (N, m) of a block into its lanes."""
     c, at, m = block.rows.numbers, block.at, block.m
     for lane in range(LANES):
         i = room.item[lane]
@@ -141,7 +146,7 @@ def load(block: TapeBlock, z: Array, room: EngineWorkspace, anew: bool) -> None:
 
 @compiled
 def minimise_start(model: EngineModel, block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
-    """Write the minimiser of the weighed squared-range rows, and of the other linear rows."""
+    """Write the minimiser of the weighted squared-range rows and of the other linear rows."""
     _lift(block, room, first)
     if block.rows.lifts.flat:
         _minimise_flat(room)
@@ -151,7 +156,7 @@ def minimise_start(model: EngineModel, block: TapeBlock, room: EngineWorkspace, 
 
 @compiled
 def _lift(block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
-    """Write the linear rows behind the range rows, weighed by their error at the last answer."""
+    """Write the linear rows after the range rows, weighted by their errors at the last minimiser."""
     lifts, r = block.rows.lifts, block.r
     s, scale, spare = len(room.place), room.scalar[SCALE], room.scalar[SPARE]
     together = max(1, r.shape[1] // LANES)
@@ -170,7 +175,7 @@ def _lift(block: TapeBlock, room: EngineWorkspace, first: bool) -> None:
 
 @compiled
 def _enter(lifts: Lifts, b: int, room: EngineWorkspace, r: Array, row: int, low: int, inverse: Array) -> None:
-    """Write the inputs of a row of a block into their registers; `inverse` is one over the scale."""
+    """Write the inputs of one row of block b into their registers; `inverse` (W,) is one over the scale, 1/metres."""
     table = lifts.tapes.table
     begin = table[b, INPUT]
     for i in range(table[b + 1, INPUT] - begin):
@@ -191,7 +196,10 @@ def _enter(lifts: Lifts, b: int, room: EngineWorkspace, r: Array, row: int, low:
 
 @compiled
 def _weigh(table: Array, b: int, sigma: float, r: Array, low: int, first: bool, out: Array) -> None:
-    """Write a row (d + 2, W) of a block divided by its error, or by its error at a place one scale away."""
+    """Write one row (d + 2, W) divided by its error.
+
+    For the first start, the error of each row is the error at a distance of one scale.
+    """
     begin, last = table[b, OUTPUT], len(out)
     for j in range(last):
         for lane in range(LANES):
@@ -201,7 +209,10 @@ def _weigh(table: Array, b: int, sigma: float, r: Array, low: int, first: bool, 
 
 @compiled
 def _minimise_flat(room: EngineWorkspace) -> None:
-    """Write the least-squares position: no row has the last coordinate, and the quadric would only invent one."""
+    """Write the least-squares position of rows that do not contain the last coordinate.
+
+    The quadric would determine a last coordinate that no row depends on.
+    """
     rows, y, d, vector, work = room.rows, room.y, room.d, room.vector, room.axes[0]
     diagonal, inverse, solvable = vector[DIAGONAL][:d], vector[MOVE][:d], room.scalar[SOLVABLE]
     for i in range(d):
@@ -230,7 +241,7 @@ def _minimise_flat(room: EngineWorkspace) -> None:
             solvable[lane] = solvable[lane] if 0.0 < share < _MOST else 0.0
 
 
-# One over the share of its diagonal that a pivot must keep: below it three digits of a start are left.
+# One over the least share of its diagonal that a pivot must keep: below it a start has only three correct digits.
 _MOST = 1e13
 
 
@@ -249,7 +260,7 @@ def scout(model: EngineModel, block: TapeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def complete(block: TapeBlock, room: EngineWorkspace) -> None:
-    """Write the other unknowns that fit the position best: exact where rows are linear in them."""
+    """Write the unknowns other than the position that minimise the linearised cost; exact for rows linear in them."""
     vector, d, p = room.vector, room.d, room.vector.shape[1]
     if p == d:
         return
@@ -273,7 +284,7 @@ def complete(block: TapeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def _copy(room: EngineWorkspace, shift: int) -> None:
-    """Copy information and right side at row X, or at TRIAL with shift 1, to REST and MOVE."""
+    """Copy information and right side at row X, or at TRIAL if `shift` is 1, to REST and MOVE."""
     p, left = room.vector.shape[1], room.matrix[REST]
     for i in range(p):
         for lane in range(LANES):
@@ -285,7 +296,7 @@ def _copy(room: EngineWorkspace, shift: int) -> None:
 
 @compiled
 def equations(block: TapeBlock, room: EngineWorkspace, shift: int) -> None:
-    """Write information (lower half), right side and cost at row X, or at TRIAL with shift 1."""
+    """Write information (lower half), right side and cost at row X, or at TRIAL if `shift` is 1."""
     m = _evaluate(block, room, shift)
     p, last = room.vector.shape[1], block.at.after
     matrix, vector = room.matrix[H + shift], room.vector[G + shift]
@@ -301,7 +312,7 @@ def equations(block: TapeBlock, room: EngineWorkspace, shift: int) -> None:
 
 @compiled
 def _evaluate(block: TapeBlock, room: EngineWorkspace, shift: int) -> Any:
-    """Write the equations at row X, or at TRIAL with shift 1, into the memory of the lanes, which is returned."""
+    """Return the memory of the lanes, with the normal equations at row X, or at TRIAL if `shift` is 1."""
     m = _enter_place(block, room, shift)
     write_equations(block.rows.tables, block.rows.numbers, m, block.r, block.at, True, LANES)
     return m
@@ -309,7 +320,7 @@ def _evaluate(block: TapeBlock, room: EngineWorkspace, shift: int) -> Any:
 
 @compiled
 def _enter_place(block: TapeBlock, room: EngineWorkspace, shift: int) -> Any:
-    """Write row X, or TRIAL with shift 1, into the memory of the lanes, which is returned."""
+    """Return the memory of the lanes after writing row X, or TRIAL if `shift` is 1, into it."""
     x, origin = room.vector[X + shift], room.vector[ORIGIN]
     for i in range(room.vector.shape[1]):
         for lane in range(LANES):
@@ -319,7 +330,7 @@ def _enter_place(block: TapeBlock, room: EngineWorkspace, shift: int) -> Any:
 
 @compiled
 def costs(block: TapeBlock, room: EngineWorkspace) -> None:
-    """Write the cost at TRIAL, the least over the other unknowns, to COST_TRIAL."""
+    """Write the cost at the position TRIAL, minimised over the other unknowns, to COST_TRIAL."""
     p, d, at = room.vector.shape[1], room.d, block.at.after
     if p == d:
         m = _enter_place(block, room, 1)
@@ -342,20 +353,20 @@ def costs(block: TapeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def bow_of(block: TapeBlock, room: EngineWorkspace) -> float:
-    """Return infinity: tapes have no bound of their curvature."""
+    """Return infinity: for tapes no bound of the curvature is known."""
     return np.inf
 
 
 @compiled
 def note_nearest(block: TapeBlock, room: EngineWorkspace, least: Array) -> None:
-    """Write that no station is near."""
+    """Write an infinite range to the nearest station: tapes do not report ranges."""
     for lane in range(LANES):
         least[lane] = np.inf
 
 
 @compiled
 def bend(block: TapeBlock, room: EngineWorkspace) -> None:
-    """Write the information to H_TRIAL: tapes have first derivatives only."""
+    """Write the information to H_TRIAL in place of the second derivatives: tapes have first derivatives only."""
     p = room.vector.shape[1]
     for i in range(p):
         for j in range(i + 1):
@@ -365,14 +376,14 @@ def bend(block: TapeBlock, room: EngineWorkspace) -> None:
 
 @compiled
 def measure_infinity(block: TapeBlock, room: EngineWorkspace) -> None:
-    """Write infinity where no far position fits, else NaN: not measured."""
+    """Write infinity to BEYOND if no far position fits, else NaN (not measured)."""
     for lane in range(LANES):
         room.scalar[BEYOND, lane] = np.inf if block.rows.bounded else np.nan
 
 
 @compiled
 def search_infinity(model: EngineModel, block: TapeBlock, room: EngineWorkspace) -> None:
-    """Write to BEYOND what infinity costs: a search, for fixes that are bent."""
+    """Write the least cost at infinity to BEYOND by a search on a sphere."""
     if block.rows.bounded or block.rows.scaled:
         measure_infinity(block, room)
     else:

@@ -1,9 +1,9 @@
-"""Normal equations of many problems at once, in lanes: memory, measurements with derivatives, sums over groups of rows.
+"""Normal equations of many problems in lanes: memory, measurements with derivatives, sums over groups of rows.
 
-A lane is a problem; one interpreter runs the tape of a kind over all of them. A cell of the memory holds one number of
-every lane: one array instead of many, because each array that is handed to a kernel costs as much time as dozens of
-multiplications. Numbers are reached by whole indices, never by views of arrays: a view counts references, which takes
-longer than what is done with it.
+A lane is a problem; one interpreter runs the tape of a kind over all lanes. A cell of the memory contains one number of
+every lane. All cells are in one array, because each array argument of a kernel costs as much time as dozens of
+multiplications. Kernels use integer indices instead of views: a view counts references, which takes longer than the
+arithmetic.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from optloc.kernels.tables import (
 )
 from optloc.kernels.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN, SQRT, SUB
 
-# Working memory of a block of lanes, and where everything stands in it.
+# Working memory of a block of lanes, and the addresses of its parts.
 
 LENGTH = 128
 """Length of a register: rows of one kind are put behind each other, lanes of one and then of the next.
@@ -52,16 +52,16 @@ A few lanes share the choice of an operation over several rows; twice the most l
 
 
 class LaneCells(NamedTuple):
-    """First cell of each part, for p unknowns of which n are shared and l local."""
+    """First cell of each part, for p unknowns of which n are shared and l are local."""
 
-    own: int  # sources, whitening matrices and priors that each problem has to itself
+    own: int  # sources, whitening matrices and priors that differ between problems
     observed: int  # (m,)
-    present: int  # (m,), or none where all rows count
+    present: int  # (m,), or empty if all rows are present
     rows: int  # (rows of a packet, columns and residual)
     whitened: int  # (rows of a group, columns and residual)
     error: int  # (2 * largest prior,)
     scale: int
-    trial: int  # (p,): where equations are wanted
+    trial: int  # (p,): vector at which the equations are computed
     best: int  # (p,)
     after: int  # (n + l + 1, n + l + 1): equations at `trial`, lower triangle, then vector and cost
     now: int  # the same at `best`
@@ -71,23 +71,23 @@ class LaneCells(NamedTuple):
     local: int  # (l, l)
     local_scale: int  # (l,)
     half: int  # (n + 1, l): the local factor's inverse times coupling and vector
-    state: int  # what a refinement remembers
+    state: int  # state of a refinement
     cells: int
-    absent: int  # 1 where some rows do not count
+    absent: int  # 1 if some rows are absent
 
 
 STATE = 8
 """Cells that a refinement keeps of every problem."""
 _EPSILON = float(np.finfo(float).eps)
 
-# Lanes of a block: as many as keep the cells that are used again and again (2**18 doubles, 2 MB) in the cache, and all
-# of them in bounds (64 MB). 64 lanes share the cost of choosing an operation; eight fill a vector register.
+# Lanes of a block: so few that the frequently used cells (2**18 doubles, 2 MB) stay in the cache, and that all cells
+# fit into 64 MB. 64 lanes share the cost of selecting an operation; eight lanes fill a vector register.
 _LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
 
 
 @compiled
 def cell_layout(t: Tables, c: Numbers, size: int) -> LaneCells:
-    """Return where things stand for problems of p = `size` unknowns."""
+    """Return the addresses of all parts of the memory for problems of p = `size` unknowns."""
     n, local, largest = t.shared, t.local, 0
     for i in range(t.groups, c.place.shape[0]):
         largest = max(largest, c.place[i, PRIOR_SIZE])
@@ -137,7 +137,7 @@ def cell_layout(t: Tables, c: Numbers, size: int) -> LaneCells:
 def load(
     m: Array, lane: int, item: int, source: Array, white: Array, prior: Array, observed: Array, present: Array
 ) -> None:
-    """Bring the numbers of a problem into a lane of the memory (cells, B); the arrays are those of `Numbers`."""
+    """Copy the numbers of a problem into a lane of the memory (cells, B); the arrays are those of `Numbers`."""
     cell = _fill(m, 0, lane, source, item)
     cell = _fill(m, cell, lane, white, item)
     cell = _fill(m, cell, lane, prior, item)
@@ -147,7 +147,7 @@ def load(
 
 @compiled
 def rounding_of_residuals(sigma: Array, size: Array, m: Array, room: LaneCells, lane: int, item: int) -> float:
-    """Return the rounding error of the whitened residuals: arrival times that count from long ago are coarse."""
+    """Return the rounding error of the whitened residuals; it is large for arrival times counted from long ago."""
     row, squares = item if sigma.shape[0] > 1 else 0, 0.0
     for i in range(sigma.shape[1]):
         if not room.absent or m[room.present + i, lane] != 0.0:
@@ -160,6 +160,7 @@ def rounding_of_residuals(sigma: Array, size: Array, m: Array, room: LaneCells, 
 
 @compiled
 def _fill(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
+    # Copy the numbers of a problem to a lane, from `cell` on, and return the next cell.
     row = item if source.shape[0] > 1 else 0
     for i in range(source.shape[1]):
         m[cell + i, lane] = source[row, i]
@@ -168,9 +169,12 @@ def _fill(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
 
 @compiled
 def blocks(packed: Packed, size: int, count: int) -> int:
-    """Return how many of a number of problems of p = `size` unknowns are worked on together: they fit the cache."""
+    """Return the number of lanes of a block for `count` problems of p = `size` unknowns.
+
+    The block is so small that its cells stay in the cache.
+    """
     t = packed.tables
-    # Cells that one step touches again and again: rows of a packet, and the equations at two places.
+    # Cells that one step uses repeatedly: rows of a packet, and the equations at two vectors.
     each = t.rows * t.width + 2 * (t.shared + t.local + 1) ** 2
     fitting = min(_CELLS // each, _MOST // (each + 2 * size + packed.numbers.observed.shape[1]))
     return int(max(1, min(count, _LANES, max(_FEWEST, _FEWEST * (fitting // _FEWEST)))))
@@ -178,15 +182,14 @@ def blocks(packed: Packed, size: int, count: int) -> int:
 
 @compiled
 def memory(t: Tables, room: LaneCells, lanes: Constant) -> tuple[Array, Array]:
-    """Return cells and registers for a number of lanes."""
+    """Return cells (cells, lanes) and registers for a number of lanes."""
     return np.zeros((room.cells, lanes)), np.empty((t.registers, max(LENGTH, lanes)))
 
 
 @compiled
 def run_operations(code: Array, first: int, last: int, r: Array, count: Constant) -> None:
-    """Run operations on the first numbers of registers; see `Tape` and `symbol.OPERATIONS`."""
-    # The operation is chosen once for all lanes, and each loop is one that the compiler turns into vector
-    # instructions.
+    """Run operations first <= i < last on the first `count` columns of the registers; see `Tape` and `OPERATIONS`."""
+    # The operation is selected once for all lanes, and the compiler turns each loop into vector instructions.
     for step in range(first, last):
         operation, to, u, v = code[step, 0], code[step, 1], code[step, 2], code[step, 3]
         if operation == MUL:
@@ -210,12 +213,13 @@ def run_operations(code: Array, first: int, last: int, r: Array, count: Constant
 
 @compiled
 def _rare(operation: int, r: Array, to: int, u: int, v: int, count: Constant) -> None:
+    # Run one of the less frequent operations on the first `count` numbers of registers.
     if operation == NEG:
         for i in range(count):
             r[to, i] = -r[u, i]
     elif operation == HYPOT:
         for i in range(count):
-            # Squares of metres do not overflow, and a call of hypot would end the vector loop.
+            # Squares of metres do not overflow, and a call of hypot would prevent vector instructions.
             r[to, i] = np.sqrt(r[u, i] * r[u, i] + r[v, i] * r[v, i])
     elif operation == ATAN2:
         for i in range(count):
@@ -238,26 +242,26 @@ def _rare(operation: int, r: Array, to: int, u: int, v: int, count: Constant) ->
 def write_derivatives(
     t: Tables, common: Array, m: Array, r: Array, room: LaneCells, packet: int, x: int, lanes: Constant
 ) -> None:
-    """Write derivatives and residuals of a packet: columns of the row's group, then the residual.
+    """Write derivatives and residuals of the rows of a packet: the columns of the row's group, then the residual.
 
     Parameters
     ----------
     t : Tables
         Indices.
     common : array
-        What the problems share.
+        Numbers that the problems share.
     m : array (cells, B)
         Memory; the rows of the packet are written to `room.rows`.
     r : array (registers, LENGTH)
         Registers.
     room : LaneCells
-        Where things stand.
+        Addresses in the memory.
     packet : int
-        Which rows.
+        Number of the packet.
     x : int
         Cell of the parameter vectors.
     lanes : int
-        How many lanes hold a problem.
+        Number of lanes that contain a problem.
     """
     index, together = t.table, LENGTH // max(1, min(lanes, LENGTH))
     for number in range(t.kinds):
@@ -285,7 +289,10 @@ def write_derivatives(
 def _inputs(
     t: Tables, common: Array, m: Array, own: int, r: Array, begin: int, row: int, end: int, x: int, lanes: Constant
 ) -> None:
-    """Write the inputs of rows of one kind, which `begin` in the table of inputs, into their registers."""
+    """Write the inputs of the rows of one kind into their registers.
+
+    `begin` is their first line in the table of inputs.
+    """
     index = t.table
     for one in range(row, end):
         low, source = (one - row) * lanes, index[t.row + one, ROW_SOURCE]
@@ -306,7 +313,7 @@ def _inputs(
 
 @compiled
 def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int, to: int, lanes: Constant) -> None:
-    """Write the derivatives of h of one row by the unknowns that move its inputs."""
+    """Write the derivatives of h of one row by the unknowns that change its inputs."""
     index = t.table
     source = index[line, ROW_SOURCE]
     for j in range(index[line, ROW_WIDTH]):
@@ -325,13 +332,13 @@ def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int,
 def _measurement(
     t: Tables, m: Array, r: Array, place: int, line: int, low: int, to: int, x: int, scale: int, lanes: Constant
 ) -> None:
-    """Write the value of one row behind its derivatives, and what scales and offsets do to both."""
+    """Write the value of one row after its derivatives, and apply scales and offsets to both."""
     index = t.table
     value, end = to + index[line, ROW_WIDTH], index[line + 1, ROW_ADDEND]
     first, last = index[line, ROW_SCALE], index[line + 1, ROW_SCALE]
     for b in range(lanes):
         m[value, b] = r[place, low + b]
-    # Rows without a scale, nearly all of them, are left as they are.
+    # Nearly all rows have no scale, and are not changed.
     if last > first:
         for b in range(lanes):
             m[scale, b] = 1.0
@@ -357,46 +364,46 @@ def _measurement(
 
 @compiled
 def _residual(m: Array, value: int, observed: int, periodic: int, lanes: Constant) -> None:
-    """Replace values by residuals, angles wrapped."""
+    """Replace values by residuals; angles are wrapped."""
     for b in range(lanes):
         m[value, b] = m[observed, b] - m[value, b]
     if periodic:
         for b in range(lanes):
-            # Wrapped only where it must be: that takes three transcendental functions.
+            # Wrapped only if necessary, because wrapping takes three transcendental functions.
             if not -pi < m[value, b] <= pi:
                 m[value, b] = np.arctan2(np.sin(m[value, b]), np.cos(m[value, b]))
 
 
 @compiled
 def _mask(m: Array, value: int, present: int, lanes: Constant) -> None:
-    """Make the residuals of absent rows zero."""
+    """Set the residuals of absent rows to zero."""
     for b in range(lanes):
         m[value, b] = m[value, b] if m[present, b] != 0.0 else 0.0
 
 
-# From derivatives and residuals to normal equations: whitened, multiplied with themselves, summed over groups.
+# From derivatives and residuals to normal equations: rows are whitened, multiplied, and summed over groups.
 
 
 @compiled
 def write_equations(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, priors: bool, lanes: Constant) -> None:
-    """Write the normal equations at `room.trial` into `room.after`.
+    """Write the normal equations at `room.trial` to `room.after`.
 
     Parameters
     ----------
     t : Tables
-        Indices of problems of one epoch, or without unknowns local to the epochs.
+        Indices of problems of one epoch, or without local unknowns.
     c : Numbers
-        What the problems share.
+        Numbers that the problems share.
     m : array (cells, B)
         Memory.
     r : array (registers, LENGTH)
         Registers.
     room : LaneCells
-        Where things stand.
+        Addresses in the memory.
     priors : bool
         Whether Gaussian priors are added.
     lanes : int
-        How many lanes hold a problem.
+        Number of lanes that contain a problem.
     """
     clear(m, room.after, (t.shared + t.local + 1) ** 2, lanes)
     add_groups(t, c, m, r, room, room.trial, ALL, 0, 0, lanes)
@@ -407,7 +414,7 @@ def write_equations(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, 
 
 @compiled
 def write_cost(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, lanes: Constant) -> None:
-    """Write the cost at `room.trial`, the last cell of `room.after`."""
+    """Write the cost at `room.trial` to the last cell of `room.after`."""
     total = room.after + (t.shared + t.local + 1) ** 2 - 1
     for b in range(lanes):
         m[total, b] = 0.0
@@ -440,9 +447,9 @@ def add_groups(
     packet: int,
     lanes: Constant,
 ) -> tuple[int, int]:
-    """Add the rows of an epoch at the vectors of cell x on to `room.after`; return the next group and packet.
+    """Add the rows of an epoch at the vectors in cell x to `room.after`; return the next group and packet.
 
-    Groups come in the order of their epochs, packets in that of their groups: one pass goes through all.
+    Groups are sorted by epoch, and packets by group, so that one pass visits all of them.
     """
     while group < t.groups and (epoch == ALL or t.table[t.group + group, GROUP_EPOCH] == epoch):
         if packet < t.packets and t.table[t.packet + packet, FIRST] == group:
@@ -457,7 +464,7 @@ def add_groups(
 def add_priors(
     t: Tables, c: Numbers, m: Array, room: LaneCells, x: int, local: bool, epoch: int, lanes: Constant
 ) -> None:
-    """Add the priors of the shared unknowns, or of those of an epoch, to the equations in `room.after`."""
+    """Add the priors of the shared unknowns, or of the unknowns of an epoch, to the equations in `room.after`."""
     for i in range(t.groups, c.place.shape[0]):
         if (c.place[i, PRIOR_LOCAL] == 1) == local:
             start = c.place[i, PRIOR_START] + (t.shared if local else 0)
@@ -467,7 +474,7 @@ def add_priors(
 
 @compiled
 def clear(m: Array, first: int, count: int, lanes: Constant) -> None:
-    """Write zeros."""
+    """Set `count` cells from `first` on to zero."""
     for cell in range(first, first + count):
         for b in range(lanes):
             m[cell, b] = 0.0
@@ -487,7 +494,7 @@ def add_group(t: Tables, common: Array, place: Array, m: Array, room: LaneCells,
 def whiten_group(
     t: Tables, common: Array, place: Array, m: Array, room: LaneCells, group: int, residual: bool, lanes: Constant
 ) -> int:
-    """Whiten the rows of a group, or their residuals alone, and return the cell of the first."""
+    """Whiten the rows of a group, or only their residuals, and return the cell of the first whitened row."""
     line = t.group + group
     columns = t.table[line + 1, GROUP_COLUMN] - t.table[line, GROUP_COLUMN]
     begin = room.rows + t.table[line, FIRST] * t.width + (columns if residual else 0)
@@ -517,7 +524,7 @@ def _whiten(
             cell = to + i * width + s
             for b in range(lanes):
                 m[cell, b] = 0.0
-            # Whitening matrices are lower triangular but for singular covariances.
+            # Whitening matrices are lower triangular, except for singular covariances.
             for j in range(size if full else i + 1):
                 row = first + j * width + s
                 if place >= 0:
@@ -549,7 +556,7 @@ def _square(
         for j in range(i + 1):
             cell = line + (index[column + j, FIRST] if j < columns - 1 else last)
             r, u, v = 0, first + i, first + j
-            # Four rows at a time in two sums: a cell is loaded and stored once for four products.
+            # Four rows at a time in two sums, so that a cell is loaded and stored once for four products.
             while r + 3 < size:
                 for b in range(lanes):
                     m[cell, b] += (m[u, b] * m[v, b] + m[u + width, b] * m[v + width, b]) + (
@@ -566,7 +573,7 @@ def _square(
 def _add_prior(
     common: Array, place: int, size: int, m: Array, room: LaneCells, x: int, start: int, last: int, lanes: Constant
 ) -> None:
-    """Add a Gaussian prior of the `size` unknowns at cell x on, whose first column is `start`."""
+    """Add a Gaussian prior of the `size` unknowns from cell x on, whose first column is `start`."""
     error, pull, to = room.error, room.error + size, room.after
     vector = to + last * (last + 1)
     for i in range(size):

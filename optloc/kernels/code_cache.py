@@ -1,11 +1,11 @@
-"""Machine code on disk: each kernel is kept under the digest of its call graph (`optloc.kernels.digests`).
+"""Machine code on disk: each kernel is stored under the digest of its call graph (`optloc.kernels.digests`).
 
-numba renews its files of a function when the file of that function changes. But machine code contains all functions
-that it calls, in any file: after an edit or an upgrade of one of those, stale code would answer. So numba's own
-stamp is not used. The folder of machine code is named by the versions of the compilers and by the processor. The
-folder of an installed distribution (`optloc.kernels.manifest`) comes first.
+numba recompiles a stored function if the file of this function changes. But machine code contains all functions that it
+calls, from any file: after an edit or an upgrade of one of them, numba would run stale code. So numba's file stamp is
+not used. The name of the folder of machine code depends on the versions of the compilers and on the processor. The
+folder of an installed distribution (`optloc.kernels.manifest`) is read first.
 
-Callees are kept too where they save time: in a checkout, and while `optloc compile` makes everything.
+Callees are stored too if this saves time: in a checkout, and while `optloc compile` compiles everything.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from optloc.kernels.compilation import callee_library
 from optloc.kernels.digests import Compilable, digest_of
 from optloc.kernels.manifest import PACKAGE, PREFIX, installed, of_this_process
 
-# Folders for other compilers that are left, the last used ones, and versions of one function: branches of a checkout
-# and releases that share a folder by NUMBA_CACHE_DIR take turns.
+# Number of folders for other compilers that are not deleted (the most recent ones), and of stored versions of one
+# function. So branches of a checkout, and releases that share a folder by NUMBA_CACHE_DIR, can alternate.
 _LEFT = 4
 CALLEES = "OPTLOC_CALLEES"
-"""The variable that names a folder for callees while `optloc compile` makes everything in several processes."""
+"""Environment variable with the folder for callees while `optloc compile` compiles everything in several processes."""
 _LOG = logging.getLogger("optloc")
 
 
 @cache
 def folder() -> Path | None:
-    """Return the folder that machine code is kept in, None where nothing can be written.
+    """Return the folder in which machine code is stored, or None if no folder is writable.
 
-    It lies in the folder that NUMBA_CACHE_DIR names, else beside the package, else in the user's folder of caches.
+    The candidates are: the folder in NUMBA_CACHE_DIR, a folder in the package, and the user's cache folder.
     """
     from numba.core import config
     from numba.misc import appdirs
@@ -53,7 +53,7 @@ def folder() -> Path | None:
         try:
             place.mkdir(parents=True, exist_ok=True)
             TemporaryFile(dir=place).close()
-            os.utime(place)  # used now
+            os.utime(place)  # mark the folder as used now
             _clear(place)
         except OSError:
             continue
@@ -62,21 +62,22 @@ def folder() -> Path | None:
 
 
 def _clear(place: Path) -> None:
-    """Remove folders for other compilers but the last used; a process that still uses one makes its own anew."""
+    """Remove folders for other compilers except the most recent ones; a process that still uses one compiles again."""
     others = [path for path in place.parent.glob(f"{PREFIX}*") if path != place and path.is_dir()]
     for path in sorted(others, key=_used, reverse=True)[_LEFT:]:
         shutil.rmtree(path, ignore_errors=True)
 
 
 def _used(path: Path) -> float:
+    """Return the time at which a folder was last used, seconds; 0 if it no longer exists."""
     try:
         return path.stat().st_mtime
-    except OSError:  # removed by another process meanwhile
+    except OSError:  # another process has removed it
         return 0.0
 
 
-class _KeptPlace:
-    """Where the machine code of a function is kept, as numba asks for it (a cache locator)."""
+class _CacheLocator:
+    """The location of the machine code of a function, with the interface of a cache locator of numba."""
 
     def __init__(self, function: Callable[..., Any], place: Path, digest: str) -> None:
         self._py_file = str(Path(function.__code__.co_filename).resolve())
@@ -89,7 +90,7 @@ class _KeptPlace:
         return self._path
 
     def get_source_stamp(self) -> str:
-        return ""  # the digest is in the name
+        return ""  # the name of the file contains the digest
 
     def get_disambiguator(self) -> str:
         return self._digest
@@ -97,13 +98,13 @@ class _KeptPlace:
 
 @cache
 def _entries() -> tuple[Any, Any]:
-    """Return numba's types of a stored function: one that Python calls, and one that only kernels call."""
+    """Return numba's cache types for functions that Python calls, and for functions that only kernels call."""
     from numba.core import caching
 
     numba: Any = caching  # half typed
 
     class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
-        def __init__(self, place: _KeptPlace, function: Callable[..., Any]) -> None:
+        def __init__(self, place: _CacheLocator, function: Callable[..., Any]) -> None:
             self._locator, self._lineno = place, function.__code__.co_firstlineno
             self._filename_base = file_prefix_of(name_of(function), place.get_disambiguator())
 
@@ -123,7 +124,7 @@ def _entries() -> tuple[Any, Any]:
 
 
 def _fields(kind: Any) -> tuple[Any, ...]:
-    """Return the fields of a type of numba, and of the types in it; () of one without."""
+    """Return the fields of a numba type and of the types inside it; () for a type without fields."""
     from numba.core import types
 
     numba: Any = types  # half typed
@@ -134,7 +135,7 @@ def _fields(kind: Any) -> tuple[Any, ...]:
 
 @cache
 def _cache_type() -> Any:
-    """Return numba's cache of a function, told where it lies and by which name; damaged entries are as good as none."""
+    """Return the class of numba's function cache with our folder and file names; damaged entries are ignored."""
     from numba.core import caching
 
     numba: Any = caching  # half typed
@@ -142,24 +143,27 @@ def _cache_type() -> Any:
     class CachedKernel(numba.FunctionCache):  # type: ignore[misc]
         def __init__(self, kernel: Compilable, place: Path, *, callee: bool) -> None:
             function = kernel.function
-            self._impl_class = partial(_entries()[callee], _KeptPlace(function, place, digest_of(kernel)))
+            self._impl_class = partial(_entries()[callee], _CacheLocator(function, place, digest_of(kernel)))
             super().__init__(function)
             self._name = name_of(function)
             self._installed = None if callee else installed()
 
         def _index_key(self, sig: Any, codegen: Any) -> Any:
-            # For numba two named tuples differ by class and types of fields, not by the names of the fields.
+            """Return the key of an entry, with the names of fields of named tuples."""
+            # numba distinguishes named tuples by class and types of the fields, but not by the names of the fields.
             return *super()._index_key(sig, codegen), tuple(map(_fields, getattr(sig, "args", sig)))
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
+            """Return the stored machine code for a signature, or None."""
             try:
                 found = self._from_installed(sig, target_context)
                 return super().load_overload(sig, target_context) if found is None else found
-            except Exception as error:  # noqa: BLE001  # whatever a damaged pickle raises
-                _LOG.warning("machine code of %s on disk cannot be read (%r); it is made anew", self._name, error)
+            except Exception as error:  # noqa: BLE001  # a damaged pickle may raise anything
+                _LOG.warning("cannot read the stored machine code of %s (%r); it is compiled again", self._name, error)
                 return None
 
         def _from_installed(self, sig: Any, target_context: Any) -> Any:
+            """Return the installed machine code for a signature, or None."""
             if self._installed is None:
                 return None
             place, made = self._installed
@@ -170,35 +174,36 @@ def _cache_type() -> Any:
             return None if data is None else self._impl.rebuild(target_context, data)
 
         def save_overload(self, sig: Any, data: Any) -> None:
+            """Store machine code for a signature, and remove old versions of the function."""
             place, base = Path(self._cache_path), self._impl.filename_base
             try:
                 try:
                     super().save_overload(sig, data)
                 except OSError:
                     raise
-                except Exception:  # noqa: BLE001  # the index is damaged, or names a class that no longer exists
+                except Exception:  # noqa: BLE001  # the index is damaged, or its class no longer exists
                     (place / f"{base}.nbi").unlink()
                     super().save_overload(sig, data)
                 _leave_last(place, self._name, base)
-            except OSError as error:  # a full disk: the code serves this process
-                _LOG.warning("machine code of %s cannot be kept on disk: %s", self._name, error)
+            except OSError as error:  # a full disk: the machine code is used in this process only
+                _LOG.warning("cannot store the machine code of %s: %s", self._name, error)
 
     return CachedKernel
 
 
 def code_cache_of(kernel: Compilable, *, callee: bool) -> Any:
-    """Return a cache for the machine code of a kernel, as a dispatcher of numba holds one; None without a folder."""
+    """Return a cache for the machine code of a kernel, for numba's dispatcher; None without a folder."""
     place = _callees() if callee else folder_in_use()
     return None if place is None else _cache_type()(kernel, place, callee=callee)
 
 
 def folder_in_use() -> Path | None:
-    """Return the folder that machine code is kept in, or was installed in where nothing can be written."""
+    """Return the folder in which machine code is stored; if none is writable, the installed folder."""
     return folder() or _installed_folder()
 
 
 def _callees() -> Path | None:
-    """Return the folder for code that only kernels call; None where no later compilation will need it."""
+    """Return the folder for code that only kernels call, or None if no later compilation will use it."""
     named = os.environ.get(CALLEES)
     if named:
         return Path(named)
@@ -207,36 +212,36 @@ def _callees() -> Path | None:
 
 
 def is_checkout() -> bool:
-    """Return whether this package is a checkout, whose kernels are edited."""
+    """Return whether this package is a checkout, whose kernels change."""
     return (PACKAGE.parent / "pyproject.toml").is_file()
 
 
 def is_cached(kernel: Compilable) -> bool:
-    """Return whether there is machine code of a kernel on disk."""
+    """Return whether machine code of a kernel is on disk."""
     return bool(files_of(kernel, _installed_folder(), folder()))
 
 
 def files_of(kernel: Compilable, *places: Path | None) -> list[Path]:
-    """Return the files that machine code of a kernel is kept in, in the first folder that has some; [] without any."""
+    """Return the files with the machine code of a kernel, from the first folder that contains it; [] if none does."""
     index = f"{file_prefix_of(name_of(kernel.function), digest_of(kernel))}.nbi"
     found = next((place for place in places if place is not None and (place / index).exists()), None)
     return [] if found is None else [found / index, *found.glob(index.replace(".nbi", ".*.nbc"))]
 
 
 def name_of(function: Callable[..., Any]) -> str:
-    """Return the whole name of a function."""
+    """Return the qualified name of a function, with its module."""
     return f"{function.__module__}.{function.__qualname__}"
 
 
 def file_prefix_of(name: str, digest: str) -> str:
-    """Return how the names of files of machine code begin, of a function by its whole name."""
-    # Windows forbids the brackets of a function inside another.
+    """Return the start of the file names of machine code, for a qualified name and a digest."""
+    # Windows forbids the angle brackets that occur in names of inner functions.
     version = f"py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, 'abiflags', '')}"
     return f"{name.replace('<', '').replace('>', '')}-{digest}.{version}"
 
 
 def _leave_last(place: Path, name: str, base: str) -> None:
-    """Remove files of other digests of a function, but the newest."""
+    """Remove the files of other digests of a function, except the newest."""
     others = [path for path in place.glob(f"{file_prefix_of(name, '*')}.nbi") if path.stem != base]
     for path in sorted(others, key=_used, reverse=True)[_LEFT - 1 :]:
         for file in (path, *place.glob(f"{path.stem}.*.nbc")):
@@ -244,15 +249,17 @@ def _leave_last(place: Path, name: str, base: str) -> None:
 
 
 def _installed_folder() -> Path | None:
+    """Return the folder of installed machine code, or None."""
     found = installed()
     return None if found is None else found[0]
 
 
 @cache
 def start_background_compiler() -> None:
-    """Begin a process in the background that makes all machine code, if none does so already; it may outlive this one.
+    """Start a background process that compiles all machine code, unless one is running; it may outlive this process.
 
-    Its absence is no failure: what it would have made is made later, or never, and answers come in plain Python.
+    A failure to start it is only logged: the machine code is compiled later or never, and plain Python is used until
+    then.
     """
     path = os.pathsep.join([str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     quiet = subprocess.DEVNULL
@@ -265,13 +272,13 @@ def start_background_compiler() -> None:
             env=os.environ | {"PYTHONPATH": path},
             start_new_session=True,
         )
-        _LOG.warning("machine code is made in the background, once and in some minutes; plain Python answers meanwhile")
+        _LOG.warning("a background process compiles machine code (once, some minutes); until then plain Python is used")
     except OSError as error:
-        _LOG.warning("no process can be begun that would make machine code: %s", error)
+        _LOG.warning("cannot start the process that compiles machine code: %s", error)
 
 
 def _holds(file: IO[bytes], *, wait: bool) -> bool:
-    """Return whether a file could be locked, until it is closed; True on systems and file systems without locks."""
+    """Return whether a file could be locked until it is closed; True if the system or file system has no locks."""
     try:
         import fcntl
 
@@ -285,7 +292,7 @@ def _holds(file: IO[bytes], *, wait: bool) -> bool:
 
 @contextmanager
 def sole_compiler() -> Iterator[bool]:
-    """Tell whether no other process makes all machine code, and be the one that does."""
+    """Yield True and lock the compilation of all machine code, or yield False if another process has the lock."""
     place = folder()
     if place is None:
         yield False
@@ -296,7 +303,10 @@ def sole_compiler() -> Iterator[bool]:
 
 @contextmanager
 def locked(kernel: Compilable) -> Iterator[None]:
-    """Hold the machine code of a kernel while it is made: a process that waits for it loads it afterwards."""
+    """Lock the machine code of a kernel while it is compiled.
+
+    Processes that wait for the lock load the result afterwards.
+    """
     place = folder()
     if place is None or is_cached(kernel):
         yield
@@ -304,7 +314,7 @@ def locked(kernel: Compilable) -> Iterator[None]:
     with ExitStack() as stack:
         try:
             file = stack.enter_context((place / f"{name_of(kernel.function)}.lock").open("ab"))
-        except OSError:  # the folder was removed: it is made once more
+        except OSError:  # the folder was removed, so it is created again
             yield
             return
         _holds(file, wait=True)

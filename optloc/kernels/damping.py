@@ -1,9 +1,9 @@
-"""When a damped step of Gauss and Newton is taken, and when it was the last: one rule, for arrays and for lanes.
+"""The rules by which a damped Gauss-Newton step is accepted or is the last one, for arrays and for lanes.
 
-Levenberg's method with Marquardt's scaling. A step is taken where it does not raise the cost by more than rounding
-explains. The damping follows the ratio of the achieved decrease to that of the linear model: it falls continuously
-where they agree, and grows faster and faster where steps are refused. A fix is finished when its next step is shorter
-than a share of its own standard deviations, and stuck when no damping helps.
+Levenberg's method with Marquardt's scaling. A step is accepted if it does not raise the cost by more than rounding
+explains. The damping follows the ratio of the achieved decrease to the decrease in the linear model. It falls
+continuously where they agree, and grows faster and faster while steps are rejected. A fix has converged if its next
+step is shorter than a share of its standard deviations. A fix is stuck if no damping helps.
 
 References
 ----------
@@ -20,22 +20,23 @@ from optloc.base.types import Array
 from optloc.kernels.jit import compiled
 
 FIRST_DAMPING = 1e-6
-"""Starts are closed forms near the minimum, where steps should be those of Gauss and Newton (Nielsen's tau)."""
+"""Initial damping. Starts are closed forms near the minimum, where undamped steps are best (Nielsen's tau)."""
 FIRST_GROWTH = 2.0
-"""Factor of the damping when a step is refused; each further refusal doubles it (Nielsen's nu)."""
+"""Factor of the damping when a step is rejected; each further rejection doubles it (Nielsen's nu)."""
 
-# Rounding of a cost, relative to one more than it: 450 units in the last place, for sums of some hundred squares.
+# Rounding error of a cost, relative to the cost plus one: 450 units in the last place, for sums of some hundred
+# squares.
 _ROUNDING = 1e-13
-# The damping must not become zero, from which no factor leads back; here a step is undamped but for its last digits.
+# Least damping. From zero no factor leads back; at this value only the last digits of a step are damped.
 _LEAST = 1e-12
-# The inverse of the least: a step so much shorter than that of Gauss and Newton moves nothing but last digits.
+# Greatest damping, the inverse of the least: steps with this damping change only the last digits.
 _MOST = 1e12
-# Nielsen's limits of one change: no more than to a third, but to a tenth where the linear model holds to 10 %.
+# Nielsen's limits of one change: at most to a third, or to a tenth if the linear model agrees to 10 %.
 _FALL, _QUICK_FALL, _AGREED = 1.0 / 3.0, 0.1, 0.9
 
 
 class StopRules(NamedTuple):
-    """When a refinement ends; see `optloc.kernels.least_squares.refine`, whose defaults these are."""
+    """The conditions that end a refinement; see `optloc.kernels.least_squares.refine`, which has the same defaults."""
 
     tolerance: float = 1e-7
     limit: int = 60
@@ -43,18 +44,18 @@ class StopRules(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """What becomes of a step: each an array (N,), or a scalar.
+    """The decision on a step; each field is an array (N,) or a scalar.
 
     Parameters
     ----------
     better : bool
-        Whether it is taken.
+        Whether the step is accepted.
     small : bool
-        Whether it was the last: the fix is finished.
+        Whether the step was the last, because the fix has converged.
     stuck : bool
-        Whether it was refused and no damping helps.
+        Whether the step was rejected and no damping helps.
     damping, growth : float
-        For the next step.
+        Values for the next step.
     """
 
     better: Array
@@ -75,24 +76,24 @@ def judge(
     tolerance: float,
     damped: bool,
 ) -> Judged:
-    """Judge a step of each of N fixes.
+    """Return the decision on one step of each of N fixes.
 
     Parameters
     ----------
     cost, after : array (N,)
-        Before the step and behind it.
+        Cost before and after the step.
     gain : array (N,)
-        Step times right-hand side: its squared length in its own standard deviations, but for the damping.
+        Step times right side: the squared length of the step in standard deviations, apart from the damping.
     solvable : bool array (N,)
         Whether the normal equations have a solution.
     blur : array (N,)
         Rounding error of the whitened residuals.
     damping, growth : array (N,)
-        Of the step, and the factor if it is refused.
+        Damping of the step, and the factor if the step is rejected.
     tolerance : float
-        A fix is finished when a step is shorter than this many of its standard deviations.
+        A fix has converged if a step is shorter than this number of standard deviations.
     damped : bool
-        False: every step is taken whatever it does to the cost.
+        If False, every step is accepted, even if it raises the cost.
     """
     achieved, floor = cost - after, _ROUNDING * (1.0 + cost)
     rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
@@ -117,7 +118,7 @@ def judge_lane(
     tolerance: float,
     damped: bool,
 ) -> tuple[bool, bool, bool, float, float]:
-    """Judge a step of one fix: the same to the last bit, as machine code; returns the fields of `Judged`."""
+    """Return the fields of `Judged` for one step of one fix: `judge` as machine code, with identical rounding."""
     achieved, floor = cost - after, _ROUNDING * (1.0 + cost)
     rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
     better = solvable and np.isfinite(after) and (achieved >= -rounding or not damped)

@@ -1,8 +1,8 @@
-"""The digest of a kernel: of its own code, its constants, and everything that it calls.
+"""The digest of a kernel: a hash of its code, its constants, and everything that it calls.
 
-Machine code of a kernel contains its callees and the values of module constants. So the digest covers the whole call
-graph below the kernel, and nothing else: an edit renews only the kernels that reach the edited function. Comments,
-docstrings and line numbers are not part of it.
+The machine code of a kernel contains its callees and the values of module constants. So the digest covers the whole
+call graph below the kernel and nothing else: after an edit, only the kernels that reach the edited function are
+compiled again. Comments, docstrings and line numbers do not change the digest.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from typing import Any
 
 import numpy as np
 
-# Modules whose functions belong to numba, so that its version speaks for them.
+# Modules of numpy, numba and the standard library: the version of numba, which is part of the folder name, covers them.
 _LIBRARIES = ("math", "numpy", "heapq", "typing", "operator", "numba")
-# Hexadecimal digits of a digest in a file name: 64 bits never meet by chance.
+# Hexadecimal digits of a digest in a file name: with 64 bits no accidental collision is expected.
 _DIGITS = 16
 
 
 class Compilable:
-    """A function that numba compiles, alone or into its callers; it may be replaced.
+    """A function that numba compiles separately or into its callers; it can be replaced.
 
     Parameters
     ----------
     function : callable
-        The function in Python.
+        The Python function.
     taken_in : bool
-        Whether each caller inlines it.
+        Whether each caller inlines the function.
     """
 
     def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
@@ -39,7 +39,7 @@ class Compilable:
 
 
 def digest_of(kernel: Compilable) -> str:
-    """Return the digest of a kernel's call graph; kernels that call each other share one."""
+    """Return the digest of a kernel's call graph; kernels that call each other have the same digest."""
     own = sorted(
         f"{one.function.__module__}.{one.function.__qualname__} {one.taken_in} {_own(one.function)[0]}"
         for one in closure(kernel)
@@ -48,7 +48,7 @@ def digest_of(kernel: Compilable) -> str:
 
 
 def closure(kernel: Compilable) -> set[Compilable]:
-    """Return a kernel and all that it calls, at any depth."""
+    """Return a kernel and all kernels that it calls, directly or indirectly."""
     found, left = {kernel}, [kernel]
     while left:
         new = set(callees(left.pop())) - found
@@ -58,12 +58,12 @@ def closure(kernel: Compilable) -> set[Compilable]:
 
 
 def callees(kernel: Compilable) -> tuple[Compilable, ...]:
-    """Return the compiled functions that a kernel names."""
+    """Return the compiled functions whose names a kernel uses."""
     return _own(kernel.function)[1]
 
 
 def callers(kernels: Iterable[Compilable], known: Iterable[Compilable]) -> set[Compilable]:
-    """Return kernels and all of those known that call one of them, at any depth."""
+    """Return the given kernels, and all of `known` that call one of them directly or indirectly."""
     found, known = set(kernels), tuple(known)
     while True:
         more = {one for one in known if one not in found and not found.isdisjoint(callees(one))}
@@ -84,7 +84,7 @@ def _own(function: Callable[..., Any]) -> tuple[str, tuple[Compilable, ...]]:
 
 
 def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
-    """Yield the texts that a function is made of, and a callee where a text is the name of one."""
+    """Yield (text, callee) for each part of a function; callee is None unless the text is the name of a kernel."""
     assert isinstance(function, FunctionType)
     if function in seen:
         return
@@ -103,14 +103,19 @@ def _parts(function: Callable[..., Any], seen: set[FunctionType]) -> Iterator[tu
 
 
 def _value(name: str, value: Any, names: list[str], seen: set[FunctionType]) -> Iterator[tuple[str, Compilable | None]]:
-    """Yield the texts of a value that a function names; of a module the attributes that the function may mean."""
+    """Yield (text, callee) for a value whose name a function uses.
+
+    For a module, the attributes that the function may use are included.
+    """
     if isinstance(value, Compilable):
         yield f"{name} calls {value.function.__module__}.{value.function.__qualname__}", value
     elif isinstance(value, ModuleType) and not _is_library(value.__name__):
         for attribute in names:
             if hasattr(value, attribute):
                 yield from _value(f"{name}.{attribute}", getattr(value, attribute), names, seen)
-    elif isinstance(inner := getattr(value, "py_func", value), FunctionType):  # compiled by numba's `njit`, or plain
+    elif isinstance(
+        inner := getattr(value, "py_func", value), FunctionType
+    ):  # compiled by numba's `njit`, or a plain function
         yield f"{name} calls {inner.__module__}.{inner.__qualname__}", None
         yield from () if _is_library(inner.__module__) else _parts(inner, seen)
     else:
@@ -118,17 +123,17 @@ def _value(name: str, value: Any, names: list[str], seen: set[FunctionType]) -> 
 
 
 def _words(annotations: Mapping[str, Any]) -> set[str]:
-    """Return the names in annotations, which are strings."""
+    """Return the names that occur in annotations, which are strings."""
     return set(re.findall(r"[A-Za-z_]\w*", " ".join(map(str, annotations.values()))))
 
 
 def is_record(value: Any) -> bool:
-    """Return whether a value is a class of named tuples: machine code knows their fields by their places."""
+    """Return whether a value is a class of named tuples; machine code addresses their fields by position."""
     return isinstance(value, type) and hasattr(value, "_fields")
 
 
 def _record(kind: Any) -> str:
-    """Return the text of a class of named tuples: its name, its fields, and the named tuples among them."""
+    """Return a text for a class of named tuples: its name, its fields, and the named tuples among the fields."""
     space = vars(sys.modules[kind.__module__])
     inner = [space[word] for word in sorted(_words(kind.__annotations__)) if is_record(space.get(word))]
     return f"{kind.__module__}.{kind.__qualname__}{kind._fields} of {list(map(_record, inner))}"
@@ -139,18 +144,18 @@ def _is_library(module: str) -> bool:
 
 
 def _names(code: CodeType) -> set[str]:
-    """Return the names of globals and attributes in a function, and in functions inside it.
+    """Return the names of globals and attributes in a function, and in the functions inside it.
 
-    An attribute with the name of a kernel counts as a call: bytecode, read for the difference, takes too long.
+    An attribute with the name of a kernel counts as a call: to distinguish them from bytecode would take too long.
     """
     inner = [_names(part) for part in code.co_consts if isinstance(part, CodeType)]
     return set(code.co_names).union(*inner)
 
 
 def _text(value: Any, documentation: str | None = None) -> str:
-    """Return a text that two values have in common only if they compile to the same machine code."""
+    """Return a text that two values share only if they compile to the same machine code."""
     if isinstance(value, CodeType):
-        # The docstring is the first constant; some versions of Python put None there without one.
+        # The docstring is the first constant; some Python versions put None there if there is no docstring.
         constants = value.co_consts[value.co_consts[:1] in ((documentation,), (None,)) :]
         return _text((value.co_code, value.co_names, value.co_varnames, value.co_argcount, constants))
     if isinstance(value, tuple):

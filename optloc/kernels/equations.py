@@ -1,4 +1,7 @@
-"""Normal equations of many problems in one call: sums over the epochs of a run, unknowns of each epoch kept apart."""
+"""Normal equations of many problems in one call.
+
+The equations are summed over the epochs of a run; the unknowns of each epoch keep separate blocks.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +28,12 @@ from optloc.kernels.pack import Numbers, Packed
 from optloc.kernels.tables import Tables
 from optloc.linear.normal import Normal
 
-# Starts that are worth a thread of their own: one block of lanes, see `optloc.kernels.batched_rows`.
+# Least number of starts for a thread: one block of lanes, see `optloc.kernels.batched_rows`.
 _SHARE = 64
 
 
 class Sums(NamedTuple):
-    """The arrays of `optloc.linear.normal.Normal`, of M vectors."""
+    """The arrays of `optloc.linear.normal.Normal` for M vectors."""
 
     shared: Array
     local: Array
@@ -41,15 +44,15 @@ class Sums(NamedTuple):
 
 
 def chunks(count: int) -> list[tuple[int, int]]:
-    """Return stretches (first, last) of a number of starts, one for each thread that is worth it."""
-    # Threads get stretches of equal length: starts take about the same time, and each stretch keeps its memory.
+    """Return ranges (first, last) of start numbers, one for each thread that pays off."""
+    # Ranges of equal length: starts take about the same time, and each range has its own memory.
     parts = max(1, min(thread_count(), count // _SHARE))
     ends = np.linspace(0, count, parts + 1).round().astype(int).tolist()
     return list(pairwise(ends))
 
 
 def normal_at(packed: Packed, x: Array, item: Array, *, priors: bool = False) -> Normal:
-    """Return the normal equations of problems at vectors.
+    """Return the normal equations of problems at given vectors.
 
     Parameters
     ----------
@@ -88,11 +91,12 @@ def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, p
     for begin in range(first, last, lanes):
         used = min(lanes, last - begin)
         for b in range(used):
-            # Several vectors may belong to one problem: its numbers go into each of their lanes.
+            # Several vectors may belong to one problem: its numbers are copied into each of their lanes.
             load(m, b, item[begin + b], c.source, c.white, c.prior, c.observed, c.present)
             for i in range(size):
                 m[room.trial + i, b] = x[begin + b, i]
-        # Of one epoch the own unknowns are columns beside the shared ones; of several they would be mostly zeros.
+        # With one epoch, the local unknowns are columns after the shared ones. With several epochs most columns would
+        # be zero.
         if t.local > 0 and t.epochs > 1:
             _epochs(t, c, m, r, room, begin, used, priors, out.local, out.cross, out.local_vector)
         else:
@@ -115,7 +119,10 @@ def _epochs(
     cross: Array,
     vector: Array,
 ) -> None:
-    """Write the equations of each epoch's own unknowns; sum up those of the shared ones in `room.after`."""
+    """Write the equations of the local unknowns of each epoch.
+
+    The equations of the shared unknowns are summed in `room.after`.
+    """
     group, packet, last = 0, 0, t.shared + t.local
     clear(m, room.now, (last + 1) ** 2, used)
     for epoch in range(t.epochs):
@@ -124,7 +131,7 @@ def _epochs(
         if priors:
             add_priors(t, c, m, room, room.trial, True, epoch, used)
         _own(m, room.after, t.shared, t.local, begin, epoch, used, local, cross, vector)
-        # Only what concerns the shared unknowns is summed; couplings belong to the epoch and are written out.
+        # Only the equations of the shared unknowns are summed. The couplings belong to one epoch, and are written out.
         for i in range(last + 1):
             if i < t.shared or i == last:
                 for j in range(i + 1):
@@ -142,7 +149,7 @@ def _epochs(
 def _own(
     m: Array, to: int, n: int, size: int, begin: int, epoch: int, used: int, local: Array, cross: Array, vector: Array
 ) -> None:
-    """Write what concerns the unknowns of one epoch."""
+    """Write the equations of the local unknowns of one epoch, and their coupling with the shared unknowns."""
     width = n + size + 1
     for i in range(size):
         line = to + (n + i) * width
@@ -159,7 +166,7 @@ def _own(
 def _whole(
     m: Array, to: int, n: int, width: int, begin: int, used: int, shared: Array, vector: Array, cost: Array
 ) -> None:
-    """Write what concerns the unknowns of all epochs, and the cost."""
+    """Write the equations of the unknowns that all epochs share, and the cost."""
     last = to + (width - 1) * width
     for b in range(used):
         cost[begin + b] = m[last + width - 1, b]

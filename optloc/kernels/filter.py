@@ -1,9 +1,9 @@
 """One scan of a tracker as machine code: prediction, gate and update of states by rows of every kind.
 
 States are ``x = mean + L y`` with ``L L' = P`` the predicted covariance, so that the prior is ``|y|^2``. The update is
-the minimum of the prior and the rows' cost: ``(I + B' B) y = B' e``. B holds the whitened derivatives of the rows times
-L, and e their whitened residuals. For a state that is known exactly in some direction, L has a
-column of zeros.
+the minimum of the prior and the cost of the rows: ``(I + B' B) y = B' e``. B contains the whitened derivatives of the
+rows times L, and e the whitened residuals. For a state that is known exactly in some direction, L has a column of
+zeros.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ memory.
 """
 VALUES = 10
 
-# Of the memory of a track: sum and variance of the products of the scores of two scans in succession, and of NIS less
-# rows. The scores for the errors of the stations follow. The last ``m (n + 2)`` numbers are the rows of the scan:
-# derivatives, residual and weight.
+# Indices in the memory of a track: sum and variance of the products of the scores of two successive scans, and of NIS
+# minus its expectation. The scores for the errors of the stations follow. The last ``m (n + 2)`` numbers are the rows
+# of the scan: derivatives, residual and weight.
 _PRODUCT, _PRODUCT_VARIANCE, _NIS, _NIS_VARIANCE, COLUMNS = range(5)
-# Weight of earlier scans in a memory: as in `optloc.tracking.lasting`.
+# Weight of earlier scans in a memory, as in `optloc.tracking.lasting`.
 _KEEP = 0.98
 
 GENERAL = -1.0
-"""In the place of a status: the scan takes the general form of the filter."""
+"""Value instead of a status, if the scan needs the general form of the filter."""
 _OK, _SILENT, _NUMERICAL, _REJECTED = (
     float(one) for one in (Status.OK, Status.TOO_FEW_ROWS, Status.NUMERICAL, Status.REJECTED)
 )
@@ -49,28 +49,28 @@ _OK, _SILENT, _NUMERICAL, _REJECTED = (
 # Gauss-Legendre nodes along a step from 0 to 1: exact up to degree 9, and derivatives of ranges and angles are smooth.
 NODES = tuple(0.5 + 0.5 * float(node) for node in np.polynomial.legendre.leggauss(5)[0])
 SHARES = tuple(0.5 * float(weight) for weight in np.polynomial.legendre.leggauss(5)[1])
-# Halvings of a step that raises the cost: the last is a 128th, beyond which the point is as good as stationary. And the
-# rise of a cost, as a share of it, that is rounding and no reason to halve.
+# Greatest number of halvings of a step that raises the cost: after the last (a 128th) the point counts as stationary;
+# and the relative rise of a cost that counts as rounding.
 HALVINGS, RISE = 8, 1e-9
-# Share of the largest variance below which what is left of one is rounding.
+# Share of a variance below which its remainder is rounding.
 _NOTHING = 1e-15
-# Share of a variance that other rows must leave of it: as of `optloc.base.linalg.whitening`.
+# Share of a variance that must remain after the other rows, as in `optloc.base.linalg.whitening`.
 _LOOP = 1e-12
 
 
 class ScanRows(NamedTuple):
-    """The rows of G scans of one structure; an array (G or 1, ...) has one row where the scans share it."""
+    """The rows of G scans of one structure; an array (G or 1, ...) has one row if the scans share it."""
 
     tables: Tables  # all rows are one group
-    common: Array  # what all scans share, see `Numbers`
-    source: Array  # (G or 1, q): what they do not
-    covariance: Array  # (G or 1, m): variances; or (G or 1, m * m) where rows are correlated
-    white: Array  # (G or 1, m * m): whitening matrix of all rows where they are correlated; else (1, 0)
+    common: Array  # numbers that all scans share, see `Numbers`
+    source: Array  # (G or 1, q): numbers that differ between scans
+    covariance: Array  # (G or 1, m): variances; or (G or 1, m * m) if rows are correlated
+    white: Array  # (G or 1, m * m): whitening matrix of all rows if they are correlated; else (1, 0)
     total: Array  # (G or 1, 2): rank of the covariance, logarithm of the determinant of 2 pi R
     z: Array  # (G or 1, N or 1, m): measurements less corrections
     weight: Array  # (G or 1, N or 1, m)
-    station: Array  # (m, 2): places of the errors of each row's stations in a memory, -1 for none
-    sign: Array  # (m,): of the second of them
+    station: Array  # (m, 2): indices of the errors of each row's stations in a memory, -1 for none
+    sign: Array  # (m,): sign of the error of the second station
 
 
 class Move(NamedTuple):
@@ -82,22 +82,22 @@ class Move(NamedTuple):
 
 
 class Filtering(NamedTuple):
-    """How states are updated.
+    """Settings of the update of states.
 
     Parameters
     ----------
     form : int
-        One of `EKF` and its like.
+        EKF, IEKF, MGEKF or MVEKF.
     limit : int
-        Steps of the iterated filter, at most.
+        Greatest number of steps of the iterated filter.
     tolerance : float
-        Length of a step, in standard deviations of the prediction, that ends them.
+        Length of the last step, in standard deviations of the prediction.
     gate : float
-        Rows further than this many standard deviations of their innovation are left out; infinite for none.
+        Rows with a larger innovation than this number of standard deviations are left out; infinite for no gate.
     most : float
-        Squared innovation that a row counts as at most.
+        Greatest squared innovation with which a row is counted.
     d : int
-        Coordinates of the position.
+        Number of coordinates of the position.
     """
 
     form: int
@@ -109,7 +109,7 @@ class Filtering(NamedTuple):
 
 
 class Filtered(NamedTuple):
-    """States after a scan, written: means (N, n), covariances (N, n, n), and numbers (N, VALUES) of each."""
+    """States after a scan, written: means (N, n), covariances (N, n, n), and numbers (N, VALUES) of each state."""
 
     mean: Array
     cov: Array
@@ -117,7 +117,10 @@ class Filtered(NamedTuple):
 
 
 class _Space(NamedTuple):
-    """Memory of one state: of `lanes`, matrices (n, n), rows (m, n + 1) that end with the residual, vectors."""
+    """Workspace of one state.
+
+    It contains the memory of one lane, matrices (n, n), rows (m, n + 1) with the residual last, and vectors.
+    """
 
     m: Array
     r: Array
@@ -126,7 +129,7 @@ class _Space(NamedTuple):
     root: Array
     factor: Array
     rows: Array  # derivatives times root
-    white: Array  # the same, whitened
+    white: Array  # whitened `rows`
     W: Array  # (m, m): whitening matrix of the rows used
     used: Array  # (m,): weights, zero for rows that are left out
     x: Array
@@ -140,24 +143,24 @@ class _Space(NamedTuple):
 def filter_scan(
     rows: ScanRows, item: int, move: Move, mean: Array, cov: Array, how: Filtering, memory: Array, out: Filtered
 ) -> None:
-    """Predict N states, leave out the rows that do not pass the gate, and update the states by the others.
+    """Predict N states, leave out the rows outside the gate, and update the states with the other rows.
 
     Parameters
     ----------
     rows : ScanRows
-        Of scans.
+        Rows of the scans.
     item : int
-        Which scan.
+        Number of the scan.
     move : Move
-        From the states to the time of the scan.
+        Prediction from the states to the time of the scan.
     mean, cov : array (N, n), array (N, n, n)
         States.
     how : Filtering
-        The filter and its gate.
+        Form of the filter, and its gate.
     memory : array
-        Of a single track, changed: what `_remember` keeps of its scans; empty for none.
+        Memory of a single track, which `_remember` updates; empty for none.
     out : Filtered
-        Written: the prediction where no row is used, or where the update is not finite.
+        Written. If no row is used or the update is not finite, the prediction is written.
     """
     n = mean.shape[1]
     s = _space(rows, item, n)
@@ -169,7 +172,7 @@ def filter_scan(
         for i in range(how.d):
             values[SPREAD] += s.P[i, i]
         values[CODE] = _update(rows, item, one, how, s, memory, out)
-        if values[CODE] != GENERAL and values[COUNT] > 0.0:  # else nothing has been written
+        if values[CODE] != GENERAL and values[COUNT] > 0.0:  # else no update was written
             for i in range(n):
                 if not isfinite(out.mean[one, i]) or not isfinite(out.cov[one, i, i]):
                     values[CODE] = _NUMERICAL
@@ -183,6 +186,7 @@ def filter_scan(
 
 @compiled
 def _space(rows: ScanRows, item: int, n: int) -> _Space:
+    # Return the workspace for states of n components.
     t, m, none = rows.tables, rows.z.shape[2], np.zeros((1, 0))
     place, observed = np.zeros((0, 4), np.int64), np.zeros((1, m))
     c = Numbers(rows.common, place, rows.source, none, none, observed, none, none, none[0])
@@ -261,13 +265,13 @@ def _update(rows: ScanRows, item: int, one: int, how: Filtering, s: _Space, memo
 
 @compiled
 def _of(count: int, i: int) -> int:
-    """Return the row of item i in an array of a number of rows; a single row is shared by all items."""
+    """Return the row of item i in an array with `count` rows; a single row is shared by all items."""
     return i if count > 1 else 0
 
 
 @compiled
 def _take(rows: ScanRows, item: int, one: int, s: _Space) -> bool:
-    """Take the measurements and weights of a state; return whether a row that counts is not finite."""
+    """Load the measurements and weights of a state; return whether a present row is not finite."""
     broken = False
     for i in range(len(s.used)):
         z = rows.z[_of(rows.z.shape[0], item), _of(rows.z.shape[1], one), i]
@@ -280,7 +284,7 @@ def _take(rows: ScanRows, item: int, one: int, s: _Space) -> bool:
 
 @compiled
 def _root(cov: Array, root: Array) -> bool:
-    """Write the lower triangular root of a covariance; return whether it is one."""
+    """Write the lower triangular root of a covariance, and return whether the covariance is positive semidefinite."""
     n, most = len(cov), 0.0
     for i in range(n):
         most = max(most, cov[i, i])
@@ -290,7 +294,7 @@ def _root(cov: Array, root: Array) -> bool:
         left = cov[j, j]
         for k in range(j):
             left -= root[j, k] * root[j, k]
-        # what is known exactly has no variance, nor a share in others'
+        # an exactly known coordinate has no variance and no covariance
         if not left > _NOTHING * cov[j, j]:
             if not left >= -1e-9 * most:
                 return False
@@ -306,7 +310,7 @@ def _root(cov: Array, root: Array) -> bool:
 
 @compiled
 def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
-    """Write derivatives times root, and residuals, of the rows used at a state."""
+    """Write residuals and derivatives times root of the used rows at a state."""
     t, n = rows.tables, len(x)
     for i in range(n):
         s.m[s.room.trial + i, 0] = x[i]
@@ -327,7 +331,7 @@ def _evaluate(rows: ScanRows, s: _Space, x: Array) -> None:
 
 @compiled
 def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -> None:
-    """Leave out the rows whose innovation is outside the gate, and count."""
+    """Leave out the rows whose innovation is outside the gate, and count the rejected rows."""
     n, own = len(s.x), _of(len(rows.covariance), item)
     for i in range(len(s.used)):
         if s.used[i] > 0.0:
@@ -336,7 +340,7 @@ def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -
                 total += s.rows[i, k] * s.rows[i, k]
             square = s.rows[i, n] * s.rows[i, n] / total
             values[PRESENT] += 1.0
-            # how wild a row is says nothing of the others: none counts further than the gate, nor NaN less
+            # a large innovation counts at most with the limit, and a NaN with the limit too
             values[INNOVATION] += min(how.most, square)
             if how.gate < np.inf and not sqrt(square) <= how.gate:
                 values[REJECTED_ROWS] += 1.0
@@ -345,16 +349,16 @@ def _gate(rows: ScanRows, item: int, how: Filtering, s: _Space, values: Array) -
 
 @compiled
 def _whitener(rows: ScanRows, item: int, s: _Space) -> tuple[float, float]:
-    """Write the whitening matrix of the rows used; return how many they are and the log determinant of 2 pi R.
+    """Write the whitening matrix of the used rows; return their number and the log determinant of 2 pi R.
 
-    The number is negative where a row that is left out makes a covariance of those that stay singular.
+    The number is negative if the covariance of the used rows is singular because a row is left out.
     """
     m, W, own, correlated = len(s.used), s.W, _of(len(rows.covariance), item), rows.white.shape[1] > 0
     whole, count, logdet = correlated, 0.0, 0.0
     for i in range(m):
         whole = whole and s.used[i] == 1.0
         s.used[i] = s.used[i] if _entry(rows, own, i, i) > 0.0 else 0.0
-    for j in range(m):  # row j less what those before it say of it, in units of what is left
+    for j in range(m):  # row j minus its regression on the rows before, in units of the remaining standard deviation
         for i in range(m):
             W[j, i] = rows.white[_of(len(rows.white), item), j * m + i] if whole else 0.0
         if s.used[j] > 0.0 and not whole:
@@ -380,7 +384,7 @@ def _whitener(rows: ScanRows, item: int, s: _Space) -> tuple[float, float]:
 
 @compiled
 def _entry(rows: ScanRows, own: int, i: int, j: int) -> float:
-    """Return an entry of the covariance of the rows."""
+    """Return entry (i, j) of the covariance of the rows."""
     m = rows.z.shape[2]
     if rows.covariance.shape[1] == m:
         return float(rows.covariance[own, i]) if i == j else 0.0
@@ -410,13 +414,16 @@ def _equations(s: _Space) -> float:
             slope[i] += s.white[r, i] * s.white[r, n]
             for j in range(i + 1):
                 factor[i, j] += s.white[r, i] * s.white[r, j]
-    cholesky(factor, n, 0.0)  # no less than the unit matrix
+    cholesky(factor, n, 0.0)  # at least the unit matrix, so it is regular
     return cost
 
 
 @compiled
 def _least(s: _Space) -> float:
-    """Return the least cost along straight rows, the innovations' own square: an error of the step enters squared."""
+    """Return the least cost of the linearised rows (NIS), from its definition as a minimum.
+
+    An error of the step changes the result only in second order.
+    """
     n, total = len(s.x), 0.0
     for i in range(n):
         total += s.move[i] * s.move[i]
@@ -432,7 +439,7 @@ def _least(s: _Space) -> float:
 def _remember(rows: ScanRows, item: int, s: _Space, memory: Array, values: Array) -> None:
     """Test whether errors of the stations repeat from scan to scan, and whether the innovations are too large.
 
-    Both results are numbers of standard deviations, over the last fifty scans or so. The scores for the errors of the
+    Both results are numbers of standard deviations, over about the last fifty scans. The scores for the errors of the
     stations are ``a = D' S^-1 nu``. Their product with the scores b of the scan before has the mean zero. For a given b
     its variance is ``(D b)' S^-1 (D b)``.
     """
@@ -494,13 +501,16 @@ def _write_rows(t: Tables, s: _Space, out: Array) -> None:
 
 @compiled
 def _size(rows: ScanRows, own: int, i: int) -> float:
-    """Return the standard deviation of the error of each station of a row: all stations err alike."""
+    """Return the standard deviation of the error of each station of a row: all its stations have the same."""
     return sqrt(_entry(rows, own, i, i) / (2.0 if rows.station[i, 1] >= 0 else 1.0))
 
 
 @compiled
 def _iterate(rows: ScanRows, how: Filtering, s: _Space, cost: float) -> None:
-    """Take steps, halved where they would raise the cost, until one is short; y is the least, with its equations."""
+    """Take steps until one is short, and write the minimiser to y with its equations.
+
+    Steps that would raise the cost are halved.
+    """
     n, place = len(s.x), np.empty(len(s.x))
     put(s.y, place)
     for _ in range(how.limit):
@@ -511,7 +521,7 @@ def _iterate(rows: ScanRows, how: Filtering, s: _Space, cost: float) -> None:
             _place(s, 1.0, s.at)
             _evaluate(rows, s, s.at)
             now = _equations(s)
-            # NaN counts as worse: a step beyond where h is defined is halved, too
+            # NaN counts as worse: a step to where h is not defined is halved too
             if now <= cost + RISE * (1.0 + abs(cost)):
                 break
             share = 0.5 * share if turn < HALVINGS - 1 else share
@@ -527,9 +537,9 @@ def _iterate(rows: ScanRows, how: Filtering, s: _Space, cost: float) -> None:
 
 @compiled
 def _modify(rows: ScanRows, s: _Space, cov: Array) -> None:
-    """Write the covariance of the modified gain: the derivative is the mean over the way from the prediction.
+    """Write the covariance of the modified gain, whose derivative is the mean along the way from the prediction.
 
-    In units of the prediction it is ``(I - N G)(I - N G)' + N N'``: N = M^-1 B' is the gain, and G that mean.
+    In units of the prediction it is ``(I - N G)(I - N G)' + N N'``: N = M^-1 B' is the gain, and G the mean derivative.
     """
     n, m = len(s.x), len(s.used)
     gain, mean = np.zeros((m, n)), np.zeros((m, n))
@@ -544,7 +554,7 @@ def _modify(rows: ScanRows, s: _Space, cov: Array) -> None:
         for r in range(m):
             for i in range(n):
                 mean[r, i] += SHARES[node] * s.white[r, i]
-    parts, out = np.zeros((n, n + m)), np.zeros((n, n + m))  # [I - N G, N], and L times it
+    parts, out = np.zeros((n, n + m)), np.zeros((n, n + m))  # [I - N G, N], and L times this matrix
     for i in range(n):
         parts[i, i] = 1.0
         for r in range(m):
@@ -560,7 +570,7 @@ def _modify(rows: ScanRows, s: _Space, cov: Array) -> None:
 
 @compiled
 def _place(s: _Space, share: float, out: Array) -> None:
-    """Write the state at a share of y."""
+    """Write the state at the given share of y."""
     for i in range(len(s.x)):
         out[i] = s.x[i]
         for k in range(i + 1):
@@ -569,7 +579,7 @@ def _place(s: _Space, share: float, out: Array) -> None:
 
 @compiled
 def _covariance(s: _Space, out: Array) -> None:
-    """Write ``L (C C')^-1 L'``, C the factor: symmetric and positive, whatever rounding does."""
+    """Write ``L (C C')^-1 L'``, C the factor: the result is symmetric and positive despite rounding."""
     n, rows = len(s.x), np.zeros((len(s.x), len(s.x)))
     for i in range(n):  # rows of (C^-1 L')'
         for j in range(i + 1):

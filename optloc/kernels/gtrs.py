@@ -1,9 +1,9 @@
-"""Squared-range least squares on lanes: Newton on the multiplier, many problems side by side.
+"""Squared-range least squares in lanes: Newton's method on the multiplier for many problems side by side.
 
 Minimise ``|B y - g|^2`` over the cone ``y = (x, r)``, ``|x|^2 = r^2``, or the paraboloid ``y = (x, w)``, ``|x|^2 = w``.
-The last axis of every array here counts W = LANES problems, so that one instruction serves several of them. Problems
-whose normal matrix is not definite, or whose iteration does not settle, are flagged: they need the eigenvalues of
-their pencil, which a batch of few hard problems computes elsewhere.
+The last axis of every array counts W = LANES problems, so that one instruction serves several of them. Problems whose
+normal matrix is not definite, or whose iteration does not converge, are flagged. They need the eigenvalues of a matrix
+pencil, which other code computes for a batch of a few hard problems.
 
 Source: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), theorem 3.2.
 """
@@ -16,49 +16,49 @@ from optloc.base.types import Array
 from optloc.kernels.jit import compiled
 from optloc.kernels.systems import LANES, factor_plain, principal_axes, solve_plain
 
-# Newton's steps: with range differences and ranges of five and six stations all lanes settled in three or four; what
-# has not settled after three times as many needs the other tool.
+# Greatest number of Newton steps. With range differences and ranges of five and six stations all lanes converged in
+# three or four. Problems that need more than three times this number are left to the eigenvalue method.
 _STEPS = 12
-# A pivot below this share of the largest entry of B'B: half of the digits are gone, and the eigenvalues of the pencil
-# are the better tool.
+# Least pivot as a share of the largest entry of B'B. Below it half of the digits are lost, and the eigenvalue method is
+# better.
 _WEAK = 1e-7
-# Relative change of y below which the last, polishing step squares the error away: 1e-14.
+# Relative change of y below which the last Newton step squares the error to 1e-14.
 _SETTLED = 1e-7
 
-# Numbers of each lane in the scratch of `minimise`, behind its matrices and vectors.
+# Scalars of each lane in the scratch of `minimise`, after its matrices and vectors.
 MULTIPLIER, BEND, TODO, LEAST, VALUE, LAST, DEFINITE = range(7)
 _NUMBERS = 7
 
 
 @compiled
 def scratch(n: int) -> int:
-    """Return how many rows of lanes `minimise` needs as scratch for y of length n."""
-    # Two matrices, five vectors and some numbers of each lane: see the split in `minimise`.
+    """Return the number of rows of lanes that `minimise` needs as scratch for y of length n."""
+    # Two matrices, five vectors and some scalars of each lane, as `minimise` splits them.
     return 2 * n * n + 5 * n + _NUMBERS
 
 
 @compiled
 def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) -> None:
-    """Find the global minimisers of squared-range problems, one in each lane.
+    """Write the global minimisers of squared-range problems, one in each lane.
 
     Parameters
     ----------
     rows : array (q, n + 1, W)
-        B and behind it g: whitened rows, numbers of order one; absent rows are zero.
+        B and, in the last column, g: whitened rows, numbers of order one; absent rows are zero.
     on_cone : bool
         Whether the last entry of y is a range r; else it is ``|x|^2``.
     y : array (n, W)
-        Written: the minimisers; meaningless where not settled.
+        Written: the minimisers; without meaning if not settled.
     settled : float array (W,)
-        Written: 1.0 where the iteration converged inside the interval where ``B'B + multiplier C`` is positive
-        definite, else 0.0.
+        Written: 1.0 if the iteration converged in the interval where ``B'B + multiplier C`` is positive definite, else
+        0.0.
     work : array (at least ``scratch(n)``, W)
         Scratch.
 
     Notes
     -----
-    More (1993), theorem 3.2: the function ``y'Cy + 2h'y`` of the multiplier falls on that interval, and its only zero
-    is the global minimiser.
+    More (1993), theorem 3.2: the function ``y'Cy + 2h'y`` of the multiplier decreases on this interval, and its only
+    zero is the global minimiser.
     """
     n = len(y)
     A, lower = work[: n * n].reshape(n, n, LANES), work[n * n : 2 * n * n].reshape(n, n, LANES)
@@ -69,7 +69,8 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     last, definite, bend = spare[LAST], spare[DEFINITE], spare[BEND]
     _normal(rows, A, b, least)
     for lane in range(LANES):
-        # Least squares without the constraint is the start: multiplier zero, inside where B'B is definite.
+        # The iteration starts from unconstrained least squares: the multiplier zero is in the interval if B'B is
+        # definite.
         multiplier[lane], last[lane], todo[lane] = 0.0, 0.0, 1.0
     for _ in range(_STEPS):
         _shift(A, b, multiplier, on_cone, slope, y)
@@ -85,7 +86,7 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
         solve_plain(lower, inverse, p)
         if not _advance(y, across, p, on_cone, spare, slope):
             break
-    # One more Newton step on the optimality conditions themselves restores the digits that B'B has lost.
+    # One Newton step on the optimality conditions restores the digits that B'B has lost.
     _residual_slope(rows, y, across, multiplier, slope, value)
     solve_plain(lower, inverse, slope)
     _step(y, across, p, on_cone, slope, bend, value)
@@ -96,26 +97,27 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
             settled[lane] = settled[lane] if abs(y[i, lane]) < np.inf else 0.0
 
 
-# Share of the largest eigenvalue of B'B below which a direction is open, with a margin of four digits to rounding; and
-# curvature of the quadric along it below which it meets the line once.
+# Share of the largest eigenvalue of B'B below which a direction is undetermined, four digits above rounding; and
+# curvature of the quadric along this direction below which the line meets the quadric only once.
 _OPEN, _STRAIGHT = 1e-11, 1e-12
 
 
 @compiled
 def meet(rows: Array, on_cone: bool, y: Array, other: Array, settled: Array, two: Array, work: Array) -> None:
-    """Find where lines of minimisers meet the quadric: of problems whose rows leave one direction open.
+    """Write the two points where a line of minimisers meets the quadric, if the rows leave one direction undetermined.
 
-    Stations in a plane leave the direction across it open, and as few rows as coordinates one direction in any case.
-    All points along it cost the same, so that both points on the quadric are minimisers.
+    Stations in a plane leave the direction across the plane undetermined. If there are only as many rows as
+    coordinates, one direction is always undetermined. All points along this direction have the same cost, so both
+    points on the quadric are minimisers.
 
     Parameters
     ----------
     rows, on_cone : array (q, n + 1, W), bool
-        As of `minimise`.
+        As for `minimise`.
     y, other : array (n, W)
-        Written where a lane is not settled: one point, and the second one.
+        Written if a lane is not settled: the first point and the second point.
     settled, two : float array (W,)
-        Lanes that are not settled are looked at; written: 1.0 where there is a point, and where there is a second one.
+        In: lanes that are not settled are computed. Written: 1.0 if there is a point, and if there is a second one.
     work : array (at least ``scratch(n)``, W)
         Scratch.
     """
@@ -138,7 +140,10 @@ def meet(rows: Array, on_cone: bool, y: Array, other: Array, settled: Array, two
 
 @compiled
 def _open_axis(A: Array, lane: int) -> int:
-    """Return the axis of the only eigenvalue, on the diagonal of A, that is nothing; -1 where there is not one."""
+    """Return the axis of the only eigenvalue on the diagonal of A that is zero up to rounding.
+
+    The result is -1 if there is not exactly one such eigenvalue.
+    """
     n, first, most, second = len(A), 0, 0.0, np.inf
     for k in range(n):
         most = max(most, A[k, k, lane])
@@ -162,7 +167,10 @@ def _meet_lane(
     two: Array,
     lane: int,
 ) -> None:
-    """Do so for one lane: eigenvalues on the diagonal of A, eigenvectors in the columns of axes."""
+    """Write the points of `meet` for one lane.
+
+    The eigenvalues are on the diagonal of A, the eigenvectors in the columns of `axes`.
+    """
     n, first = len(y), _open_axis(A, lane)
     if first < 0:
         return
@@ -188,12 +196,12 @@ def _meet_lane(
     inside = cross * cross - square * value
     if not inside >= 0.0:
         return
-    # the larger root first, and the other one from their product: nothing cancels
+    # the larger root first, and the other one from their product, so that no digits cancel
     sum_of = -(cross + (np.sqrt(inside) if cross >= 0.0 else -np.sqrt(inside)))
     roots = (value / sum_of if sum_of != 0.0 else 0.0, sum_of / square if abs(square) > _STRAIGHT else np.nan)
     for t in roots:
         last = v + t * u
-        # behind the apex there is nothing
+        # a negative last coordinate is behind the apex of the cone
         if not (last >= 0.0 and abs(t) < np.inf):
             continue
         for i in range(n):
@@ -207,7 +215,7 @@ def _meet_lane(
 
 @compiled
 def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
-    """Find the lower half of ``B'B``, ``B'g``, and the smallest pivot that counts."""
+    """Write the lower half of ``B'B``, ``B'g``, and the least valid pivot (W,)."""
     q, n = len(rows), len(b)
     for lane in range(LANES):
         least[lane] = 0.0
@@ -241,7 +249,7 @@ def _shift(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Array
 
 @compiled
 def _gradient(y: Array, on_cone: bool, across: Array, p: Array) -> None:
-    """Write ``C y + h`` twice."""
+    """Write ``C y + h`` to `across` and to `p`."""
     n = len(y)
     for i in range(n - 1):
         for lane in range(LANES):
@@ -252,10 +260,10 @@ def _gradient(y: Array, on_cone: bool, across: Array, p: Array) -> None:
 
 @compiled
 def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
-    """Write half of ``y'Cy + 2h'y``."""
+    """Write half of ``y'Cy + 2h'y`` to `out` (W,)."""
     n = len(y)
     for lane in range(LANES):
-        # h is zero for the cone, and minus a half in its last entry for the paraboloid.
+        # h is zero for the cone; for the paraboloid its last entry is minus a half.
         out[lane] = 0.0 if on_cone else -0.25 * y[n - 1, lane]
     for i in range(n):
         for lane in range(LANES):
@@ -264,9 +272,9 @@ def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
 
 @compiled
 def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, free: Array) -> bool:
-    """Move the multipliers of the lanes that still change, and return whether there are any.
+    """Update the multipliers of the lanes that have not converged, and return whether there are any.
 
-    Newton's step; a step that left the definite interval is halved.
+    The update is Newton's step; a step out of the definite interval is halved.
     """
     n = len(y)
     multiplier, todo, value = spare[MULTIPLIER], spare[TODO], spare[VALUE]
@@ -282,10 +290,10 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
     for lane in range(LANES):
         inside, now = definite[lane] != 0.0, multiplier[lane]
         step = value[lane] / bend[lane]
-        # By how much the answer moves, not the multiplier, whose size says little.
+        # The criterion is the change of y, since the size of the multiplier has no meaning.
         moves = abs(step) * far[lane] > _SETTLED * big[lane]
         todo[lane] = todo[lane] if moves or not inside else 0.0
-        # The last multiplier inside is known to be definite: halving towards it must come back.
+        # The last multiplier inside the interval is known to be definite, so repeated halving towards it succeeds.
         target = now + step if inside else 0.5 * (now + last[lane])
         last[lane] = now if inside else last[lane]
         multiplier[lane] = target if todo[lane] != 0.0 else now
@@ -297,7 +305,7 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
 
 @compiled
 def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slope: Array, left: Array) -> None:
-    """Write ``B'(B y - g) + multiplier (C y + h)``: near the answer its digits are those of B, not of B'B."""
+    """Write ``B'(B y - g) + multiplier (C y + h)``; near the solution it has the accuracy of B, not of B'B."""
     q, n = len(rows), len(y)
     for i in range(n):
         for lane in range(LANES):
@@ -315,7 +323,7 @@ def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slo
 
 @compiled
 def _step(y: Array, across: Array, p: Array, on_cone: bool, slope: Array, bend: Array, value: Array) -> None:
-    """Take the Newton step on the optimality conditions: slope and constraint to zero."""
+    """Take one Newton step on the optimality conditions: slope and constraint become zero to first order."""
     n = len(y)
     _value(y, across, on_cone, value)
     for i in range(n):

@@ -1,4 +1,4 @@
-"""Compilation of scalar kernels: machine code by numba, or the same functions as plain Python."""
+"""Compilation of scalar kernels: numba compiles them to machine code, or they run as plain Python functions."""
 
 from __future__ import annotations
 
@@ -23,26 +23,27 @@ from optloc.kernels.progress import Reporter
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 Constant: TypeAlias = int
-"""The annotation of an argument that has machine code for each constant in the calls, not one for all.
+"""Annotation of an argument for whose constant values numba compiles separate machine code.
 
-Annotations are read as text, so a module with kernels has ``from __future__ import annotations``.
-"""
+All other arguments are compiled as variables. Annotations are read as text, so a module with kernels needs
+``from __future__ import annotations``."""
 
-# A context variable: one thread may run plainly while others run machine code.
+# A context variable: one thread may run plain Python while others run machine code.
 _PLAIN = ContextVar("plain", default=False)
 _LOCK = held_by_forks(Lock())
-# While a thread loads or makes machine code it has numba's own lock, which a child of a fork would wait for in vain.
+# A thread that loads or compiles machine code holds numba's own lock. A child process forked meanwhile would wait for
+# this lock forever.
 _LOADING = held_by_forks(Lock())
 
 
 @cache
 def _numba() -> Any:
+    """Return the module numba, or None if it is missing or disabled."""
     try:
         import numba
     except ImportError:
         return None
-    # numba reads the variable NUMBA_DISABLE_JIT; its kernels would then be plain functions, without its rules of
-    # division.
+    # With NUMBA_DISABLE_JIT, numba returns plain functions, whose division by zero raises an exception.
     settings: Any = numba.config
     if settings.DISABLE_JIT:
         return None
@@ -69,29 +70,29 @@ _KERNELS: list[_Kernel] = []
 
 
 class _Kernel(Compilable):
-    """A function of scalars and arrays: as it is, compiled for Python, and compiled for kernels that call it."""
+    """A function of scalars and arrays in three forms: plain, compiled for Python, and compiled for calling kernels."""
 
     def __init__(self, function: Callable[..., Any], *, taken_in: bool) -> None:
         super().__init__(function, taken_in=taken_in)
         self.ready = False
-        self.seen, self.asked = False, 0  # machine code on disk; problems that it was asked for
+        self.seen, self.asked = False, 0  # whether machine code is on disk; number of problems requested so far
         self._forms: dict[bool, Any] = {}
         update_wrapper(self, function)
         _KERNELS.append(self)
 
     @property
     def name(self) -> str:
-        """The whole name of the function."""
+        """The qualified name of the function, with its module."""
         return name_of(self.function)
 
     @property
     def machine(self) -> Any:
-        """The form that Python calls."""
+        """The compiled form that Python calls."""
         return self._form(callee=False)
 
     def _form(self, *, callee: bool) -> Any:
-        """Return a compiled form, of which there is one for all threads: numba looks up types for each form anew."""
-        made = self._forms.get(callee)  # by a name of its own: another thread may renew the kernel meanwhile
+        """Return a compiled form, shared by all threads: numba infers types again for each new form."""
+        made = self._forms.get(callee)  # a local name, because another thread may discard the form meanwhile
         if made is None:
             with _LOCK:
                 made = self._forms.get(callee)
@@ -99,18 +100,19 @@ class _Kernel(Compilable):
                     made = _numba().njit(**options(callee=callee, taken_in=self.taken_in))(self.function)
                     if callee:
                         _take_as_variables(made, self.function)
-                    # What numba's own option `cache` sets; where nothing can be written, machine code is not kept.
+                    # Replaces the effect of numba's option `cache`. Without a writable folder, machine code is not
+                    # stored.
                     made._cache = code_cache_of(self, callee=callee) or made._cache  # noqa: SLF001
                     self._forms[callee] = made
         return made
 
     def renew(self) -> None:
-        """Forget the compiled forms."""
+        """Discard the compiled forms, so that the next use compiles them again."""
         with _LOCK:
             self.ready, self.seen, self._forms = False, False, {}
 
     def __getattr__(self, name: str) -> Any:
-        """Return what numba wants to know of a function that a kernel calls."""
+        """Return the attributes that numba reads from a function that a kernel calls."""
         if name not in ("_numba_type_", "targetoptions", "py_func"):
             raise AttributeError(name)
         return getattr(self._form(callee=True), name)
@@ -135,10 +137,10 @@ class _Kernel(Compilable):
 
 
 def _take_as_variables(made: Any, function: Callable[..., Any]) -> None:
-    """Compile constants in calls like variables, except for arguments that are a `Constant`.
+    """Make numba compile constants in calls as variables, except for arguments annotated with `Constant`.
 
-    numba compiles a callee once more for each constant that it is handed, and for its callees in turn: of a thousand
-    forms, 175 differed by a constant. LLVM knows the constants in what it inlines all the same.
+    Otherwise numba compiles a callee again for each constant argument, and its callees as well: of a thousand forms,
+    175 differed only by a constant. LLVM still uses the constants in code that it inlines.
     """
     from numba.core import types
 
@@ -156,7 +158,7 @@ def _take_as_variables(made: Any, function: Callable[..., Any]) -> None:
 
 @contextmanager
 def compiling(tell: Callable[[str, bool], None]) -> Iterator[None]:
-    """Have the name of each kernel told when its compilation begins (False) and ends (True), in whichever thread."""
+    """Call `tell(name, done)` when the compilation of a kernel begins (False) and ends (True), in any thread."""
     stop = _listen(tell)
     try:
         yield
@@ -165,6 +167,7 @@ def compiling(tell: Callable[[str, bool], None]) -> Iterator[None]:
 
 
 def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
+    """Register a listener for compilations, and return the function that removes it."""
     from numba.core import event
 
     events: Any = event  # without types
@@ -181,22 +184,24 @@ def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
     return partial(events.unregister, "numba:compile", listener)
 
 
-# The whole names of functions that this process has compiled, and of those that it compiles now.
+# Qualified names of the functions that this process has compiled, and of those that it is compiling.
 _DONE: set[str] = set()
 _BEGUN: set[str] = set()
 
 
 def _text() -> str:
+    """Return the progress line."""
     if not _BEGUN:
         return "loading machine code"
     loaded = {kernel.name for kernel in _KERNELS}
-    return f"making machine code: {len(_DONE)} of about {len(loaded | _DONE)} functions, once; kept in {folder()}"
+    return f"making machine code: {len(_DONE)} of about {len(loaded | _DONE)} functions (once, stored in {folder()})"
 
 
 REPORTER = Reporter(_text)
 
 
 def _report(name: str, done: bool) -> None:
+    """Count the start or the end of a compilation."""
     if done:
         _DONE.add(name)
         _BEGUN.discard(name)
@@ -207,42 +212,44 @@ def _report(name: str, done: bool) -> None:
 
 
 def names_in(package: str) -> list[str]:
-    """Return the whole names of all kernels of a package, as far as it is loaded."""
+    """Return the qualified names of all kernels in the modules of a package that are imported."""
     return [kernel.name for kernel in _KERNELS if kernel.name.startswith(f"{package}.")]
 
 
 def named(name: str) -> Compilable:
-    """Return a kernel by its whole name; its module is imported."""
+    """Return a kernel by its qualified name, and import its module."""
     import_module(name.rpartition(".")[0])
     return next(kernel for kernel in _KERNELS if kernel.name == name)
 
 
-# So many problems are few: plain Python answers them before machine code could be made.
+# Greatest number of problems for which plain Python is faster than compiling first.
 FEW = 16
-# What is done where there is no machine code yet: wait for it, have a process in the background make it, or neither.
+# Settings if machine code is missing: wait until it is compiled, compile it in a background process, or never compile.
 _VARIABLE, _WAYS = "OPTLOC_COMPILE", ("wait", "child", "never")
 
 
 def compile_mode() -> str:
-    """Return what OPTLOC_COMPILE says of machine code that has to be made first: wait, child, never, or nothing."""
+    """Return the value of OPTLOC_COMPILE: "wait", "child", "never", or "" if it is not set."""
     given = os.environ.get(_VARIABLE, "").strip()
     if given and given not in _WAYS:
-        raise InvalidProblem(f"{given!r} is no way to come by machine code", _VARIABLE, f"one of {', '.join(_WAYS)}")
+        raise InvalidProblem(f"{given!r} is not a setting for machine code", _VARIABLE, f"one of {', '.join(_WAYS)}")
     return given
 
 
 def may_use_code(kernel: Callable[..., Any], count: int) -> bool:
-    """Return whether machine code is the way for a number of problems: it is at hand, or they may wait for it.
+    """Return whether to use machine code for a number of problems: it exists, or it may be compiled for them.
 
     Raises
     ------
     InvalidProblem
-        If OPTLOC_COMPILE is neither wait, child nor never.
+        If OPTLOC_COMPILE has another value than wait, child or never.
     """
     assert isinstance(kernel, _Kernel)
     if not enabled():
         return False
-    kernel.seen = kernel.seen or is_in_use(kernel) or is_cached(kernel)  # to look into the folder takes a millisecond
+    kernel.seen = (
+        kernel.seen or is_in_use(kernel) or is_cached(kernel)
+    )  # stored, because a look into the folder takes a millisecond
     if kernel.seen:
         return True
     chosen = compile_mode()
@@ -252,9 +259,9 @@ def may_use_code(kernel: Callable[..., Any], count: int) -> bool:
 
 
 def worth_loading(kernel: Callable[..., Any], count: int) -> bool:
-    """Return whether machine code is the way for so many problems more: plain Python is sooner done with the first few.
+    """Return whether to load machine code for `count` more problems; for the first few, plain Python is faster.
 
-    Counts the problems of a process, so that one which solves few again and again goes on with machine code.
+    The problems of the whole process are counted, so that a process with many small calls changes to machine code.
     """
     assert isinstance(kernel, _Kernel)
     kernel.asked += count
@@ -262,29 +269,30 @@ def worth_loading(kernel: Callable[..., Any], count: int) -> bool:
 
 
 def is_in_use(kernel: Callable[..., Any]) -> bool:
-    """Return whether machine code of a kernel has been used in this process: the next call need not load it."""
+    """Return whether this process has used the machine code of a kernel, so that the next call does not load it."""
     return bool(getattr(kernel, "ready", False))
 
 
 def require_code(kernel: Callable[..., Any]) -> None:
-    """Let a kernel count as at hand, so that its next use compiles it where there is no machine code on disk."""
+    """Mark a kernel as ready, so that its next use compiles it if there is no machine code on disk."""
     assert isinstance(kernel, _Kernel)
     kernel.ready = True
 
 
 def is_available(kernel: Callable[..., Any]) -> bool:
-    """Return whether machine code of a kernel was used in this process, or was on disk when that was first asked."""
+    """Return whether the machine code of a kernel was used in this process, or was on disk at the first check."""
     assert isinstance(kernel, _Kernel)
     return enabled() and (kernel.ready or _was_kept(kernel))
 
 
-@cache  # to look into the folder takes longer than what it is asked for
+@cache  # cached, because a look into the folder takes longer than the work of the kernel
 def _was_kept(kernel: _Kernel) -> bool:
+    """Return whether the machine code of a kernel is on disk."""
     return is_cached(kernel)
 
 
 def replace(functions: Mapping[Callable[..., Any], Callable[..., Any]]) -> None:
-    """Replace the functions of some kernels; these and all of their callers are compiled again at their next use."""
+    """Replace the functions of some kernels; they and all of their callers are compiled again at their next use."""
     for kernel, function in functions.items():
         assert isinstance(kernel, _Kernel)
         kernel.function = function
@@ -293,44 +301,47 @@ def replace(functions: Mapping[Callable[..., Any], Callable[..., Any]]) -> None:
 
 
 def compiled(function: _Function) -> _Function:
-    """Return a function of scalars and arrays as machine code that releases the interpreter lock, kept on disk.
+    """Return a function of scalars and arrays as machine code that is stored on disk and releases the interpreter lock.
 
-    Division by zero gives infinity or NaN, as in numpy; the order of operations is that of the source.
+    Division by zero gives infinity or NaN, as in numpy; the order of operations is the order in the source.
     """
     return cast(_Function, _Kernel(function, taken_in=False))
 
 
 def inlined(function: _Function) -> _Function:
-    """Return a function like `compiled`, which compiled callers always take in: every array handed on costs."""
+    """Return a function like `compiled`, which compiled callers always inline, since each array argument costs time."""
     return cast(_Function, _Kernel(function, taken_in=True))
 
 
 @compiled
 def zero() -> int:
-    """Return 0 as the start of a count: numba would compile what is handed a constant once more for a variable."""
-    return int(0.0)  # not 0, which it takes for a constant again
+    """Return 0 as the initial value of a counter that is not a compile-time constant.
+
+    numba would compile a function that takes the constant once more for a variable.
+    """
+    return int(0.0)  # not 0, which numba would treat as a constant again
 
 
-# In `out[:] = values` numba compiles what would tell of shapes that differ, in words: each kernel with one took half a
-# second more to make, and the first of a process three.
+# For `out[:] = values`, numba also compiles an error message about different shapes. Each kernel with such a statement
+# took half a second longer to compile, and the first of a process three seconds.
 
 
 @compiled
 def put(values: Array, out: Array) -> None:
-    """Write a vector (n,) into another, as numpy does."""
+    """Copy a vector (n,) into `out`, as numpy does."""
     for i in range(out.shape[0]):
         out[i] = values[i]
 
 
 @compiled
 def put_rows(values: Array, out: Array) -> None:
-    """Write a matrix (m, n) into another."""
+    """Copy a matrix (m, n) into `out`."""
     for i in range(out.shape[0]):
         for k in range(out.shape[1]):
             out[i, k] = values[i, k]
 
 
-# Copies of kernels with other constants, by the ends of their names.
+# Copies of kernels with other constants, by kernel and name suffix.
 _COPIES: dict[tuple[_Kernel, str], _Kernel] = {}
 
 
@@ -341,27 +352,28 @@ def specialise(
     /,
     **constants: Any,
 ) -> _Function:
-    """Return a kernel with other values of module constants, in it and in all kernels that it calls.
+    """Return a copy of a kernel with other values of module constants, in the kernel and in all kernels that it calls.
 
-    Machine code knows constants when it is made, so others take machine code of their own; the source is one.
+    The values of constants are fixed when machine code is compiled. So other values need another copy of the machine
+    code from the same source.
 
     Parameters
     ----------
     kernel : callable
-        As `compiled` returns it.
+        Kernel returned by `compiled`.
     mark : str
-        Ends the names of kernels that call replaced ones. Kernels that differ by constants alone have these in their
-        names, and are the same for all.
+        Suffix of the names of kernels that call replaced kernels. Kernels that differ only by constants have the
+        constants in their names, and are shared.
     replaced : dict, optional
-        Kernels that are called in the place of others.
+        Kernels to call instead of others.
     constants : object
-        New values by name; kernels that use none of them, nor call one that does, stay as they are.
+        New values by name. Kernels that do not use them, directly or in callees, are not copied.
     """
     others = cast(Mapping[_Kernel, _Kernel], replaced or {})
     made = dict[_Kernel, tuple[_Kernel, frozenset[tuple[str, Any]], bool]]()
 
     def copy(one: _Kernel) -> tuple[_Kernel, frozenset[tuple[str, Any]], bool]:
-        """Return a copy, the constants that differ in it or below, and whether it reaches what is replaced."""
+        """Return a copy of a kernel, the constants that differ in it or below, and whether it calls a replaced one."""
         one, other = others.get(one, one), one in others
         if one in made:
             return made[one][0], made[one][1], made[one][2] or other
@@ -376,7 +388,7 @@ def specialise(
                 new = constants.get(name, value)
                 differ |= {(name, new)} if new is not value else set()
             changed |= {} if new is value else {name: new}
-        # what only differs by constants is the same for all that call it
+        # copies that differ only by constants are shared by all callers
         key = one, mark if reaches else "_".join(f"{name}_{value}" for name, value in sorted(differ)).replace(".", "_")
         if changed and key not in _COPIES:
             own = FunctionType(old.__code__, {**old.__globals__, **changed}, old.__name__, old.__defaults__)
@@ -390,5 +402,5 @@ def specialise(
     out = copy(kernel)[0]
     for one in {*made, *others}:
         if one in _KERNELS and not closure(one).isdisjoint(others):
-            _KERNELS.remove(one)  # a pattern, of which there will be no machine code
+            _KERNELS.remove(one)  # a template, which is never compiled itself
     return cast(_Function, out)

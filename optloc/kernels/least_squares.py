@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton (Taylor least squares, LSR) for a batch of problems; finished ones leave the batch."""
+"""Damped Gauss-Newton (Taylor least squares, LSR) for a batch of problems; converged problems leave the batch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WEIGHINGS = 2
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Ends of an unknown at which steps stop.
+    """Limits of one unknown, at which steps stop.
 
     Parameters
     ----------
@@ -43,24 +43,24 @@ class Limits:
     high: Array
 
     def take(self, items: Array) -> Limits:
-        """Return the limits of some refinements."""
+        """Return the limits of the selected refinements."""
         return Limits(self.column, self.low[items], self.high[items])
 
     def clip(self, x: Array) -> Array:
-        """Return vectors (M, size) with the unknown between its limits."""
+        """Return vectors (M, size) with the unknown clipped to its limits."""
         out = np.array(x)
         out[:, self.column] = np.clip(x[:, self.column], self.low, self.high)
         return out
 
     def reached(self, x: Array, within: float = 0.0) -> Array:
-        """Return -1 for vectors (M, size) at the low limit, 1 at the high limit, and 0 between them, (M,)."""
+        """Return (M,) -1 for vectors (M, size) at the low limit, 1 at the high limit, and 0 between the limits."""
         z = x[:, self.column]
         return np.where(z - self.low <= within, -1, np.where(self.high - z <= within, 1, 0))
 
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """Where the refinement ended.
+    """The refined estimates, with their costs and statuses.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Refined:
     status : int array (N,)
         `Status` of each: ok, max iterations, stalled, singular geometry, numerical.
     iterations : int array (N,)
-        Steps tried.
+        Number of steps tried.
     make : callable
         Returns the normal equations at `x`.
     """
@@ -100,10 +100,10 @@ def refine(
     folded: Folded | None = None,
     limits: Limits | None = None,
 ) -> Refined:
-    """Return the local maximum-likelihood estimates next to given starts.
+    """Return the local maximum-likelihood estimates near given starts.
 
-    Levenberg's method with Marquardt's scaling: a step is taken where it lowers the cost, and the damping follows
-    the ratio of the achieved to the predicted decrease (Nielsen 1999).
+    Levenberg's method with Marquardt's scaling: a step is accepted if it lowers the cost, and the damping follows the
+    ratio of the achieved to the predicted decrease (Nielsen 1999).
 
     Parameters
     ----------
@@ -112,28 +112,28 @@ def refine(
     start : array (M, size)
         Starting vectors.
     item : int array (M,), optional
-        Problem of each start; None: one start for each problem, M = N.
+        Problem of each start; by default one start for each problem, M = N.
     tolerance : float
-        A fix is finished when its next step is shorter than this many of its own standard deviations.
+        A fix has converged if its next step is shorter than this number of its standard deviations.
     limit : int
-        Steps tried at most.
+        Greatest number of steps.
     damped : bool
-        False: plain Taylor iteration, every step is taken whatever it does to the cost.
+        If False, plain Taylor iteration: every step is accepted, even if it raises the cost.
     face : Face
-        Constraints that hold with equality, also in every epoch of a run: steps follow their tangent space and are put
-        back onto them.
+        Constraints that hold with equality, also in every epoch of a run. Steps follow their tangent space, and the
+        vectors are projected back onto them.
     folded : Folded, optional
-        Steps across a plane of symmetry of the problem, instead of a face.
+        Restricts steps to a plane of symmetry of the problem, instead of a face.
     limits : Limits, optional
-        Ends of an unknown of each start. A refinement that a step holds at an end stops there as stalled.
+        Limits of one unknown for each start. A refinement ends with the status stalled if a step stays at a limit.
 
     Returns
     -------
     Refined
         One entry for each start.
     """
-    # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost; sixty steps are ten
-    # times what fixes near their stations take.
+    # By default the last step is far below any uncertainty, and its square adds 1e-14 to the cost. Sixty steps are ten
+    # times the number that fixes near their stations take.
     rules = StopRules(float(tolerance), int(limit), bool(damped))
     quick = None if face or folded or limits else _by_machine_code(problem, start, item, rules)
     if quick is not None:
@@ -141,7 +141,7 @@ def refine(
     weights = None
     if not depends_on_place(problem):
         weights = _Weights.of(problem, start)
-        # One matrix for each problem, however many starts it has.
+        # One matrix for each problem, even if the problem has several starts.
         weights = weights if item is None else weights.take(item)
     if item is not None:
         problem = problem.take(item)
@@ -153,31 +153,39 @@ def refine(
     return done
 
 
-# By numpy: all problems of a batch side by side, those that are finished leave it.
+# Refinement by numpy: all problems of a batch side by side; converged problems leave the batch.
 
 
 def _remade(problem: Problem, start: Array, rules: StopRules, face: Face = (), limits: Limits | None = None) -> Refined:
+    """Return the refinement by numpy, with weights at the start."""
     return _iterate(problem, start, _Weights.of(problem, start), rules, face, None, limits)
 
 
 @dataclass(frozen=True, slots=True)
 class _Weights:
-    """What whitens the rows during an iteration: matrices of a run that is one window, else where they are taken."""
+    """The weights of the rows during an iteration.
+
+    `matrices` are the whitening matrices of a run that is one window. `at` are the vectors at which station errors are
+    converted to noise.
+    """
 
     matrices: tuple[Whitener, ...] | None
     at: Array | None
 
     @classmethod
     def of(cls, problem: Problem, start: Array) -> _Weights:
+        """Return the weights of a problem at given starts (N, size)."""
         at = start if depends_on_place(problem) else None
         one = is_one_window(problem, len(start))
         return cls(whiten(with_station_noise(problem, at).noise, problem.weight) if one else None, at)
 
     def take(self, items: Array) -> _Weights:
+        """Return the weights of the selected problems."""
         matrices = None if self.matrices is None else tuple(w.take(items) for w in self.matrices)
         return _Weights(matrices, None if self.at is None else self.at[items])
 
     def equations(self, problem: Problem, x: Array) -> Normal:
+        """Return the normal equations at vectors x (N, size) with these weights."""
         return equations_at(problem, x, self.matrices, at=self.at)
 
 
@@ -196,13 +204,13 @@ def _iterate(
         start = start if limits is None else limits.clip(start)
         state = _DescentState.begin(problem, start, weights)
         active = np.arange(len(start))
-        part = _LanePart(problem, weights, face, _blur(problem, len(start)), folded, limits)
+        part = _ActiveProblems(problem, weights, face, _blur(problem, len(start)), folded, limits)
         for iteration in range(rules.limit):
-            # The status until another is found: what still moves.
+            # MAX_ITERATIONS is the initial status: these problems have not ended.
             moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
             if not len(moving):
                 break
-            # As long as all move, nothing is copied.
+            # Nothing is copied while all problems are active.
             if len(moving) < len(active):
                 active, part = active[moving], part.take(moving)
             _advance(part, state, active, rules, iteration)
@@ -211,7 +219,7 @@ def _iterate(
 
 @dataclass(slots=True)
 class _DescentState:
-    """What the iteration remembers of every problem; only the active entries change."""
+    """The state of the iteration of every problem; a step changes only the entries of active problems."""
 
     x: Array
     equations: Normal
@@ -222,6 +230,7 @@ class _DescentState:
 
     @classmethod
     def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _DescentState:
+        """Return the state at given starts (N, size)."""
         count = len(start)
         equations = _own(weights.equations(problem, start))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
@@ -237,8 +246,8 @@ class _DescentState:
 
 
 @dataclass(frozen=True, slots=True)
-class _LanePart:
-    """The problems still moving."""
+class _ActiveProblems:
+    """The active problems of a refinement, with their weights and constraints."""
 
     problem: Problem
     weights: _Weights
@@ -247,11 +256,11 @@ class _LanePart:
     folded: Folded | None
     limits: Limits | None
 
-    def take(self, items: Array) -> _LanePart:
-        """Return some of them."""
+    def take(self, items: Array) -> _ActiveProblems:
+        """Return the selected problems."""
         folded = None if self.folded is None else self.folded.take(items)
         limits = None if self.limits is None else self.limits.take(items)
-        return _LanePart(
+        return _ActiveProblems(
             self.problem.take(items), self.weights.take(items), self.face, self.blur[items], folded, limits
         )
 
@@ -261,12 +270,12 @@ class _LanePart:
         return Equalities.of(self.problem, self.face) if self.face else self.folded
 
 
-# Roundings that lie between a measurement and its residual.
+# Number of roundings between a measurement and its residual.
 _ROUNDINGS = 4.0
 
 
 def _blur(problem: Problem, count: int) -> Array:
-    """Return the rounding error (N,) of the whitened residuals: arrival times that count from long ago are coarse."""
+    """Return the rounding error (N,) of the whitened residuals; it is large for arrival times counted from long ago."""
     squares: Any = 0.0
     for _, _, part in windows(problem, count):
         sigma = np.sqrt(variances(part.noise, part.count))
@@ -277,10 +286,10 @@ def _blur(problem: Problem, count: int) -> Array:
 
 
 def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | float:
-    """Return what a known height adds to the rounding error (N,) of the whitened residuals.
+    """Return the rounding error (N,) that a known height adds to the whitened residuals.
 
-    A place is put back onto it from the Earth's centre, so that its coordinates are off by the rounding of that
-    distance; the information of the rows says what that makes of their residuals.
+    A position is projected onto the height from the centre of the Earth. So its coordinates have the rounding error of
+    this distance. The information of the rows converts this error to residuals.
     """
     if not any(is_height(problem, level) for level in face):
         return 0.0
@@ -290,9 +299,9 @@ def _blur_of_face(problem: Problem, face: Face, equations: Normal) -> Array | fl
     return np.asarray(_ROUNDINGS * np.finfo(float).eps * WGS84_A * np.sqrt(np.maximum(information, 0.0)))
 
 
-def _advance(part: _LanePart, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
-    """Try one step of every problem still moving."""
-    # Most batches end together: as long as all move, arrays are handed on instead of gathered.
+def _advance(part: _ActiveProblems, state: _DescentState, active: Array, rules: StopRules, iteration: int) -> None:
+    """Try one step of every active problem."""
+    # In most batches all problems end together: while all are active, arrays are not copied.
     everything = len(active) == len(state.x)
     now = state.equations if everything else _at(state.equations, active)
     here = state.x[active]
@@ -317,7 +326,7 @@ def _advance(part: _LanePart, state: _DescentState, active: Array, rules: StopRu
     _keep(state, active, found.better, x, after)
     state.damping[active], state.growth[active] = found.damping, found.growth
     if part.limits is not None:
-        # a step that ends where it began is held: it moves along the limit, which is a face
+        # a step that stays at the limit is stalled: it could only move along the limit, as on a face
         pinned = (part.limits.reached(x) != 0) & (part.limits.reached(here) == part.limits.reached(x))
         state.status[active[pinned]] = Status.STALLED
     state.status[active[found.small]] = Status.OK
@@ -327,6 +336,7 @@ def _advance(part: _LanePart, state: _DescentState, active: Array, rules: StopRu
 
 
 def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: Normal) -> None:
+    """Store accepted vectors and their equations in the state."""
     if better.all() and len(active) == len(state.x):
         state.x, state.equations = x, _own(after)
         return
@@ -337,47 +347,51 @@ def _keep(state: _DescentState, active: Array, better: Array, x: Array, after: N
 
 
 def _own(equations: Normal) -> Normal:
+    """Return normal equations whose arrays are writable."""
     return Normal(*(array if array.flags.writeable else np.array(array) for array in equations.parts))
 
 
 def _at(equations: Normal, index: Array) -> Normal:
+    """Return the normal equations of the selected problems."""
     return Normal(*(part[index] for part in equations.parts))
 
 
-# By machine code: which problems it serves, and with which weights.
+# Refinement by machine code: the supported problems, and their weights.
 
-# Systems of more unknowns are better solved one after the other, by LAPACK, than side by side in lanes; of runs with
-# unknowns of their epochs, whose elimination lanes share, networks of 64 took half of the time in lanes.
+# Greatest number of unknowns for lanes: LAPACK solves larger systems faster one after the other. For runs with local
+# unknowns, lanes share the elimination: networks of 64 took half of the time in lanes.
 _UNKNOWNS, _OF_RUNS = 40, 70
-# Numbers of the derivatives from which weights that depend on the place are made at a time: 16 MB.
+# Number of derivatives that are computed at a time for weights that depend on the position: 16 MB.
 _WEIGHED = 2**21
 
 
 def _by_machine_code(problem: Problem, start: Array, item: Array | None, rules: StopRules) -> Refined | None:
-    """Return the refinement by machine code, or None without machine code for the problem."""
+    """Return the refinement by machine code, or None if machine code does not support the problem."""
     most = _OF_RUNS if problem.layout.n_local and problem.epochs > 1 else _UNKNOWNS
     few = problem.layout.n_shared + problem.layout.n_local <= most
     if not few or not serves(problem, len(start)):
         return None
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
     if not depends_on_place(problem):
-        return _at_once(problem, start, own, whiten(with_station_noise(problem).noise, problem.weight), rules)
+        return _refine_with_weights(
+            problem, start, own, whiten(with_station_noise(problem).noise, problem.weight), rules
+        )
     width = problem.layout.n_shared + offsets_of(problem)
-    # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
+    # Each problem has different weights. They are computed in parts, so that the derivatives fit into the memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
 
     def work(part: Array) -> Refined | None:
-        return _anew(problem.take(own[part]), start[part], rules)
+        return _refine_reweighted(problem.take(own[part]), start[part], rules)
 
     done = map_on_threads(work, parts) if len(parts) > 1 else [work(parts[0])]
     found = [one for one in done if one is not None]
     return _join(found) if len(found) == len(parts) else None
 
 
-def _at_once(
+def _refine_with_weights(
     problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: StopRules
 ) -> Refined | None:
-    """Return the refinement by machine code with given weights, or None without machine code."""
+    """Return the refinement by machine code with given weights, or None if machine code is not supported."""
     found = packed(problem, noise)
     if found is None:
         return None
@@ -388,7 +402,7 @@ def _at_once(
         done, lost = refined_runs(found, item, start, rules)
     else:
         done, lost = refine.refined(found, item, start, rules)
-    # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
+    # numpy refines the runs in which an epoch does not determine its local unknowns: it takes the step of least norm.
     if lost.any():
         more = _remade(problem.take(item[lost]), start[lost], rules)
         for name in ("x", "cost", "status", "iterations"):
@@ -402,11 +416,14 @@ def _at_once(
     return Refined(done.x, done.cost, done.status, done.iterations, make)
 
 
-def _anew(problem: Problem, start: Array, rules: StopRules) -> Refined | None:
-    """Return the refinement of one start of each problem, with weights of the start and then of the end."""
+def _refine_reweighted(problem: Problem, start: Array, rules: StopRules) -> Refined | None:
+    """Return the refinement of one start of each problem.
+
+    It runs with the weights at the start, and again with the weights at the result (`WEIGHINGS` times).
+    """
     done = None
     for _ in range(WEIGHINGS):
-        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules)
+        done = _refine_with_weights(problem, start, np.arange(len(start)), whitener_at(problem, start), rules)
         if done is None:
             return None
         start = done.x

@@ -1,4 +1,4 @@
-"""What machine code is made by and made for: compilers and a processor; and such code that was installed."""
+"""The compilers and the processor that machine code depends on, and machine code that was installed."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 PACKAGE = Path(__file__).resolve().parents[1]
-"""The folder of optloc."""
+"""The folder of the package optloc."""
 
-# How kernels are compiled. Their own code is known by digests of each (`optloc.kernels.digests`).
+# Files that define how kernels are compiled. The code of kernels has separate digests (`optloc.kernels.digests`).
 COMPILERS = ("kernels/no_refcount_pass.py", "kernels/compilation.py")
 
 PREFIX = "optloc-"
-"""How the names of folders of machine code begin."""
+"""Start of the names of folders with machine code."""
 
 INSTALLED, FILE = "optloc_kernels", "manifest.json"
-"""The folder that the distribution ``optloc-kernels`` installs, and the file in it that says what for."""
+"""The folder that the distribution ``optloc-kernels`` installs, and the file with its `Manifest`."""
 
 _LOG = logging.getLogger("optloc")
 
 
 @cache
 def compiler_digest() -> str:
-    """Return the digest of the files that say how kernels are compiled."""
+    """Return the digest of the files that define how kernels are compiled."""
     return sha256(b"".join((PACKAGE / name).read_bytes() for name in COMPILERS)).hexdigest()
 
 
 class Manifest(NamedTuple):
-    """The compilers of machine code, and its processor.
+    """The compilers and the processor of machine code.
 
     Parameters
     ----------
     compiler : str
         Digest of the options and of the pipeline for numba.
     python, numba, llvmlite : str
-        Versions; of Python the first two numbers.
+        Versions; of Python only the first two numbers.
     triple, processor, features : str
-        As numba tells them, features with a sign before each and a comma between two.
+        Target triple, processor name and features, as in numba: each feature with a sign, separated by commas.
     """
 
     compiler: str
@@ -55,7 +55,7 @@ class Manifest(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return what such code is kept under."""
+        """Return the name of the folder for this machine code."""
         made = (self.compiler, self.numba, self.llvmlite, self.triple, self.processor, self.features)
         return PREFIX + sha256("\n".join(made).encode()).hexdigest()[:16]
 
@@ -65,7 +65,7 @@ class Manifest(NamedTuple):
         return {word[1:] for word in self.features.split(",") if word.startswith("+")}
 
     def misfit(self, here: Manifest) -> str:
-        """Return what of this process the code was not made for; empty where it fits."""
+        """Return the first property in which this machine code does not fit the process `here`; "" if it fits."""
         for key in ("compiler", "python", "numba", "llvmlite", "triple"):
             if getattr(self, key) != getattr(here, key):
                 return f"{key} {getattr(self, key)}"
@@ -75,7 +75,7 @@ class Manifest(NamedTuple):
 
 @cache
 def of_this_process() -> Manifest:
-    """Return what numba makes machine code of and for in this process."""
+    """Return the compilers and the processor for which numba compiles in this process."""
     from llvmlite import binding
     from numba.core import codegen, config
 
@@ -93,7 +93,7 @@ def of_this_process() -> Manifest:
 
 
 def is_chosen() -> bool:
-    """Return whether somebody has chosen what processor code is made for, by NUMBA_CPU_NAME."""
+    """Return whether NUMBA_CPU_NAME selects the processor to compile for."""
     from numba.core import config
 
     settings: Any = config  # without types
@@ -102,9 +102,9 @@ def is_chosen() -> bool:
 
 @cache
 def installed() -> tuple[Path, Manifest] | None:
-    """Return the folder and the manifest of machine code that was installed, if it fits this process.
+    """Return the folder and the manifest of installed machine code, if it fits this process; else None.
 
-    It lies beside numba: entries are pickles, which nobody may read from where others could write.
+    The folder is next to numba. Its entries are pickles, which must not be read from a folder that others can write.
     """
     try:
         place = Path(str(distribution("numba").locate_file(INSTALLED)))
@@ -112,10 +112,10 @@ def installed() -> tuple[Path, Manifest] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError) as error:
-        _LOG.warning("the manifest of optloc-kernels cannot be read (%r); machine code is made here", error)
+        _LOG.warning("cannot read the manifest of optloc-kernels (%r); machine code is compiled here", error)
         return None
-    why = "another one, which NUMBA_CPU_NAME names" if is_chosen() else found.misfit(of_this_process())
+    why = "another processor than the one in NUMBA_CPU_NAME" if is_chosen() else found.misfit(of_this_process())
     if why:
-        _LOG.info("optloc-kernels was made for %s; machine code is made here", why)
+        _LOG.info("optloc-kernels was built for %s; machine code is compiled here", why)
         return None
     return place, found

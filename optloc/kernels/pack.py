@@ -1,4 +1,4 @@
-"""The numbers of problems as plain arrays: what the compiled core computes with, next to its tables."""
+"""The numbers of problems as plain arrays for the compiled kernels; `optloc.kernels.tables` has the indices."""
 
 from __future__ import annotations
 
@@ -18,38 +18,39 @@ from optloc.problem.forms import form_of
 from optloc.problem.noise import Block, Noise, Whitener, variances
 from optloc.problem.problem import Problem
 
-# Columns of `Numbers.place`. Of a group: place of its whitening matrix, and whether that is not lower triangular. Of a
-# prior: place of its mean, with its precision behind; first unknown, how many, 1 for those of an epoch.
+# Columns of `Numbers.place`. For a group: the index of its whitening matrix, and 1 unless the matrix is lower
+# triangular. For a prior: the index of its mean, followed by its precision; the first unknown, the number of unknowns,
+# and 1 for unknowns of an epoch.
 AT, FULL = range(2)
 PRIOR_START, PRIOR_SIZE, PRIOR_LOCAL = range(1, 4)
 _COLUMNS = 4
 
 
 class Numbers(NamedTuple):
-    """The numbers of N problems; what all of them share is kept once.
+    """The numbers of N problems; numbers that all problems share are stored once.
 
-    An array (N or 1, ...) has one row where the problems share it. A place >= 0 counts through the shared numbers, one
-    of -1 - i through those of each problem: sources, whitening matrices, priors.
+    An array (N or 1, ...) has one row if the problems share it. An index >= 0 counts in the shared numbers, an index of
+    -1 - i in the numbers of each problem: sources, whitening matrices, priors.
     """
 
-    common: Array  # zero; stations, rates, axes, known targets; whitening matrices; priors
-    place: Array  # int64 (groups + priors, 4): columns as named above
+    common: Array  # shared numbers: zero; stations, rates, axes, known targets; whitening matrices; priors
+    place: Array  # int64 (groups + priors, 4): the columns above
     source: Array  # (N or 1, ...)
     white: Array  # (N or 1, ...)
     prior: Array  # (N or 1, ...)
     observed: Array  # (N or 1, m): measurements less corrections
-    present: Array  # (N or 1, m): 1 for a row that counts; (1, 0) where all do
+    present: Array  # (N or 1, m): 1 for a present row, else 0; (1, 0) if all rows are present
     sigma: Array  # (N or 1, m): standard deviations of the rows
-    size: Array  # (m,): numbers of this size, beside the measurement, are rounded to get to the row's value
+    size: Array  # (m,): size of other numbers whose rounding enters the row's value
 
 
 class Packed(NamedTuple):
-    """Problems as the compiled core takes them.
+    """Problems in the form that the compiled kernels take.
 
     Parameters
     ----------
     tables : Tables
-        Indices, one set for all.
+        Indices, the same for all problems.
     numbers : Numbers
         Arrays.
     """
@@ -59,12 +60,12 @@ class Packed(NamedTuple):
 
 
 def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
-    """Return a flat batch of problems for the compiled core, or None where it does not serve them.
+    """Return a flat batch of problems for the compiled kernels, or None if the kernels do not support them.
 
     Parameters
     ----------
     problem : Problem
-        N problems, or one without a batch axis.
+        N problems, or one problem without a batch axis.
     noise : tuple of Whitener
         Whitening matrices of their rows.
     """
@@ -72,11 +73,11 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
     if kept is None:
         return None
     source, white, prior = sources(problem), _whiteners(noise), _priors(problem)
-    # Places count on from one kind of numbers to the next.
+    # The indices of one kind of numbers follow the indices of the kind before.
     for one, before in ((white, (source,)), (prior, (source, white))):
         shared, own = (sum(part.size(mine) for part in before) for mine in (False, True))
         one.place[:, AT] += np.where(one.place[:, AT] >= 0, shared, -own)
-    # Presence is looked at where some row is absent only: an empty array says that all count.
+    # An empty array means that all rows are present, so that no kernel reads it.
     weight = problem.weight
     present = np.zeros((1, 0)) if np.all(weight > 0.0) else _plain(weight > 0.0, 1)
     return Packed(
@@ -96,14 +97,14 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
 
 
 class PackedRuns(NamedTuple):
-    """Runs as machine code takes them: their epochs, and how many each has."""
+    """Runs in the form for machine code: their epochs as problems, and the number of epochs of each run."""
 
     packed: Packed
     epochs: int
 
 
 def pack_runs(problem: Problem, noise: tuple[Whitener, ...]) -> PackedRuns | None:
-    """Return a flat batch of N runs, or None where their epochs differ in more than numbers.
+    """Return a flat batch of N runs for machine code, or None if the structures of their epochs differ.
 
     Parameters
     ----------
@@ -122,8 +123,8 @@ def pack_runs(problem: Problem, noise: tuple[Whitener, ...]) -> PackedRuns | Non
 
 
 def coarseness(problem: Problem) -> Array:
-    """Return the size (m,) of the numbers beside the measurement that are rounded to get to a row's value."""
-    # courses over ground are worked out from the centre of the Earth
+    """Return the size (m,) of the numbers, other than the measurement, whose rounding enters the value of each row."""
+    # courses over ground are computed from the centre of the Earth
     far = [MODELS[rows.kind].ecef or over_ground(problem) for rows in problem.rows]
     return np.repeat(np.where(far, WGS84_A, 0.0), [rows.count for rows in problem.rows])
 
@@ -144,19 +145,22 @@ def _plain(values: Array, core: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Divided:
-    """Numbers that are shared (numbers,), those that are not (N or 1, numbers), and where to find them."""
+    """Shared numbers (numbers,), numbers of each problem (N or 1, numbers), and the indices of both."""
 
     common: Array
     own: Array
     place: Array
 
     def size(self, own: bool) -> int:
-        """Return the count of the numbers of each problem, or of the shared ones."""
+        """Return the count of the numbers of each problem, or the count of the shared numbers."""
         return self.own.shape[1] if own else len(self.common)
 
     @classmethod
     def of(cls, parts: list[Array]) -> Divided:
-        """Return parts (N or 1, numbers) divided; `place` (parts, 4) begins with the place of each."""
+        """Return parts (N or 1, numbers) split into shared and separate numbers.
+
+        `place` (parts, 4) begins with their indices.
+        """
         place, lengths = np.zeros((len(parts), _COLUMNS), dtype=np.int64), [0, 0]
         for i, part in enumerate(parts):
             mine = int(len(part) > 1)
@@ -165,7 +169,7 @@ class Divided:
         shared, own = ([part for part in parts if (len(part) > 1) == mine] for mine in (False, True))
         flat = np.concatenate([part[0] for part in shared]) if shared else np.zeros(0)
         if len(own) > 1:
-            # A single array of the problems' own numbers, mostly that of the stations, is taken without a copy.
+            # A single array of separate numbers, mostly the stations, is used without a copy.
             own = [np.concatenate(own, axis=1)]
         return cls(flat, own[0] if own else np.zeros((1, 0)), place)
 
@@ -177,7 +181,7 @@ def sources(problem: Problem) -> Divided:
 
 
 def _whiteners(noise: tuple[Whitener, ...]) -> Divided:
-    """Return whitening matrices; a line of `place` for each group."""
+    """Return whitening matrices as `Divided`, with one line of `place` for each group."""
     divided, lines = Divided.of([_plain(w.matrix, 3) for w in noise]), []
     for start, w in zip(divided.place[:, AT], noise, strict=True):
         count, size = w.row.shape
@@ -190,6 +194,7 @@ def _whiteners(noise: tuple[Whitener, ...]) -> Divided:
 
 
 def _priors(problem: Problem) -> Divided:
+    """Return the means and precisions of the priors as `Divided`, with one line of `place` for each prior."""
     layout, parts, heads = problem.layout, [], []
     for name, mean, precision in prior_parts(problem):
         slot, shared = layout.find(name)
@@ -204,11 +209,11 @@ def _priors(problem: Problem) -> Divided:
 
 
 def _single(values: Array, core: int) -> Array:
-    """Return values of an epoch without their epoch axis of length one, where they have one."""
+    """Return values of one epoch without the epoch axis of length one, if they have this axis."""
     return np.take(values, 0, axis=-1 - core) if values.ndim > core else values
 
 
-# Epochs that have equal rows, as a flat batch of problems of one epoch: lanes are epochs then.
+# Epochs with equal rows are treated as a flat batch of problems of one epoch: then each lane is an epoch.
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,13 +223,13 @@ class Folding:
     Parameters
     ----------
     rows : tuple of int array (k, r)
-        Rows of each epoch, for each kind and within it.
+        For each kind, the rows of each epoch, numbered within the kind.
     local : int array (m,)
         Number of each row of the run within its epoch.
     epoch : int array (m,)
         Epoch of each row of the run.
     touches : tuple of int array (n,)
-        Touches of one epoch, for each bias. Priors are numbers of a problem, which structures leave out.
+        For each bias, its entries in the rows of one epoch.
     """
 
     rows: tuple[Array, ...]
@@ -238,9 +243,9 @@ class Folding:
         return len(self.rows[0])
 
     def groups(self, row: Array) -> tuple[Array, Array] | None:
-        """Return the groups (q, r) of one epoch and their numbers (k, q) in each epoch, from groups of rows (g, r).
+        """Return the groups (q, r) of one epoch, and their numbers (k, q) in each epoch, from groups of rows (g, r).
 
-        None where groups have rows of several epochs, or epochs differ in their groups.
+        The result is None if a group has rows of several epochs, or if the groups of two epochs differ.
         """
         epoch, local = self.epoch[row], self.local[row]
         own = _alike(epoch[:, 0], self.epochs, local)
@@ -248,7 +253,7 @@ class Folding:
 
 
 def _alike(epoch: Array, epochs: int, *values: Array) -> Array | None:
-    """Return the entries (k, q) of each epoch, or None where epochs differ in values (n, ...) of their entries."""
+    """Return the entries (k, q) of each epoch, or None if the values (n, ...) of the entries differ between epochs."""
     if not len(epoch) or len(epoch) % epochs:
         return np.zeros((epochs, 0), dtype=np.int64) if not len(epoch) else None
     own = np.argsort(epoch, kind="stable").reshape(epochs, -1)
@@ -260,9 +265,10 @@ _KEPT = Cache["Folding | None"](2**19, lambda folding: 1 if folding is None else
 
 
 def folding(problem: Problem) -> Folding | None:
-    """Return the common rows of the epochs of a run; None where epochs differ in more than numbers.
+    """Return the common rows of the epochs of a run, or None if the structures of the epochs differ.
 
-    Local unknowns, targets at rest and biases that do not depend on the time enter each epoch in the same way.
+    The result requires that local unknowns, targets at rest and biases that do not depend on the time enter each epoch
+    in the same way.
     """
     if problem.epochs == 1 or any(m.order or m.known is not None or m.rise is not None for m in problem.motions):
         return None
@@ -270,6 +276,7 @@ def folding(problem: Problem) -> Folding | None:
 
 
 def _fold(problem: Problem) -> Folding | None:
+    """Return the common rows of the epochs, see `folding`."""
     k, rows, local, start = problem.epochs, [], np.zeros(problem.count, dtype=np.int64), 0
     for block, first in zip(problem.rows, problem.starts, strict=True):
         own = _alike(block.epoch, k, block.a, block.b, block.target)
@@ -282,7 +289,7 @@ def _fold(problem: Problem) -> Folding | None:
     for bias in problem.biases:
         own = _alike(epoch[bias.row], k, local[bias.row], bias.member, bias.coefficient)
         form = form_of(bias)
-        # Errors that depend on the time are another function of their members in each epoch.
+        # Errors that depend on the time are a different function of their unknowns in each epoch.
         if own is None or form.changes or form.enters == "moves":
             return None
         touches.append(own[0])
@@ -291,7 +298,7 @@ def _fold(problem: Problem) -> Folding | None:
 
 
 def fold(problem: Problem, found: Folding) -> Problem:
-    """Return the epochs of a flat batch of N runs as a flat batch of N k problems, epoch by epoch of each run.
+    """Return the epochs of a flat batch of N runs as a flat batch of N k problems, sorted by run, then by epoch.
 
     Unknowns that the epochs share are unknowns of each problem, and have the priors of the run.
 
@@ -300,11 +307,12 @@ def fold(problem: Problem, found: Folding) -> Problem:
     problem : Problem
         N runs of k epochs.
     found : Folding
-        Of their structure.
+        Common rows of the epochs.
     """
     count, k = problem.batch_shape[0], problem.epochs
 
     def spread(array: Array | None, core: int) -> Array | None:
+        """Return an array for the batch of epochs, from an array with an axis of epochs."""
         # numbers of each epoch, with an axis of epochs of length 1 or k
         if array is None or (array.ndim == core and array.shape[0] == 1):
             return array
@@ -312,6 +320,7 @@ def fold(problem: Problem, found: Folding) -> Problem:
         return whole.reshape(count * k, 1, *whole.shape[2:])
 
     def repeat(array: Array | None, core: int) -> Array | None:
+        """Return an array for the batch of epochs, repeated for the epochs of each run."""
         return array if array is None or array.ndim == core or len(array) == 1 else np.repeat(array, k, axis=0)
 
     s = problem.stations
@@ -343,17 +352,19 @@ def fold(problem: Problem, found: Folding) -> Problem:
 
 
 def _fold_bias(bias: Bias, own: Array, found: Folding) -> Bias:
+    """Return a bias for the batch of epochs."""
     return replace(bias, row=found.local[bias.row[own]], member=bias.member[own], coefficient=bias.coefficient[own])
 
 
 def fold_whiteners(noise: tuple[Whitener, ...], found: Folding, count: int) -> tuple[Whitener, ...] | None:
-    """Return whitening matrices of N runs for the batch of `fold`; None where epochs differ in their groups."""
+    """Return the whitening matrices of N runs for the batch of `fold`, or None if the groups of two epochs differ."""
     if any(found.groups(whitener.row) is None for whitener in noise):
         return None
     return tuple(Whitener(*_fold_groups(whitener.row, whitener.matrix, found, count)) for whitener in noise)
 
 
 def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
+    """Return rows of one kind for the batch of epochs."""
     first = own[0]
     return replace(
         rows,
@@ -368,7 +379,7 @@ def _fold_rows(rows: Rows, own: Array, count: int) -> Rows:
 
 
 def _fold_values(values: Array, own: Array, count: int) -> Array:
-    """Return values (N or none, m) of rows as (N k, r), or (r,) where all have the same."""
+    """Return values (N or none, m) of rows as (N k, r), or (r,) if all epochs have the same values."""
     picked = values[..., own]
     if values.ndim == 1 and (picked == picked[:1]).all():
         return np.asarray(picked[0])

@@ -10,16 +10,16 @@ from optloc.kernels.jit import compiled
 DEGREE = 4
 """Greatest degree."""
 
-# Halvings that reach neighbouring doubles from any two.
+# Halvings after which any two doubles have become neighbours.
 _MOST = 200
 
 
 @compiled
 def real_roots(c: Array, low: float, high: float, work: Array, out: Array) -> int:
-    """Write the real roots of c[0] + c[1] t + ... between two limits, ascending, and return how many there are.
+    """Write the real roots of c[0] + c[1] t + ... between two limits in ascending order, and return their number.
 
-    Between two roots of its derivative a polynomial has one root at most, and it is bracketed. Roots of even order,
-    where it touches zero, may be missed.
+    Between two roots of its derivative, a polynomial has at most one root, which is bracketed. Roots of even order,
+    where the polynomial touches zero, may be missed.
 
     Parameters
     ----------
@@ -30,11 +30,13 @@ def real_roots(c: Array, low: float, high: float, work: Array, out: Array) -> in
     work : array (2, DEGREE + 2)
         Scratch.
     out : array (DEGREE,)
-        Written.
+        Written: the roots.
     """
     slope, edge = work[0], work[1]
     count = 0
-    for order in range(DEGREE - 1, -1, -1):  # the derivative of that order; its own derivative has the roots in `out`
+    for order in range(
+        DEGREE - 1, -1, -1
+    ):  # the derivative of this order; `out` contains the roots of the next higher derivative
         degree = DEGREE - order
         for i in range(degree + 1):
             slope[i] = c[i + order]
@@ -55,6 +57,7 @@ def real_roots(c: Array, low: float, high: float, work: Array, out: Array) -> in
 
 @compiled
 def _value(c: Array, degree: int, t: float) -> float:
+    # Return the value of a polynomial at t, by Horner's rule.
     value = c[degree]
     for i in range(degree - 1, -1, -1):
         value = value * t + c[i]
@@ -63,7 +66,10 @@ def _value(c: Array, degree: int, t: float) -> float:
 
 @compiled
 def _root(c: Array, degree: int, low: float, high: float, left: float) -> float:
-    """Return the root between two places of different signs: Newton's step where it stays between, else the middle."""
+    """Return the root between two points of different signs.
+
+    The iteration uses Newton's step if it stays between the points, else the middle.
+    """
     t = high
     for _ in range(_MOST):
         value, slope = c[degree], 0.0
@@ -85,5 +91,5 @@ def _root(c: Array, degree: int, low: float, high: float, left: float) -> float:
     return t
 
 
-# Share of a root that is rounding.
+# Relative difference of two roots that counts as rounding.
 _NOTHING = 2.0 * np.finfo(float).eps

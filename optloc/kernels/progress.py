@@ -1,7 +1,7 @@
-"""A line every two seconds while machine code is made or loaded, unless the user wants none (`--quiet`).
+"""A progress line every two seconds while machine code is compiled or loaded; the option `--quiet` switches it off.
 
-On a terminal one line is written over and over; elsewhere each is a warning of the log ``optloc.compile``, which goes
-to standard error unless a program has other plans for it.
+On a terminal, one line is overwritten. Elsewhere each line is a warning of the log ``optloc.compile``, which goes to
+standard error unless the program configures logging differently.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from typing import ClassVar
 
 from optloc.base.threads import held_by_forks
 
-# Seconds after which somebody who sees nothing begins to wonder; seconds between two looks at the clock; and between
-# two compilations that belong together.
+# Seconds between two lines, so that a user does not wait without any output; seconds between two checks of the clock;
+# longest pause between two compilations that count as one activity.
 _EVERY, _LOOK, _PAUSE = 2.0, 0.2, 1.0
 _LOG = logging.getLogger("optloc.compile")
-# To the begin of the line, and clear it.
+# Return to the start of the line and clear it.
 _CLEAR = "\r\x1b[2K"
 
 
 class Reporter:
-    """Says every two seconds how far something is, for as long as it goes on.
+    """Prints the progress of an activity every two seconds while it lasts.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Reporter:
         Returns the line.
     """
 
-    # Whether the user wants no line at all, in this process.
+    # Whether this process prints no progress at all.
     quiet: ClassVar[bool] = False
 
     def __init__(self, text: Callable[[], str]) -> None:
@@ -42,10 +42,11 @@ class Reporter:
         held_by_forks(self._lock, self._start)
 
     def _start(self) -> None:
+        """Reset the counters, also in a child process after a fork."""
         self._depth, self._watching, self._since, self._ended = 0, False, 0.0, -_PAUSE
 
     def begin(self) -> None:
-        """Note that something begins, in whichever thread, or within what has begun before."""
+        """Count the start of an activity, in any thread, also inside another activity."""
         with self._lock:
             self._depth += 1
             now = monotonic()
@@ -56,12 +57,13 @@ class Reporter:
                 Thread(target=self._watch, daemon=True, name="optloc progress").start()
 
     def end(self) -> None:
-        """Note that what began has ended."""
+        """Count the end of an activity."""
         with self._lock:
             self._depth -= 1
             self._ended = monotonic()
 
     def _watch(self) -> None:
+        """Print lines until the activity has ended."""
         said = False
         while True:
             sleep(_LOOK)
@@ -81,10 +83,12 @@ class Reporter:
 
 
 def _on_terminal() -> bool:
+    """Return whether standard error is a terminal."""
     return sys.stderr is not None and sys.stderr.isatty()
 
 
 def _say(text: str) -> None:
+    """Print a line on the terminal, or log it."""
     if _on_terminal():
         sys.stderr.write(_CLEAR + text)
         sys.stderr.flush()
@@ -93,6 +97,6 @@ def _say(text: str) -> None:
 
 
 def keep_quiet(quiet: bool) -> bool:
-    """Switch progress off or on in this process, and return the argument, as the callback of an option must."""
+    """Switch progress off or on in this process, and return the argument, as a callback of an option must."""
     Reporter.quiet = quiet
     return quiet

@@ -1,6 +1,6 @@
-"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.kernels.least_squares`, lane by lane.
+"""Damped Gauss-Newton for many problems in one call, with the rules of `optloc.kernels.least_squares` in lanes.
 
-A lane whose problem is finished takes the next one, so that the lanes are full until the problems run out.
+When a problem in a lane has ended, the lane takes the next problem, so that all lanes work until no problem is left.
 """
 
 from __future__ import annotations
@@ -39,20 +39,21 @@ _OK, LIMIT, _STALLED, NUMERICAL = (
 
 
 class Answers(NamedTuple):
-    """Where the refinements of M starts ended; p unknowns, shared ones and then local ones."""
+    """The results of the refinements of M starts with p unknowns, first the shared ones, then the local ones."""
 
-    x: Array  # (M, p): starts, replaced by the answers
+    x: Array  # (M, p): starts, replaced by the refined vectors
     cost: Array  # (M,)
     status: Array  # int8 (M,)
     iterations: Array  # int32 (M,)
-    matrix: Array  # (M, p, p): information at the answers
+    matrix: Array  # (M, p, p): information at the refined vectors
     vector: Array  # (M, p)
 
 
-# Cells that a refinement keeps of every problem, from `room.state` on; `room.STATE` of them.
+# Cells with the state of the refinement of every lane, from `room.state` on. Their number is
+# `optloc.kernels.batched_rows.STATE`.
 DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, CLOSED = range(8)
-# What it keeps beside them: which start it is, 1 while nothing but the start is
-# known and 2 before it is there, steps tried, status.
+# Integer state of every lane: the number of the start; FRESH (1 while only the start is evaluated, 2 before it is
+# loaded); the steps tried; the status.
 START, FRESH, STEPS, STATUS = range(4)
 _TAGS = 4
 # The lane waits for its start.
@@ -60,7 +61,10 @@ EMPTY = 2
 
 
 def new_answers(start: Array, kept: int | None = None) -> Answers:
-    """Return room for the answers of starts (M, p), which are copied, and equations of `kept` unknowns (all)."""
+    """Return arrays for the results of starts (M, p), which are copied.
+
+    They contain the equations of `kept` unknowns, by default of all.
+    """
     count, size = len(start), start.shape[1] if kept is None else kept
     return Answers(
         np.array(start, dtype=float, order="C"),
@@ -73,12 +77,13 @@ def new_answers(start: Array, kept: int | None = None) -> Answers:
 
 
 LEFT_OPEN = -1
-"""Status of a start on whose way an epoch left its own unknowns open: what then holds is left to numpy."""
+"""Status of a start if an epoch does not determine its local unknowns during the refinement: then numpy refines the
+start."""
 
 
 @compiled
 def refine_block(packed: Packed, item: Array, first: int, last: int, rules: StopRules, out: Answers) -> None:
-    """Refine the starts first <= i < last; several threads may work on one set of answers.
+    """Refine the starts first <= i < last; several threads may write to one `Answers`.
 
     Parameters
     ----------
@@ -87,12 +92,12 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Stop
     item : int64 array (M,)
         Problem of each start.
     first, last : int
-        Which starts.
+        Range of the starts.
     rules : StopRules
-        When to stop.
+        Conditions to stop.
     out : Answers
-        Starts; they become the answers. Status: ok, max iterations, stalled, numerical, `LEFT_OPEN`. Neither
-        information nor vector is written of runs whose epochs have unknowns of their own.
+        In: starts. Written: the results. Status: ok, max iterations, stalled, numerical, `LEFT_OPEN`. For runs whose
+        epochs have local unknowns, neither information nor vector is written.
     """
     t, c = packed
     size, runs = out.x.shape[1], is_run(t)
@@ -120,19 +125,22 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Stop
 
 @compiled
 def is_run(t: Tables) -> bool:
-    """Return whether problems have several epochs with unknowns of their own, which are eliminated one by one."""
+    """Return whether problems have several epochs with local unknowns, which are eliminated epoch by epoch."""
     return t.local > 0 and t.epochs > 1
 
 
 @compiled
 def is_over(tag: Array, lane: int, limit: int) -> bool:
-    """Return whether the start in a lane needs no further step."""
+    """Return whether the start in a lane has ended."""
     return bool(tag[STATUS, lane] != LIMIT or tag[STEPS, lane] >= limit)
 
 
 @compiled
 def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: int, limit: int) -> tuple[int, int]:
-    """Give the lanes of ended starts to the following ones, or close them; return lanes in use and the next start."""
+    """Give the lanes of ended starts to the next starts, or close them.
+
+    Returns the number of open lanes and the next start.
+    """
     b = 0
     while b < used:
         if not is_over(tag, b, limit):
@@ -148,7 +156,7 @@ def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: in
 
 @compiled
 def begin(c: Numbers, m: Array, room: LaneCells, tag: Array, used: int, item: Array, x: Array) -> None:
-    """Bring the starts of empty lanes into them."""
+    """Load the starts of empty lanes."""
     for b in range(used):
         if tag[FRESH, b] == EMPTY:
             start = tag[START, b]
@@ -162,7 +170,7 @@ def begin(c: Numbers, m: Array, room: LaneCells, tag: Array, used: int, item: Ar
 
 @compiled
 def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
-    """Bring the problem of one lane into another."""
+    """Copy the problem of one lane into another lane."""
     if to != lane:
         for i in range(tag.shape[0]):
             tag[i, to] = tag[i, lane]
@@ -174,7 +182,7 @@ def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
 def _judge(
     m: Array, room: LaneCells, size: int, runs: bool, line: int, tag: Array, rules: StopRules, used: int
 ) -> None:
-    """Take the places tried that are better, and set damping and status."""
+    """Accept the trial vectors that are better, and update damping and status."""
     state, total = room.state, room.after + line * line - 1
     better, cost = state + BETTER, state + COST
     for b in range(used):
@@ -198,7 +206,7 @@ def _judge(
 
 @compiled
 def judge_trial(m: Array, room: LaneCells, now: int, after: int, rules: StopRules, b: int) -> int:
-    """Return the status of a lane after a step; say whether it is better and set the damping."""
+    """Return the status of lane b after a step; write whether the step is better, and the new damping."""
     state = room.state
     better, small, stuck, m[state + DAMPING, b], m[state + GROWTH, b] = judge_lane(
         m[now, b],
@@ -219,7 +227,7 @@ def judge_trial(m: Array, room: LaneCells, now: int, after: int, rules: StopRule
 
 @compiled
 def _finish(m: Array, room: LaneCells, tag: Array, lane: int, out: Answers) -> None:
-    """Write the answer of a lane."""
+    """Write the result of a lane."""
     start, size = tag[START, lane], out.matrix.shape[-1]
     last = room.now + size * (size + 1)
     out.cost[start], out.iterations[start] = m[room.state + COST, lane], tag[STEPS, lane]
@@ -235,7 +243,7 @@ def _finish(m: Array, room: LaneCells, tag: Array, lane: int, out: Answers) -> N
 
 @compiled
 def _advance(m: Array, room: LaneCells, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
-    """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
+    """Write the next trial vector of every lane that is not fresh, and the squared length of the step."""
     size, damping, gain = n + local, room.state + DAMPING, room.state + GAIN
     vector = room.now + size * (size + 1)
     for b in range(used):
@@ -250,17 +258,16 @@ def _advance(m: Array, room: LaneCells, n: int, local: int, tag: Array, damped: 
         tag[STEPS, b] += 1 - tag[FRESH, b]
 
 
-# Runs whose epochs have unknowns of their own: these are eliminated epoch by epoch, and nothing of an epoch is kept.
-#
-# A step takes two passes over the epochs: one sums up what they say about the shared unknowns, one works out their own;
-# a third one finds the cost of the place tried.
+# Runs whose epochs have local unknowns: these are eliminated epoch by epoch, and no data of an epoch are stored.  A
+# step takes three passes over the epochs. The first sums the equations of the shared unknowns. The second computes the
+# steps of the local unknowns. The third computes the cost at the trial vector.
 
 
 @compiled
 def _advance_run(
     t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array, damped: bool, used: int
 ) -> None:
-    """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
+    """Write the next trial vector of every lane that is not fresh, and the squared length of the step."""
     n, damping, gain = t.shared, room.state + DAMPING, room.state + GAIN
     vector = room.now + (n + t.local) * (n + t.local + 1)
     for b in range(used):
@@ -284,7 +291,7 @@ def _advance_run(
 
 @compiled
 def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array, summing: bool, lanes: int) -> None:
-    """Go through the epochs at `room.best`: sum up the shared system (in `room.now` undamped), or step their own."""
+    """Process all epochs at `room.best`: sum the shared system (undamped in `room.now`), or compute the local steps."""
     n, local, last = t.shared, t.local, t.shared + t.local
     group, packet, line = 0, 0, last + 1
     if summing:
@@ -295,7 +302,7 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array
             m[room.state + SOLVABLE, b], m[room.state + CLOSED, b] = 1.0, 1.0
     for epoch in range(t.epochs + 1):
         clear(m, room.after, line * line, lanes)
-        whole = epoch == t.epochs  # behind the last epoch come the priors of what lasts the run
+        whole = epoch == t.epochs  # after the last epoch come the priors of unknowns of the run
         group, packet = add_groups(t, c, m, r, room, room.best, epoch, group, packet, lanes)
         add_priors(t, c, m, room, room.best, not whole, epoch, lanes)
         if not whole:
@@ -315,7 +322,7 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: LaneCells, tag: Array
 
 @compiled
 def _own(m: Array, room: LaneCells, tag: Array, n: int, local: int, epoch: int, lanes: int) -> None:
-    """Write the step of the unknowns of an epoch."""
+    """Write the step of the local unknowns of an epoch."""
     complete(m, room, n, local, lanes)
     vector, at = room.after + (n + local) * (n + local + 1) + n, n + epoch * local
     for a in range(local):
@@ -327,7 +334,7 @@ def _own(m: Array, room: LaneCells, tag: Array, n: int, local: int, epoch: int, 
 
 @compiled
 def _add(m: Array, room: LaneCells, n: int, line: int, lanes: int) -> None:
-    """Add the damped sums of all epochs to what their unknowns cost them."""
+    """Add the damped sums of all epochs to the terms from the elimination of the local unknowns."""
     for i in range(n):
         for j in range(i + 1):
             for b in range(lanes):
@@ -337,11 +344,11 @@ def _add(m: Array, room: LaneCells, n: int, line: int, lanes: int) -> None:
             m[room.step + i, b] += m[room.now + (line - 1) * line + i, b]
 
 
-# Refinements of many starts spread over threads, by the kernel that serves the problem.
+# Refinements of many starts in several threads, by the kernel for the problem.
 
 
 def refined(packed: Packed, item: Array, start: Array, rules: StopRules) -> tuple[Answers, Array]:
-    """Return where the refinements of starts (M, size) of given problems end, and where numpy must take over, (M,).
+    """Return the refined starts (M, size) of given problems, and whether numpy must refine them instead (M,).
 
     Parameters
     ----------
@@ -352,16 +359,16 @@ def refined(packed: Packed, item: Array, start: Array, rules: StopRules) -> tupl
     start : array (M, size)
         Starting vectors.
     rules : StopRules
-        When to stop.
+        Conditions to stop.
     """
     out = new_answers(start, 0 if is_run(packed.tables) else None)
-    item = np.ascontiguousarray(item)  # machine code would be made anew for entries that lie apart
+    item = np.ascontiguousarray(item)  # a strided array would need separate machine code
     map_on_threads(lambda part: refine_block(packed, item, part[0], part[1], rules, out), chunks(len(start)))
     return out, np.asarray(out.status == LEFT_OPEN)
 
 
 def equations(packed: Packed, item: Array, done: Answers) -> Normal:
-    """Return the normal equations at the answers."""
+    """Return the normal equations at the refined vectors."""
     n, matrix, vector = packed.tables.shared, done.matrix, done.vector
     if matrix.shape[-1] == 0:
         return normal_at(packed, done.x, item, priors=True)

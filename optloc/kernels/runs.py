@@ -1,8 +1,9 @@
 """Runs whose epochs have local unknowns, by machine code: each lane is an epoch.
 
-Normal equations of a run are shaped like an arrow: one block for the unknowns that epochs share, and for each epoch a
-block for the others, with a coupling. A block of lanes evaluates the rows of 64 epochs together. The unknowns of each
-epoch are then eliminated (Schur complement), and the rest is summed up in the order of the epochs.
+The normal equations of a run have an arrow shape: one block for the unknowns that epochs share, and for each epoch a
+block for the local unknowns, with a coupling. A block of lanes evaluates the rows of 64 epochs together. Then the local
+unknowns of each epoch are eliminated (Schur complement), and the reduced equations are summed in the order of the
+epochs.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from optloc.linear.normal import OPEN, Normal
 _OK, _STALLED = int(Status.OK), int(Status.STALLED)
 
 LEFT_OPEN = -1
-"""Status of a start if an epoch left local unknowns open: numpy refines it."""
+"""Status of a start if an epoch does not determine its local unknowns: then numpy refines the start."""
 
 
 class EpochShare(NamedTuple):
@@ -51,7 +52,7 @@ class EpochShare(NamedTuple):
     cost : array (1,)
         Weighted sum of squared residuals.
     own : array (q, cells, B)
-        Rows of the equations of each epoch that belong to its local unknowns, for blocks of lanes.
+        Equations of the local unknowns of each epoch, in blocks of lanes.
     """
 
     matrix: Array
@@ -62,6 +63,7 @@ class EpochShare(NamedTuple):
 
 @compiled
 def _share(n: int, local: int, parts: int, lanes: int) -> EpochShare:
+    # Return empty sums for n shared and `local` local unknowns, in `parts` blocks of lanes.
     return EpochShare(np.zeros((n, n)), np.zeros(n), np.zeros(1), np.zeros((parts, local * (n + local + 2), lanes)))
 
 
@@ -107,7 +109,7 @@ def _blur(packed: Packed, m: Array, room: LaneCells, item: int, epochs: int) -> 
 
 @compiled
 def _keep(m: Array, rows: int, vector: int, count: int, local: int, own: Array, used: int) -> None:
-    """Write the equations of the local unknowns: rows, then right sides."""
+    """Store the equations of the local unknowns in `own`: rows, then right sides."""
     for cell in range(count):
         for b in range(used):
             own[cell, b] = m[rows + cell, b]
@@ -118,7 +120,7 @@ def _keep(m: Array, rows: int, vector: int, count: int, local: int, own: Array, 
 
 @compiled
 def _sum(m: Array, matrix: int, line: int, vector: int, cost: int, n: int, used: int, out: EpochShare) -> None:
-    """Add the equations of the shared unknowns and the costs of all lanes."""
+    """Add the equations of the shared unknowns and the costs of all lanes to `out`."""
     for i in range(n):
         for j in range(i + 1):
             for b in range(used):
@@ -131,7 +133,7 @@ def _sum(m: Array, matrix: int, line: int, vector: int, cost: int, n: int, used:
 
 @compiled
 def _factor_epochs(m: Array, room: LaneCells, n: int, local: int, own: Array, damping: float, used: int) -> None:
-    """Factor the damped systems of the local unknowns; CLOSED is 1.0 where they are determined."""
+    """Factor the damped systems of the local unknowns; CLOSED becomes 1.0 if they are determined."""
     line = n + local + 1
     for cell in range(local * line):
         for b in range(used):
@@ -156,9 +158,9 @@ def _reduce(
     matrix: Array,
     vector: Array,
 ) -> bool:
-    """Write the shared system (n, n), (n,) without the local unknowns; return if each epoch determines all of them.
+    """Write the shared system without the local unknowns, and return whether each epoch determines all of them.
 
-    Lower triangles.
+    The lower triangle is written to `matrix` (n, n), the right side to `vector` (n,).
     """
     lanes, closed = m.shape[1], True
     for i in range(n):
@@ -184,7 +186,7 @@ def _reduce(
 
 @compiled
 def _factor_shared(m: Array, room: LaneCells, n: int, matrix: Array) -> bool:
-    """Factor the shared system in the first lane; return whether it is positive definite."""
+    """Factor the shared system in the first lane, and return whether it is positive definite."""
     for i in range(n):
         for j in range(i + 1):
             m[room.shared + i * n + j, 0] = matrix[i, j]
@@ -216,7 +218,7 @@ def _step(
     matrix: Array,
     move: Array,
 ) -> int:
-    """Write the damped step of the shared unknowns to `move` (n,); return its status, see `LEFT_OPEN`."""
+    """Write the damped step of the shared unknowns to `move` (n,), and return its status, see `LEFT_OPEN`."""
     if not _reduce(m, room, n, local, epochs, now, damping, matrix, move):
         return LEFT_OPEN
     if not _factor_shared(m, room, n, matrix):
@@ -238,7 +240,7 @@ def _move(
     x: Array,
     to: Array,
 ) -> float:
-    """Write the vector one step from x, and return the squared length of the step in its own standard deviations."""
+    """Write the vector after one step from x, and return the squared length of the step in standard deviations."""
     lanes, gain = m.shape[1], 0.0
     for i in range(n):
         to[i] = x[i] + move[i]
@@ -260,18 +262,18 @@ def _move(
 
 
 class Spread(NamedTuple):
-    """Information and covariances of M runs at vectors.
+    """Information and covariances of M runs at given vectors.
 
     Parameters
     ----------
     information, covariance : array (M, n, n)
-        Of the shared unknowns; local unknowns are eliminated.
+        Matrices of the shared unknowns; local unknowns are eliminated.
     local : array (M, k, q, q)
         Covariance of the first q unknowns of each epoch.
     weakest : array (M,)
         Smallest squared pivot of the information scaled to a unit diagonal.
     regular : bool array (M,)
-        Whether run and epochs determine all unknowns; the other fields hold only in this case.
+        Whether run and epochs determine all unknowns; otherwise the other fields have no meaning.
     """
 
     information: Array
@@ -323,7 +325,7 @@ def _spread_epochs(
     for b in range(used):
         for u in range(size):
             for v in range(u + 1):
-                # errors of the epoch, and errors that the shared unknowns bring
+                # the errors of the epoch, plus the errors that come from the shared unknowns
                 total = m[room.now + u * local + v, b]
                 for i in range(n):
                     for j in range(n):
@@ -336,25 +338,25 @@ def _spread_epochs(
 def refine_runs(
     packed: Packed, item: Array, epochs: int, first: int, last: int, rules: StopRules, out: Answers, spread: Spread
 ) -> None:
-    """Refine the starts first <= i < last of runs; several threads may work on one set of answers.
+    """Refine the starts first <= i < last of runs; several threads may write to one `Answers`.
 
     Parameters
     ----------
     packed : Packed
-        The epochs of N runs, N k problems.
+        The epochs of N runs, as N k problems.
     item : int64 array (M,)
         Run of each start.
     epochs : int
         Number k of epochs of a run.
     first, last : int
-        Which starts.
+        Range of the starts.
     rules : StopRules
-        When to stop.
+        Conditions to stop.
     out : Answers
-        Starts; they become the answers. Status: ok, max iterations, stalled, numerical, `LEFT_OPEN`. Neither
+        In: starts. Written: the results. Status: ok, max iterations, stalled, numerical, `LEFT_OPEN`. Neither
         information nor vector is written.
     spread : Spread
-        Written at the answers, unless it has no runs.
+        Written at the results, unless it has no runs.
     """
     t, c = packed
     n, local = t.shared, t.local
@@ -398,7 +400,7 @@ def refine_runs(
 def sum_runs(
     packed: Packed, x: Array, item: Array, epochs: int, first: int, last: int, priors: bool, out: Sums
 ) -> None:
-    """Write the normal equations of runs at the vectors first <= i < last, x (M, n + k l)."""
+    """Write the normal equations of runs at the vectors first <= i < last of x (M, n + k l)."""
     t, c = packed
     n, local = t.shared, t.local
     lanes, room = blocks(packed, n + local, epochs), cell_layout(t, c, n + local)
@@ -424,11 +426,11 @@ def sum_runs(
                     out.local[start, epoch, j, i] = own[i * line + n + j, b]
 
 
-# From Python: runs whose epochs are alike.
+# Calls from Python, for runs whose epochs have equal rows.
 
 
 def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: StopRules) -> tuple[Answers, Array]:
-    """Return the ends of refinements of starts (M, size) of given runs (M,), and whether numpy must take over, (M,)."""
+    """Return the refined starts (M, size) of given runs (M,), and whether numpy must refine them instead (M,)."""
     done, _ = fixed_runs(runs, item, start, rules, None)
     return done, np.asarray(done.status == LEFT_OPEN)
 
@@ -436,7 +438,10 @@ def refined_runs(runs: PackedRuns, item: Array, start: Array, rules: StopRules) 
 def fixed_runs(
     runs: PackedRuns, item: Array, start: Array, rules: StopRules, size: int | None
 ) -> tuple[Answers, Spread]:
-    """Return the ends of refinements and the covariances there, of the first unknowns of an epoch, `size` of them."""
+    """Return the refined starts (M, size) of given runs (M,), and their covariances.
+
+    The covariances contain the first `size` unknowns of each epoch. If `size` is None, they are empty.
+    """
     n, out, item = runs.packed.tables.shared, new_answers(start, 0), np.ascontiguousarray(item)
     count, wanted = len(start), 0 if size is None else len(start)
     spread = Spread(

@@ -1,4 +1,4 @@
-"""The normal equations of a run: sums over its epochs, window by window."""
+"""The normal equations of a run, summed over its epochs in windows."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from optloc.problem.epochs import windows
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
 
-# Rows of a problem up to which there is machine code, but for runs of equal epochs: longer tables would not be constant
-# in memory.
+# Greatest number of rows of a problem for which machine code is used: the tables of longer problems would need memory
+# that grows with the run. Runs of equal epochs have no limit.
 _LONGEST = 2**13
 
 
 def equations_at(
     problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None
 ) -> Normal:
-    """Return the normal equations, priors included, of a batch of problems.
+    """Return the normal equations of a batch of problems, including priors.
 
-    Working memory beyond the measurements does not depend on the number of epochs: only sums are kept, and the local
-    blocks of epochs that have unknowns of their own.
+    Beyond the measurements, the working memory does not depend on the number of epochs: only sums are stored, and the
+    blocks of epochs that have local unknowns.
 
     Parameters
     ----------
@@ -38,15 +38,15 @@ def equations_at(
     x : array (..., size)
         Parameter vectors.
     noise : tuple of Whitener, optional
-        Whitening matrices of all rows, used where the run is one window; None: made from the problem.
+        Whitening matrices of all rows, used if the run is one window; by default computed from the problem.
     at : array (..., size), optional
-        Where station errors of span "noise" are weighed; None: at `x`.
+        Vectors at which station errors of span "noise" are converted to noise; by default `x`.
     """
     return with_priors(problem, x, summed(problem, x, noise, at=at))
 
 
 def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None) -> Normal:
-    """Return the normal equations of the measurements alone; arguments as of `equations_at`."""
+    """Return the normal equations of the measurements without priors; the arguments are those of `equations_at`."""
     if x.shape[-1] == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     quick = _by_machine_code(problem, checked_vectors(problem, x), noise) if at is None else None
@@ -63,9 +63,9 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
 
 
 def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
-    """Return the sums by machine code, or None where it does not serve the problem."""
+    """Return the normal equations computed by machine code, or None if machine code does not support the problem."""
     count, shape = x.size // x.shape[-1], x.shape[:-1]
-    # one vector for each problem, or several side by side
+    # one vector for each problem, or several vectors for each problem
     alike = problem.batch_shape in {(), (1,), (count,)} if x.ndim == 2 else problem.batch_shape == shape[-1:]
     if not alike or not serves(problem, count) or (noise is None and depends_on_place(problem)):
         return None
@@ -79,13 +79,16 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
 
 
 def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | PackedRuns | None:
-    """Return problems for machine code, or None where it does not serve them; arguments as of `pack`."""
+    """Return problems in the form for machine code, or None if it does not support them; arguments as for `pack`."""
     runs = pack_runs(problem, noise) if is_run(problem) else None
     return pack(problem, noise) if runs is None and problem.count <= _LONGEST else runs
 
 
 def sums_at(found: Packed | PackedRuns, x: Array, item: Array, *, priors: bool = False) -> Normal:
-    """Return the normal equations of problems at vectors x (M, size) of given problems (M,), by machine code."""
+    """Return the normal equations at vectors x (M, size), computed by machine code.
+
+    `item` (M,) is the problem of each vector.
+    """
     from optloc.kernels.equations import normal_at
     from optloc.kernels.runs import sums_of_runs
 
@@ -100,7 +103,7 @@ def is_run(problem: Problem) -> bool:
 
 
 def serves(problem: Problem, starts: int) -> bool:
-    """Return whether machine code is at hand, or may be waited for, for a number of vectors of a problem."""
+    """Return whether machine code supports a problem, and exists or may be compiled, for `starts` vectors."""
     if not starts or not enabled() or walks(problem):
         return False
     from optloc.kernels.equations import normal_block

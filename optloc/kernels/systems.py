@@ -1,9 +1,9 @@
-"""Small symmetric positive definite systems side by side in lanes: one that is singular never disturbs the others.
+"""Small symmetric positive definite systems side by side in lanes; a singular system does not affect the other lanes.
 
-Systems of unknowns of mixed units (metres, radians, seconds) are scaled to a unit diagonal and flagged where a pivot
-vanishes, as `optloc.base.linalg` does; their matrices and vectors stand in cells of a memory (cells, B), row by row.
-Systems of lengths alone, as of positions from ranges, are factored as they are: that takes no roots, and the number of
-lanes is known when they are compiled.
+Systems of unknowns with mixed units (metres, radians, seconds) are scaled to a unit diagonal. They are flagged if a
+pivot vanishes, as in `optloc.base.linalg`. Their matrices and vectors are stored in cells of a memory (cells, B), row
+by row. Systems of lengths only, such as positions from ranges, are factored without scaling. This takes no square
+roots, and the number of lanes is known when they are compiled.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from optloc.kernels.jit import compiled, inlined
 def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lanes: int) -> None:
     """Replace the lower triangle (n, n) by the factor of the matrix scaled to a unit diagonal.
 
-    Its diagonal holds inverse pivots.
+    The diagonal then contains inverse pivots.
 
     Parameters
     ----------
     m : array (cells, B)
         Memory.
     matrix : int
-        Cell of the matrix.
+        First cell of the matrix.
     n : int
-        Its size.
+        Size of the matrix.
     scale : int
-        Cell that receives the scales (n,).
+        First cell of the scales (n,), which are written.
     ok : int
-        Cell that becomes 0.0 where a matrix is not numerically positive definite.
+        Cell that becomes 0.0 if a matrix is not numerically positive definite.
     least : float
         Share of its diagonal that a pivot must exceed.
     lanes : int
-        How many lanes count.
+        Number of lanes that contain a problem.
     """
     for i in range(n):
         for b in range(lanes):
             positive = m[matrix + i * n + i, b] > 0.0
-            # A lane that is not definite goes on with ones: its numbers stay finite, and its flag is down.
+            # A lane that is not definite continues with ones: its numbers stay finite, and `ok` is zero.
             m[scale + i, b] = 1.0 / np.sqrt(m[matrix + i * n + i, b] if positive else 1.0)
             m[ok, b] = m[ok, b] if positive else 0.0
         for j in range(i + 1):
@@ -72,7 +72,7 @@ def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lan
 
 @compiled
 def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace a vector by the factor's inverse times it, scaled."""
+    """Replace a vector by the inverse of the factor times the scaled vector."""
     for i in range(n):
         for b in range(lanes):
             m[right + i, b] *= m[scale + i, b]
@@ -99,22 +99,22 @@ def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -
 
 @compiled
 def step(m: Array, room: LaneCells, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
-    """Write the damped step from `room.now` into `room.step`, zero where cell `ok` becomes 0.0.
+    """Write the damped step from `room.now` to `room.step`; the step is zero if cell `ok` becomes 0.0.
 
     Parameters
     ----------
     m : array (cells, B)
         Memory.
     room : LaneCells
-        Where things stand.
+        Addresses in the memory.
     n, local : int
         Numbers of shared and of local unknowns.
     damping : int
-        Cell of Marquardt's factor: the diagonal of the information is multiplied by one more than it.
+        Cell of Marquardt's factor f: the diagonal of the information is multiplied by 1 + f.
     ok : int
-        Cell that says where the systems can be solved.
+        Cell that becomes 0.0 if the systems cannot be solved.
     lanes : int
-        How many lanes count.
+        Number of lanes that contain a problem.
     """
     size = n + local
     line = size + 1
@@ -144,7 +144,7 @@ def step(m: Array, room: LaneCells, n: int, local: int, damping: int, ok: int, l
 def factor_local(
     m: Array, room: LaneCells, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
 ) -> None:
-    """Factor the damped system of the local unknowns of equations at cell `source`; prepare what couples it."""
+    """Factor the damped system of the local unknowns of the equations at cell `source`, and prepare its coupling."""
     line, half = n + local + 1, room.half
     for i in range(local):
         row, own = source + (n + i) * line, room.local + i * local
@@ -152,23 +152,23 @@ def factor_local(
             for b in range(lanes):
                 m[own + j, b] = m[row + n + j, b]
         for b in range(lanes):
-            # Marquardt's scaling, as of the shared unknowns.
+            # Marquardt's scaling, as for the shared unknowns.
             grown = m[own + i, b] * (1.0 + m[damping, b])
-            m[own + i, b] = grown if grown != 0.0 else 1.0  # what no row touches stays where it is
+            m[own + i, b] = grown if grown != 0.0 else 1.0  # an unknown without a row keeps its value
         for j in range(n):
             for b in range(lanes):
                 m[half + j * local + i, b] = m[row + j, b]
         for b in range(lanes):
             m[half + n * local + i, b] = m[source + (n + local) * line + n + i, b]
     factor(m, room.local, local, room.local_scale, ok, least, lanes)
-    # The couplings of all shared unknowns, and the vector behind them.
+    # The couplings of all shared unknowns, followed by the vector.
     for j in range(n + 1):
         forward(m, room.local, local, room.local_scale, half + j * local, lanes)
 
 
 @compiled
 def eliminate(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
-    """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
+    """Subtract the Schur complement of the local unknowns from the shared system in `room.shared` and `room.step`."""
     half = room.half
     for a in range(local):
         for i in range(n):
@@ -177,13 +177,13 @@ def eliminate(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None
                 m[room.step + i, b] -= m[u, b] * m[v, b]
             for j in range(i + 1):
                 for b in range(lanes):
-                    # Schur's complement: half is L^-1 C', so that its products are C B^-1 C'.
+                    # `half` is L^-1 C', so that its products are C B^-1 C'.
                     m[room.shared + i * n + j, b] -= m[u, b] * m[half + j * local + a, b]
 
 
 @compiled
 def complete(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
-    """Write the step of the local unknowns behind that of the shared ones; their system is factored."""
+    """Write the step of the local unknowns after the step of the shared ones; the local system is factored."""
     own = room.step + n
     for a in range(local):
         for b in range(lanes):
@@ -194,7 +194,7 @@ def complete(m: Array, room: LaneCells, n: int, local: int, lanes: int) -> None:
     backward(m, room.local, local, room.local_scale, own, lanes)
 
 
-# Systems of one unit, in arrays whose last axis counts the lanes.
+# Systems of one unit, in arrays whose last axis is the lane.
 
 LANES = 64
 """Problems side by side where only lengths are unknown: a fix takes the same time from 16 to 256, with 8 twice."""
@@ -202,14 +202,14 @@ LANES = 64
 
 @compiled
 def factor_plain(A: Array, diagonal: Array, lower: Array, inverse: Array) -> None:
-    """Find the unit lower factors of symmetric matrices, and one over each pivot.
+    """Write the unit lower factors of symmetric matrices, and one over each pivot.
 
     Parameters
     ----------
     A : array (n, n, W)
         Read below the diagonal.
     diagonal : array (n, W)
-        Read in its place.
+        Diagonal of the matrices, used instead of that of A.
     lower : array (n, n, W)
         Written: the factors below the diagonal; above it is scratch.
     inverse : array (n, W)
@@ -221,7 +221,7 @@ def factor_plain(A: Array, diagonal: Array, lower: Array, inverse: Array) -> Non
         for lane in range(LANES):
             pivot[lane] = diagonal[i, lane]
         for j in range(i):
-            # above the diagonal stay the entries before they are divided by their pivot
+            # above the diagonal are the entries before the division by their pivot
             for lane in range(LANES):
                 lower[j, i, lane] = A[i, j, lane]
             for k in range(j):
@@ -231,7 +231,7 @@ def factor_plain(A: Array, diagonal: Array, lower: Array, inverse: Array) -> Non
                 lower[i, j, lane] = lower[j, i, lane] * inverse[j, lane]
                 pivot[lane] -= lower[j, i, lane] * lower[i, j, lane]
         for lane in range(LANES):
-            # Infinite or negative where the matrix is not definite: the caller compares it with the diagonal.
+            # Infinite or negative if the matrix is not definite; the caller compares it with the diagonal.
             pivot[lane] = 1.0 / pivot[lane]
 
 
@@ -259,27 +259,27 @@ def solve_plain(lower: Array, inverse: Array, right: Array) -> None:
                 right[i, lane] -= lower[j, i, lane] * right[j, lane]
 
 
-# Share of its diagonal that a pivot must keep: an unknown that no row feels is left as it is.
+# Share of its diagonal that a pivot must keep: an unknown that no row depends on keeps its value.
 _FELT = 1e-13
 
 
 @compiled
 def eliminate_last(A: Array, right: Array, cost: Array, diagonal: Array, keep: int) -> None:
-    """Take the last unknowns from normal equations, the others at whatever values: what is left is about those.
+    """Eliminate the last unknowns from normal equations: the result holds for any values of the others.
 
     Parameters
     ----------
     A : array (n, n, W)
-        Information below the diagonal. Overwritten: of the first `keep` unknowns the information that is left; row i of
-        an unknown that is taken holds ``-d x_i / d x_j`` for j < i.
+        Information below the diagonal. Overwritten: the remaining information about the first `keep` unknowns; row i of
+        an eliminated unknown contains ``-d x_i / d x_j`` for j < i.
     right : array (n, W)
         Right side; overwritten.
     cost : array (W,)
-        Cost, which becomes the least over the unknowns that are taken.
+        Cost; overwritten with the minimum over the eliminated unknowns.
     diagonal : array (n, W)
         Scratch.
     keep : int
-        Unknowns that stay.
+        Number of unknowns that stay.
     """
     n = len(right)
     for k in range(keep, n):
@@ -290,7 +290,7 @@ def eliminate_last(A: Array, right: Array, cost: Array, diagonal: Array, keep: i
             felt = A[k, k, lane] > _FELT * diagonal[k, lane]
             A[k, k, lane] = 1.0 / A[k, k, lane] if felt else 0.0
             cost[lane] -= A[k, k, lane] * right[k, lane] * right[k, lane]
-        # from the last column down: what is overwritten is no longer needed
+        # from the last column backwards, so that overwritten entries are no longer needed
         for i in range(k - 1, -1, -1):
             share = diagonal[k]
             for lane in range(LANES):
@@ -308,8 +308,8 @@ def eliminate_last(A: Array, right: Array, cost: Array, diagonal: Array, keep: i
 
 @compiled
 def positive(a: float, b: float, c: float, d: float, e: float, f: float) -> bool:
-    """Return whether the matrix [[a, b, c], [b, d, e], [c, e, f]] is positive definite, rounding taken against it."""
-    # Some thousand times the rounding of the entries, which are sums over rows: what then is positive is so indeed.
+    """Return whether the matrix [[a, b, c], [b, d, e], [c, e, f]] is positive definite despite rounding."""
+    # Some thousand times the rounding error of the entries, which are sums over rows: above it, the matrix is positive.
     shift = 1e-12 * (abs(a) + abs(d) + abs(f))
     a, d, f = a - shift, d - shift, f - shift
     if not a > 0.0:
@@ -320,10 +320,10 @@ def positive(a: float, b: float, c: float, d: float, e: float, f: float) -> bool
 
 @inlined
 def positive_along(a: float, b: float, c: float, d: float, e: float, f: float, second: bool, third: bool) -> bool:
-    """Return whether a matrix is positive definite along the coordinates that there are, see `positive`.
+    """Return whether a matrix is positive definite in the coordinates that exist, see `positive`.
 
-    Of a coordinate that there is not (`second`, `third` False) no entry counts: its pivot is as large as the others,
-    because beside 1, whatever its unit, large ones would leave it to rounding.
+    `second` and `third` are False if the coordinate does not exist. Then its entries are ignored, and its pivot is set
+    as large as the others. A pivot of 1 would be rounding compared with large ones in other units.
     """
     most = max(abs(a), abs(d) if second else 0.0, abs(f) if third else 0.0)
     return positive(a, b, c, d if second else most, e, f if third else most)
@@ -331,26 +331,30 @@ def positive_along(a: float, b: float, c: float, d: float, e: float, f: float, s
 
 @compiled
 def principal(matrix: Array, vectors: Array) -> None:
-    """Make a symmetric 3x3 matrix diagonal by Jacobi rotations, in place; `vectors` receives the columns."""
+    """Diagonalise a symmetric 3x3 matrix by Jacobi rotations in place.
+
+    `vectors` receives the eigenvectors in columns.
+    """
     _rotate_until(matrix, vectors, 0.0)
 
 
 @compiled
 def roughly_principal(matrix: Array, vectors: Array) -> None:
-    """Make a positive definite 3x3 matrix nearly diagonal: correlations of a hundredth are left."""
-    # Search coordinates need be no exact axes: at a hundredth a box is no worse, and a sweep or two is spared.
+    """Diagonalise a positive definite 3x3 matrix approximately; correlations of up to 0.01 remain."""
+    # Search coordinates need not be exact axes: with 0.01 a box is not worse, and one or two sweeps are saved.
     _rotate_until(matrix, vectors, 1e-2)
 
 
 @compiled
 def _rotate_until(matrix: Array, vectors: Array, correlation: float) -> None:
+    # Rotate until the remaining squared correlations are small.
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0
-    for _ in range(12):  # Jacobi's sweeps converge quadratically: a handful reaches the rounding
+    for _ in range(12):  # Jacobi's sweeps converge quadratically: a few are enough
         b, c, e = matrix[0, 1], matrix[0, 2], matrix[1, 2]
         a, d, f = abs(matrix[0, 0]), abs(matrix[1, 1]), abs(matrix[2, 2])
-        # Some units in the last place: smaller entries are rounding, and no rotation takes them away.
+        # Some units in the last place: smaller entries are rounding, which no rotation removes.
         if not abs(b) + abs(c) + abs(e) > 1e-15 * (a + d + f):
             return
         share = correlation * correlation
@@ -363,10 +367,11 @@ def _rotate_until(matrix: Array, vectors: Array, correlation: float) -> None:
 
 @compiled
 def _rotate(matrix: Array, vectors: Array, p: int, q: int) -> None:
+    # Apply the Jacobi rotation that makes entry (p, q) zero.
     away = matrix[p, q]
     if away == 0.0:
         return
-    # The smaller of the two angles that make the entry zero: the order of the axes stays, and nothing cancels.
+    # The smaller of the two angles that make the entry zero: the order of the axes stays, and no digits cancel.
     ratio = (matrix[q, q] - matrix[p, p]) / (2.0 * away)
     tangent = (1.0 if ratio >= 0.0 else -1.0) / (abs(ratio) + sqrt(1.0 + ratio * ratio))
     cosine = 1.0 / sqrt(1.0 + tangent * tangent)
@@ -383,13 +388,14 @@ def _rotate(matrix: Array, vectors: Array, p: int, q: int) -> None:
 
 @compiled
 def inverse(a: float, b: float, c: float, d: float, e: float, f: float, out: Array) -> bool:
-    """Write the inverse of [[a, b, c], [b, d, e], [c, e, f]] into out (3, 3); return False where it is singular."""
+    """Write the inverse of [[a, b, c], [b, d, e], [c, e, f]] to out (3, 3); return False if the matrix is singular."""
     u, v, t = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * u + b * v + c * t
-    # What the determinant is the sum of, before anything cancels: of a matrix of rank one the cofactors are rounding
-    # themselves, and beside them nothing looks small. However rows and columns are scaled, the ratio is the same.
+    # The sum of the absolute terms of the determinant, before cancellation. For a matrix of rank one the cofactors are
+    # rounding themselves, and would not be small compared with each other. The ratio does not depend on the scales of
+    # rows and columns.
     size = abs(a * d * f) + 2.0 * abs(b * c * e) + abs(a) * e * e + abs(d) * c * c + abs(f) * b * b
-    # Cancelled to its last four digits: an inverse would be noise.
+    # Only the last four digits are left: an inverse would be noise.
     if not abs(determinant) > 1e-12 * size:
         return False
     scale = 1.0 / determinant
@@ -408,7 +414,7 @@ def cholesky(matrix: Array, size: int, least: float) -> bool:
     matrix : array (n, n)
         Symmetric; its lower triangle is read and written.
     size : int
-        How many rows and columns count.
+        Size of the leading block.
     least : float
         Share of its diagonal that a pivot must exceed.
     """
@@ -430,7 +436,7 @@ def cholesky(matrix: Array, size: int, least: float) -> bool:
 
 @compiled
 def substitute(lower: Array, right: Array) -> None:
-    """Replace a vector (n,) by the inverse of a lower triangular matrix times it."""
+    """Replace a vector (n,) by the inverse of a lower triangular matrix times the vector."""
     for i in range(len(right)):
         for k in range(i):
             right[i] -= lower[i, k] * right[k]
@@ -439,7 +445,7 @@ def substitute(lower: Array, right: Array) -> None:
 
 @compiled
 def solve_factored(lower: Array, right: Array) -> None:
-    """Replace a vector (n,) by the solution of the system of which `cholesky` returned the factor."""
+    """Replace a vector (n,) by the solution of the system whose factor `cholesky` returned."""
     substitute(lower, right)
     for i in range(len(right) - 1, -1, -1):
         for k in range(i + 1, len(right)):
@@ -449,20 +455,20 @@ def solve_factored(lower: Array, right: Array) -> None:
 
 @compiled
 def invert(matrix: Array, size: int, least: float) -> bool:
-    """Replace the leading block of a positive definite matrix by its inverse; return False where it is singular.
+    """Replace the leading block of a positive definite matrix by its inverse; return False if it is singular.
 
     Parameters
     ----------
     matrix : array (n, n)
-        Symmetric; its lower triangle is read, both are written.
+        Symmetric; its lower triangle is read, both triangles are written.
     size : int
-        How many rows and columns count.
+        Size of the leading block.
     least : float
         Share of its diagonal that a pivot must exceed.
     """
     if not cholesky(matrix, size, least):
         return False
-    for j in range(size):  # the lower factor by its own inverse
+    for j in range(size):  # replace the lower factor by its inverse
         matrix[j, j] = 1.0 / matrix[j, j]
         for i in range(j + 1, size):
             total = 0.0
@@ -483,23 +489,23 @@ def invert(matrix: Array, size: int, least: float) -> bool:
 
 # Principal axes of many small matrices side by side.
 
-# Squared correlation that is left, at most: axes so near cost what the exact ones do to ten digits.
+# Greatest squared correlation that remains: with such axes, costs agree with the exact ones to ten digits.
 _CORRELATION = 1e-20
-# Squared share of the trace below which an entry is rounding that no rotation takes away.
+# Squared share of the trace below which an entry is rounding, which no rotation removes.
 _ROUNDING = 1e-31
-# Jacobi's sweeps converge quadratically: of 64 matrices one always needs three, and a few more reach the rounding from
-# any matrix. In the plane a single turn is exact.
+# Jacobi's sweeps converge quadratically. Of 64 matrices one always needs three, and a few more reach the rounding from
+# any matrix. In two dimensions a single rotation is exact.
 _FIRST, _SWEEPS = 3, 8
 
 
 @compiled
 def principal_axes(matrix: Array, axes: Array, spare: Array) -> None:
-    """Make symmetric matrices diagonal by Jacobi rotations.
+    """Diagonalise symmetric matrices by Jacobi rotations.
 
     Parameters
     ----------
     matrix : array (n, n, W)
-        Read on and below the diagonal; its diagonal is overwritten with the eigenvalues, in no order.
+        Read on and below the diagonal; the diagonal is overwritten with the eigenvalues, not sorted.
     axes : array (n, n, W)
         Written: unit eigenvectors, in columns.
     spare : array (W,)
@@ -520,7 +526,7 @@ def principal_axes(matrix: Array, axes: Array, spare: Array) -> None:
 
 @compiled
 def _is_left(matrix: Array, trace: Array) -> bool:
-    """Return whether an entry beside a diagonal is more than rounding."""
+    """Return whether an off-diagonal entry is more than rounding."""
     n, left = len(matrix), 0.0
     for lane in range(LANES):
         trace[lane] = 0.0
@@ -534,18 +540,18 @@ def _is_left(matrix: Array, trace: Array) -> bool:
                 least = max(
                     _CORRELATION * abs(matrix[i, i, lane] * matrix[j, j, lane]), _ROUNDING * trace[lane] * trace[lane]
                 )
-                # NaN is never left: a lane without a matrix holds up no other
+                # comparisons with NaN are false, so that a lane without a matrix does not delay the others
                 left += 1.0 if entry * entry > least else 0.0
     return left > 0.0
 
 
 @compiled
 def _turn(matrix: Array, axes: Array, p: int, q: int) -> None:
-    """Turn axes p < q so that the entry between them vanishes."""
+    """Rotate axes p < q so that the entry (q, p) vanishes."""
     n = len(matrix)
     for lane in range(LANES):
         entry, first, second = matrix[q, p, lane], matrix[p, p, lane], matrix[q, q, lane]
-        # the smaller of the two angles: the axes keep their order, and nothing cancels
+        # the smaller of the two angles: the axes keep their order, and no digits cancel
         ratio = (second - first) / (2.0 * entry)
         size = 1.0 / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
         tangent = size if ratio >= 0.0 else -size
@@ -553,7 +559,7 @@ def _turn(matrix: Array, axes: Array, p: int, q: int) -> None:
         cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
         sine = tangent * cosine
         matrix[p, p, lane], matrix[q, q, lane] = first - tangent * entry, second + tangent * entry
-        # the entry's place holds the angle until the others are turned
+        # the entry stores the angle until the other entries are rotated
         matrix[q, p, lane], matrix[p, q, lane] = cosine, sine
     for k in range(n):
         if k not in (p, q):

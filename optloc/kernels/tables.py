@@ -1,4 +1,7 @@
-"""Which number goes where: the indices that the compiled core follows, made once for problems of equal structure."""
+"""The indices that the compiled kernels follow, computed once for problems of equal structure.
+
+They define which data enter which row, and which unknowns a row depends on.
+"""
 
 from __future__ import annotations
 
@@ -13,31 +16,31 @@ from optloc.kernels.trace import Traced, trace
 from optloc.linear.evaluate import BlockLinks, Terms, block_links, given
 from optloc.problem.problem import Problem
 
-# The order in which rows are evaluated, and the unknowns that each group of them touches.
+# The order in which rows are evaluated, and the unknowns of each group of rows.
 
-# Rows whose derivatives are at hand together: about this many numbers a lane, so that they stay in the cache.
+# Approximate number of derivatives per lane that are computed together, so that they stay in the cache.
 _NUMBERS, _MOST, _LEAST = 512, 128, 8
 
 
 def starts(counts: Any) -> Array:
-    """Return where each of several parts of given lengths begins, and the end."""
+    """Return the first index of each of several parts of given lengths, and the total length."""
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class RowGroups:
-    """Groups of correlated rows in the order of their epochs.
+    """Groups of correlated rows, sorted by epoch.
 
     Parameters
     ----------
     of : int array (m,)
         Group of each row of the problem.
     member : int array (m,)
-        Its place in the group.
+        Index of each row in its group.
     size, epoch : int array (g,)
-        Rows of each group, and the epoch of its first.
+        Number of rows of each group, and the epoch of its first row.
     number : int array (g,)
-        Which of the groups handed in each is, counted through all of them.
+        Number of each group in the original order.
     """
 
     of: Array
@@ -48,7 +51,7 @@ class RowGroups:
 
     @classmethod
     def sorted(cls, problem: Problem, groups: tuple[Array, ...]) -> RowGroups:
-        """Return the groups (g, r) of a problem, sorted."""
+        """Return the groups (g, r) of a problem, sorted by epoch."""
         rows = np.concatenate([group.ravel() for group in groups])
         size = np.concatenate([np.full(len(group), group.shape[1]) for group in groups])
         head = starts(size)[:-1]
@@ -65,16 +68,16 @@ class RowGroups:
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """Which unknown moves what: one entry for each, rows counted through the problem.
+    """The dependences of rows on unknowns, one entry for each; rows are numbered in the problem.
 
     Parameters
     ----------
     row, column : int array (n,)
         Row, and column of the full parameter vector.
     factor : array (n,)
-        How strongly.
+        Coefficient of the unknown.
     place : int array (n,)
-        Which input of the row's kind; zero where it acts on the measurement itself.
+        Index of the input that the unknown changes; zero if it changes the measurement directly.
     """
 
     row: Array
@@ -84,19 +87,19 @@ class Entries:
 
     @classmethod
     def joined(cls, parts: list[Entries]) -> Entries:
-        """Return the entries of several."""
+        """Return the entries of several parts as one."""
         none = np.zeros(0, dtype=np.int64)
         parts = [cls(none, none, np.zeros(0), none), *parts]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
 
     @classmethod
     def terms(cls, terms: Terms, start: int) -> Entries:
-        """Return those of linear terms of a block whose first row has a given number."""
+        """Return the entries of the linear terms of a block whose first row has the number `start`."""
         return cls(start + terms.row, terms.column, terms.coefficient, np.zeros_like(terms.row))
 
     @classmethod
     def feeds(cls, links: BlockLinks, trace: Traced, start: int) -> Entries:
-        """Return those of the inputs of a block that its function needs."""
+        """Return the entries of those inputs of a block that its function needs."""
         place, parts = {seed: i for i, (seed, _) in enumerate(trace.tape.inputs)}, []
         for feed in links.feeds:
             if feed.seed in place:
@@ -108,14 +111,14 @@ class Entries:
 
 @dataclass(frozen=True, slots=True)
 class RowColumns:
-    """The unknowns that each group touches: shared ones, then the local ones of its epoch.
+    """The unknowns of each group: shared unknowns, then the local unknowns of its epoch.
 
     Parameters
     ----------
     column : int array (c,)
-        Of all groups, one after the other, ascending in each.
+        Columns of all groups, one group after the other, ascending in each.
     at : int array (g + 1,)
-        Where each group begins.
+        First index of each group.
     """
 
     column: Array
@@ -123,11 +126,11 @@ class RowColumns:
 
     @classmethod
     def of(cls, problem: Problem, groups: RowGroups, entries: list[Entries]) -> tuple[RowColumns, list[Array]]:
-        """Return the columns, and the place of each entry among those of its group."""
+        """Return the columns of each group, and the index of each entry in the columns of its group."""
         n, length = problem.layout.n_shared, problem.layout.n_local
         keys = []
         for part in entries:
-            # Local columns of all epochs fall on those of one: a group has rows of a single epoch.
+            # The local columns of all epochs have the same numbers, because a group has rows of a single epoch.
             folded = np.where(part.column < n, part.column, n + (part.column - n) % max(length, 1))
             keys.append(groups.of[part.row] * (n + length) + folded)
         found, place = np.unique(np.concatenate(keys), return_inverse=True)
@@ -143,15 +146,15 @@ class Order:
     Parameters
     ----------
     row : int array (m,)
-        Number in the problem of each row evaluated.
+        Number in the problem of each row in the order of evaluation.
     at : int array (m,)
-        When each row of the problem is evaluated.
+        Position of each row of the problem in the order of evaluation.
     place : int array (m,)
-        Place of each row evaluated among those of its packet; rows of a group follow each other there.
+        Index of each evaluated row in its packet, where the rows of a group are adjacent.
     packet_group : int array (p + 1,)
         First group of each packet.
     packet_row : int array (p, q + 1)
-        First row evaluated of each kind in each packet.
+        First evaluated row of each kind in each packet.
     """
 
     row: Array
@@ -162,8 +165,8 @@ class Order:
 
     @classmethod
     def of(cls, problem: Problem, groups: RowGroups, width: int) -> Order:
-        """Return the order for groups whose rows have a number of columns at most."""
-        # Wide rows, fewer of them: a packet keeps its numbers in the first cache.
+        """Return the order of evaluation for groups whose rows have at most `width` columns."""
+        # If rows are wide, a packet has fewer rows, so that its numbers stay in the first-level cache.
         limit = int(np.clip(_NUMBERS // width, _LEAST, _MOST))
         first = starts(groups.size)
         packet = np.unique(first[:-1] // limit, return_inverse=True)[1]
@@ -172,7 +175,7 @@ class Order:
         kind = np.repeat(np.arange(kinds), [rows.count for rows in problem.rows])
         place = first[groups.of] + groups.member
         mine = packet[groups.of]
-        # Packet by packet, in it kind by kind: a tape runs over as many rows as possible.
+        # Within a packet, rows are sorted by kind: each tape runs over as many rows as possible.
         row = np.lexsort((place, kind, mine))
         at = np.empty_like(row)
         at[row] = np.arange(len(row))
@@ -181,41 +184,41 @@ class Order:
         return cls(row, at, (place - first[packet_group[mine]])[row], packet_group, begin)
 
 
-# Columns of the tables, each of whole numbers. The operations of `code` are those of `Tape.code`; tables of one column
-# (constant, packet, part, column) are read at FIRST or REGISTER.
+# Columns of the integer tables. The operations of `code` are those of `Tape.code`; tables of one column (constant,
+# packet, part, column) are read at FIRST or REGISTER.
 FIRST = REGISTER = 0
-DERIVATIVE = 1  # of an input: the register of the derivative by it, -1 for none
+DERIVATIVE = 1  # register of the derivative by an input, -1 for none
 KIND_CODE, KIND_CONSTANT, KIND_INPUT, KIND_VALUE, KIND_PERIODIC = range(5)
 ROW_NUMBER, ROW_PLACE, ROW_WIDTH, ROW_SOURCE, ROW_SCALE, ROW_ADDEND = range(6)
 SOURCE_NUMBER, SOURCE_FEED = range(2)
 TERM_COLUMN, TERM_SLOT = range(2)
-GROUP_ROWS, GROUP_EPOCH, GROUP_COLUMN = range(1, 4)  # behind its first row in the packet
+GROUP_ROWS, GROUP_EPOCH, GROUP_COLUMN = range(1, 4)  # after the first row of the group in the packet
 _WIDEST = 6
 
 
 class Tables(NamedTuple):
-    """The indices of a structure; rows are numbered in the order in which they are evaluated.
+    """The indices of a structure; rows are numbered in the order of evaluation.
 
-    Rows whose noise is correlated form a group, groups follow each other in time, and a stretch of groups whose rows
-    are evaluated together is a packet. All tables stand below each other, for every array that is handed to
-    a kernel takes time. Where a table says "first", its next line says where that ends.
+    Rows with correlated noise form a group. Groups are sorted by time, and successive groups whose rows are evaluated
+    together form a packet. All tables are stored in one array, because each array argument of a kernel costs time. An
+    entry "first" of a table is an index whose end is in the next line.
     """
 
-    table: Array  # int64 (n, 6): all tables below each other
+    table: Array  # int64 (n, 6): all tables, one after the other
     real: Array  # constants and factors
-    # Where each table begins in `table`.
+    # First line of each table in `table`.
     code: int  # operation, target, operands, see `Tape`; the tapes of all kinds
     kind: int  # first operation, constant, input; register of the value; 1 for an angle
     constant: int  # register; its values are the first of `real`
     input: int  # register, and the register of the derivative by it; -1 for none
-    row: int  # number in the problem, place in the packet, columns of the group; first source, scale, addend
-    source: int  # input of a row: >= 0 a number that all problems share, else -1 - one of its own; first feed
-    term: int  # column of the vector, place among the columns of the group: of feeds, scales, addends
+    row: int  # number in the problem, index in the packet, columns of the group; first source, scale, addend
+    source: int  # input of a row: >= 0 a shared number, else -1 - a number of each problem; first feed
+    term: int  # column of the vector, index in the columns of the group: of feeds, scales, addends
     packet: int  # first group
     part: int  # first row, for each packet and kind
     group: int  # first row in the packet, rows, epoch; first column
     column: int  # unknowns of a group, ascending: shared ones, then local ones of its epoch
-    factor: int  # where the factors of the terms begin in `real`
+    factor: int  # first index of the factors of the terms in `real`
     kinds: int
     packets: int
     groups: int
@@ -223,14 +226,14 @@ class Tables(NamedTuple):
     local: int
     epochs: int
     registers: int
-    width: int  # most columns of a group, and one for the residual
-    rows: int  # most rows of a packet
-    size: int  # most rows of a group
+    width: int  # greatest number of columns of a group, plus one for the residual
+    rows: int  # greatest number of rows of a packet
+    size: int  # greatest number of rows of a group
 
 
 @dataclass(frozen=True, slots=True)
 class CachedTables:
-    """Tables, and which of the groups of the whiteners each group is: int array (groups,)."""
+    """Tables, and the number of each group among the groups of the whitening matrices: int array (groups,)."""
 
     tables: Tables
     number: Array
@@ -238,14 +241,16 @@ class CachedTables:
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """The data arrays that inputs come from, in order, and where each begins: the first number of all is zero.
+    """The data arrays that contain the inputs, in order, and the number of their first entries.
+
+    Number 0 is the constant zero.
 
     Parameters
     ----------
     arrays : tuple of (array, core rank)
         Station positions, rates, axes, known targets, known shapes of heights.
     start : tuple of int
-        Number of the first entry of each, counted over one problem.
+        Number of the first entry of each array, counted for one problem.
     """
 
     arrays: tuple[tuple[Array, int], ...]
@@ -263,11 +268,11 @@ class Sources:
 
     @property
     def own(self) -> tuple[bool, ...]:
-        """Return whether each problem of the batch has its own array."""
+        """Return for each array whether each problem of the batch has different values."""
         return tuple(array.ndim > core and array.shape[0] > 1 for array, core in self.arrays)
 
     def numbered(self, problem: Problem) -> Problem:
-        """Return the problem with every number of these arrays replaced by its place among them."""
+        """Return the problem with each entry of these arrays replaced by its number."""
         places = iter(
             start + np.arange(np.prod(array.shape[array.ndim - core :]), dtype=float).reshape(array.shape[-core:])
             for (array, core), start in zip(self.arrays, self.start, strict=True)
@@ -283,7 +288,7 @@ class Sources:
         return replace(problem, stations=stations, motions=motions)
 
     def lookup(self) -> Array:
-        """Return for each number its place among those that all problems share, or -1 - its place among their own."""
+        """Return for each number its index in the shared numbers, or -1 - its index in the numbers of each problem."""
         shared, own, out = 1, 0, [np.zeros(1, dtype=np.int64)]
         for (array, core), mine in zip(self.arrays, self.own, strict=True):
             count = int(np.prod(array.shape[array.ndim - core :]))
@@ -292,21 +297,21 @@ class Sources:
         return np.concatenate(out)
 
 
-# Tables of longer problems are made anew each time: that takes less time than a fix, and no memory that lasts.
+# Tables of longer problems are not cached: to compute them takes less time than a fix.
 _KEPT_ROWS = 2**13
-# 2**19 lines of six whole numbers are 24 MB; a structure without tables counts as one line.
+# 2**19 lines of six integers are 24 MB; a structure without tables counts as one line.
 _KEPT = Cache["CachedTables | None"](2**19, lambda kept: 1 if kept is None else len(kept.tables.table))
 
 
 def tables(problem: Problem, groups: tuple[Array, ...]) -> CachedTables | None:
-    """Return the tables of a flat batch of problems, or None where the compiled core does not serve it.
+    """Return the tables of a flat batch of problems, or None if the compiled kernels do not support it.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     groups : tuple of int array (g, r)
-        Rows whose noise is correlated, every row in exactly one group.
+        Rows with correlated noise; every row is in exactly one group.
     """
     sources = Sources.of(problem)
     if problem.count > _KEPT_ROWS:
@@ -317,11 +322,12 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> CachedTables | None:
 
 
 def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> CachedTables | None:
+    """Return the tables of a problem, see `tables`, without the cache."""
     layout = problem.layout
     if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
         return None
-    # What is done to the data on their way to the inputs is done to their numbers: so it is known what comes from
-    # where.
+    # The entries of the data are replaced by their numbers. After the usual operations on the data, the numbers in the
+    # inputs show their sources.
     numbered, found = sources.numbered(problem), []
     for links in block_links(problem):
         inputs = given(numbered, links)
@@ -329,27 +335,28 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ca
         made = trace(problem, links, frozenset(inputs), moved)
         if made is None:
             return None
-        found.append(_Kind(links, made, inputs))
+        found.append(_TracedRows(links, made, inputs))
     return _fill(problem, RowGroups.sorted(problem, groups), found, sources.lookup())
 
 
 def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
-    """Return whether noise ties epochs that have unknowns of their own."""
+    """Return whether noise correlates rows of several epochs with local unknowns."""
     epoch = problem.epoch
     several = problem.layout.n_local > 0 and problem.epochs > 1
     return several and any(bool((epoch[group] != epoch[group[:, :1]]).any()) for group in groups)
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
-    """A block of rows, its tape, and the number of each input of each row among the sources."""
+class _TracedRows:
+    """A block of rows, its tape, and the number in `Sources` of each input of each row."""
 
     links: BlockLinks
     trace: Traced
     inputs: dict[int, Array]
 
 
-def _fill(problem: Problem, groups: RowGroups, found: list[_Kind], lookup: Array) -> CachedTables:
+def _fill(problem: Problem, groups: RowGroups, found: list[_TracedRows], lookup: Array) -> CachedTables:
+    """Return the tables of traced blocks of rows."""
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.links, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.links.gains, start) for kind, start in pairs])
@@ -402,15 +409,15 @@ def _fill(problem: Problem, groups: RowGroups, found: list[_Kind], lookup: Array
 
 
 def _table(*columns: Array) -> Array:
-    """Return columns side by side; shorter ones end with a zero."""
+    """Return columns side by side; shorter columns are filled with zeros."""
     out = np.zeros((max(len(column) for column in columns), len(columns)), dtype=np.int64)
     for i, column in enumerate(columns):
         out[: len(column), i] = column
     return out
 
 
-def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) -> Array:
-    """Return where each input of each row evaluated is found."""
+def _sources(found: list[_TracedRows], source_at: Array, order: Order, lookup: Array) -> Array:
+    """Return the index of each input of each evaluated row, see `Sources.lookup`."""
     out, start = np.zeros(int(source_at[-1]), dtype=np.int64), 0
     for kind in found:
         count = kind.links.block.count
@@ -425,7 +432,7 @@ def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) 
 def _list(
     parts: list[Entries], slots: list[Array], owners: list[Array], counts: list[int]
 ) -> tuple[Array, Array, list[Array]]:
-    """Return entries one after the other, owner by owner: indices, factors, and where each owner begins."""
+    """Return entries sorted by owner (an input or a row): indices, factors, and the first entry of each owner."""
     terms, factors, at, start = [], [], [], 0
     for part, slot, owner, count in zip(parts, slots, owners, counts, strict=True):
         order = np.argsort(owner, kind="stable")
@@ -436,7 +443,7 @@ def _list(
     return np.concatenate(terms), np.concatenate(factors), at
 
 
-def _tapes(found: list[_Kind]) -> tuple[Array, dict[str, Array]]:
+def _tapes(found: list[_TracedRows]) -> tuple[Array, dict[str, Array]]:
     """Return the constants of the tapes of all kinds, and the tapes one after the other."""
     tapes = [kind.trace.tape for kind in found]
     constants = [pair for tape in tapes for pair in tape.constants]

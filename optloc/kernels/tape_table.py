@@ -1,4 +1,4 @@
-"""Several tapes in one table, because every array that a kernel takes costs time."""
+"""Several tapes in one table, because each array argument of a kernel costs time."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class TapeTable(NamedTuple):
     Parameters
     ----------
     table : int64 array (n, 4)
-        A line for each tape, and one behind: where its operations, constants, inputs and outputs begin in this table.
-        Then the operations of all tapes, see `optloc.kernels.trace.Tape`; registers of constants; registers of inputs,
-        and the seed of each; registers of outputs, -1 for what is zero.
+        First, one line for each tape and one more line: the first line of its operations, constants, inputs and outputs
+        in this table. Then the operations of all tapes (see `optloc.kernels.trace.Tape`), the registers of constants,
+        register and seed of each input, and the registers of outputs (-1 for an output that is zero).
     value : array (c,)
-        What the registers of constants hold.
+        Values of the constants.
     registers : int
-        How many.
+        Number of registers.
     """
 
     table: Array
@@ -38,7 +38,7 @@ class TapeTable(NamedTuple):
 
 
 def tape_table(tapes: Sequence[Tape], outputs: Sequence[Sequence[int]]) -> TapeTable:
-    """Return tapes as one table, with the registers of the outputs of each; -1 for what is zero."""
+    """Return tapes as one table; `outputs` has the registers of the outputs of each tape, -1 for a zero output."""
     columns = (
         [one.code for one in tapes],
         [[(register, 0, 0, 0) for register, _ in one.constants] for one in tapes],
@@ -60,7 +60,7 @@ def tape_table(tapes: Sequence[Tape], outputs: Sequence[Sequence[int]]) -> TapeT
 
 @compiled
 def run_tape(t: TapeTable, k: int, r: Array, count: int) -> None:
-    """Run a tape on the first numbers of registers (registers, n), whose inputs are there."""
+    """Run tape k on the first `count` columns of the registers r (registers, n), which already contain the inputs."""
     table = t.table
     for i in range(table[k, CONSTANT], table[k + 1, CONSTANT]):
         value = t.value[i - table[0, CONSTANT]]

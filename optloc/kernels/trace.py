@@ -1,4 +1,8 @@
-"""Measurement functions with their derivatives as tapes: each kind is traced once, whoever registered it."""
+"""Measurement functions with their derivatives as tapes; each kind is traced once, including user-defined kinds.
+
+To trace a function means to call it with symbols that record every operation. A *tape* is the list of these operations
+on registers; machine code runs it without calling Python.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from optloc.models import Model
 from optloc.models.primitives import Jet
 from optloc.problem.problem import Problem
 
-# Numbers that are not known yet: what a function does with them is written down, each operation once.
+# Symbols represent numbers that are not known yet. Each operation on them is recorded once.
 
 OPERATIONS = ("add", "sub", "mul", "div", "neg", "sqrt", "hypot", "atan2", "sin", "cos", "log", "exp")
 ADD, SUB, MUL, DIV, NEG, SQRT, HYPOT, ATAN2, SIN, COS, LOG, EXP = range(len(OPERATIONS))
@@ -44,19 +48,19 @@ _NUMBER = {function.__name__: number for number, function in enumerate(_FUNCTION
 
 
 def operate(operation: int, left: Any, right: Any) -> Any:
-    """Return the value of an operation on numbers or arrays, by numpy."""
+    """Return the result of an operation on numbers or arrays, computed by numpy."""
     with np.errstate(all="ignore"):
         return _FUNCTIONS[operation](left) if operation in UNARY else _FUNCTIONS[operation](left, right)
 
 
 @dataclass(slots=True)
 class Recorder:
-    """Every operation of a function, each of them once.
+    """The recorded operations of a function, each of them once.
 
     Parameters
     ----------
     nodes : list of (operation, left, right)
-        What each node is made of; inputs and constants have negative operations.
+        Operation and operands of each node; inputs and constants have negative operation numbers.
     known : dict
         The number of each node.
     """
@@ -73,11 +77,11 @@ class Recorder:
         if isinstance(value, Symbol):
             return value.node
         number = float(value)
-        # Keyed by its bits: -0.0 is not 0.0, and one NaN is as good as another.
+        # The sign is part of the key, because -0.0 differs from 0.0.
         return self._number((CONSTANT, number, math.copysign(1.0, number)))
 
     def constant(self, node: int) -> float | None:
-        """Return the value of a constant node, None for any other."""
+        """Return the value of a constant node, or None for other nodes."""
         operation, value, _ = self.nodes[node]
         return float(value) if operation == CONSTANT else None
 
@@ -88,13 +92,17 @@ class Recorder:
         return Symbol(self, self._simplify(operation, u, v))
 
     def _number(self, key: tuple[int, Any, Any]) -> int:
+        """Return the number of a node, which is added if it is new."""
         if key not in self.known:
             self.known[key] = len(self.nodes)
             self.nodes.append(key)
         return self.known[key]
 
     def _simplify(self, operation: int, u: int, v: int) -> int:
-        """Return the node of an operation: folded, or another form that gives the same number to the last bit."""
+        """Return the node of an operation.
+
+        Constants are evaluated, and equivalent forms with identical rounding are used.
+        """
         left, right = self.constant(u), self.constant(v)
         if left is not None and right is not None:
             return self.node(operate(operation, left, right))
@@ -102,20 +110,22 @@ class Recorder:
         found = None if rule is None else rule(u, v)
         if found is not None:
             return found
-        # Operands of commutative operations in one order, so that equal ones are found.
+        # A fixed order of the operands of commutative operations, so that equal operations are found.
         if operation in (ADD, MUL, HYPOT):
             u, v = min(u, v), max(u, v)
         return self._number((operation, u, v))
 
     def _is(self, node: int, operation: int) -> bool:
+        """Return whether a node is a given operation."""
         return self.nodes[node][0] == operation
 
     def _add(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u + v, or None."""
         if self.constant(u) == 0.0:
             return v
         if self.constant(v) == 0.0:
             return u
-        # Doubling is exact, and a derivative of a square then meets its root: see `_rescale`.
+        # Doubling is exact, so that `_rescale` can simplify the derivative of the root of a square.
         if u == v:
             return self._simplify(MUL, self.node(2.0), u)
         if self._is(v, NEG):
@@ -123,6 +133,7 @@ class Recorder:
         return self._simplify(SUB, v, self.nodes[u][1]) if self._is(u, NEG) else None
 
     def _sub(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u - v, or None."""
         if self.constant(v) == 0.0:
             return u
         if self.constant(u) == 0.0:
@@ -130,9 +141,10 @@ class Recorder:
         return self._simplify(ADD, u, self.nodes[v][1]) if self._is(v, NEG) else None
 
     def _mul(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u v, or None."""
         for one, other in ((u, v), (v, u)):
             value = self.constant(one)
-            # Zero times infinity or NaN is given up here: derivatives have many zeros, and h is finite where it is
+            # Zero times infinity or NaN becomes zero here: derivatives contain many zeros, and h is finite where it is
             # used.
             if value == 0.0:
                 return self.node(0.0)
@@ -154,12 +166,13 @@ class Recorder:
         if self.constant(factor) is None:
             factor, a = a, factor
         power, top = self.constant(factor), self.constant(self.nodes[v][1])
-        # A power of two moves no digit; any other factor would round differently.
+        # A factor that is a power of two is exact; any other factor would change the rounding.
         if power is None or top is None or math.frexp(power)[0] != 0.5:
             return None
         return self._simplify(MUL, a, self._simplify(DIV, self.node(power * top), self.nodes[v][2]))
 
     def _div(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of u / v, or None."""
         if self.constant(v) == 1.0:
             return u
         if self._is(u, NEG):
@@ -168,6 +181,7 @@ class Recorder:
         return None
 
     def _neg(self, u: int, v: int) -> int | None:
+        """Return the node of a simpler form of -u, or None."""
         operation, left, right = self.nodes[u]
         if operation == NEG:
             return int(left)
@@ -176,14 +190,14 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Symbol:
-    """A number that is not known yet: arithmetic on it is written down.
+    """A number that is not known yet; arithmetic on it is recorded.
 
     Parameters
     ----------
     recorder : Recorder
-        Where.
+        Recorder of the operations.
     node : int
-        Its own node.
+        Number of this symbol's node.
     """
 
     recorder: Recorder
@@ -225,9 +239,10 @@ class Symbol:
         return self.recorder.apply(NEG, self)
 
     def __bool__(self) -> bool:
-        raise TypeError("a measurement function must not test its arguments")
+        raise TypeError("a measurement function must not branch on its arguments")
 
     def _with(self, operation: int, left: Any, right: Any) -> Any:
+        """Return the symbol of an operation with a symbol or a number."""
         for one in (left, right):
             if not isinstance(one, Symbol | int | float | np.number):
                 return NotImplemented
@@ -235,6 +250,8 @@ class Symbol:
 
 
 def _function(operation: int) -> Callable[..., Symbol]:
+    """Return the function that records an operation."""
+
     def record(u: Any, v: Any = None) -> Symbol:
         owner = u if isinstance(u, Symbol) else v
         return owner.recorder.apply(operation, u, v)
@@ -242,29 +259,29 @@ def _function(operation: int) -> Callable[..., Symbol]:
     return record
 
 
-# What a measurement function finds here by way of `optloc.models.primitives`.
+# Functions that `optloc.models.primitives` calls for symbols.
 sqrt, hypot, atan2, sin, cos, log, exp = (_function(op) for op in (SQRT, HYPOT, ATAN2, SIN, COS, LOG, EXP))
 
 
-# A function of numbers as a straight list of operations on registers: only what is needed, registers used again.
+# A tape contains only the operations that the outputs need, and uses registers again.
 
 
 @dataclass(frozen=True, slots=True)
 class Tape:
-    """A straight list of operations on registers.
+    """A list of operations on registers, without branches.
 
     Parameters
     ----------
     code : int array (n, 4)
-        Operation, target register, left and right operand; a target is never an operand of its own operation.
+        Operation, target register, left and right operand; a target is never an operand of the same operation.
     inputs : tuple of (seed, register)
-        Where each input is expected.
+        Register of each input.
     constants : tuple of (register, value)
-        What must be there before the first operation.
+        Values to load before the first operation.
     outputs : tuple of int
         Registers of the outputs.
     registers : int
-        How many there are.
+        Number of registers.
     """
 
     code: Array
@@ -275,11 +292,11 @@ class Tape:
 
 
 def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
-    """Return the operations that given outputs (symbols or numbers) need, in order, registers used again and again."""
+    """Return the tape of the operations that the given outputs (symbols or numbers) need."""
     wanted = [recorder.node(value) for value in outputs]
     needed = _trace_back(recorder, wanted)
     last = _last_uses(recorder, needed, wanted)
-    # Registers of operands that are not needed later are used again: fewer of them stay in the cache.
+    # Registers whose values are not needed later are used again, so that fewer registers stay in the cache.
     free: list[int] = []
     code: list[tuple[int, int, int, int]] = []
     loaded = [node for node in needed if recorder.nodes[node][0] < 0]
@@ -292,7 +309,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
         count += not free
         register[node] = free.pop() if free else count - 1
         code.append((operation, register[node], register[left], register[right]))
-        # Freed after the target was chosen: no operation writes over an operand of its own.
+        # Freed after the choice of the target, so that no operation overwrites one of its operands.
         free.extend(register[used] for used in {left, right} if last[used] == node)
     return Tape(
         np.array(code, dtype=np.int64).reshape(-1, 4),
@@ -304,7 +321,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
 
 
 def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
-    """Return the nodes that others need, in the order in which they were written down."""
+    """Return the nodes that the wanted nodes depend on, in the order in which they were recorded."""
     found: set[int] = set()
     ahead = list(wanted)
     while ahead:
@@ -317,6 +334,7 @@ def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
 
 
 def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict[int, int]:
+    """Return the last node that uses each node; outputs are used after all nodes."""
     last: dict[int, int] = {}
     for node in needed:
         operation, left, right = recorder.nodes[node]
@@ -326,7 +344,10 @@ def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict
 
 
 def evaluate(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
-    """Return the outputs of a tape for numbers or arrays, in plain numpy: what the compiled interpreter is held to."""
+    """Return the outputs of a tape for numbers or arrays, computed by numpy.
+
+    Tests compare the compiled interpreter with this function.
+    """
     own: list[Any] = [0.0] * tape.registers
     for seed, register in tape.inputs:
         own[register] = inputs[seed]
@@ -339,37 +360,38 @@ def evaluate(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Traced:
-    """A measurement function on registers.
+    """The tape of a measurement function.
 
     Parameters
     ----------
     tape : Tape
         Its first output is the value, the others are the derivatives.
     seeds : tuple of int
-        Which input each derivative belongs to; a seed that does not move the value is missing.
+        Input of each derivative; inputs whose derivative is always zero are missing.
     """
 
     tape: Tape
     seeds: tuple[int, ...]
 
 
-# A dozen kinds, in two dimensions, with a few sets of unknowns each; every origin of local coordinates has its own.
+# A dozen kinds, in two dimensions, with a few sets of unknowns each. Each origin of local coordinates has its own
+# entry.
 _TRACED = Cache["Traced | None"](256)
 
 
 def trace(problem: Problem, links: BlockLinks, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
-    """Return the tape of a block of rows, or None where its function cannot be traced.
+    """Return the tape of a block of rows, or None if its function cannot be traced.
 
     Parameters
     ----------
     problem : Problem
-        Gives dimension and frame.
+        Problem with the dimension and the frame.
     links : BlockLinks
-        The block.
+        The block of rows.
     given : set of int
         Inputs that are data.
     moved : set of int
-        Inputs that unknowns move: those that derivatives are wanted of.
+        Inputs that depend on unknowns; the tape has the derivatives by them.
     """
     model = links.model
     medium = problem.medium if model.straight else None
@@ -379,6 +401,7 @@ def trace(problem: Problem, links: BlockLinks, given: frozenset[int], moved: fro
 
 
 def _trace(problem: Problem, model: Model, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
+    """Return the tape of a kind's function, see `trace`, without the cache."""
     recorder = Recorder()
     inputs: dict[int, Any] = {seed: recorder.input(seed) for seed in sorted(given | moved)}
     inputs |= {seed: Jet(inputs[seed], {seed: 1.0}) for seed in sorted(moved)}
@@ -388,8 +411,8 @@ def _trace(problem: Problem, model: Model, given: frozenset[int], moved: frozens
         value = value.value if isinstance(value, Jet) else value
         if not isinstance(value, Symbol | int | float):
             return None
-        # A derivative that is zero whatever the inputs is left out.
+        # Derivatives that are always zero are left out.
         seeds = tuple(seed for seed in sorted(partials) if recorder.constant(recorder.node(partials[seed])) != 0.0)
         return Traced(tape(recorder, [value, *(partials[seed] for seed in seeds)]), seeds)
-    except (TypeError, AttributeError, ValueError):  # it asks for more than the elementary functions
+    except (TypeError, AttributeError, ValueError):  # the function uses more than the elementary functions
         return None

@@ -1,9 +1,10 @@
-"""Symmetric systems of blocks in a chain: epochs that are tied to the next one, solved in time linear in their number.
+"""Symmetric block tridiagonal systems of epochs that are coupled to the next epoch.
 
-Regular ones are banded matrices, which LAPACK factors. For blocks of an inverse, and where a block leaves something
-open, every other block is eliminated at once and the rest is a chain again, half as long: cyclic reduction, which for
-positive definite matrices is Cholesky's method in another order. B. L. Buzbee, G. H. Golub, C. W. Nielson, "On direct
-methods for solving Poisson's equations", SIAM J. Numer. Anal. 7 (1970) 627-656.
+The time to solve them is linear in the number of epochs. Regular systems are banded matrices, which LAPACK factors.
+Blocks of the inverse, and systems with singular blocks, use cyclic reduction: every other block is eliminated, and the
+rest is a chain of half the length. For positive definite matrices this is Cholesky's method in another order.
+B. L. Buzbee, G. H. Golub, C. W. Nielson, "On direct methods for solving Poisson's equations", SIAM J. Numer. Anal. 7
+(1970) 627-656.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.types import Array
 
-# Share of its information below which a block leaves a combination open: that of `optloc.linear.normal`.
+# Share of its information below which a block leaves a combination undetermined, as in `optloc.linear.normal`.
 _OPEN = 1e-12
-# Share of the largest block below which what is left for the last block is rounding: sums of k blocks lose k eps.
+# Share of the largest block below which the remainder of the last block is rounding: sums of k blocks lose k eps.
 _ROUNDING = 1e-13
 
 
@@ -27,18 +28,18 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     block : array (..., k, l, l)
-        On the diagonal; positive semidefinite as a whole.
+        Blocks on the diagonal; the whole matrix is positive semidefinite.
     link : array (..., k - 1, l, l)
-        Rows of a block, columns of the next.
+        Blocks above the diagonal: rows of a block, columns of the next block.
     right : array (..., k, l, p)
-        Right-hand sides. Of what a block by itself leaves open the solution is that of least norm.
+        Right sides. If a block is singular, the solution is the one of least norm.
 
     Returns
     -------
     solved : array (..., k, l, p)
         Solutions.
     ok : bool array (...)
-        False where the chain as a whole is singular.
+        False if the whole chain is singular.
     """
     shape = np.broadcast_shapes(block.shape[:-3], right.shape[:-3])
     out, ok = np.empty((*shape, *right.shape[-3:])), np.ones(shape, dtype=bool)
@@ -53,11 +54,11 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
 
 
 def _banded(block: Array, link: Array, right: Array) -> Array | None:
-    """Return the solution (k, l, p) of one chain by a banded factor; None where it is not safely regular."""
+    """Return the solution (k, l, p) of one chain by a banded factor, or None if the chain is not safely regular."""
     from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
     k, length = block.shape[:2]
-    # LAPACK's lower band: the entry of row i + d and column i stands in line d, column i
+    # LAPACK's lower band format: entry (i + d, i) of the matrix is in line d, column i
     band = np.zeros((2 * length, k, length))
     for d in range(length):
         band[d, :, : length - d] = np.diagonal(block, -d, 1, 2)
@@ -78,21 +79,21 @@ def _banded(block: Array, link: Array, right: Array) -> Array | None:
 
 
 def inverse_blocks(block: Array, link: Array) -> tuple[Array, Array]:
-    """Return the blocks (..., k, l, l) on the diagonal of the inverse of a chain, and whether it is regular."""
+    """Return the diagonal blocks (..., k, l, l) of the inverse of a chain, and whether the chain is regular."""
     none = np.zeros((*block.shape[:-1], 0))
     _, (inner, _), ok = _reduce(block, link, none, np.abs(block).max((-1, -2, -3)), inverse=True)
     return inner, ok
 
 
 class _ChainParts(NamedTuple):
-    """Blocks of an inverse on its diagonal, and beside it: those of each block with the next."""
+    """Blocks of an inverse: on its diagonal, and next to it (each block with the next)."""
 
     inner: Array
     beside: Array
 
 
 def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool) -> tuple[Array, _ChainParts, Array]:
-    """Return solutions, parts of the inverse (empty where they are not wanted), and whether the chain is regular."""
+    """Return solutions, blocks of the inverse (empty if not requested), and whether the chain is regular."""
     k, length = block.shape[-3:-1]
     eye = np.broadcast_to(np.eye(length) if inverse else np.zeros((length, 0)), (*block.shape[:-1], length * inverse))
     if k == 1:
@@ -101,14 +102,14 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
         ok = good.all(-1) & (left > _ROUNDING * size)
         inner = np.where(ok[..., None, None, None], both[..., right.shape[-1] :], np.nan)
         return both[..., : right.shape[-1]], _ChainParts(inner, link), ok
-    # an odd block knows those before and after it; the last one of an even number has none after it
+    # an odd block is coupled to the blocks before and after it; the last block of an even number has none after it
     after = np.zeros((*block.shape[:-3], k // 2, length, length))
     after[..., : (k - 1) // 2, :, :] = link[..., 1::2, :, :]
     before = link[..., ::2, :, :].mT
     sides = np.concatenate([before, after, right[..., 1::2, :, :], eye[..., 1::2, :, :]], axis=-1)
     solved = _regular(block[..., 1::2, :, :], sides)
     back, on, own, self_ = np.split(solved, np.cumsum([length, length, right.shape[-1]]), axis=-1)
-    # what is left of the even blocks
+    # the reduced system of the even blocks
     rest, vector = block[..., ::2, :, :].copy(), right[..., ::2, :, :].copy()
     m = k // 2
     rest[..., :m, :, :] -= before.mT @ back
@@ -120,22 +121,22 @@ def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool)
     even, parts, ok = _reduce(rest, between, vector, size, inverse)
     out = np.empty((*block.shape[:-3], k, length, right.shape[-1]))
     out[..., ::2, :, :] = even
-    behind = _behind(even, m)
+    behind = _following_even(even, m)
     out[..., 1::2, :, :] = own - back @ even[..., :m, :, :] - on @ behind
     return out, _inner(parts, back, on, self_, k) if inverse else parts, ok
 
 
-def _behind(even: Array, count: int) -> Array:
-    """Return what stands at the even blocks after the odd ones; zero where there is none."""
+def _following_even(even: Array, count: int) -> Array:
+    """Return the values of the even blocks that follow the odd ones; zero after the last block."""
     out = np.zeros((*even.shape[:-3], count, *even.shape[-2:]))
     out[..., : even.shape[-3] - 1, :, :] = even[..., 1:, :, :]
     return out
 
 
 def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _ChainParts:
-    """Return the parts of the inverse from those of the even blocks: x_odd = own - back x_before - on x_after."""
+    """Return the blocks of the inverse from the blocks of the even ones: x_odd = own - back x_before - on x_after."""
     m, first = k // 2, parts.inner[..., : k // 2, :, :]
-    second, across = _behind(parts.inner, m), np.zeros_like(back)
+    second, across = _following_even(parts.inner, m), np.zeros_like(back)
     across[..., : parts.beside.shape[-3], :, :] = parts.beside
     with_before = -(back @ first + on @ across.mT)
     with_after = -(back @ across + on @ second)
@@ -149,7 +150,7 @@ def _inner(parts: _ChainParts, back: Array, on: Array, own: Array, k: int) -> _C
 
 
 def _regular(block: Array, right: Array) -> Array:
-    """Return solutions of blocks by themselves, of least norm where they are singular."""
+    """Return the solutions of separate blocks, of least norm if a block is singular."""
     solved, good = linalg.solve(block, right, _OPEN)
     if not good.all():
         root, _ = linalg.root(block[~good])

@@ -1,4 +1,7 @@
-"""Constraints: how users state them, and the faces on which an answer may lie."""
+"""Constraints: functions for users to state them, and the faces on which an estimate may lie.
+
+A *face* is a set of constraints that hold with equality together.
+"""
 
 from __future__ import annotations
 
@@ -20,22 +23,22 @@ from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 
-# Share of its size by which a constraint may be broken, a micrometre where the bound is zero: rounding of coordinates
-# of the Earth's size (a nanometre) passes, and no measurement is as good.
+# Relative violation of a constraint that is accepted; a micrometre if the bound is zero. This is above the rounding of
+# coordinates of the Earth's size (a nanometre), and below the error of any measurement.
 TOLERANCE = 1e-6
 
-# How users state constraints.
+# Functions with which users state constraints.
 
 
 def box(lower: Sequence[Amount] | Array, upper: Sequence[Amount] | Array, *, target: int = 0) -> tuple[Band, ...]:
-    """Return the constraint that a target lies in a box; infinite bounds are none.
+    """Return the constraint that a target is in a box; an infinite bound means no bound.
 
     Parameters
     ----------
     lower, upper : sequence of d float or str
         Least and greatest coordinates in the problem's frame: metres, or text such as "2 km".
     target : int
-        Which target.
+        Number of the target.
     """
     d = len(lower)
     return tuple(
@@ -54,19 +57,19 @@ def height(
 ) -> tuple[Band, ...]:
     """Return the constraint on a target's height above the WGS 84 ellipsoid: a band, or one exact value.
 
-    A straight course leaves a height above the curved Earth: a target that moves needs ``Motion(order,
-    over="ground")``, see also `reported`.
+    A straight course departs from a height above the curved Earth. So a moving target needs
+    ``Motion(order, over="ground")``, see also `reported`.
 
     Parameters
     ----------
     lower, upper : float or str
         Band, metres or text such as "1640 ft"; `lower` = 0 is "above ground".
     exactly : float, str or array (...), optional
-        Known height, in the place of a band.
+        Known height, instead of a band.
     target : int
-        Which target.
+        Number of the target.
     along : bool
-        Whether it holds at every epoch, or at the reference time alone.
+        Whether the constraint holds at every epoch, or only at the reference time.
     """
     low, high = (lower, upper) if exactly is None else (exactly, exactly)
     low, high = _metres(low, "height"), _metres(high, "height")
@@ -82,43 +85,43 @@ def reported(
     reference: float | None = None,
     target: int = 0,
 ) -> tuple[Motion, tuple[Band, ...]]:
-    """Return motion and constraint of a target whose height is known at every epoch, as aircraft report theirs.
+    """Return motion and constraint of a target whose height is known at every epoch.
 
-    The way over ground has the given order; the height is that of the report, to which a constant and a rate may be
-    added where it is known within a band only.
+    An example is an aircraft that reports its height. The way over ground has the given order. The height is the
+    reported one. If it is known only within a band, a constant and a rate may be added.
 
     Parameters
     ----------
     heights : array (..., k)
-        Above the WGS 84 ellipsoid at each epoch, metres.
+        Heights above the WGS 84 ellipsoid at each epoch, metres.
     times : array (k,)
-        Seconds of the epochs, ascending.
+        Times of the epochs, seconds, ascending.
     within : float or str
         Half the width of the band: metres, or text such as "50 ft"; zero: exact.
     order : 1 or 2
-        Of the motion.
+        Order of the motion.
     reference : float, optional
-        Time at which the state holds, seconds; the first epoch by default.
+        Time to which the state belongs, seconds; the first epoch by default.
     target : int
-        Which target.
+        Number of the target.
 
     Returns
     -------
     Motion
-        Over ground, with the shape of the height.
+        Motion over ground, with the shape of the height.
     tuple of Band
-        The height at the reference time, and so at every epoch.
+        The height at the reference time, and therefore at every epoch.
 
     Raises
     ------
     InvalidProblem
-        Where heights and times do not belong together.
+        If the number of heights differs from the number of times, or times are not ascending.
     """
     heights, times = np.asarray(heights, dtype=float), np.asarray(times, dtype=float)
     if times.ndim != 1 or heights.shape[-1:] != times.shape or not (np.diff(times) > 0.0).all():
         what = f"heights of shape {heights.shape} for times of shape {times.shape}"
         raise InvalidProblem(what, "reported heights", "give one height for each epoch, and ascending times")
-    # straight between the epochs, where the reference time is none of them
+    # linear between epochs, if the reference time is not an epoch
     last = len(times) - 1
     place = float(np.interp(times[0] if reference is None else reference, times, np.arange(last + 1.0)))
     before = min(int(place), last)
@@ -132,7 +135,7 @@ def reported(
 
 
 def visible(points: ArrayLike, *, elevation: Amount = 0.0, target: int = 0) -> tuple[Band, ...]:
-    """Return the constraint that points, for instance satellites, stand above the target's horizon.
+    """Return the constraint that points, for instance satellites, are above the target's horizon.
 
     Parameters
     ----------
@@ -141,9 +144,9 @@ def visible(points: ArrayLike, *, elevation: Amount = 0.0, target: int = 0) -> t
     elevation : float or str
         Least elevation: radians, or text such as "5 deg".
     target : int
-        Which target.
+        Number of the target.
     """
-    # Bounded is the sine, see `optloc.models.surfaces`; it grows with the elevation.
+    # The bounded quantity is the sine, see `optloc.models.surfaces`, which increases with the elevation.
     least = _number(np.sin(in_si(elevation, "angle", "elevation")))
     return tuple(
         Band("visible", least, _number(np.inf), point, f"sight of point {i}", target)
@@ -154,24 +157,26 @@ def visible(points: ArrayLike, *, elevation: Amount = 0.0, target: int = 0) -> t
 def speed(upper: Amount, *, lower: Amount = 0.0, target: int = 0) -> tuple[Band, ...]:
     """Return the constraint on a target's speed: metres per second, or text such as "90 km/h"."""
     upper, lower = float(in_si(upper, "speed", "speed")), float(in_si(lower, "speed", "speed"))
-    # No speed is negative: a lower bound of zero would be a side on which nothing can lie with a gradient.
+    # A lower bound of zero is left out: no speed is negative, and at zero the gradient does not exist.
     return (Band("speed", _number(lower if lower > 0.0 else -np.inf), _number(upper), np.zeros(0), "speed", target),)
 
 
 def polygon(vertices: ArrayLike, *, target: int = 0) -> tuple[Polygon, ...]:
-    """Return the constraint that a target's plan position lies in a simple polygon (v, 2), metres."""
+    """Return the constraint that a target's plan position is in a simple polygon (v, 2), metres."""
     return (Polygon(np.asarray(vertices, dtype=float), "polygon", target),)
 
 
 def _number(value: Any) -> Array:
+    """Return a value as an array of floats."""
     return np.asarray(value, dtype=float)
 
 
 def _metres(value: Any, where: str) -> Array:
+    """Return a length in metres, from a number or a text with a unit."""
     return _number(in_si(value, "length", where, place=True))
 
 
-# Faces: the sides that hold with equality together, and how vectors are brought onto them.
+# Faces: sides that hold with equality together, and the projection of vectors onto them.
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,9 +188,9 @@ class Level:
     constraint : int
         Number of the constraint.
     side : "equal", "lower", "upper", or int
-        Which bound; of a polygon, which edge.
+        The bound; for a polygon, the number of the edge.
     epoch : int, optional
-        Where along a course; None: at the reference time.
+        Epoch along a course; None: the reference time.
     """
 
     constraint: int
@@ -197,7 +202,7 @@ Face = tuple[Level, ...]
 
 
 def exact(problem: Problem) -> Face:
-    """Return the equalities of a problem; one along a course holds everywhere if it does at the epochs named."""
+    """Return the equality constraints of a problem, each at the epochs that decide about the whole course."""
     return tuple(
         Level(i, "equal", epoch)
         for i, c in enumerate(problem.constraints)
@@ -207,10 +212,10 @@ def exact(problem: Problem) -> Face:
 
 
 def decisive_epochs(problem: Problem, constraint: Band | Polygon) -> list[int | None]:
-    """Return the epochs at which a constraint along a course decides about all of them; None is the reference time.
+    """Return the epochs at which a constraint along a course decides about all epochs; None is the reference time.
 
-    What is bounded is a polynomial of time of the motion's order: it is constant if it is at one epoch more than that,
-    and a straight one lies between bounds if its ends do.
+    The bounded quantity is a polynomial of time of the motion's order n. It is constant if it is equal at n + 1 epochs,
+    and a linear one is between bounds if its ends are.
     """
     if not isinstance(constraint, Band) or not holds_along(problem, constraint):
         return [None]
@@ -220,26 +225,29 @@ def decisive_epochs(problem: Problem, constraint: Band | Polygon) -> list[int | 
 
 
 def holds_along(problem: Problem, band: Band) -> bool:
-    """Return whether a band bounds a course: that of a target whose state of the run moves."""
+    """Return whether a band bounds a course: its target moves, and its state lasts for the run."""
     motion = problem.motions[band.target]
     return band.along and motion.span == "run" and motion.order > 0
 
 
 def faces(problem: Problem) -> list[Face]:
-    """Return every set of constraints that can hold with equality together; the equalities alone come first."""
+    """Return every set of constraints that can hold with equality together.
+
+    The set with only the equalities is the first.
+    """
     found = [exact(problem)]
     for i, constraint in enumerate(problem.constraints):
         sides = (
             [] if is_exact(constraint) else _meetings(list(_sides(i, constraint)), decisive_epochs(problem, constraint))
         )
-        # More sides than dimensions meet in no point; speeds bound other unknowns, and do not count.
+        # More sides than dimensions have no common point. Speeds bound other unknowns, and do not count.
         wider = [(*face, *side) for face in found for side in sides]
         found += [face for face in wider if _most_at_once(problem, face) <= problem.dimension]
     return sorted(found, key=len)
 
 
 def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
-    """Return the sides of a constraint at each of some epochs, and those of several epochs together."""
+    """Return the sides of a constraint at each of some epochs, and the combinations of several epochs."""
     found: list[Face] = [()]
     for epoch in epochs:
         here = [tuple(replace(level, epoch=epoch) for level in side) for side in sides]
@@ -248,7 +256,7 @@ def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
 
 
 def _most_at_once(problem: Problem, face: Face) -> int:
-    """Return how many levels of positions a face has at the epoch with most of them."""
+    """Return the greatest number of levels of positions that a face has at one epoch."""
     count = Counter(level.epoch for level in face if _kind(problem, level) != "speed")
     return max(count.values(), default=0)
 
@@ -264,29 +272,33 @@ def on_face(problem: Problem, face: Face) -> Problem:
 
 
 def _padded(problem: Problem, band: Band) -> Array:
-    """Return the coefficients of a band, of a plane as many as dimensions: an edge of a polygon is one of the plan."""
+    """Return the coefficients of a band.
+
+    For a plane, zeros are appended up to the dimension (edges of polygons have two).
+    """
     lacking = problem.dimension - band.coefficients.shape[-1] if band.kind == "plane" else 0
     return np.concatenate([band.coefficients, np.zeros((*band.coefficients.shape[:-1], lacking))], axis=-1)
 
 
 def is_corner(problem: Problem, face: Face) -> bool:
-    """Return whether a face is one point: as many planes as dimensions."""
+    """Return whether a face is one point: the number of its planes is the dimension."""
     return len(face) == problem.dimension and all(_kind(problem, level) == "plane" for level in face)
 
 
 def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
-    """Return at which minima along a face (N, size) a cost falls out of what is admitted, (N,): inwards it grows.
+    """Return (N,) whether each minimum along a face (N, size) is a constrained minimum: the cost grows inwards.
 
     Parameters
     ----------
     problem : Problem
         N problems.
     face : Face
-        What holds with equality.
+        Constraints that hold with equality.
     x : array (N, size)
-        Vectors on it.
+        Vectors on the face.
     descent : array (N, n)
-        Minus the gradient to the shared unknowns: a sum of outward normals, none of them less than zero times.
+        Minus the gradient with respect to the shared unknowns. At a constrained minimum it is a sum of outward normals
+        with factors that are not negative.
     """
     gradients = levels(problem, face, x)[1]
     share = (np.linalg.pinv(np.swapaxes(gradients, -1, -2)) @ descent[..., None])[..., 0]
@@ -296,7 +308,7 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
         if not is_exact(constraint):
             out &= share[:, i] * outwards(problem, level) >= 0.0
         if isinstance(constraint, Polygon):
-            # where a polygon is not convex, its corner is admitted on both sides: costs fall along one of them
+            # at a concave corner, both sides are admitted, and the cost decreases along one of them
             here = [other.side for other in face if other.constraint == level.constraint]
             out &= len(here) < 2 or _turn(constraint.vertices) * _turn(_corner(constraint, here)) > 0.0
     return out
@@ -309,7 +321,7 @@ def bounds(problem: Problem) -> Face:
 
 
 def outwards(problem: Problem, level: Level) -> float:
-    """Return 1 if the quantity of a level grows out of what its bound admits, -1 if it falls, 0 of an equality."""
+    """Return 1 if the quantity of a level increases out of its bound, -1 if it decreases, 0 for an equality."""
     constraint = problem.constraints[level.constraint]
     if isinstance(constraint, Polygon):
         return _turn(constraint.vertices)
@@ -322,20 +334,20 @@ def is_flat(problem: Problem, level: Level) -> bool:
 
 
 def _corner(region: Polygon, edges: list[str | int]) -> Array:
-    """Return the corner (3, 2) between two edges of a polygon, the first before the other."""
+    """Return the corner (3, 2) between two successive edges of a polygon."""
     first, count = edges[0], len(region.vertices)
     assert isinstance(first, int)
     return region.vertices[[first, (first + 1) % count, (first + 2) % count]]
 
 
 def _turn(vertices: Array) -> float:
-    """Return 1 where corners (v, 2) go counter-clockwise around what they enclose, -1 where they go clockwise."""
+    """Return 1 if corners (v, 2) are in counter-clockwise order around their interior, -1 if clockwise."""
     (x, y), (u, v) = vertices.T, np.roll(vertices, -1, axis=0).T
     return float(np.sign((x * v - u * y).sum()))
 
 
 def face_names(problem: Problem, face: Face) -> tuple[str, ...]:
-    """Return what each level of a face is called, for instance "height upper"."""
+    """Return the name of each level of a face, for instance "height upper"."""
     return tuple(
         f"{problem.constraints[level.constraint].name} {'edge ' if isinstance(level.side, int) else ''}{level.side}"
         + ("" if level.epoch is None else f" at {problem.times[level.epoch]:g} s")
@@ -344,12 +356,13 @@ def face_names(problem: Problem, face: Face) -> tuple[str, ...]:
 
 
 def _kind(problem: Problem, level: Level) -> str:
+    """Return the kind of surface of a level; the edges of polygons are planes."""
     constraint = problem.constraints[level.constraint]
     return constraint.kind if isinstance(constraint, Band) else "plane"
 
 
 def is_height(problem: Problem, level: Level) -> bool:
-    """Return whether a level is of a height above the Earth."""
+    """Return whether a level is a height above the Earth."""
     return _kind(problem, level) == "height"
 
 
@@ -364,20 +377,21 @@ def needs_velocity(constraint: Band | Polygon) -> bool:
 
 
 def _sides(i: int, constraint: Band | Polygon) -> Iterator[Face]:
+    """Yield the finite bounds of a band, or the edges and corners of a polygon."""
     if isinstance(constraint, Band):
         if np.isfinite(constraint.lower).all():
             yield (Level(i, "lower"),)
         if np.isfinite(constraint.upper).all():
             yield (Level(i, "upper"),)
         return
-    # An answer lies on an edge, or in the corner where it meets the one before.
+    # An estimate is on an edge, or in the corner with the edge before.
     for edge in range(len(constraint.vertices)):
         yield (Level(i, edge),)
         yield (Level(i, (edge - 1) % len(constraint.vertices)), Level(i, edge))
 
 
 def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
-    """Return g(x) - value (N, c) of the levels of a face and their gradients (N, c, n) to the shared unknowns."""
+    """Return g(x) - value (N, c) of the levels of a face, and their gradients (N, c, n) to the shared unknowns."""
     values = np.zeros((len(x), len(face)))
     gradients = np.zeros((len(x), len(face), problem.layout.n_shared))
     for i, level in enumerate(face):
@@ -390,12 +404,12 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
 
 
 def restore(problem: Problem, face: Face, x: Array) -> Array:
-    """Return vectors (N, size) moved onto a face along the shortest way, by Newton steps."""
+    """Return vectors (N, size) projected onto a face along the shortest way, by Newton steps."""
     n = problem.layout.n_shared
-    # Newton squares a small relative distance: 1e-2 becomes rounding in three steps, and five are to spare.
+    # Newton squares a small relative distance: three steps reduce 1e-2 to rounding, and five are in reserve.
     for _ in range(8):
         values, gradients = levels(problem, face, x)
-        # A nanometre is the last digit of an ECEF coordinate; vectors that are NaN must not keep the others going.
+        # A nanometre is the last digit of an ECEF coordinate. NaN vectors must not keep the iteration going.
         if np.nanmax(np.abs(values), initial=0.0) < 1e-9:
             break
         space = tangent(gradients, np.ones((len(x), n)))
@@ -409,22 +423,26 @@ def tangent_at(problem: Problem, face: Face, x: Array) -> Array:
 
 
 def _band(constraint: Band | Polygon, side: str | int) -> Band:
+    """Return the band of a level; the edge of a polygon becomes a plane."""
     if isinstance(constraint, Band):
         return constraint
     assert isinstance(side, int)
     here, there = constraint.vertices[side], constraint.vertices[(side + 1) % len(constraint.vertices)]
     along = there - here
-    # Unit length, so that a level is in metres; it points outwards where corners go counter-clockwise.
+    # Unit length, so that a level is in metres; it points outwards if corners are counter-clockwise.
     normal = np.array([along[1], -along[0]]) / np.hypot(*along)
     value = _number(normal @ here)
     return Band("plane", value, value, normal, constraint.name, constraint.target)
 
 
-# What vectors and programs need to know of the constraints as they are stated.
+# Functions on the stated constraints, for vectors and for nonlinear programs.
 
 
 def conjunction(problem: Problem) -> list[Band]:
-    """Return the constraints as bands that must all hold: edges of a convex polygon too, a concave one is left out."""
+    """Return the constraints as bands that must all hold.
+
+    Edges of convex polygons are included. Concave polygons are left out.
+    """
     bands: list[Band] = []
     for c in problem.constraints:
         if isinstance(c, Band):
@@ -433,7 +451,7 @@ def conjunction(problem: Problem) -> list[Band]:
         corners = c.vertices
         edge = np.roll(corners, -1, axis=0) - corners
         turn = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
-        # Edges of a concave polygon need not all hold: such a region is no conjunction.
+        # For a concave polygon, not all edges need to hold: the region is not a conjunction.
         if (turn >= 0.0).all() or (turn <= 0.0).all():
             sign = 1.0 if turn.sum() > 0.0 else -1.0
             for i in range(len(corners)):
@@ -447,18 +465,18 @@ def conjunction(problem: Problem) -> list[Band]:
 
 
 def face_of(problem: Problem, x: Array) -> Array:
-    """Return the number of the face (N,) in `faces` on which vectors x (N, size) lie, the one with most levels."""
+    """Return the number (N,) of the face in `faces` on which vectors x (N, size) lie: the face with most levels."""
     found = np.zeros(len(x), dtype=int)
     for number, face in enumerate(faces(problem)):
         if face:
             values, _ = levels(problem, face, x)
-            # Faces come with fewest levels first, so that the last one that fits has the most.
+            # Faces are sorted by number of levels, so that the last one that fits has the most.
             found[(np.abs(values) <= 10.0 * TOLERANCE * (1.0 + np.abs(x).max(1, keepdims=True))).all(1)] = number
     return found
 
 
 def violation(problem: Problem, x: Array) -> Array:
-    """Return by how much vectors x (N, size) break their worst constraint, relative to its size (N,), or 0."""
+    """Return the relative violation (N,) of the worst constraint at vectors x (N, size), or 0."""
     worst = np.zeros(len(x))
     for c in problem.constraints:
         if isinstance(c, Polygon):
@@ -472,12 +490,12 @@ def violation(problem: Problem, x: Array) -> Array:
 
 
 def _short(band: Band, value: Array) -> Array:
-    """Return by how much values (N,) break a band, relative to its size (N,); negative where they do not."""
+    """Return the violation (N,) of a band by values (N,), relative to its size; negative if the band is satisfied."""
     worst = np.full(len(value), -np.inf)
     for bound, sign in ((band.lower, 1.0), (band.upper, -1.0)):
         with np.errstate(invalid="ignore"):
             short = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
-        # Metres of an altitude and sines of an elevation by one measure: relative to the bound, absolute near zero.
+        # One measure for metres of a height and sines of an elevation: relative to the bound, absolute near zero.
         size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
         worst = np.maximum(worst, short / size)
     return worst
@@ -489,7 +507,7 @@ def violation_names(problem: Problem) -> str:
 
 
 def _quantity(problem: Problem, band: Band, x: Array, epoch: int | None = None) -> tuple[Jet, dict[int, int]]:
-    """Return the bounded quantity at an epoch with its derivatives, and the column of x behind each seed."""
+    """Return the bounded quantity at an epoch with its derivatives, and the column of x for each seed."""
     d, columns, states = problem.dimension, dict[int, int](), []
     for j, name in enumerate(state_names(band.target, len(problem.motions), problem.motions[band.target].order)):
         slot, shared = problem.layout.find(name)
@@ -512,15 +530,15 @@ def bounded(
     Parameters
     ----------
     problem : Problem
-        Says how the target moves.
+        Problem with the motion of the target.
     band : Band
         The constraint.
     states : sequence of tuples of d numbers
-        Position, velocity and acceleration, as many as the target has: jets or symbols.
+        Position, velocity and acceleration, as far as the target has them: jets or symbols.
     coefficients : tuple of c numbers
-        Those of the band.
+        Coefficients of the band.
     epoch : int, optional
-        Where along the course; None: at the reference time.
+        Epoch along the course; None: the reference time.
     """
     surface = SURFACES[band.kind]
     since = 0.0 if epoch is None else float(elapsed(problem, band.target)[epoch])
@@ -528,12 +546,13 @@ def bounded(
         return height_at(problem, list(states), since)
     position = states[0] if epoch is None else course_at(problem, band.target, list(states), since)
     ecef = to_ecef(problem, position) if surface.ecef else None
-    # An edge of a polygon is a plane with two coefficients: it bounds the plan of a target in space.
+    # An edge of a polygon is a plane with two coefficients: it bounds the plan position of a target in space.
     used = position[: len(coefficients)] if band.kind == "plane" else position
     return surface.g(Point(used, states[1] if surface.velocity else None, None, ecef), coefficients)
 
 
 def _horizontal(problem: Problem, target: int, x: Array) -> Array:
+    """Return the plan positions (N, 2) of a target in vectors x (N, size), metres."""
     slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
     return x[:, slot.start : slot.start + 2]
 
@@ -545,7 +564,7 @@ def _outside(region: Polygon, points: Array) -> Array:
     along, to = b - a, p - a
     share = np.clip((to * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
     distance = np.sqrt(((to - share[..., None] * along) ** 2).sum(-1)).min(1)
-    # Even-odd rule: a ray to the right crosses the boundary an odd number of times from inside.
+    # Even-odd rule: a ray from inside to the right crosses the boundary an odd number of times.
     crosses = (a[:, 1] > p[..., 1]) != (b[:, 1] > p[..., 1])
     with np.errstate(divide="ignore", invalid="ignore"):
         at = a[:, 0] + (p[..., 1] - a[:, 1]) * along[:, 0] / along[:, 1]

@@ -1,4 +1,4 @@
-"""Where targets are along their courses, in the frame of a problem: polynomials in space, or ways over ground."""
+"""Positions of targets along their courses, in the frame of a problem: polynomials in space, or ways over ground."""
 
 from __future__ import annotations
 
@@ -14,23 +14,26 @@ from optloc.problem.problem import Problem
 
 
 def over_ground(problem: Problem) -> bool:
-    """Return whether the courses of a problem follow the Earth: those of all targets that move, or none."""
+    """Return whether the courses of a problem follow the Earth; this holds for all moving targets or for none."""
     return any(motion.over == "ground" for motion in problem.motions)
 
 
 def elapsed(problem: Problem, target: int) -> Array:
-    """Return the seconds (k,) since a target's state holds; zero where each epoch has its own state."""
+    """Return the seconds (k,) from the reference time of a target's state to each epoch.
+
+    They are zero if each epoch has its own state.
+    """
     motion = problem.motions[target]
     if motion.span == "epoch":
         return np.zeros(problem.epochs)
-    # The first epoch by default, so that adding later epochs does not move what a state means.
+    # The default is the first epoch, so that later epochs do not change the meaning of a state.
     reference = problem.times[0] if motion.reference is None else motion.reference
     return np.asarray(problem.times - reference)
 
 
 def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return a position of the problem's frame as ECEF components of the same type."""
-    # Spelled out with numbers as factors: components may be jets or symbols, which know no matrices.
+    """Return a position in the problem's frame as ECEF components of the same type, metres."""
+    # Written with scalar factors, because components may be jets or symbols, which do not support matrices.
     turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
     if problem.frame.kind == "ecef":
         return position
@@ -57,24 +60,24 @@ def place_and_rate(
     rate: Components | None = None,
     rise: tuple[Any, Any] = (0.0, 0.0),
 ) -> tuple[Components, Components | None]:
-    """Return place and rate on a course over ground, in the problem's frame.
+    """Return position and rate on a course over ground, in the problem's frame.
 
     Parameters
     ----------
     problem : Problem
-        In a geodetic frame.
+        Problem in a geodetic frame.
     start : tuple of 3 numbers
-        Place at the reference time, metres.
+        Position at the reference time, metres.
     straight : tuple of 3 numbers
-        Where the same state leads in space.
+        Position to which the same state leads in space, metres.
     rate : tuple of 3 numbers, optional
-        Its rate there, metres per second.
+        Rate at `straight`, metres per second.
     rise : pair of numbers
-        Height beyond its polynomial, metres, and its rate.
+        Height above its polynomial, metres, and its rate, metres per second.
     """
     if rate is None:
         return _from_ecef(problem, carry(to_ecef(problem, start), to_ecef(problem, straight), rise[0])), None
-    # the derivative along time is one more of the same kind: all numbers are jets of it, constants too
+    # the derivative by time is one more partial derivative: all numbers, also constants, become jets of it
     begun = tuple(Jet(p, {}) for p in start)
     led = tuple(Jet(p, {0: v}) for p, v in zip(straight, rate, strict=True))
     place = carry(to_ecef(problem, begun), to_ecef(problem, led), Jet(rise[0], {0: rise[1]}))
@@ -83,20 +86,20 @@ def place_and_rate(
 
 
 def course_at(problem: Problem, target: int, states: list[Components], since: Any, rise: Any = 0.0) -> Components:
-    """Return where a target is some seconds after its reference time.
+    """Return the position of a target `since` seconds after its reference time, metres.
 
     Parameters
     ----------
     problem : Problem
-        Says how the target moves.
+        Problem with the motion of the target.
     target : int
-        Which.
+        Number of the target.
     states : list of tuples of d numbers
-        Position, velocity and acceleration, as many as it has: arrays, jets or symbols.
+        Position, velocity and acceleration, as far as the target has them: arrays, jets or symbols.
     since : float or array
         Seconds.
     rise : float or array
-        Height beyond its polynomial, metres; by default what is known of that is left out.
+        Height above its polynomial, metres; by default zero.
     """
     place = _straight(states, since)
     return (
@@ -107,9 +110,10 @@ def course_at(problem: Problem, target: int, states: list[Components], since: An
 
 
 def height_at(problem: Problem, states: list[Components], since: float) -> Any:
-    """Return the height of a course over ground some seconds after its reference time, less its rise, metres.
+    """Return the height on a course over ground `since` seconds after the reference time, less its rise, metres.
 
-    It is what `optloc.models.course.carry` keeps to: the height of the start, and the upward part of the straight way.
+    `optloc.models.course.carry` keeps to this height: the height of the start, plus the upward part of the straight
+    way.
     """
     start = to_ecef(problem, states[0])
     ahead = to_ecef(problem, _straight(states, since))
@@ -117,7 +121,7 @@ def height_at(problem: Problem, states: list[Components], since: float) -> Any:
 
 
 def _straight(states: list[Components], since: Any) -> Components:
-    """Return where states lead in space."""
+    """Return the position to which the states lead in space after `since` seconds."""
     place = states[0]
     for j, state in enumerate(states[1:], 1):
         place = tuple(p + since**j / factorial(j) * v for p, v in zip(place, state, strict=True))
@@ -125,6 +129,7 @@ def _straight(states: list[Components], since: Any) -> Components:
 
 
 def _from_ecef(problem: Problem, ecef: Components) -> Components:
+    """Return ECEF components as a position in the problem's frame, metres."""
     turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
     if problem.frame.kind == "ecef":
         return ecef

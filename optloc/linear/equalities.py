@@ -1,4 +1,4 @@
-"""Equalities of a run: those of states that last, and those that every epoch's own state keeps."""
+"""Equality constraints of a run, for states that last for the run and for states of each epoch."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from optloc.problem.problem import Problem
 
 @dataclass(frozen=True, slots=True)
 class Equalities:
-    """The equalities of a flat batch of M problems.
+    """The equality constraints of a flat batch of M problems.
 
     Parameters
     ----------
     problem : Problem
-        The batch: runs of k epochs with l unknowns local to each.
+        The batch: runs of k epochs with l local unknowns in each.
     lasting : Face
-        Equalities of states that are shared by all epochs.
+        Equalities of states that all epochs share.
     single : Problem, optional
-        An epoch: its states, and its equalities with bounds (M or 1, k or 1); None where no epoch has one of its own.
+        The states of one epoch, with their equalities and bounds (M or 1, k or 1). None if no epoch has own equalities.
     each : Face
-        Equalities that hold in every epoch, of `single`.
+        Equalities of `single`, which hold in every epoch.
     """
 
     problem: Problem
@@ -38,7 +38,7 @@ class Equalities:
 
     @classmethod
     def of(cls, problem: Problem, face: Face | None = None) -> Equalities:
-        """Return the equalities of a problem, by default those that it states, else the levels of a face."""
+        """Return the equalities of a problem: by default the stated ones, else the levels of a face."""
         face = exact(problem) if face is None else face
         own = {i for level in face if problem.motions[_target(problem, i := level.constraint)].span == "epoch"}
         lasting = tuple(level for level in face if level.constraint not in own)
@@ -49,27 +49,27 @@ class Equalities:
         return cls(problem, lasting, single, exact(single))
 
     def restore(self, x: Array) -> Array:
-        """Return vectors (M, size) moved onto the equalities along the shortest way."""
+        """Return vectors (M, size) projected onto the equalities, along the shortest way."""
         x = restore(self.problem, self.lasting, x) if self.lasting else x
         if self.single is None:
             return x
         return self._put(x, restore(self._single(x), self.each, self._states(x)))
 
     def retract(self, x: Array, move: Array) -> Array:
-        """Return the vectors (M, size) that steps (M, size) from vectors lead to, on the equalities."""
+        """Return the vectors (M, size) after steps (M, size), projected onto the equalities."""
         return self.restore(x + move)
 
     def step(self, equations: Normal, damping: Array, x: Array) -> tuple[Array, Array]:
-        """Return the damped steps (M, size) that keep the equalities to first order, and where they exist (M,).
+        """Return the damped steps (M, size) that keep the equalities to first order, and whether they exist (M,).
 
         Parameters
         ----------
         equations : Normal
-            Of the batch at `x`.
+            Normal equations of the batch at `x`.
         damping : array (M,)
-            As of `optloc.linear.normal.step`.
+            Marquardt's factor, as for `optloc.linear.normal.step`.
         x : array (M, size)
-            Where the steps begin.
+            Vectors before the steps.
         """
         along = tangent_at(self.problem, self.lasting, x) if self.lasting else None
         if self.single is None:
@@ -81,7 +81,10 @@ class Equalities:
         return np.concatenate([move[:, :n], local.reshape(m, -1)], axis=1), ok
 
     def shared(self, equations: Normal, x: Array) -> tuple[Array, Array]:
-        """Return information (M, n, n) and vector (M, n) of shared unknowns; local ones keep their equalities."""
+        """Return information (M, n, n) and right side (M, n) of the shared unknowns, with the local ones eliminated.
+
+        The local unknowns keep their equalities.
+        """
         if self.single is not None:
             equations = _within(equations, self._own_space(x))
         information, vector, _ = marginal(equations)
@@ -110,11 +113,12 @@ class Equalities:
 
     @property
     def _epoch(self) -> Problem:
-        assert self.single is not None  # callers have looked
+        """Return the problem of one epoch."""
+        assert self.single is not None  # callers check this
         return self.single
 
     def _slots(self) -> list[tuple[slice, slice]]:
-        """Return where the states stand among the local unknowns of the run, and in the vector of an epoch."""
+        """Return pairs of slices of each state: in the local unknowns of the run, and in the vector of an epoch."""
         own = {slot.name: slice(slot.start, slot.start + slot.size) for slot in self._epoch.layout.shared}
         local = [slot for slot in self.problem.layout.local if slot.name in own]
         return [(slice(slot.start, slot.start + slot.size), own[slot.name]) for slot in local]
@@ -128,7 +132,7 @@ class Equalities:
         return out
 
     def _put(self, x: Array, states: Array) -> Array:
-        """Return vectors (M, size) with the states of their epochs in the place of their own."""
+        """Return vectors (M, size) whose epochs have the given states (M k, size of an epoch)."""
         shared, local = self.problem.layout.split(x)
         local = local.reshape(len(states), -1).copy()
         for here, there in self._slots():
@@ -137,12 +141,12 @@ class Equalities:
 
 
 def spare_rows(problem: Problem) -> Array:
-    """Return the degrees of freedom (N,) of a flat batch; an equality of an epoch's own state counts in every epoch."""
+    """Return the degrees of freedom (N,) of a flat batch; equalities of local states count once in every epoch."""
     found = degrees_of_freedom(problem)
     own = sum(problem.motions[_target(problem, level.constraint)].span == "epoch" for level in exact(problem))
     if not own or problem.epochs == 1:
         return found
-    # an epoch without a row has no unknowns to hold
+    # an epoch without a row has no unknowns to constrain
     weight = np.atleast_2d(problem.weight)
     heard = np.zeros((len(weight), problem.epochs), dtype=bool)
     for i, row in enumerate(weight > 0.0):
@@ -151,7 +155,7 @@ def spare_rows(problem: Problem) -> Array:
 
 
 def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
-    """Return an equality with one bound for each of M problems and k epochs, in one row."""
+    """Return an equality with one bound for each of M problems and k epochs, as one axis."""
     if isinstance(band, Polygon):
         return band
     lower, upper = (b if b.ndim == 0 else np.broadcast_to(b, shape).ravel() for b in (band.lower, band.upper))
@@ -161,11 +165,12 @@ def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
 
 
 def _target(problem: Problem, constraint: int) -> int:
+    """Return the target of a constraint."""
     return problem.constraints[constraint].target
 
 
 def _within(equations: Normal, basis: Array) -> Normal:
-    """Return normal equations whose local unknowns move along a basis (M, k, l, l - c) only."""
+    """Return normal equations whose local unknowns move only along a basis (M, k, l, l - c)."""
     turned = np.swapaxes(basis, -1, -2)
     return Normal(
         equations.shared,

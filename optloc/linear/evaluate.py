@@ -1,4 +1,7 @@
-"""Modelled measurements and their derivatives at a point, all rows at once, by indices made once for each structure."""
+"""Predicted measurements and their derivatives at a point, for all rows at once.
+
+The indices from unknowns to rows are computed once for each structure.
+"""
 
 from __future__ import annotations
 
@@ -21,28 +24,28 @@ from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, emission_name, state_names
 from optloc.problem.problem import Problem
 
-# Which unknown moves which input of which row: the indices of a problem, made once for each structure.
+# The unknowns that change each input of each row: indices of a problem, computed once for each structure.
 
-# Inputs of a measurement function: target, its rate, both stations, their rates, axes and the turn of the axes; of a
-# course over ground where it began, and the shape of its height with its rate.
-# Sixteen apart: the largest input, a set of axes, has nine components.
+# Inputs of a measurement function: target, its rate, both stations, their rates, axes and the rotation of the axes. For
+# a course over ground also its start, and the shape of its height with its rate. The numbers are sixteen apart, because
+# the largest input, a set of axes, has nine components.
 TARGET, TARGET_RATE, A, B, RATE_A, RATE_B, AXES_A, AXES_B, TURN, START, RISE = (16 * i for i in range(11))
 
 
 @dataclass(frozen=True, slots=True)
 class Feed:
-    """How one unknown of each row moves a seed: ``seed += gain * x[column]``.
+    """The contribution of one unknown of each row to an input: ``input += gain * x[column]``.
 
     Parameters
     ----------
     seed : int
-        Which input of the measurement function.
+        Number of the component of an input of the measurement function.
     column : int array (m,)
         Column of the full parameter vector.
     gain : float or array (m,)
         Factor.
     rows : slice or int array
-        Rows of the block it applies to.
+        Rows of the block that have this contribution.
     """
 
     seed: int
@@ -51,8 +54,11 @@ class Feed:
     rows: Any
 
     def table(self, count: int) -> tuple[Array, Array]:
-        """Return column and factor, each (count,), for all rows of the block: factor zero where it does not apply."""
-        # Column zero with factor zero where it does not apply: a gather needs some column.
+        """Return column and factor, each (count,), for all rows of the block.
+
+        The factor is zero for rows without it.
+        """
+        # Column zero with factor zero for the other rows: a gather needs a valid column.
         column, gain = np.zeros(count, dtype=np.int64), np.zeros(count)
         column[self.rows], gain[self.rows] = self.column, self.gain
         return column, gain
@@ -84,9 +90,9 @@ class Terms:
         return out
 
     def tables(self, count: int) -> list[tuple[Array, Array]]:
-        """Return pairs of column and coefficient, each (count,), that add up to the terms of all rows of the block."""
+        """Return pairs of column and coefficient, each (count,), whose sum is the terms of all rows of the block."""
         found, left = [], np.arange(len(self.row))
-        while left.size:  # a row with several terms takes part in several tables
+        while left.size:  # a row with several terms has an entry in several tables
             rows, first = np.unique(self.row[left], return_index=True)
             column, coefficient = np.zeros(count, dtype=np.int64), np.zeros(count)
             column[rows], coefficient[rows] = self.column[left[first]], self.coefficient[left[first]]
@@ -97,18 +103,18 @@ class Terms:
 
 @dataclass(frozen=True, slots=True)
 class BlockLinks:
-    """The links from the unknowns to one block of rows: measurement = h(fed inputs) * (1 + gains) + adds.
+    """The dependence of one block of rows on the unknowns: measurement = h(inputs) * (1 + gains) + adds.
 
     Parameters
     ----------
     block : Rows
         The rows.
     model : Model
-        Their kind.
+        Model of their kind.
     feeds : tuple of Feed
-        Which unknowns move which inputs of h.
+        Contributions of unknowns to the inputs of h.
     gains, adds : Terms
-        Scale factors, and offsets, drifts and emission times.
+        Scale factors; and offsets, drifts and emission times.
     """
 
     block: Rows
@@ -121,31 +127,33 @@ class BlockLinks:
 def columns(layout: Layout, name: str, epoch: Array) -> Array:
     """Return the columns (m, size) of a slot in the full parameter vector for rows of given epochs."""
     slot, shared = layout.find(name)
-    # Local unknowns of epoch k stand behind those of all epochs before it.
+    # Local unknowns of epoch k follow those of all earlier epochs.
     base = slot.start + (0 if shared else layout.n_shared + epoch * layout.n_local)
     return np.broadcast_to(np.asarray(base)[..., None] + np.arange(slot.size), (len(epoch), slot.size))
 
 
-# Links from unknowns to rows: made once for each structure.
+# Links from unknowns to rows, computed once for each structure.
 
-# Rows of a problem whose links are kept, half of what all kept ones may have: the links of a longer problem are made
-# each time, which takes less time than its rows do, and no memory that lasts.
+# Greatest number of rows of a problem whose links are cached; the cache has twice this number of rows. Longer problems
+# compute their links each time: this takes less time than their rows, and no permanent memory.
 _KEPT_ROWS = 4096
 _LINKS = Cache[tuple[BlockLinks, ...]](2 * _KEPT_ROWS, lambda kept: sum(links.block.count for links in kept))
 
 
 def block_links(problem: Problem) -> tuple[BlockLinks, ...]:
-    """Return the links of each block of rows; kept for problems of equal structure that are not long."""
+    """Return the links of each block of rows, cached by structure unless the problem is long."""
     if problem.count > _KEPT_ROWS:
         return _links_of_all(problem)
     return _LINKS.find(problem.structure, lambda: _links_of_all(problem))
 
 
 def _links_of_all(problem: Problem) -> tuple[BlockLinks, ...]:
+    """Return the links of each block of rows, without the cache."""
     return tuple(_links_of(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True))
 
 
 def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
+    """Return the links of one block of rows, whose first row has the number `start`."""
     model = MODELS[block.kind]
     if (block.target < 0).any():
         where = f"{block.kind} row {int(np.argmax(block.target < 0))}"
@@ -157,6 +165,7 @@ def _links_of(problem: Problem, block: Rows, start: int) -> BlockLinks:
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
+    """Return the offsets, drifts and emission times of a block of rows, as linear terms."""
     parts = [_terms(problem, block, start, "adds")]
     for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)
@@ -166,6 +175,7 @@ def _adds(problem: Problem, block: Rows, start: int) -> Terms:
 
 
 def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
+    """Return the linear terms of the biases that enter a block of rows in the given way."""
     parts = [Terms(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
     for bias in _entering(problem, enters):
         inside = (bias.row >= start) & (bias.row < start + block.count)
@@ -178,17 +188,19 @@ def _terms(problem: Problem, block: Rows, start: int, enters: str) -> Terms:
 
 
 def _entering(problem: Problem, enters: str) -> list[Bias]:
-    """Return the biases that enter rows in a way, see `BiasForm.enters`."""
+    """Return the biases that enter rows in the given way, see `BiasForm.enters`."""
     return [bias for bias in problem.biases if form_of(bias).enters == enters]
 
 
 def _append(parts: list[Terms]) -> Terms:
+    """Return several lists of terms as one."""
     return Terms(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "column", "coefficient"))
     )
 
 
 def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
+    """Return the contributions of the states of targets to positions and rates."""
     feeds, count = [], len(problem.motions)
     for i, motion in enumerate(problem.motions):
         if motion.known is not None or not np.any(block.target == i):
@@ -199,7 +211,7 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
         for j, name in enumerate(state_names(i, count, motion.order)):
             column = columns(problem.layout, name, epoch)
             for c in range(problem.dimension):
-                # Taylor's polynomial of the course; its derivative feeds the rate.
+                # Taylor's polynomial of the course; its derivative contributes to the rate.
                 feeds.append(Feed(TARGET + c, column[:, c], since**j / factorial(j), rows))
                 if ground and not j:
                     feeds.append(Feed(START + c, column[:, c], 1.0, rows))
@@ -209,7 +221,8 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 
 def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
-    # Errors that are noise are no unknowns: `optloc.linear.normal` puts them into the covariance of rows.
+    """Return the contributions of station errors to the positions and rates of stations."""
+    # Errors of span "noise" are not unknowns: `optloc.linear.normal` adds them to the covariance of rows.
     d, feeds = problem.dimension, []
     for name, _, _ in problem.stations.errors if problem.stations.unknown_for else ():
         rates = name == "station velocities"
@@ -225,11 +238,14 @@ def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 
 def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
+    """Return the contributions of mount errors to the rotation of axes."""
     feeds = []
     for bias in _entering(problem, "turns"):
         left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
         turns = 1 if problem.dimension == 2 else 3
-        while left.size:  # a row turned by several members takes one pass for each: a feed holds a row once
+        while (
+            left.size
+        ):  # a row rotated by several members takes one pass for each, since a feed contains a row only once
             rows, first = np.unique(bias.row[left] - start, return_index=True)
             touch, left = left[first], np.delete(left, first)
             column = columns(problem.layout, bias.name, rows)
@@ -240,7 +256,7 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
 
 
 def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> list[Feed]:
-    """Return what seconds along a course add to places and rates of stations, to first order."""
+    """Return the contributions of time offsets along a course to positions and rates of stations, to first order."""
     feeds: list[Feed] = []
     for bias in _entering(problem, "moves"):
         rates = course(problem)
@@ -256,11 +272,11 @@ def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> li
     return feeds
 
 
-# How the points of a measurement come out of the parameter vector, as values or with derivatives.
+# The points of a measurement from the parameter vector, as values or with derivatives.
 
 
 def checked_vectors(problem: Problem, x: Array) -> Array:
-    """Return parameter vectors (..., size) of a problem; refuse those of another length."""
+    """Return the parameter vectors (..., size); raise `InvalidProblem` for vectors of another length."""
     size = problem.layout.size
     if x.shape[-1:] != (size,):
         raise InvalidProblem(f"a vector of shape {x.shape} for {size} unknowns", "vector", "order it by problem.layout")
@@ -273,39 +289,39 @@ def points(problem: Problem, links: BlockLinks, x: Array, differentiate: bool) -
     Parameters
     ----------
     problem : Problem
-        Its numbers.
+        Problem with the data.
     links : BlockLinks
-        The block's indices.
+        Indices of the block.
     x : array (..., size)
-        Parameter vector.
+        Parameter vectors.
     differentiate : bool
-        Whether fed inputs become `Jet` values seeded with one.
+        Whether inputs that depend on unknowns become `Jet` values with derivative one.
     """
-    # Data first, then what unknowns add: an offset of a station adds to its surveyed place.
+    # First data, then contributions of unknowns: an offset of a station is added to its surveyed position.
     inputs = {seed: as_array_like(value, x) for seed, value in given(problem, links).items()}
     for feed in links.feeds:
         inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, links.block.count)
-    if isinstance(x, Portable):  # what is data only is computed like what the vector feeds
+    if isinstance(x, Portable):  # data are computed in the same way as inputs from the vector
         inputs = {seed: np.asarray(value).view(Portable) for seed, value in inputs.items()}
     if differentiate:
         fed = {feed.seed for feed in links.feeds}
-        # Arrays of other libraries need not hand arithmetic with a Jet on the right to the Jet: there all are jets.
+        # Arrays of other libraries may not delegate arithmetic to a Jet on the right side; so all inputs become jets.
         for seed in inputs if is_other_library(x) else fed:
             inputs[seed] = Jet(inputs[seed], {seed: as_array_like(np.ones(1), x)} if seed in fed else {})
     return join(problem, links.model, inputs)
 
 
 def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point, Point, Point]:
-    """Return target, first and second station made of inputs of any type: arrays, jets or symbols.
+    """Return target, first and second station from inputs of any type: arrays, jets or symbols.
 
     Parameters
     ----------
     problem : Problem
-        Gives dimension and frame.
+        Problem with dimension and frame.
     model : Model
-        Says what the points must carry.
+        Model with the quantities that the points need.
     inputs : dict of seed to number
-        Components; an absent one is zero.
+        Components; a missing one is zero.
     """
     d = problem.dimension
 
@@ -313,7 +329,7 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
         return tuple(inputs.get(seed + c, 0.0) for c in range(d))
 
     def station(place: int, rate: int, axes: int) -> Point:
-        # Seeds stand 16 apart and axes 3: nine numbers of one set of axes fit below the next input.
+        # Inputs are 16 numbers apart and axes 3: nine numbers of one set of axes fit before the next input.
         own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
         if TURN in inputs:
             identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
@@ -333,7 +349,7 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
             problem, vector(START), place, rate, (inputs.get(RISE, 0.0), inputs.get(RISE + 1, 0.0))
         )
     target = seen(place, rate)
-    # A kind without stations gets the target in their place, which its h does not look at.
+    # A kind without stations gets the target in place of the stations, which its h does not use.
     a = station(A, RATE_A, AXES_A) if model.stations else target
     return target, a, station(B, RATE_B, AXES_B) if model.stations > 1 else a
 
@@ -357,7 +373,7 @@ def given(problem: Problem, links: BlockLinks) -> dict[int, Any]:
         if motion.known is None or not len(rows):
             continue
         epoch = block.epoch if motion.known.shape[-3] > 1 else np.zeros_like(block.epoch)
-        # Every row gets a sum over targets in which its own counts: no scatter, which some libraries lack.
+        # Each row gets a sum over targets in which only its target has the weight one: some libraries have no scatter.
         mine = as_array_like(1.0 * (block.target == i), motion.known)
         for seed, order in ((TARGET, 0), (TARGET_RATE, 1)):
             for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
@@ -370,7 +386,7 @@ def given(problem: Problem, links: BlockLinks) -> dict[int, Any]:
 def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> dict[int, Any]:
     """Return the components of a per-station vector (rank 1) or set of axes (rank 2) at each row."""
     epochs, count = array.shape[-2 - rank : -rank]
-    # Epoch and station as one index: a single table gathers rows of moving stations.
+    # Epoch and station as one index, so that one table gathers rows of moving stations.
     joint = library(array).reshape(array, (*array.shape[: -2 - rank], epochs * count, *array.shape[-rank:]))
     picked = gather(joint, index + (count * block.epoch if epochs > 1 else 0), -1 - rank)
     if rank == 1:
@@ -380,22 +396,23 @@ def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> d
 
 
 def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
+    """Return the value of an input plus the contribution of an unknown."""
     column, gain = feed.table(count)
     part = gather(x, column)
-    # Most unknowns enter as they are; a product with ones would cost as much as the rest.
+    # Most unknowns have the factor one; a product with ones would cost as much as the rest.
     return value + (part if np.all(gain == 1.0) else part * as_array_like(gain, x))
 
 
-# Values and derivatives of all rows: those of a kind together, then what biases do to them.
+# Values and derivatives of all rows: all rows of a kind together, then the effects of biases.
 
 
-# At a station an angle, a ratio or a rate has no value: NaN says so, and what asked judges it.
+# At a station, an angle, a ratio or a rate is undefined: the value is NaN, which the callers handle.
 _undefined = np.errstate(divide="ignore", invalid="ignore")
 
 
 @_undefined
 def predict(problem: Problem, x: Array) -> Array:
-    """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
+    """Return the predicted measurements h(x) (..., m) of a problem at vectors x (..., size)."""
     values, x, xp = [], checked_vectors(problem, x), library(x)
     for links in block_links(problem):
         value = as_array_like(links.model.h(*points(problem, links, x, differentiate=False)), x)
@@ -413,7 +430,7 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     problem : Problem
         Batch of problems (...).
     x : array (..., size)
-        Parameter vectors, ordered by ``problem.layout``, of any array library; so are the answers.
+        Parameter vectors, ordered by ``problem.layout``, of any array library; the results have the same library.
 
     Returns
     -------
@@ -425,7 +442,7 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     layout, x, xp = problem.layout, checked_vectors(problem, x), library(x)
     width = layout.n_shared + layout.n_local
     batch = np.broadcast_shapes(problem.batch_shape, x.shape[:-1])
-    # In numpy derivatives are written where they belong; other libraries stack columns.
+    # numpy writes derivatives into one array; other libraries stack columns.
     place = None if is_other_library(x) else np.zeros((*batch, problem.count, width))
     residuals, jacobians = [], []
     for links, block, start in zip(block_links(problem), problem.rows, problem.starts, strict=True):
@@ -445,13 +462,13 @@ _Terms = list[tuple[Array, Array, Any]]
 
 
 def _derive(problem: Problem, links: BlockLinks, x: Array) -> tuple[Any, _Terms]:
-    """Return the values (..., m) of one block, biases included, and their derivatives."""
+    """Return the values (..., m) of one block, including biases, and their derivatives."""
     jet, m, fold = (
         links.model.h(*points(problem, links, x, differentiate=True)),
         links.block.count,
         _fold(problem.layout),
     )
-    # A kind that nothing moves (known targets and stations) has a value without derivatives.
+    # A kind without unknowns (known targets and stations) has a value without derivatives.
     if not isinstance(jet, Jet):
         jet = Jet(as_array_like(np.asarray(jet), x), {})
     value, gain = _bias(links, x, jet.value)
@@ -478,7 +495,7 @@ def _fold(layout: Layout) -> Any:
 
 
 def _bias(links: BlockLinks, x: Array, value: Any) -> tuple[Any, Any]:
-    """Return values with scales, offsets, drifts and emission times, and the factor that scales them or None."""
+    """Return values with scales, offsets, drifts and emission times, and the factor that scales them, or None."""
     m, gain = links.block.count, None
     if links.gains.row.size:
         gain = 1.0 + links.gains.total(x, m)
@@ -487,19 +504,20 @@ def _bias(links: BlockLinks, x: Array, value: Any) -> tuple[Any, Any]:
 
 
 def _residual(block: Rows, value: Any, periodic: bool) -> Any:
-    """Return what is measured less the values of one block; absent rows count as met."""
+    """Return measured minus predicted values of one block; absent rows have the residual zero."""
     residual = as_array_like(block.z - block.correction, value) - value
     residual = wrap(residual) if periodic else residual
-    # Absent rows may hold NaN, which zero times would keep.
+    # Absent rows may contain NaN, and zero times NaN is NaN.
     if not is_other_library(block.weight) and np.all(block.weight > 0.0):
         return residual
     return library(residual).where(as_array_like(block.weight, residual) > 0.0, residual, 0.0)
 
 
 def _add(terms: _Terms, jacobian: Array) -> None:
-    """Add derivatives to a block's part of the Jacobian."""
+    """Add derivatives to the block's part of the Jacobian."""
     for column, coefficient, factor in terms:
-        # One column for all rows of the block (a shared position) is a slice, where others need a scatter.
+        # If all rows of the block have the same column (a shared position), a slice is enough; otherwise a scatter is
+        # needed.
         if np.all(column == column[:1]):
             jacobian[..., column[0]] += factor if np.all(coefficient == 1.0) else factor * coefficient
             continue
@@ -509,7 +527,7 @@ def _add(terms: _Terms, jacobian: Array) -> None:
 
 
 def _stack(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
-    """Return the Jacobian (*shape, width) of a block, column by column: in some libraries nothing can be written."""
+    """Return the Jacobian (*shape, width) of a block, column by column: in some libraries arrays cannot be written."""
     columns: dict[int, Any] = {}
     for column, coefficient, factor in terms:
         for j in np.unique(column[coefficient != 0.0]):
@@ -520,6 +538,7 @@ def _stack(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
 
 
 def _joined(parts: list[Any]) -> Array:
+    """Return arrays (..., m) of blocks of rows as one array."""
     xp = library(parts[0])
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)

@@ -1,4 +1,4 @@
-"""A fixed number of Gauss-Newton steps on arrays of any library: for accelerators, and inside other people's loops."""
+"""A fixed number of Gauss-Newton steps on arrays of any library, for accelerators and for use in other programs."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from optloc.problem.problem import Problem
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Where a fixed number of steps ended; no verdict is part of it.
+    """The vectors after a fixed number of steps, without a verdict.
 
     Parameters
     ----------
     x : array (..., size)
         Parameter vectors, ordered by ``problem.layout``.
     covariance : array (..., n, n)
-        Covariance of the shared unknowns at `x`; NaN where the geometry is singular.
+        Covariance of the shared unknowns at `x`; NaN if the geometry is singular.
     cost : array (...)
         Weighted sum of squared residuals and prior penalties at `x`.
     regular : bool array (...)
-        Whether every step had a solution; a problem without one stays where it is.
+        Whether every step had a solution; a problem without a solution keeps its vector.
     """
 
     x: Any
@@ -37,21 +37,21 @@ class Estimate:
 def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 0.0) -> Estimate:
     """Return the vectors after a fixed number of Gauss-Newton steps from given starts.
 
-    Only operations of the array-API standard are used and nothing is tested on the way, so that arrays of JAX, PyTorch,
-    CuPy or another library stay in their library and on their device. Whether the answer is a minimum, and the best
-    one, is for `optloc.solve` to say. Constraints are not kept.
+    The function uses only operations of the array-API standard and no branches that depend on values. So arrays of JAX,
+    PyTorch, CuPy or another library stay in their library and on their device. The function does not check whether the
+    result is a minimum, or the best one; use `optloc.solve` for this. Constraints are ignored.
 
     Parameters
     ----------
     problem : Problem
-        Batch of problems (...). Its numbers are numpy arrays or, made so by ``problem.placed(x)``, arrays of the
-        library of `x`.
+        Batch of problems (...). Its numbers are numpy arrays or, after ``problem.placed(x)``, arrays of the library
+        of `x`.
     x : array (..., size)
-        Starts, ordered by ``problem.layout``; decide library, device and float type.
+        Starts, ordered by ``problem.layout``. They determine the library, the device and the float type.
     steps : int
         Number of steps, at least one.
     damping : float
-        Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``; 0 for plain steps.
+        Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``; 0 for undamped steps.
 
     Returns
     -------
@@ -61,8 +61,8 @@ def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 
     Raises
     ------
     InvalidProblem
-        If `steps` or `damping` is out of range, or if the noise of the rows depends on the place of the target, which
-        only numpy arrays support.
+        If `steps` or `damping` is out of range, or if the noise of the rows depends on the position of the target,
+        which only numpy arrays support.
 
     References
     ----------
@@ -73,12 +73,12 @@ def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 
         raise InvalidProblem(f"{steps} steps with damping {damping:g}", "gauss_newton", "give steps >= 1, damping >= 0")
     noise = whiteners(problem, x)
     equations = _equations(problem, x, noise)
-    # Of the shape and library of the cost, whatever they are.
+    # Same shape and library as the cost.
     factor = as_array_like(damping, equations.cost) + 0.0 * equations.cost
-    # True but for NaN, as a mask on the array's own device.
+    # True except for NaN, as a mask on the device of the array.
     regular: Any = equations.cost == equations.cost
     for _ in range(steps):
-        # A step that does not exist is zero: the problem stays where it is and its batch goes on.
+        # A step without a solution is zero: the problem keeps its vector, and the other problems continue.
         move, solvable = step(equations, factor)
         x, regular = x + move, regular & solvable
         equations = _equations(problem, x, noise)
@@ -87,7 +87,10 @@ def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 
 
 
 def whiteners(problem: Problem, x: Any) -> tuple[Whitener, ...] | None:
-    """Return the whitening matrices of a problem where they do not depend on `x`, else None; refuse foreign arrays."""
+    """Return the whitening matrices of a problem, or None if they depend on `x`.
+
+    In the second case, arrays of another library than numpy raise `InvalidProblem`.
+    """
     if not depends_on_place(problem):
         return whitener_at(problem, x)
     if is_other_library(x):
@@ -100,4 +103,5 @@ def whiteners(problem: Problem, x: Any) -> tuple[Whitener, ...] | None:
 
 
 def _equations(problem: Problem, x: Any, noise: tuple[Whitener, ...] | None) -> Normal:
+    """Return the normal equations with priors at vectors x (..., size)."""
     return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))

@@ -1,8 +1,8 @@
-"""Rows that are linear in ranges carry no more than the least-squares ranges, known up to one common unknown.
+"""Least-squares ranges: a sufficient statistic of all rows that are linear in ranges.
 
-Rows z = D r + n (range, tdoa, toa, range_sum; D holds 0 and +-1) link stations into a graph. In each connected
-group the ranges that fit best are r = c + sign * t: known (t = 0), or known up to one unknown t, the range to a
-reference station. c and its covariance are an exact sufficient statistic of these rows.
+Rows z = D r + n (range, tdoa, toa, range_sum; D contains 0 and +-1) connect stations into a graph. In each connected
+group, the ranges that fit best are r = c + sign * t: known (t = 0), or known up to one unknown t, the range to a
+reference station. c and its covariance contain all information of these rows.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from optloc.models import MODELS
 from optloc.problem.noise import Block, Noise, whiten
 from optloc.problem.problem import Problem
 
-# Eigenvalue, as a share of the largest, that is a zero: D holds 0 and +-1, so that the least eigenvalue on a chain of s
-# stations is some 1 / s^2, and rounding leaves 1e-15.
+# Eigenvalue, as a share of the largest, that counts as zero. D contains 0 and +-1, so that the least eigenvalue on a
+# chain of s stations is about 1 / s^2, and rounding is 1e-15.
 _SINGULAR = 1e-9
-# Graphs that are kept, at some kilobytes each: a batch has the same ones for each set of rows that is left out.
+# Number of cached graphs, of some kilobytes each: a batch repeats the graph for each set of rows that is left out.
 _GRAPHS = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """How the range rows that are present link the stations.
+    """The connections of stations by the present range rows.
 
     Parameters
     ----------
     members : tuple of int array
         Stations of each connected group, as nodes; nodes are (station, epoch), then emission times.
     inside : bool array (s,)
-        Whether a node belongs to the main group, of the most stations.
+        Whether a node belongs to the main group, which has the most stations.
     sign : int array (s,)
-        Sign with which the range to the reference enters a node's range; 0 where that is determined.
+        Sign of the range to the reference in a node's range; 0 if the node's range is determined.
     reference : int
-        First node of the main group; 0 where there is none.
+        First node of the main group; 0 if there is none.
     pinned : bool array (q,)
-        Nodes that hold no unknown of the least-squares problem: absent ones and one of each free group.
+        Nodes that are not unknowns of the least-squares problem: absent nodes, and one node of each free group.
     """
 
     members: tuple[Array, ...]
@@ -53,24 +53,24 @@ class Graph:
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Least-squares ranges of a flat batch of problems, r = c + sign * t over the main group of each.
+    """Least-squares ranges of a flat batch of problems, r = c + sign * t in the main group of each problem.
 
     Parameters
     ----------
     station, epoch : int array (s,)
-        Station and epoch of each node; the epoch is 0 where stations stay.
+        Station and epoch of each node; the epoch is 0 if stations do not move.
     inside : bool array (N, s)
         Whether a node belongs to the main group of its problem.
     sign : int array (N, s)
-        +1, -1, or 0 where the range is determined.
+        +1, -1, or 0 if the range is determined.
     reference : int array (N,)
         Node whose range is t.
     offset : array (N, s)
         c, metres.
     covariance : array (N or 1, s, s)
-        Covariance of c; identity rows for nodes that carry none.
+        Covariance of c, m^2; identity rows for nodes without a range.
     cost : array (N,)
-        Weighted squared misfit of the loops: chi-square of the rows among themselves.
+        Weighted squared misfit of the loops: chi-square of redundant rows.
     groups : tuple of tuple of tuple of int
         The stations of each group, for each distinct pattern of present rows.
     pattern : int array (N,)
@@ -95,7 +95,7 @@ class Ranges:
 
 
 def ranges(problem: Problem) -> Ranges | None:
-    """Return the least-squares ranges of a flat batch of problems, or None where no row is linear in ranges.
+    """Return the least-squares ranges of a flat batch of problems, or None if no row is linear in ranges.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def ranges(problem: Problem) -> Ranges | None:
     if not len(station):
         return None
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
-    # rows of other kinds have no part in D
+    # rows of other kinds are not in D
     used = np.any(design != 0.0, axis=1)
     present = weight[:, used] > 0.0
     patterns, pattern = _patterns(present)
@@ -117,7 +117,7 @@ def ranges(problem: Problem) -> Ranges | None:
     groups = tuple(tuple(tuple(int(station[n]) for n in nodes) for nodes in graph.members) for graph in graphs)
     offset, covariance, cost = _least_squares(problem, design, pinned)
     s = len(station)
-    # emission times are nodes behind the stations: they have done their part
+    # emission times are the nodes after the stations, and are not part of the result
     known = covariance[:, :s, :s]
     return Ranges(station, epoch, inside, sign, reference, offset[:, :s], known, cost, groups, pattern)
 
@@ -126,23 +126,24 @@ def reduce(problem: Problem) -> Problem:
     """Return the problem with all rows that are linear in ranges replaced by their sufficient statistic.
 
     Redundant differences around a ring of s stations become s - 1 differences to one reference with their full
-    covariance; range sums and arrival times likewise; rows that fix the ranges become ranges. The fix is the same.
+    covariance. The same applies to range sums and arrival times. Rows that determine the ranges become ranges. The fix
+    is the same.
 
     Parameters
     ----------
     problem : Problem
-        One target, without biases; one epoch, or target and stations that stay.
+        One target, without biases; one epoch, or target and stations at rest.
 
     Returns
     -------
     Problem
-        Reduced rows first, then the rows of other kinds as they were.
+        First the reduced rows, then the unchanged rows of other kinds.
 
     Raises
     ------
     InvalidProblem
-        Where the rows fall into groups without a common station, differ in which rows are present, belong to several
-        targets or to a bias, or where their noise is correlated with that of other kinds.
+        If the rows form groups without a common station, or different problems have different present rows. Also if
+        rows belong to several targets or to a bias, or if their noise is correlated with other kinds.
     """
     _check(problem)
     found = ranges(problem.flat())
@@ -165,13 +166,13 @@ def reduce(problem: Problem) -> Problem:
 
 
 def _check(problem: Problem) -> None:
-    """Refuse what has no common ranges: they are those of one target, and free of unknown errors."""
+    """Raise `InvalidProblem` if the rows have no common ranges: several targets, or unknown errors."""
     if len(problem.motions) > 1:
         raise InvalidProblem("there are several targets", "reduce", "reduce the rows of one target")
     if problem.biases:
         name = problem.biases[0].name
         raise InvalidProblem(
-            f"the bias {name!r} belongs to rows that would go", "reduce", "solve the problem unreduced"
+            f"the bias {name!r} belongs to range rows, which reduce replaces", "reduce", "solve the problem unreduced"
         )
 
 
@@ -193,7 +194,7 @@ def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Ar
     """Return range, tdoa and range_sum rows of the statistic with batch axes `shape`, and their joint covariance."""
     free, reference = bool(found.free[0]), int(found.reference[0])
     nodes = [n for n in np.flatnonzero(found.inside[0]) if not (free and n == reference)]
-    # r_i = c_i + t is a difference to the reference, r_i = c_i - t a sum with it
+    # r_i = c_i + t is a difference to the reference, r_i = c_i - t a sum with the reference
     kinds = ["range" if not free else "tdoa" if found.sign[0, n] > 0 else "range_sum" for n in nodes]
     order, rows = [], []
     for kind in dict.fromkeys(kinds):
@@ -208,7 +209,7 @@ def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Ar
 
 
 def _patterns(present: Array) -> tuple[Array, Array]:
-    """Return the distinct rows of a mask (N, m), and which of them each problem has."""
+    """Return the distinct rows of a mask (N, m), and the number of the row of each problem."""
     if present.all() or (present == present[:1]).all():
         return present[:1], np.zeros(len(present), dtype=int)
     patterns, pattern = np.unique(present, axis=0, return_inverse=True)
@@ -216,6 +217,7 @@ def _patterns(present: Array) -> tuple[Array, Array]:
 
 
 def _stays(problem: Problem) -> bool:
+    """Return whether all targets are at rest for the run."""
     return all(motion.order == 0 and motion.span == "run" for motion in problem.motions)
 
 
@@ -228,7 +230,7 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
         model = MODELS[rows.kind]
         if model.ranges is None:
             continue
-        # ranges to stations that stay, from a target that stays, are one and the same at all epochs
+        # between stations and a target at rest, the range is the same at all epochs
         when = rows.epoch if moving else np.zeros_like(rows.epoch)
         for i in range(rows.count):
             for index, coefficient in zip((rows.a[i], rows.b[i]), model.ranges, strict=True):
@@ -247,11 +249,11 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=_GRAPHS)
 def _graph(rows: bytes, count: int, stations: int) -> Graph:
-    """Return how nodes are linked, from the bytes of D, whose columns they are, stations before others."""
+    """Return the graph of nodes from the bytes of D, whose columns are the nodes, stations first."""
     group, sign = _connect(np.frombuffer(rows).reshape(-1, count))
     names = np.unique(group[group >= 0])
     members = tuple(np.flatnonzero(group[:stations] == name) for name in names)
-    # most stations; of equals the first, so that the same rows always give the same group
+    # the group with most stations; if equal, the first one, so that the same rows always give the same group
     main = max(range(len(names)), key=lambda i: (len(members[i]), -i)) if len(names) else -1
     inside = (group == names[main])[:stations] if len(names) else np.zeros(stations, dtype=bool)
     reference = int(np.flatnonzero(inside)[0]) if inside.any() else 0
@@ -259,7 +261,7 @@ def _graph(rows: bytes, count: int, stations: int) -> Graph:
     for name in np.unique(group[sign != 0]):
         nodes = np.flatnonzero(group == name)
         pinned[reference if main >= 0 and name == names[main] and group[reference] == name else nodes[0]] = True
-    # ranges grow with that of the reference: its own sign is plus
+    # the sign of the reference itself is plus
     own = np.where(inside, sign[:stations], 0)
     return Graph(members, inside, own * (own[reference] or 1), reference, pinned)
 
@@ -267,7 +269,7 @@ def _graph(rows: bytes, count: int, stations: int) -> Graph:
 def _connect(design: Array) -> tuple[Array, Array]:
     """Return the connected group of each node (q,), -1 without rows, and the sign of its unknown in its range.
 
-    The sign is 0 where ranges are determined.
+    The sign is 0 if ranges are determined.
     """
     count = design.shape[1]
     # nodes that share a row; signs do not matter
@@ -286,15 +288,15 @@ def _connect(design: Array) -> tuple[Array, Array]:
     sign, determined = np.zeros(count, dtype=int), np.zeros(count, dtype=bool)
     for name in np.unique(group[group >= 0]):
         nodes = np.flatnonzero(group == name)
-        # what moves all rows of a group by nothing is its unknown t; the graph is connected, so there is one at most
+        # the null vector of the rows of a group is its unknown t; the graph is connected, so there is at most one
         inner = design[:, nodes]
         values, vectors = np.linalg.eigh(inner.T @ inner)
         if values[0] < _SINGULAR * max(values[-1], 1.0):
-            # the null vector holds +-1 / sqrt(n): signs relative to the largest entry, against rounding
+            # the null vector contains +-1 / sqrt(n); signs are relative to the largest entry, because of rounding
             sign[nodes] = np.sign(vectors[:, 0] * vectors[np.argmax(np.abs(vectors[:, 0])), 0]).astype(int)
         else:
             determined[nodes] = True
-    group[determined] = count  # ranges that are all known belong together, linked or not
+    group[determined] = count  # known ranges form one group, whether connected or not
     return group, sign
 
 
@@ -310,9 +312,9 @@ def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Arra
         information = information + transposed @ white
         vector = vector + transposed @ seen
         total = total + np.swapaxes(seen, -1, -2) @ seen
-    # one pattern of present rows: one inverse serves the batch
+    # one pattern of present rows: one inverse is enough for the batch
     held = pinned[:1] if (pinned == pinned[:1]).all() else pinned
-    # pinned nodes keep a one on the diagonal: their value is zero, and the rest is inverted with them
+    # pinned nodes have 1 on the diagonal, so that their value is zero and the other nodes are inverted without them
     information = np.where(held[:, :, None] | held[:, None, :], 0.0, information) + held[:, :, None] * np.eye(q)
     covariance, _ = linalg.inverse(information)
     offset = (covariance @ np.where(held[..., None], 0.0, vector))[..., 0]

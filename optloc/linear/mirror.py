@@ -1,8 +1,8 @@
-"""Mirror images of a position in the plane of the stations, and steps where both sides of the plane are alike.
+"""Mirror images of a position in the plane of the stations, and steps for targets near this plane.
 
-Where all stations lie in a plane, ranges depend on the distance w of the target from it by the square alone. On the
-plane the derivatives by w vanish, so steps of Gauss and Newton in w have no end there; those in q = w^2 do, and a
-minimum on the plane is one at the bound q = 0.
+If all stations are in a plane, ranges depend only on the square of the target's distance w from the plane. On the plane
+the derivatives by w vanish, so Gauss-Newton steps in w do not converge. Steps in q = w^2 converge, and a minimum on the
+plane is a minimum at the bound q = 0.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from optloc.problem.problem import Problem
 
 
 def one_position(problem: Problem) -> bool:
-    """Return whether a single position, seen from stations that stay, is all that needs a start."""
+    """Return whether the only unknown state is one position.
+
+    This holds for a single unknown target, if it and the stations are at rest, or if there is only one epoch.
+    """
     if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
         return False
     still = problem.stations.position.shape[-3] == 1 and problem.motions[0].order == 0
@@ -26,7 +29,7 @@ def one_position(problem: Problem) -> bool:
 
 
 def is_of_ranges(kind: str) -> bool:
-    """Return whether a kind is a sum or a ratio of ranges."""
+    """Return whether the formula of a kind is a sum or a ratio of ranges."""
     model = MODELS[kind]
     return model.ranges is not None or (model.lifted is not None and not model.axes)
 
@@ -41,9 +44,9 @@ def rows_of_stations(problem: Problem) -> Array:
 
 
 def mirror(problem: Problem, position: Array) -> Array:
-    """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
+    """Return points (N, ..., d), metres, mirrored in the plane (or line) that fits the stations best."""
     centre, axes, _, _ = plane_of_stations(problem)
-    # eigenvalues ascend: the stations spread least along the first vector
+    # eigenvalues are ascending, so the stations spread least along the first vector
     normal = axes[..., :, 0]
     shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
     across, middle = normal.reshape(shape), centre.reshape(shape)
@@ -53,14 +56,14 @@ def mirror(problem: Problem, position: Array) -> Array:
 def plane_of_stations(problem: Problem) -> tuple[Array, Array, Array, Array]:
     """Return the plane (or line) that fits the stations of each problem best.
 
-    Stations that stay count where a row is present of them, those that move as they are.
+    Stations at rest are used if a row of them is present; moving stations are always used.
 
     Returns
     -------
     centre : array (N or 1, d)
         Mean of the stations, metres.
     axes : array (N or 1, d, d)
-        Unit vectors, in columns: the normal first, and the axis along which the stations spread most last.
+        Unit vectors, in columns: first the normal, last the axis along which the stations spread most.
     off, size : array (N or 1,)
         Greatest distances of a station from the plane and from the centre, metres.
     """
@@ -81,14 +84,14 @@ def plane_of_stations(problem: Problem) -> tuple[Array, Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """Steps of M problems whose target is mirrored in a plane.
+    """Steps of M problems whose target has a mirror image in a plane.
 
     Parameters
     ----------
     column : int
-        The distance from the plane among the shared unknowns.
+        Column of the distance from the plane in the shared unknowns.
     least : array (M,)
-        The distance that counts as zero, metres: so small that its square changes no range.
+        Distance that counts as zero, metres: its square is so small that it changes no range.
     held : bool
         Whether the target stays on the plane.
     """
@@ -98,20 +101,20 @@ class Folded:
     held: bool = False
 
     def take(self, items: Array) -> Folded:
-        """Return some of them."""
+        """Return the steps of the selected problems."""
         return replace(self, least=self.least[items])
 
     def step(self, equations: Normal, damping: Array, x: Array) -> tuple[Array, Array]:
-        """Return the damped steps (M, size), and where they exist (M,); on the plane none leads across it.
+        """Return the damped steps (M, size), and whether they exist (M,); no step from the plane crosses it.
 
-        A step of Gauss and Newton in q is one in w to first order, ``dq = 2 w dw``: `retract` makes it one in q.
+        A Gauss-Newton step in q is a step in w to first order, ``dq = 2 w dw``; `retract` converts it to a step in q.
         """
         at = x[:, self.column] <= self.least
         stays = at & (self.held | (equations.shared_vector[:, self.column] <= 0.0))
         return step(_without(equations, self.column, stays), damping)
 
     def retract(self, x: Array, move: Array) -> Array:
-        """Return the vectors (M, size) that steps (M, size) from vectors lead to."""
+        """Return the vectors (M, size) after steps (M, size)."""
         out, w = x + move, x[:, self.column]
         square = w * w + 2.0 * w * move[:, self.column]
         out[:, self.column] = np.sqrt(np.maximum(square, self.least**2))
@@ -119,13 +122,13 @@ class Folded:
 
 
 def _without(equations: Normal, column: int, items: Array) -> Normal:
-    """Return normal equations in which a shared unknown of some problems does not move."""
+    """Return normal equations in which a shared unknown of the selected problems does not move."""
     if not items.any():
         return equations
     shared, cross, vector = (np.array(part) for part in (equations.shared, equations.cross, equations.shared_vector))
     own = shared[items, column, column]
     shared[items, column], shared[items, :, column] = 0.0, 0.0
-    # Any pivot serves, for nothing else is left in its row.
+    # Any pivot is valid, because all other entries of its row are zero.
     shared[items, column, column] = np.where(own > 0.0, own, 1.0)
     cross[items, :, column], vector[items, column] = 0.0, 0.0
     return replace(equations, shared=shared, cross=cross, shared_vector=vector)

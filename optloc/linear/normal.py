@@ -1,4 +1,8 @@
-"""A problem linearised at a point: normal equations shaped like an arrow, one block shared and one for each epoch."""
+"""Normal equations of a problem linearised at a point: one block for shared unknowns, and one block for each epoch.
+
+The matrix has the shape of an arrow: local unknowns of different epochs are coupled only by shared unknowns, or by
+walks.
+"""
 
 from __future__ import annotations
 
@@ -19,40 +23,40 @@ from optloc.problem.forms import form_of
 from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, group_members, whiten
 from optloc.problem.problem import Problem
 
-# Station errors that are drawn anew at each epoch and not estimated: they enlarge the noise of the rows.
+# Station errors that are independent in each epoch and not estimated: they enlarge the noise of the rows.
 
 
 def with_station_noise(problem: Problem, x: Array | None = None) -> Problem:
     """Return the problem with its station errors of span "noise" moved into the noise of its rows.
 
-    The covariance of the rows of an epoch becomes R = Q + G P G', with G the derivative of the rows with respect to
-    the station positions and P the covariance of their errors: what is left when the errors are unknowns of each epoch
-    and are eliminated from the normal equations. Where P is isotropic and the rows combine ranges, G P G' does not
-    depend on the place of the target: a station error is then nothing but an arrival error of the same size.
+    The covariance of the rows of an epoch becomes R = Q + G P G'. G is the derivative of the rows with respect to the
+    station positions, and P the covariance of their errors. The result is the same as if the errors were unknowns of
+    each epoch and were eliminated from the normal equations. If P is isotropic and the rows combine ranges, G P G' does
+    not depend on the position of the target. A station error is then equivalent to an arrival error of the same size.
 
     Parameters
     ----------
     problem : Problem
         Batch of problems (...).
     x : array (..., size), optional
-        Where G is taken; None: as if all errors were isotropic, and only for rows that combine ranges.
+        Vectors at which G is computed. None: all errors are treated as isotropic, for rows that combine ranges.
 
     Returns
     -------
     Problem
-        Without station errors; the same problem where their span is not "noise".
+        Without station errors; the same problem if their span is not "noise".
     """
     stations = problem.stations
     if not stations.weighed:
         return problem
     groups = _groups(problem)
     if x is None or not depends_on_place(problem):
-        # Ranges depend on positions alone.
+        # Ranges do not depend on velocities.
         nothing = np.zeros((stations.count, problem.dimension, problem.dimension))
         covariance = nothing if stations.covariance is None else stations.covariance
         more = [_alike(problem, members, covariance) for members in groups]
     else:
-        # G is the Jacobian to station errors as if they were unknowns; they stand last among the local ones.
+        # G is the Jacobian with respect to station errors as unknowns, which are the last of the local ones.
         named, x = with_offsets(problem, x, np.zeros(()))
         _, jacobian = differentiate(named, x)
         parts = np.split(jacobian[..., -offsets_of(problem) :], len(stations.errors), axis=-1)
@@ -65,15 +69,15 @@ def with_station_noise(problem: Problem, x: Array | None = None) -> Problem:
 
 
 def depends_on_place(problem: Problem) -> bool:
-    """Return whether what station errors of span "noise" add to the noise depends on where the target is."""
+    """Return whether the noise that station errors of span "noise" add depends on the position of the target."""
     if not problem.stations.weighed:
         return False
-    # Isotropic errors of ranges project to the same variance along every line of sight.
+    # Isotropic errors project to the same range variance along every line of sight.
     return not problem.stations.isotropic or any(MODELS[rows.kind].ranges is None for rows in problem.rows)
 
 
 def whitener_at(problem: Problem, x: Array) -> tuple[Whitener, ...]:
-    """Return the whitening matrices of a problem's rows, station errors of span "noise" included, at vectors x."""
+    """Return the whitening matrices of a problem's rows, including station errors of span "noise", at vectors x."""
     return whiten(with_station_noise(problem, x).noise, problem.weight)
 
 
@@ -100,12 +104,12 @@ def with_offsets(problem: Problem, x: Array, offsets: Array) -> tuple[Problem, A
 
 
 def offsets_of(problem: Problem) -> int:
-    """Return how many errors the stations have at an epoch, those of positions and of velocities together."""
+    """Return the number of station errors in an epoch, of positions and of velocities together."""
     return len(problem.stations.errors) * problem.stations.count * problem.dimension
 
 
 def _groups(problem: Problem) -> list[Array]:
-    """Return the rows (g, r) that may be correlated: those of one epoch, or all where noise ties the epochs."""
+    """Return the rows (g, r) that may be correlated: rows of one epoch, or all rows if noise correlates epochs."""
     epoch = problem.epoch
     if any((epoch[block.row] != epoch[block.row[:, :1]]).any() for block in problem.noise.blocks):
         return [np.arange(problem.count)[None]]
@@ -113,8 +117,11 @@ def _groups(problem: Problem) -> list[Array]:
 
 
 def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
-    """Return what isotropic errors add to groups of rows (g, r): arrival errors of the mean variance of an axis."""
-    # Of isotropic errors this is the variance of each axis; of others it is their mean over all directions.
+    """Return the covariance that isotropic station errors add to groups of rows (g, r).
+
+    They have the effect of arrival errors with the variance of one axis.
+    """
+    # For isotropic errors, this is the variance of each axis; for others, the mean over all directions.
     variance = np.trace(covariance, axis1=-2, axis2=-1) / problem.dimension
     ends = []
     for place in (0, 1):
@@ -125,11 +132,15 @@ def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
 
 
 def _signs(rows: Rows) -> tuple[int, int]:
+    """Return the coefficients of the ranges to both stations of rows; zeros if the kind has none."""
     return MODELS[rows.kind].ranges or (0, 0)
 
 
 def _propagate_all(parts: Sequence[Array], members: Array, problem: Problem) -> Array:
-    """Return what station errors of all sorts add to groups of rows (g, r), of Jacobians (..., m, s * d) to each."""
+    """Return the covariance that all station errors add to groups of rows (g, r).
+
+    `parts` are the Jacobians (..., m, s * d) with respect to each sort of errors.
+    """
     errors = problem.stations.errors
     added = [_propagate(part[..., members, :], c) for part, (_, _, c) in zip(parts, errors, strict=True)]
     return np.asarray(sum(added[1:], added[0]))
@@ -138,13 +149,13 @@ def _propagate_all(parts: Sequence[Array], members: Array, problem: Problem) -> 
 def _propagate(sensitivity: Array, covariance: Array) -> Array:
     """Return G P G' (..., g, r, r) of derivatives G (..., g, r, s * d) and station covariances P (..., s, d, d)."""
     s, d = covariance.shape[-3:-1]
-    # Stations err independently: P is applied station by station, never as one s d by s d matrix.
+    # Errors of stations are independent: P is applied station by station, without a matrix of s d by s d.
     own = sensitivity.reshape(*sensitivity.shape[:-1], s, d)
     spread = np.einsum("...grsd,...sde->...grse", own, covariance).reshape(sensitivity.shape)
     return np.asarray(spread @ np.swapaxes(sensitivity, -1, -2))
 
 
-# One linearisation for everything: residual and Jacobian of a problem at a point.
+# The linearisation: residual and Jacobian of a problem at a point.
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +165,7 @@ class Linear:
     Parameters
     ----------
     residual : array (..., m)
-        Measured less modelled, z - h(x); angles wrapped.
+        Measured minus predicted, z - h(x); angles are wrapped.
     shared : array (..., m, n)
         Derivative of h with respect to the shared unknowns.
     local : array (..., m, l)
@@ -182,7 +193,7 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
     x : array (..., size)
         Parameter vectors, ordered by ``problem.layout``.
     noise : tuple of Whitener, optional
-        Whitening matrices made before; None: made from the problem, station errors of span "noise" at `x` included.
+        Whitening matrices; by default computed from the problem, with station errors of span "noise" at `x`.
 
     Returns
     -------
@@ -200,14 +211,13 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
     )
 
 
-# Sums of information, and what is read off them: local unknowns eliminated, steps, covariances.
+# Sums of information, and results from them: elimination of local unknowns, steps, covariances.
 
 OPEN = 1e-12
-"""Share of its information below which an epoch of a run leaves a combination of its own unknowns open.
+"""Share of its information below which an epoch of a run leaves a combination of its local unknowns undetermined.
 
-Far above rounding: sums over epochs subtract what such a combination takes from the shared unknowns, so that its digits
-must not be noise.
-"""
+The value is far above rounding. The elimination subtracts a term of this combination from the shared unknowns, so that
+its digits must not be noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,15 +231,15 @@ class Normal:
     local : array (..., k, l, l)
         Information of the local unknowns of each epoch.
     cross : array (..., k, n, l)
-        Coupling.
+        Coupling of shared and local unknowns.
     shared_vector : array (..., n)
-        Right-hand side of the shared unknowns.
+        Right side of the shared unknowns.
     local_vector : array (..., k, l)
-        Right-hand side of the local unknowns.
+        Right side of the local unknowns.
     cost : array (...)
         Weighted sum of squared residuals, without a factor 1/2.
     link : array (..., k - 1, l, l), optional
-        Coupling of the local unknowns of each epoch with those of the next: of walks, which priors bring.
+        Coupling of the local unknowns of each epoch with those of the next, which comes from walks.
     """
 
     shared: Array
@@ -242,22 +252,25 @@ class Normal:
 
     @property
     def parts(self) -> tuple[Array, ...]:
-        """Return its arrays, in their order."""
+        """Return the arrays of all fields, in their order."""
         own = (self.shared, self.local, self.cross, self.shared_vector, self.local_vector, self.cost)
         return own if self.link is None else (*own, self.link)
 
     def __add__(self, other: Normal) -> Normal:
-        """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
+        """Return the sum of the information of disjoint epochs.
+
+        Shared parts are added, local parts are concatenated.
+        """
         return total([self, other])
 
 
 def total(parts: Sequence[Normal]) -> Normal:
-    """Return the sum of the information of disjoint stretches of epochs, before priors: local parts are joined once."""
+    """Return the sum of the information of disjoint ranges of epochs, before priors; local parts are concatenated."""
     first = parts[0]
     if len(parts) == 1:
         return first
     shared, vector, cost = (sum(getattr(p, name) for p in parts) for name in ("shared", "shared_vector", "cost"))
-    # Without local unknowns nothing is joined: blocks of length zero stay as they are.
+    # Without local unknowns nothing is concatenated: the empty blocks do not change.
     if first.local.shape[-1] == 0:
         return Normal(shared, first.local, first.cross, vector, first.local_vector, cost)
     local, cross = (np.concatenate([getattr(p, name) for p in parts], axis=-3) for name in ("local", "cross"))
@@ -275,7 +288,7 @@ def normal(linear: Linear, epochs: int) -> Normal:
         Number of epochs k.
     """
     n, length, xp = linear.shared.shape[-1], linear.local.shape[-1], library(linear.residual)
-    # Jacobian and residual as one matrix: its Gram matrix holds information, vector and cost.
+    # Jacobian and residual as one matrix, whose Gram matrix contains information, right side and cost.
     stacked = xp.concat([linear.shared, linear.local, linear.residual[..., None]], axis=-1)
     single = epochs == 1 or length == 0
     gram: Any = as_array_like(np.zeros(()), linear.residual)
@@ -286,7 +299,7 @@ def normal(linear: Linear, epochs: int) -> Normal:
         gram = gram + (white.mT @ white if not single else (white.mT @ white)[..., None, :, :])
     last = n + length
     flat = gram[..., 0, :, :] if single else xp.sum(gram, axis=-3)
-    # Without local unknowns one empty block stands for all epochs.
+    # Without local unknowns, one empty block represents all epochs.
     k = epochs if length else 1
     batch = flat.shape[:-2]
     return Normal(
@@ -300,8 +313,11 @@ def normal(linear: Linear, epochs: int) -> Normal:
 
 
 def _by_epoch(white: Any, epoch: Array, epochs: int) -> Any:
-    """Return the rows (..., m, p) of each epoch (..., k, r, p), zero beyond its own number of rows."""
-    # Epochs of equal length in one array: rows of shorter ones are filled up with zeros, which add nothing.
+    """Return the rows (..., m, p) sorted by epoch (..., k, r, p).
+
+    Rows beyond the number of rows of an epoch are zero.
+    """
+    # All epochs have the same length in the array: shorter ones are filled with zeros, which add nothing.
     order = np.argsort(epoch, kind="stable")
     sizes = np.bincount(epoch, minlength=epochs)
     most = max(1, int(sizes.max(initial=0)))
@@ -313,23 +329,27 @@ def _by_epoch(white: Any, epoch: Array, epochs: int) -> Any:
 
 
 def marginal(equations: Normal) -> tuple[Array, Array, Array]:
-    """Return information (..., n, n) and vector (..., n) of the shared unknowns with the local ones eliminated, and ok.
+    """Return information (..., n, n) and right side (..., n) of the shared unknowns without the local ones, and ok.
 
-    Schur complement epoch by epoch. Of several epochs one may leave some of its own unknowns open: what it says about
-    the shared ones counts all the same. `ok` (...) is False where the only epoch does so.
+    The function computes the Schur complement of each epoch. If one of several epochs leaves some of its local unknowns
+    undetermined, its information about the shared unknowns is still used. `ok` (...) is False if the only epoch leaves
+    local unknowns undetermined.
     """
     return _eliminate(equations)[:3]
 
 
 def _eliminate(equations: Normal) -> tuple[Array, Array, Array, Array]:
-    """Return what `marginal` does, and the solutions (..., k, l, n + 1) of the local systems: coupling, then vector."""
+    """Return the results of `marginal`, and the solutions (..., k, l, n + 1) of the local systems.
+
+    The solutions contain the coupling (n columns), then the right side.
+    """
     xp = library(equations.cost)
     right = xp.concat([equations.cross.mT, equations.local_vector[..., None]], axis=-1)
     if equations.local.shape[-1] == 0:
         return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool), right
-    # Coupling and vector are solved for at once.
+    # One solution for coupling and vector together.
     solved, ok = _solve_local(equations, right)
-    # One product over all epochs: their own products would take the square of the shared unknowns for each of them.
+    # One product over all epochs: separate products would store n^2 numbers for each epoch.
     lost = _joined(equations.cross.mT).mT @ _joined(solved)
     return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok, solved
 
@@ -342,7 +362,7 @@ def _joined(blocks: Array) -> Array:
 
 
 def eliminated(equations: Normal) -> Normal:
-    """Return the information about the shared unknowns alone: local ones take the values that fit best."""
+    """Return the normal equations of the shared unknowns only; the local ones take the values that fit best."""
     information, vector, _, held = _eliminate(equations)
     cost = equations.cost
     if equations.local.shape[-1]:
@@ -352,17 +372,17 @@ def eliminated(equations: Normal) -> Normal:
 
 
 def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
-    """Return solutions (..., k, l, p) of the local systems, of least norm where they are singular, and ok (...)."""
+    """Return solutions (..., k, l, p) of the local systems, of least norm if they are singular, and ok (...)."""
     local, xp = equations.local, library(equations.local)
     if equations.link is not None:
         return chain.solve(_hold_untouched(local), equations.link, right)
-    # A single epoch that leaves its own unknowns open leaves the fix open: that is for the caller to see.
+    # If a single epoch leaves its local unknowns undetermined, so is the fix; the caller handles this case.
     if local.shape[-3] == 1:
         solved, good = linalg.solve(_hold_untouched(local), right)
         return solved, xp.all(good, axis=-1)
     solved, good = linalg.solve(local, right, OPEN)
-    # Of a run, an epoch may leave a combination open (one arrival, no emission time): least norm moves only what it
-    # knows.
+    # In a run, an epoch may leave a combination undetermined (one arrival, unknown emission time). The least norm moves
+    # only the determined part.
     if xp is np and not good.all():
         root, _ = linalg.root(local[~good])
         solved[~good] = root @ (root.mT @ np.broadcast_to(right, solved.shape)[~good])
@@ -373,23 +393,23 @@ def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
 
 
 def _hold_untouched(local: Array) -> Array:
-    """Return local blocks with a one for every unknown that no row touches: it stays where it is and hides no other."""
+    """Return local blocks with 1 on the diagonal for unknowns without rows, so that their step is zero."""
     dead = library(local).linalg.diagonal(local) == 0.0
     grown: Array = local + as_number(dead, local)[..., None] * eye(local.shape[-1], local)
     return grown
 
 
 def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
-    """Return the covariance (..., k, size, size) of the first local unknowns of each epoch; NaN where they are open.
+    """Return the covariance (..., k, size, size) of the first local unknowns of each epoch; NaN if not determined.
 
     Parameters
     ----------
     equations : Normal
-        Normal equations at an answer.
+        Normal equations at the estimate.
     shared : array (..., n, n)
-        Covariance of the shared unknowns there.
+        Covariance of the shared unknowns.
     size : int
-        How many of the local unknowns are wanted.
+        Number of local unknowns in the result.
     """
     if equations.link is None:
         inverse, good = linalg.inverse(equations.local, OPEN)
@@ -398,29 +418,30 @@ def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
         held = _hold_untouched(equations.local)
         inverse, whole = chain.inverse_blocks(held, equations.link)
         gain, _ = chain.solve(held, equations.link, equations.cross.mT)
-        # of states of their own, an epoch may leave some open all the same
+        # an epoch may still leave some of its other local unknowns undetermined
         good = whole[..., None] & linalg.solve(held, np.zeros((*held.shape[:-1], 0)), OPEN)[1]
-    # Own errors, and those that come from the shared unknowns.
+    # The errors of the local unknowns, plus errors that come from the shared unknowns.
     full = inverse + gain @ shared[..., None, :, :] @ np.swapaxes(gain, -1, -2)
     return np.where(good[..., None, None], full, np.nan)[..., :size, :size]
 
 
 def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple[Array, Array]:
-    """Return the damped step (..., size) of the full parameter vector, and where it exists (...).
+    """Return the damped step (..., size) of the full parameter vector, and whether it exists (...).
 
     Parameters
     ----------
     equations : Normal
-        Information and right-hand side.
+        Information and right side.
     damping : array (...)
         Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``.
     along : array (..., n, q), optional
-        Basis of the shared part of the step, for instance of the tangent space of equalities; None: all unknowns move.
+        Basis for the shared part of the step, for instance of the tangent space of equalities. None: all unknowns move.
     """
     damped = _damp(equations, damping)
     information, vector, ok, held = _eliminate(damped)
     if equations.link is not None:
-        # Beside walks, which follow whatever is shared, little of what rows say of it is left: that is what is scaled.
+        # Walks follow the shared unknowns, so that the rows have little information about these unknowns. This
+        # information is damped.
         information = _grow(information, damping)
     if along is not None:
         shared, good = linalg.solve_within(information, vector, along)
@@ -432,29 +453,31 @@ def step(equations: Normal, damping: Array, along: Array | None = None) -> tuple
         shared = vector
     if damped.local.shape[-1] == 0:
         return shared, ok
-    # Back substitution: what an epoch does by itself, less what the shared step takes from it.
+    # Back substitution: the step of the epoch for fixed shared unknowns, less its change by the shared step.
     local, xp = held[..., -1] - (held[..., :-1] @ shared[..., None, :, None])[..., 0], library(held)
     flat = xp.reshape(local, (*local.shape[:-2], -1))
     return xp.concat([shared, flat], axis=-1), ok
 
 
 def _damp(equations: Normal, damping: Array) -> Normal:
+    """Return normal equations with a damped diagonal; the local unknowns of walks are not damped."""
     local = _grow(equations.local, damping[..., None])
     if equations.link is None:
         return replace(equations, shared=_grow(equations.shared, damping), local=local)
-    # Walks enter linearly, and the precision of their steps beside that of the rows would hold them where they are.
+    # Walks are linear. Their steps have a high precision compared with the rows, and damping would keep them from
+    # moving.
     walking = np.diagonal(equations.link, axis1=-2, axis2=-1).any(tuple(range(equations.link.ndim - 2)))
     return replace(equations, local=np.where(walking, equations.local, local))
 
 
 def _grow(matrix: Array, factor: Array) -> Array:
-    """Return a matrix with its diagonal times (1 + factor): Marquardt's scaling knows no units."""
+    """Return a matrix with its diagonal times (1 + factor): Marquardt's scaling is independent of units."""
     grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
     return grown
 
 
 def covariance(equations: Normal) -> tuple[Array, Array]:
-    """Return the covariance (..., n, n) of the shared unknowns, NaN where singular, and where it exists (...)."""
+    """Return the covariance (..., n, n) of the shared unknowns, NaN if singular, and whether it exists (...)."""
     information, _, ok = marginal(equations)
     inverse, good = linalg.inverse(information)
     xp = library(inverse)
@@ -462,13 +485,13 @@ def covariance(equations: Normal) -> tuple[Array, Array]:
 
 
 def decrement(equations: Normal, move: Array, layout_n: int) -> Array:
-    """Return the squared length of a step in units of its own standard deviations, (...)."""
+    """Return the squared length (...) of a step in standard deviations."""
     shared = move[..., :layout_n]
     local = move[..., layout_n:].reshape(*equations.local_vector.shape)
     return np.asarray((shared * equations.shared_vector).sum(-1) + (local * equations.local_vector).sum((-1, -2)))
 
 
-# Gaussian prior knowledge of named unknowns, as information.
+# Gaussian priors of named unknowns, as information.
 
 
 def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool = True, local: bool = True) -> Normal:
@@ -479,11 +502,11 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
     problem : Problem
         Priors on named unknowns, biases and station positions.
     x : array (..., size)
-        Where the problem was linearised.
+        Vectors at which the problem was linearised.
     equations : Normal
-        Of the measurements alone.
+        Normal equations of the measurements.
     shared, local : bool
-        Which priors are added: those of shared unknowns, those of unknowns local to each epoch.
+        Whether to add the priors of shared unknowns, and the priors of local unknowns.
     """
     layout = problem.layout
     parts = [part for part in prior_parts(problem) if (shared if layout.find(part[0])[1] else local)]
@@ -497,7 +520,7 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
     for name, mean, precision in parts:
         slot, is_shared = layout.find(name)
         width = layout.n_shared if is_shared else layout.n_local
-        # Columns of the unit matrix put a block where it belongs: some libraries cannot write into an array.
+        # A product with columns of the unit matrix places a block: some libraries cannot write into an array.
         pick = as_array_like(np.eye(width)[:, slot.start : slot.start + slot.size], x)
         precision = as_array_like(precision, x)  # noqa: PLW2901  # the same numbers, elsewhere
         error = (
@@ -518,7 +541,7 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
 
 
 def _with_walks(problem: Problem, x: Array, equations: Normal) -> Normal:
-    """Return normal equations with what the walks say of neighbouring epochs."""
+    """Return normal equations with the information of the walks about successive epochs added."""
     walked = chain_at(problem, x)
     link = np.broadcast_to(walked.link, (*equations.cost.shape, *walked.link.shape))
     return replace(
@@ -531,7 +554,7 @@ def _with_walks(problem: Problem, x: Array, equations: Normal) -> Normal:
 
 
 def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
-    """Return (name, mean, precision) of every prior but those of walks; local ones have an epoch axis of length one."""
+    """Return (name, mean, precision) of every prior except walks; local ones have an epoch axis of length one."""
     parts, layout = [], problem.layout
     for prior in problem.priors:
         precision, _ = linalg.inverse(prior.covariance)
@@ -539,7 +562,7 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
         mean = prior.mean if is_shared else prior.mean[..., None, :]
         parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
     for bias in problem.biases:
-        # what is known of walks ties epochs: `chain_at`
+        # priors of walks couple epochs, see `chain_at`
         if bias.sigma is not None and form_of(bias).steps is None:
             sigma = np.ravel(bias.sigma)
             # Members of a bias are independent of each other a priori.
@@ -554,6 +577,7 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
 
 
 def _block_diagonal(blocks: Array) -> Array:
+    """Return blocks (..., s, d, d) as block-diagonal matrices (..., s d, s d)."""
     s, d = blocks.shape[-3], blocks.shape[-1]
     apart = as_array_like(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
     whole: Array = library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))

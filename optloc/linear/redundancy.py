@@ -1,4 +1,4 @@
-"""Degrees of freedom of a problem: how many more rows than unknowns it has."""
+"""Degrees of freedom of a problem: the number of rows less the number of unknowns."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from optloc.problem.problem import Problem
 
 
 def degrees_of_freedom(problem: Problem) -> Array:
-    """Return rows present (the rank of their noise) less unknowns without a prior, (N,).
+    """Return the number of present rows (rank of their noise) less unknowns without a prior, (N,).
 
-    An unknown of an epoch, such as the emission time of a target, counts where a row that is present depends on it.
+    A local unknown, such as the emission time of a target, counts if a present row depends on it.
     """
     rank: Any = np.zeros(problem.batch_shape, dtype=int)
     local: Any = 0
-    # Each unknown with a prior adds one row: both count for nothing.
+    # Each unknown with a prior adds one row, so that both cancel.
     known = (
         {prior.name for prior in problem.priors}
         | {b.name for b in problem.biases if b.sigma is not None}
@@ -35,19 +35,19 @@ def degrees_of_freedom(problem: Problem) -> Array:
     states, emissions = _sizes(problem, known)
     for _, _, part in windows(problem, len(problem.weight) if problem.weight.ndim > 1 else 1):
         for whitener in whiten(part.noise, part.weight):
-            # One matrix may stand for all groups; a whitener has as many rows that are not zero as its covariance has
-            # rank.
+            # One matrix may represent all groups. A whitening matrix has as many nonzero rows as the rank of its
+            # covariance.
             same = len(whitener.row) if whitener.matrix.shape[-3] == 1 else 1
             rank = rank + same * (whitener.matrix != 0.0).any(-1).sum((-1, -2))
         local = local + _local_unknowns(part, states, emissions)
     shared = sum(slot.size for slot in problem.layout.shared if slot.name not in known)
-    # The steps of a walk add as many rows as unknowns: only the unknowns that begin it are left.
+    # The steps of a walk add as many rows as unknowns, so that only its initial unknowns count.
     unknowns = shared + local + count_free_unknowns(problem)
     return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
 
 
 def present_unknowns(problem: Problem) -> Array:
-    """Return the number of unknowns (...) that the rows present depend on; shared unknowns and walks all count."""
+    """Return the number of unknowns (...) that present rows depend on; shared unknowns and walks always count."""
     layout = problem.layout
     states, emissions = _sizes(problem, set())
     local = problem.stations.errors if problem.stations.unknown_for == "epoch" else ()
@@ -57,14 +57,9 @@ def present_unknowns(problem: Problem) -> Array:
 
 
 def _sizes(problem: Problem, known: set[str]) -> tuple[Array, Array]:
-    """Return the numbers of unknowns (targets,) that the state and the emission time of a target have in each epoch.
+    """Return two arrays (targets,): the number of state unknowns and of emission times of each target in an epoch.
 
-    Parameters
-    ----------
-    problem : Problem
-        With its targets.
-    known : set of str
-        Slots that do not count.
+    Slots whose names are in `known` do not count.
     """
     count = len(problem.motions)
     states, emissions = np.zeros(count, dtype=int), np.zeros(count, dtype=int)
@@ -77,14 +72,9 @@ def _sizes(problem: Problem, known: set[str]) -> tuple[Array, Array]:
 
 
 def _local_unknowns(problem: Problem, states: Array, emissions: Array) -> Array:
-    """Return the number of unknowns (...) of single epochs that a row which is present depends on.
+    """Return the number of local unknowns (...) that a present row depends on.
 
-    Parameters
-    ----------
-    problem : Problem
-        Batch of problems (...).
-    states, emissions : int array (targets,)
-        Unknowns of a target in an epoch: its state, and its emission time, of which only some kinds depend.
+    `states` and `emissions` (targets,) are the results of `_sizes`; only some kinds depend on the emission time.
     """
     total = np.zeros(problem.batch_shape, dtype=int)
     if not states.any() and not emissions.any():
@@ -112,5 +102,5 @@ def _targets(problem: Problem) -> tuple[list[Array], list[Array]]:
 
 @lru_cache(maxsize=512)
 def largest(dof: int, probability: float) -> float:
-    """Return the cost that noise exceeds with a probability; infinite without redundancy."""
+    """Return the cost that noise exceeds with a given probability; infinite without redundancy."""
     return float(2.0 * gammainccinv(dof / 2, probability)) if dof > 0 else np.inf

@@ -1,4 +1,4 @@
-"""Draw measurements of a known truth: from the same seed the same numbers, bit for bit, on every processor."""
+"""Simulated measurements of a known truth; the same seed gives identical numbers on every processor."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     problem : Problem
         Stations, rows and noise; its measurements are ignored. Station errors of span "noise" are drawn as well.
     truth : array (..., size)
-        True parameter vectors in the order of ``problem.layout``; leading axes must fit the problem's.
+        True parameter vectors in the order of ``problem.layout``; leading axes must fit the axes of the problem.
     seed : int or SeedSequence
-        Decides the draw, whatever else runs and wherever.
+        Seed of the random numbers; nothing else changes the result.
     trials : int, optional
         Number of independent draws of each truth; they become the first axis.
 
     Returns
     -------
     Problem
-        With leading axes (trials, ...), or (...).
+        Problem with leading axes (trials, ...), or (...).
     """
     rng = np.random.default_rng(seed)
     truth = np.asarray(truth, dtype=float)
@@ -39,9 +39,9 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     if trials is not None:
         shape = (trials, *shape)
     noise = draw(problem.noise, problem.count, shape, rng)
-    # Noise is drawn before station errors: problems with and without those meet the same noise.
+    # Noise is drawn before station errors, so that problems with and without station errors have the same noise.
     real, x = _displace(problem, truth, shape, rng)
-    # Angles and levels too: the last bit of a sine is otherwise that of a library.
+    # `Portable` computes sines and other functions without the C library, whose last bit depends on the platform.
     z = noise + np.asarray(predict(real, x.view(arrays.Portable)))
     values = []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -54,7 +54,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
 def _displace(
     problem: Problem, truth: Array, shape: tuple[int, ...], rng: np.random.Generator
 ) -> tuple[Problem, Array]:
-    """Return the problem with the stations where they really are, as far as their errors are noise, and its truth."""
+    """Return the problem with stations moved by drawn errors of span "noise", and the truth for this problem."""
     stations = problem.stations
     if not stations.weighed:
         return problem, truth
@@ -68,7 +68,7 @@ def _displace(
 
 def samples(covariance: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     """Return normal samples (*shape, r) of covariances (..., r, r) whose leading axes fit the shape."""
-    # Not by eigenvectors: those of equal eigenvalues are whatever a BLAS makes of them, and so would be the data.
+    # Not by eigenvectors: for equal eigenvalues they depend on the BLAS library, and so would the data.
     factor = linalg.factor_semidefinite(covariance)
     return arrays.product(rng.standard_normal((*shape, covariance.shape[-1])), np.swapaxes(factor, -1, -2))
 

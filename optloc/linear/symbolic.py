@@ -1,4 +1,7 @@
-"""The same problem on CasADi symbols: residuals for nonlinear programs, from the same models and the same indices."""
+"""Residuals and constraints of a problem as CasADi expressions, for nonlinear programs.
+
+They use the same models and the same indices as the numerical code.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from optloc.problem.problem import Problem
 
 
 def parameters(problem: Problem) -> Array:
-    """Return the numbers (p,) that the symbolic residual of a single problem needs beside x and z."""
+    """Return the numbers (p,) that the symbolic residual of a single problem needs in addition to x and z."""
     values = [np.zeros(0)]
     for links in block_links(problem):
         inputs = given(problem, links)
@@ -40,18 +43,18 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
     """
     out, used = [], 0
     for links, start in zip(block_links(problem), problem.starts, strict=True):
-        # Sorted in `parameters` too: numbers and symbols meet by their place.
+        # `parameters` sorts as well, so that numbers and symbols have the same order.
         seeds = sorted(given(problem, links))
         for i in range(links.block.count):
             inputs = {seed: p[used + j * links.block.count + i] for j, seed in enumerate(seeds)}
             for feed in links.feeds:
                 rows = np.arange(links.block.count)[feed.rows]
-                # Row by row: symbols are scalars, and the expression is built once for each structure.
+                # Row by row, because symbols are scalars; the expression is built once for each structure.
                 for at in np.flatnonzero(rows == i):
                     gain = np.broadcast_to(feed.gain, feed.column.shape)[at]
                     inputs[feed.seed] = inputs.get(feed.seed, 0.0) + float(gain) * x[int(feed.column[at])]
             value = links.model.h(*join(problem, links.model, inputs))
-            # The same order as in `optloc.linear.evaluate`: scaled, then shifted.
+            # The same order as in `optloc.linear.evaluate`: first scaled, then shifted.
             value = value * (1.0 + _total(links.gains, i, x)) + _total(links.adds, i, x)
             misfit = z[start + i] - value
             out.append(wrap(misfit) if links.model.period is not None else misfit)
@@ -60,6 +63,7 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
 
 
 def _total(terms: Terms, row: int, x: Any) -> Any:
+    """Return the sum of the linear terms of a row."""
     return sum(float(terms.coefficient[i]) * x[int(terms.column[i])] for i in np.flatnonzero(terms.row == row))
 
 
@@ -83,7 +87,7 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
     p : casadi.SX (q, 1)
         Numbers in the order of `bounds`.
     length : casadi.SX
-        By which quantities in metres are divided.
+        Unit of length: divisor of quantities in metres.
     """
     equal: list[Any] = []
     more: list[Any] = []
@@ -96,7 +100,7 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
         unit = length if surface.unit == "m" else 1.0
         for epoch in decisive_epochs(problem, band):
             value = bounded(problem, band, _states(problem, band.target, x), c, epoch)
-            # Which side exists is part of the structure; where it lies is a parameter.
+            # Whether a side exists is part of the structure; its value is a parameter.
             if np.all(band.lower == band.upper):
                 equal.append((value - lower) / unit)
                 continue
@@ -108,6 +112,7 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
 
 
 def _states(problem: Problem, target: int, x: Any) -> list[tuple[Any, ...]]:
+    """Return the state of a target as tuples of symbols: position, velocity, acceleration."""
     names = state_names(target, len(problem.motions), problem.motions[target].order)
     starts = [problem.layout.find(name)[0].start for name in names]
     return [tuple(x[start + i] for i in range(problem.dimension)) for start in starts]

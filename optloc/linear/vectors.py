@@ -1,4 +1,4 @@
-"""Parameter vectors of problems of one position: other unknowns take their prior mean, or fit it."""
+"""Parameter vectors from positions: the other unknowns get their prior mean, or the value that fits best."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def vectors(problem: Problem, position: Array | None) -> Array:
     problem : Problem
         Flat batch of N problems.
     position : array (N, q, d or more), optional
-        Of the only target, with what of its state follows; None: vectors (N, size) without any state.
+        Positions of the only target, optionally followed by velocity and acceleration. None: vectors (N, size) without
+        any state.
     """
     layout = problem.layout
     x = np.zeros(((problem.batch_shape[0],) if position is None else position.shape[:-1]) + (layout.size,))
@@ -39,7 +40,7 @@ def vectors(problem: Problem, position: Array | None) -> Array:
 
 
 def complete(problem: Problem, shared: Array) -> Array:
-    """Return full parameter vectors (N, q, size) of shared unknowns (N, q, n): local ones as fit them, or zero."""
+    """Return full parameter vectors (N, q, size) for shared unknowns (N, q, n); local ones fit best, or are zero."""
     x = np.zeros((*shared.shape[:-1], problem.layout.size))
     x[..., : shared.shape[-1]] = shared
     x[np.isnan(shared).any(-1)] = np.nan
@@ -47,13 +48,14 @@ def complete(problem: Problem, shared: Array) -> Array:
 
 
 def _fit_emission_times(problem: Problem, x: Array) -> Array:
-    """Return vectors (N, q, size) with the emission times that fit their positions: the mean of what is left over."""
+    """Return vectors (N, q, size) with the emission times that fit best: the mean of the remaining residuals."""
     size, q = x.shape[:2]
     part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, x.shape[-1]).copy()
     usable = np.asarray(np.isfinite(out).all(-1))
     left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
     present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
-    # an emission enters each of its rows with factor one: the mean of the rest fits it; without a row it stays zero
+    # an emission time has the factor one in each of its rows, so the mean residual fits best; without a row it stays
+    # zero
     for links, start in zip(block_links(problem), problem.starts, strict=True):
         own = np.isin(links.adds.column, emissions) & links.model.emission
         column, rows = links.adds.column[own], start + links.adds.row[own]
@@ -73,22 +75,22 @@ def emission_columns(problem: Problem) -> Array:
 
 
 def problem_at_rest(problem: Problem) -> Problem:
-    """Return the problem of the position alone: one static target, nothing else unknown but emission times."""
+    """Return the problem with a static target and no other unknowns than position and emission times."""
     motions = tuple(replace(motion, order=0) for motion in problem.motions)
     return replace(without_biases(problem), motions=motions)
 
 
 def without_biases(problem: Problem) -> Problem:
-    """Return a flat batch of problems without biases and priors: what is unknown of them is known as its prior mean.
+    """Return a flat batch of problems without biases and priors: each bias is fixed at its prior mean.
 
-    Offsets, drifts and scales without a prior are taken for zero, rotations always are.
+    Offsets, drifts and scales without a prior are set to zero, and rotations always.
     """
     x, rows = vectors(problem, None), []
     for links, block in zip(block_links(problem), problem.rows, strict=True):
         gain, added = links.gains.total(x, block.count), links.adds.total(x, block.count)
-        # a row says z = (1 + gain) h(x) + added + correction: solved for h(x)
+        # a row is z = (1 + gain) h(x) + added + correction, solved for h(x)
         z = (block.z - block.correction - added) / (1.0 + gain)
-        # rows that no bias touches stay as they are, to the last bit
+        # rows without a bias are not changed, not even by rounding
         known = replace(block, z=z, correction=np.zeros(block.count))
         rows.append(known if gain.any() or added.any() else block)
     return replace(problem, rows=tuple(rows), biases=(), priors=())

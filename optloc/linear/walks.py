@@ -1,4 +1,4 @@
-"""What walks of biases say of the unknowns of neighbouring epochs, as information."""
+"""Random walks of biases as information that couples the unknowns of successive epochs."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ def walks(problem: Problem) -> tuple[Bias, ...]:
 
 
 def walk_names(problem: Problem) -> tuple[str, ...]:
-    """Return the names of the unknowns of epochs that walk: values, and rates."""
+    """Return the names of the local unknowns that walk: values and rates."""
     return tuple(name for bias in walks(problem) for name in state_of(bias))
 
 
 def count_free_unknowns(problem: Problem) -> int:
-    """Return how many unknowns of all walks nothing is known of beforehand: what begins them, not their steps."""
+    """Return the number of initial values of all walks without a prior; the steps of walks do not count."""
     return sum(len(b.members) * len(state_of(b)) - (0 if b.sigma is None else np.size(b.sigma)) for b in walks(problem))
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Information about the unknowns of k epochs that ties each epoch to the next.
+    """Information about the unknowns of k epochs that couples each epoch to the next.
 
     Parameters
     ----------
     block : array (k, l, l)
-        About the unknowns of an epoch.
+        Information about the unknowns of an epoch.
     link : array (k - 1, l, l)
-        Rows of an epoch, columns of the next.
+        Coupling: rows of an epoch, columns of the next.
     vector : array (..., k, l)
-        Right-hand side at given vectors.
+        Right side at given vectors.
     cost : array (...)
-        What the steps cost there.
+        Cost of the steps at these vectors.
     """
 
     block: Array
@@ -53,10 +53,10 @@ class Chain:
 
 
 def chain_at(problem: Problem, x: Array) -> Chain:
-    """Return what the walks of a problem say at vectors x (..., size).
+    """Return the information of the walks of a problem at vectors x (..., size).
 
-    Of the steps ``e = x_{j+1} - F x_j`` with precision W the information is ``F'WF``, ``-F'W`` and ``W``, and the
-    right-hand side ``F'We`` and ``-We``.
+    A step ``e = x_{j+1} - F x_j`` with precision W has the information ``F'WF``, ``-F'W`` and ``W``. Its right side is
+    ``F'We`` and ``-We``.
     """
     layout, k = problem.layout, problem.epochs
     local = layout.split(x)[1]
@@ -101,30 +101,31 @@ def state_columns(layout: Layout, bias: Bias) -> Array:
 def simulate_walks(
     problem: Problem, truth: Array, seed: int | np.random.SeedSequence, trials: int | None = None
 ) -> Array:
-    """Return true parameter vectors whose walks are drawn: they begin where the given ones do.
+    """Return true parameter vectors with simulated walks, which begin at the given values.
 
     Parameters
     ----------
     problem : Problem
-        Its walks say how they go.
+        Problem with the walks.
     truth : array (..., size)
-        True parameter vectors in the order of ``problem.layout``; of walks the first epoch counts.
+        True parameter vectors in the order of ``problem.layout``. For a walk, only the value at the first epoch is
+        used.
     seed : int or SeedSequence
-        Decides the draw.
+        Seed of the random numbers.
     trials : int, optional
         Number of independent draws; they become the first axis.
 
     Returns
     -------
     array (trials, ..., size) or (..., size)
-        For `optloc.simulate`, which draws the noise of the rows.
+        Vectors for `optloc.simulate`, which draws the noise of the rows.
     """
     rng, truth = np.random.default_rng(seed), np.asarray(truth, dtype=float)
     shape = truth.shape if trials is None else (trials, *truth.shape)
     out = np.array(np.broadcast_to(truth, shape))
     local = out[..., problem.layout.n_shared :].reshape(*shape[:-1], problem.epochs, problem.layout.n_local)
     for _, place, F, Q in _steps(problem):
-        # not by eigenvectors, as `optloc.linear.simulate.samples` says
+        # not by eigenvectors, for the reason in `optloc.linear.simulate.samples`
         root = linalg.factor_semidefinite(Q)
         noise = (root @ rng.standard_normal((*shape[:-1], *Q.shape[:-1], 1)))[..., 0]
         for j in range(problem.epochs - 1):
