@@ -1,7 +1,7 @@
-"""The options of numba for kernels, and its pipeline for functions that only kernels call.
+"""The options of numba for kernels, and the compiler pipeline of functions that only kernels call.
 
-A kernel takes in what it calls. To optimise and translate a callee alone, and once more in each caller, took half of
-the time of a compilation. So callees stop before these steps.
+A kernel contains its callees. To optimise and translate a callee separately, and again in each caller, took half of the
+compilation time. So the compilation of callees stops before these steps.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from optloc.kernels.no_refcount_pass import borrowing
 def options(*, callee: bool, taken_in: bool) -> dict[str, Any]:
     """Return the options of numba's `njit` for a kernel.
 
-    Without an entry for C, which has no caller, compilation takes a fifth less time. LLVM inlines, because numba's own
-    way to join sources takes longer.
+    Without an entry point for C, which no caller uses, compilation takes a fifth less time. LLVM inlines functions,
+    because numba's method of joining sources takes longer.
     """
     common = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "forceinline": taken_in}
     return common | ({"no_cpython_wrapper": True, "pipeline_class": callee_compiler()} if callee else {})
@@ -25,7 +25,7 @@ def options(*, callee: bool, taken_in: bool) -> dict[str, Any]:
 
 @cache
 def callee_library() -> Any:
-    """Return numba's type of the code of a callee, which is neither optimised nor translated."""
+    """Return numba's type for the code of a callee, which is neither optimised nor translated."""
     from llvmlite import binding
     from numba.core import codegen
 
@@ -33,7 +33,7 @@ def callee_library() -> Any:
     numba: Any = codegen
 
     class Callee(numba.JITCodeLibrary):  # type: ignore[misc]
-        # No code of it is in the engine, so there is no place for an environment.
+        # The engine contains no code of a callee, so an environment cannot be set.
         codegen = SimpleNamespace(set_env=lambda name, environment: None)
 
         def _optimize_final_module(self) -> None:
@@ -51,7 +51,7 @@ def callee_library() -> Any:
 
         @classmethod
         def read(cls, engine: Any, stored: tuple[str, str, bytes]) -> Any:
-            """Return a stored library, in the engine of this process."""
+            """Return a stored library, loaded into the engine of this process."""
             made = cls(engine, stored[0])
             made._final_module = llvm.parse_bitcode(stored[2])
             made._finalize_final_module()
@@ -62,7 +62,7 @@ def callee_library() -> Any:
 
 @cache
 def callee_compiler() -> Any:
-    """Return numba's compiler of functions that only kernels call, for its option `pipeline_class`."""
+    """Return numba's compiler of functions that only kernels call, for the option `pipeline_class`."""
     from numba.core import compiler
     from numba.core.typed_passes import AnnotateTypes
 

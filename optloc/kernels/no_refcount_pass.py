@@ -1,9 +1,9 @@
-"""Kernels that only borrow arrays: what neither makes nor returns one need not count who refers to those handed on.
+"""A compiler pass that removes reference counts of arrays from functions that make, store and return no array.
 
-numba counts the references to an array wherever a name is given to one, also to a field of a record or a slice: with
-atomic operations, of which a function of a dozen arrays and few sums did more than sums. Whoever calls a function holds
-all that it hands on until the function returns. So one that makes no array, keeps none and returns none may borrow
-them, and its machine code counts nothing; proofs took half of their time to count.
+numba counts the references to an array at each assignment, also of a field of a record or a slice. It uses atomic
+operations, which took more time than the arithmetic in a function of a dozen arrays and few sums. A caller holds all
+arguments until the function returns. So a function that makes, stores and returns no array only borrows its arguments,
+and needs no counts. In proofs, counting took half of the time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-# What may name an array without making one: fields, slices, tuples and loops of what the function was handed.
+# Operations that name an array without making one: fields, slices, tuples and loops of the arguments.
 _BORROWS = {
     "getattr",
     "getitem",
@@ -30,7 +30,7 @@ _BORROWS = {
 
 @cache
 def borrowing() -> Any:
-    """Return numba's pass that lets the functions which only borrow arrays count no references to them."""
+    """Return numba's pass that compiles functions that only borrow arrays without reference counts."""
     from numba.core import compiler_machinery
 
     numba: Any = compiler_machinery  # without types
@@ -52,7 +52,7 @@ def borrowing() -> Any:
 
 
 def only_borrows(state: Any) -> bool:
-    """Return whether a function whose types are known makes, keeps and returns no arrays."""
+    """Return whether a function with inferred types makes, stores and returns no arrays."""
     from numba.core import types
 
     models, numba = state.targetctx.data_model_manager, types
@@ -64,7 +64,7 @@ def only_borrows(state: Any) -> bool:
     if is_counted(state.return_type) or any(
         is_counted(kind) and not isinstance(kind, plain) for kind in state.typemap.values()
     ):
-        return False  # a list keeps what it is given
+        return False  # a list stores its items
     statements = [one for block in state.func_ir.blocks.values() for one in block.body]
     return not any(_makes_or_keeps(one, state.typemap, is_counted) for one in statements)
 
@@ -81,6 +81,6 @@ def _makes_or_keeps(statement: Any, types: Any, is_counted: Any) -> bool:
     made = statement.value
     if not is_counted(types[statement.target.name]):
         return False
-    # An array as an index picks elements, which makes a new one.
+    # An array as an index selects elements, which makes a new array.
     picks = made.op == "getitem" and is_counted(types[made.index.name])
     return picks or made.op not in _BORROWS
