@@ -218,7 +218,7 @@ SHIPPED = {
         {"change": lambda text: text.replace('"clock"', '"position"')},
         ["registration.toml", "'position' is taken"],
     ),
-    "bias twice": ({"change": lambda text: text + CLOCK.replace('"B", "C"', '"R2"')}, ["'clock' is taken twice"]),
+    "bias twice": ({"change": lambda text: text + CLOCK.replace('"B", "C"', '"R2"')}, ["'clock' is used twice"]),
     "bias of a stranger": ({"change": lambda text: text.replace('"R5"', '"R6"')}, ["'clock'", "'R6'", "did you mean"]),
     "bias of a station that is not there": (
         {"rows": lambda t: t[t["a"] != "R5"]},
