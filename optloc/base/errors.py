@@ -107,7 +107,7 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         return " ".join(refused or [verdict.sentence for verdict in verdicts])
 
 
-# Maximum number of names that a message lists, and that the search for similar names compares: it takes milliseconds.
+# Maximum number of names that a message lists, and that the search for similar names compares within a keystroke.
 _FEW, _MANY = 20, 5000
 
 
@@ -163,7 +163,7 @@ def _alike(word: str, known: Iterable[str]) -> list[str]:
 
 
 def status_named(label: str) -> Status:
-    """Return the status with a label such as "too few rows"; raise InvalidProblem if there is no such status."""
+    """Return the status with a label such as "too few rows"; raise InvalidProblem if it does not exist."""
     wanted = label.strip().lower().replace("_", " ").replace("-", " ")
     for status in Status:
         if status.label == wanted:

@@ -2,8 +2,8 @@
 
 The ellipsoid is WGS 84. Latitudes and longitudes are geodetic, in radians. Heights are above the ellipsoid, in metres.
 The library pymap3d, imported at its first use, converts geodetic coordinates to ECEF. The inverse is Bowring's method.
-It uses only additions, products and square roots, which have the same bits on every processor and take a tenth of the
-time of sines and angles.
+It uses only additions, products and square roots. They have the same bits on every processor, and they take a tenth of
+the time of sines and angles.
 
 Sources: NGA, World Geodetic System 1984, NGA.STND.0036 (2014), for the ellipsoid; B. R. Bowring,
 Transformation from spatial to geographical coordinates, Survey Review 23 (1976), for the inverse.
@@ -177,7 +177,7 @@ def geodetic_to_ecef(lat: ArrayLike, lon: ArrayLike, height: ArrayLike) -> Array
     from pymap3d import geodetic2ecef
 
     given = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (lat, lon, height)))
-    # Simulated scenes on Earth must have the same bits everywhere, so the sines are those of `Portable`.
+    # Simulated scenes on Earth must have the same bits everywhere, so `Portable` computes the sines.
     place = geodetic2ecef(*(v.view(Portable) for v in given), deg=False)
     return np.stack(np.broadcast_arrays(*map(np.asarray, place)), axis=-1)
 

@@ -344,7 +344,7 @@ def toml_of(text: str, source: str) -> dict[str, Any]:
 def json_of(text: str, source: str, parse_float: Callable[[str], Any] | None = None) -> Any:
     """Return the content of a JSON text; raise InvalidProblem with the line number if the text is not valid JSON.
 
-    The arguments are those of `toml_of`. `parse_float` converts numbers with a decimal point, for instance to a type
+    The arguments are as for `toml_of`. `parse_float` converts numbers with a decimal point, for instance to a type
     that keeps all digits.
     """
     try:

@@ -14,7 +14,7 @@ PIVOT = 1e-15
 """Minimum ratio of a pivot to its diagonal: five units in the last place, below which no digit is significant."""
 
 # Number of rows above which absent rows are removed before a covariance is factored. The time grows with the cube of
-# the number of rows, and each epoch of a file has the rows of all epochs, most of them absent.
+# the number of rows. Each epoch of a file has the rows of all epochs, most of them absent.
 _MANY = 16
 
 

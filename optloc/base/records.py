@@ -1,8 +1,8 @@
 """Records: frozen dataclasses of arrays with common batch axes, and functions to slice, merge and join them.
 
-The annotation of each array field states its layout: the number of axes after the batch axes, whether the first of
-these counts slots (whose number can differ between records), and the value of an empty entry. The functions of this
-module use these annotations, so a new field of a `Fix` or a `Pool` is declared in one place.
+The annotation of each array field states its layout: the number of axes after the batch axes and the value of an empty
+entry. It also states whether the first of these axes counts slots, whose number can differ between records. The
+functions of this module use these annotations, so a new field of a `Fix` or a `Pool` is declared in one place.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def load_plugin(name: str) -> None:
 
 
 def plugin_module(name: str) -> ModuleType | None:
-    """Return the module of a loaded plugin by its name on loading; None if there is none."""
+    """Return the module of a loaded plugin by its name on loading; None if it was not loaded."""
     known = _known(name)
     if known not in _PLUGINS:
         return None

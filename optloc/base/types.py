@@ -83,7 +83,7 @@ class Stations:
         return bool((np.abs(self.covariance - equal) <= 1e-9 * equal).all())
 
     def with_noise(self) -> Stations:
-        """Return the stations with errors of span "epoch" changed to noise. They are equivalent for a single epoch."""
+        """Return the stations with errors of span "epoch" changed to noise, because no other epoch shares them."""
         return replace(self, span="noise") if self.unknown_for == "epoch" else self
 
     @property
@@ -113,7 +113,7 @@ class Rows:
     z : array (..., m)
         Measured values, SI units or radians.
     a, b : int array (m,)
-        Station numbers of each row; -1 if the kind has no such station.
+        Station numbers of each row; -1 if the kind does not use the station.
     epoch : int array (m,)
         Index into the problem's times.
     target : int array (m,)
@@ -343,7 +343,7 @@ class Status(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """Return a sentence that states what happened and what to do."""
+        """Return a sentence about the result, with advice."""
         return _SENTENCES[self]
 
     @property
@@ -419,7 +419,7 @@ PRECEDENCE = (
     Status.CURVED,
     Status.OK,
 )
-"""Statuses in the order of precedence: the first one among the findings of a fix is its status."""
+"""Statuses in the order of precedence: the first among the findings of a fix is its status."""
 
 NOTES = (Status.UNCHECKED, Status.TAILS, Status.ROBUST, Status.RESCALED)
 """Findings that are never the status. They occur together with any status, including `ok`."""

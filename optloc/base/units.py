@@ -163,7 +163,7 @@ class Conversion:
             return np.asarray(self.factor)
         if values_si is None:
             raise InvalidProblem(
-                "an error in dB has no fixed size in the unit of a ratio",
+                "an error in dB has no fixed size as a ratio",
                 "sigma",
                 "give the measured values too, or state the error in unit '1'",
             )
@@ -345,7 +345,7 @@ def in_si(value: Any, quantity: Quantity, where: str, *, deviation: bool = False
         try:
             return np.array(numbers, dtype=float)
         except ValueError:
-            raise InvalidProblem("the numbers are not an array", where, "give numbers of one shape") from None
+            raise InvalidProblem("the numbers do not form an array", where, "give numbers of one shape") from None
     if isinstance(value, np.ndarray) and value.dtype.kind == "U":
         numbers = [in_si(str(each), quantity, where, deviation=deviation, place=place) for each in value.flat]
         return np.reshape(numbers, value.shape)

@@ -95,8 +95,7 @@ class Model:
         phi is a node (`optloc.proof.nodes.node.Node`) or the name of a node of optloc. With `signs` the sum is q
         instead of h. Empty: proofs do not cover rows of this kind.
     lifted : callable of (m, a, b), optional
-        Function that returns the `LiftedRow` of a measured value m, for kinds that have one and are not a sum of
-        ranges.
+        Function that returns the `LiftedRow` of a measured value m. Only kinds that are not a sum of ranges need it.
     period : float, optional
         Period of an angle, radians, with which the residual is wrapped.
     ray : callable of (t, a, b), optional
@@ -429,7 +428,7 @@ def bent(kind: str) -> str:
 
 
 def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:
-    """Return the equation of a measured value that is linear in position and ranges; None if there is none.
+    """Return the equation of a measured value that is linear in position and ranges; None if it does not exist.
 
     Parameters
     ----------

@@ -23,10 +23,11 @@ def carry(start: Components, straight: Components, rise: Any) -> Components:
     """Return the position on a course over ground that starts like a given straight course.
 
     The straight displacement is split at its start into an upward and a horizontal part. The horizontal part becomes a
-    path along a great circle of the sphere that fits the ellipsoid there (Gauss's mean radius plus the height of the
-    start). The point is then moved along the normal of WGS 84, which keeps latitude and longitude. Its height becomes
-    the height of the start plus the upward part plus `rise`, up to rounding (4e-9 m). After a distance s the error
-    relative to the geodesic with the same speed is at most s^3 / 1800 R^2: 1.4 cm after 100 km and 1.7 m after 500 km.
+    path along a great circle. Its sphere fits the ellipsoid there: the radius is Gauss's mean radius plus the height of
+    the start. The point is then moved along the normal of WGS 84, which keeps latitude and longitude. Its height
+    becomes the height of the start plus the upward part plus `rise`, up to rounding (4e-9 m). After a distance s the
+    error relative to the geodesic with the same speed is at most s^3 / 1800 R^2: 1.4 cm after 100 km and 1.7 m after
+    500 km.
 
     Parameters
     ----------

@@ -15,8 +15,8 @@ from optloc.base.types import Array
 from optloc.models.primitives import Components, Jet, Point, differential, subtract
 
 # Number of parts of the turning rays of a layer, in each of which at most one root is searched. Eight parts find the
-# same first arrivals as a search that is a hundred times finer, except for 1 of 2 000 positions at the edge of a shadow
-# (tests/models/test_layers.py).
+# same first arrivals as a search that is a hundred times finer. The exception is 1 of 2 000 positions, at the edge of a
+# shadow (tests/models/test_layers.py).
 _PARTS = 8
 # Maximum number of Newton steps. Nearly horizontal rays need most: each step doubles the tangent of their angle.
 _STEPS = 60
@@ -109,7 +109,7 @@ class Layers:
         return differential(c * ray.time, [(end, c * slope) for end, slope in parts])
 
     def gradients(self, t: Point, a: Point) -> tuple[Components, Components]:
-        """Return the gradients of `path` at both points: slowness vectors times `unit_speed`, directed outwards."""
+        """Return the gradients of `path` at both points: slowness times `unit_speed`, away from the other point."""
         ray, c = self._ray(t, a), self.unit_speed
         dx, dy = subtract(t.position[:2], a.position[:2])
         x, y, zt, za = _value(dx), _value(dy), t.position[2], a.position[2]

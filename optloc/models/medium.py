@@ -37,9 +37,9 @@ class Atmosphere:
     """A medium for radio waves: air with a refractivity that decreases exponentially with height.
 
     Optical path lengths and wave directions are of first order in the refractivity. They are integrated along the
-    straight line, with the curvature of the Earth. For an aircraft at 10 km height, paths are too long by 0.02 m over
-    100 km, 0.2 m over 200 km and 2.6 m over 400 km. The refraction of elevations is too small by 0.3, 1 and 6 %. Near
-    the ground the errors are three times larger. The model has no ducts.
+    straight line, with the curvature of the Earth. For an aircraft at 10 km height, paths over 100, 200 and 400 km are
+    too long by 0.02, 0.2 and 2.6 m. The refraction of elevations is too small by 0.3, 1 and 6 %. Near the ground the
+    errors are three times larger. The model has no ducts.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class Atmosphere:
         return distance(t, a) * (1.0 + more)
 
     def gradients(self, t: Point, a: Point) -> tuple[Components, Components]:
-        """Return the gradients of `path` at both points: refractive index times unit vectors directed outwards."""
+        """Return the gradients of `path` at both points: refractive index times unit vectors away from the other."""
         assert t.up is not None
         assert a.up is not None
         more, length, (by_t, by_a, by_length) = self._along(t, a)

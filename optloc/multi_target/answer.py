@@ -49,7 +49,7 @@ class Emitters:
     bound : float
         Lower bound of the cost of all assignments with emitters in the region.
     costs : array (n + 2,)
-        Least cost found with 0, 1, ... n + 1 emitters; infinite if no such assignment was found.
+        Least cost found with 0, 1, ... n + 1 emitters; infinite if no assignment with this number was found.
     margin : float
         Difference between `cost` and the cost of the best assignment with another number of emitters or another
         position.

@@ -104,9 +104,9 @@ def separate(
     Control 22 (1977).
     """
     if count is not None and count < 0:
-        raise InvalidProblem(f"a count of {count}", "count", "give the number of emitters, or None")
+        raise InvalidProblem(f"the count is {count}", "count", "give the number of emitters, or None")
     if penalty is not None and not np.isfinite(penalty):
-        raise InvalidProblem(f"a penalty of {penalty}", "penalty", "give a finite number, or None")
+        raise InvalidProblem(f"the penalty is {penalty}", "penalty", "give a finite number, or None")
     within = _region(problem, region)
     return tuple(
         report(problem, scene, _solve_epoch(scene, within, count, boxes), count)
@@ -125,7 +125,7 @@ def _region(problem: Problem, given: Sequence[Any] | None) -> PricedRegion:
     good = lower.shape == upper.shape == (problem.dimension,) and np.isfinite(lower).all() and np.isfinite(upper).all()
     if not good or not (lower < upper).all():
         advice = f"give two corners of {problem.dimension} finite coordinates, the lower one first"
-        raise InvalidProblem(f"a region from {lower} to {upper}", "region", advice)
+        raise InvalidProblem(f"the region from {lower} to {upper} is not a box", "region", advice)
     return PricedRegion(lower, upper)
 
 

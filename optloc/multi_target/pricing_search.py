@@ -68,7 +68,7 @@ def search(scene: Scene, prices: Prices, region: PricedRegion, most: int) -> Pri
     f(x) = penalty - v + sum_i min(missed, min_j (z_ij - h_i(x))^2 / s_i^2 + ln 2 pi s_i^2 - gain_i + u_ij): truncated
     least squares with several values. In a box the change of each h_i is limited by its enclosure, which bounds every
     term. A term is sure if one value is the cheapest everywhere in the box. Sure terms are bounded together by their
-    linear least squares. With correlated errors chi2 >= (r/s)'(r/s) / (largest eigenvalue of their correlation), and a
+    linear least squares. With correlated errors chi2 >= (r/s)'(r/s) / (largest eigenvalue of their correlation). A
     determinant is at least the product of the conditional variances of the rows.
 
     Parameters
@@ -162,7 +162,7 @@ def _bound(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
     if len(alive):
         worst = np.where(np.isnan(apart), np.inf, ((np.abs(apart) + change[..., None]) / s) ** 2 + base)
         picks = _sure_rows(scene, option[alive], worst[alive], low[alive])
-        # With correlated errors the joint chi-square of the sure rows already includes that of the others.
+        # With correlated errors the joint chi-square of the sure rows already includes the chi-square of the others.
         rest = option if scene.independent else np.where(np.isnan(near), np.inf, base)
         others = np.where(picks >= 0, 0.0, np.minimum(rest[alive].min(-1), scene.missed)).sum(-1)
         whole = _bound_jointly(scene, picks, apart[alive], slope[alive], remainder[alive])

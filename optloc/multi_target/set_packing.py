@@ -21,8 +21,9 @@ _EVEN = 1e-4
 class Prices:
     """Dual prices u of the rows, and v of the number of emitters if it is given.
 
-    For any prices u >= 0 and v, the sum over the n sets of an assignment of (c + u(T) - v) is at least n times the
-    least such value of all sets. The cost of the assignment is therefore at least n v - sum u + n min(0, least).
+    The reduced cost of a set T is c + u(T) - v. For any u >= 0 and v, the sum of the reduced costs of n sets is at
+    least n times the least of all. Each row is in at most one set, so the cost of an assignment is at least n v - sum u
+    + n min(0, least).
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ def incidence(tuples: Tuples, width: int) -> sparse.csc_array:
 
 
 def cheapest_sets(tuples: Tuples, width: int, count: int | None, forced: int | None = None) -> tuple[Array, float]:
-    """Return the sets of least total cost that share no row, and their total cost; infinite if there are none.
+    """Return the sets of least total cost that share no row, and their total cost; infinite if they do not exist.
 
     Parameters
     ----------

@@ -288,7 +288,7 @@ def _choose(scene: Scene, x: Array, cov: Array, price: Array) -> Array:
     """Return the picks (q, m) that fit best at positions x (q, d) with covariances (q, d, d), channel by channel."""
     if not len(x):
         return np.zeros((0, scene.scan.count), dtype=np.int64)
-    # A position with a covariance is a predicted target, so the gates are those of a tracker.
+    # A position with a covariance is a predicted target, so the gates are the same as in a tracker.
     apart, S = offsets(scene.scan, State(0.0, x, cov), scene.z)
     s = np.diagonal(S, axis1=-2, axis2=-1)[..., None]
     with np.errstate(invalid="ignore"):
@@ -333,7 +333,7 @@ def around(scan: Problem, centre: Array, radius: Array) -> tuple[Array, Array, A
     """Return values, derivatives and remainders of the rows of a scan in balls.
 
     In the ball |h(x) - h - J (x - centre)| <= remainder. The remainder is half the squared radius times a bound of the
-    second derivatives. This bound is 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation, where r_h
+    second derivatives. This bound is 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation. Here r_h
     is the distance from the vertical line through the station.
 
     Parameters

@@ -1,8 +1,8 @@
 """Conversion of range differences to arrival times: one row per station, with independent errors.
 
 Range differences z = D tau + n combine the arrivals tau = r + e of one emission e at several stations. If their
-covariance is cov n = D diag(v) D', they are equivalent to the rows tau_s = r_s + e with independent variances v_s and
-an unknown e: at every position the least cost over e is the same. An error of one station then affects one row only.
+covariance is cov n = D diag(v) D', the rows tau_s = r_s + e are equivalent. These have independent variances v_s and an
+unknown e, and at every position the least cost over e is the same. An error of one station then affects one row only.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
     Parameters
     ----------
     problem : Problem
-        N problems. Three conditions apply to the range differences: their noise is that of combined arrivals, they link
+        N problems. Three conditions apply to the range differences: their noise comes from combined arrivals, they link
         all stations of an epoch, and no bias affects them. The same rows must be present in all problems.
 
     Returns
@@ -101,7 +101,7 @@ def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
 
 
 def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | None:
-    """Return arrival times (N, s), up to a common offset, and variances (N or 1, s); None if no such arrivals exist."""
+    """Return arrival times (N, s), up to a common offset, and variances (N or 1, s); None if they do not exist."""
     design, s = one.design, len(one.stations)
     # With fewer differences the stations fall into groups, and the arrivals of each group have a separate offset.
     if np.linalg.matrix_rank(design) < s - 1:

@@ -84,8 +84,8 @@ def with_bias(
     Raises
     ------
     InvalidProblem
-        The message names the bias and the fault: a name in use, an unknown kind or member, a member without rows, rows
-        of several quantities, a rotation of rows without axes, or a prior that does not fit.
+        For a name in use, an unknown kind or member, or a member without rows. For rows of several quantities, a
+        rotation of rows without axes, or a prior that does not fit.
     """
     where = f"bias {name!r}"
     bias = family(problem.rows, problem.stations.names, name, per=per, form=form, kind=kind, members=members)
@@ -126,7 +126,7 @@ def family(
     targets: Sequence[str] | None = None,
     where: str | None = None,
 ) -> Bias:
-    """Return a bias without a prior over the given rows; the other arguments are those of `with_bias`.
+    """Return a bias without a prior over the given rows; other arguments as for `with_bias`.
 
     If all azimuths that the bias affects were read clockwise, its values are clockwise too: its coefficients are
     negative. A bias of the form "time" has no sense of rotation.
@@ -144,7 +144,7 @@ def family(
     """
     where = where or f"bias {name!r}"
     if not name or name.partition("[")[0] in _TAKEN:
-        advice = f"other unknowns are called {', '.join(_TAKEN)}"
+        advice = f"choose another name; reserved are {', '.join(_TAKEN)}"
         raise InvalidProblem(f"the name {name!r} is taken" if name else "the name is empty", where, advice)
     for value, known, what in ((per, get_args(Per), "per"), (form, tuple(FORMS), "form")):
         if value not in known:
@@ -168,7 +168,7 @@ def family(
     # No measurement would determine a member without rows.
     idle = sorted(set(range(len(names))) - set(member.tolist()))
     if idle:
-        raise InvalidProblem(f"{names[idle[0]]} touches no row", f"{where}, members", "leave it out")
+        raise InvalidProblem(f"{names[idle[0]]} affects no row", f"{where}, members", "leave it out")
     if found.of_readings:
         coefficient = coefficient * _sense(rows, row)
     return Bias(name, names, row, member, coefficient, form, np.zeros(1))
@@ -203,7 +203,7 @@ def _select_rows(rows: Sequence[Rows], form: BiasForm, kind: str | None, where: 
         raise InvalidProblem(f"{kind} has no axes that could be turned", where, "use the form offset")
     # One value cannot be in metres for one row and in radians for another.
     if form.of_readings and len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
-        raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
+        raise InvalidProblem("the rows measure different quantities", where, "name the kind of the rows")
     return chosen
 
 
@@ -222,7 +222,7 @@ def _by_kind(touched: list[tuple[Rows, int]]) -> list[_Touch]:
 def _by_pair(
     touched: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Touch]]:
-    named = (*stations, "")  # the last entry stands for index -1, no station
+    named = (*stations, "")  # the last entry is index -1, no station
     # Each pair has one number. A missing second station (-1) counts as an extra station with an empty name.
     codes = [block.a * len(named) + block.b % len(named) for block, _ in touched]
     found = np.unique(np.concatenate(codes))
@@ -286,7 +286,7 @@ def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where
 
 
 def _check_names(given: Sequence[str], known: Sequence[str], what: str, where: str) -> tuple[str, ...]:
-    """Return the given names as a tuple; raise if one is unknown or repeated, or if there is none."""
+    """Return the given names as a tuple; raise if the list is empty, or if a name is unknown or repeated."""
     names = (given,) if isinstance(given, str) else tuple(given)
     place = f"{where}, members"
     unknown = [name for name in names if name not in known]
@@ -368,7 +368,7 @@ def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
     if array.size != np.prod(shape):
         raise InvalidProblem(f"there are {array.size} values", where, f"give an array of shape {shape}")
     if not np.isfinite(array).all():
-        raise InvalidProblem("a value is not finite", where, "take the biases of a fix that has an answer")
+        raise InvalidProblem("a value is not finite", where, "use the biases of a fix that has an answer")
     return array.reshape(shape)
 
 

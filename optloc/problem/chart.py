@@ -1,9 +1,9 @@
 """Coordinates in which the error of a fix is Gaussian: metres, or inverse range, or neither.
 
 With the mean c of the stations as origin, a position is ``x = c + (r / w)(u0 + B p)``. Here r and u0 are the distance
-and the direction of the fix, the columns of B are orthogonal to u0, p is a direction and w an inverse range. The fix is
-p = 0, w = 1. Infinity is w = 0, a regular point. The error of a distant emitter is curved in metres and Gaussian in ``y
-= (p, w)``.
+and the direction of the fix. The columns of B are orthogonal to u0. p is a direction and w an inverse range. The fix is
+p = 0, w = 1. Infinity is w = 0, a regular point. The error of a distant emitter is curved in metres and Gaussian in
+``y = (p, w)``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TRUNCATED = "truncated"
 Extent = Literal["range", "bearing", "elevation", "height", "x", "y", "z"]
 
 # The advice names a function, because a module of a higher layer computes the region.
-_ADVICE = "ask `optloc.uncertainty.likelihood_region(problem, fix)` for the region that the data allow"
+_ADVICE = "use `optloc.uncertainty.likelihood_region(problem, fix)` for the region of the target"
 
 
 def distance_and_direction(position: Array, centre: Array) -> tuple[Array, Array]:

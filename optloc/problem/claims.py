@@ -33,7 +33,7 @@ class Claims:
     unique : bool array (...)
         Whether all other minima cost more by a known margin.
     margin : array (...)
-        This margin; 0 if there is none.
+        This margin; 0 without one.
     boxes : int array (...)
         Number of boxes that the proof examined.
     region : object array (...)

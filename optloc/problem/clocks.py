@@ -113,9 +113,8 @@ def process(bias: Bias, times: Array) -> tuple[Array, Array]:
     """Return the transition matrices of a walk between epochs, and the covariances of its random steps.
 
     White noise of spectral density q1 drives the error. White noise of density q2 drives its rate. Over a time t they
-    add
-    ``q1 t + q2 t^3 / 3`` to the variance of the error, ``q2 t`` to the variance of its rate, and ``q2 t^2 / 2`` to
-    their covariance.
+    add ``q1 t + q2 t^3 / 3`` to the variance of the error and ``q2 t`` to the variance of its rate. Their covariance
+    increases by ``q2 t^2 / 2``.
 
     Parameters
     ----------

@@ -436,7 +436,7 @@ def _touches(problem: Problem, bias: Bias, number: _Numbers, inside: Callable[[A
 
 
 def joined(problem: Problem, more: Problem) -> Problem:
-    """Return one run that has the epochs of both runs, those of `more` last.
+    """Return one run with the epochs of both runs; the epochs of `more` are last.
 
     Parameters
     ----------

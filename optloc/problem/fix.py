@@ -187,7 +187,7 @@ class Fix:
         """Return the status of a single fix; raise InvalidProblem for a batch, which has `statuses`."""
         if self.shape:
             advice = "use fix.statuses, or the status of one of them: fix[i].status"
-            raise InvalidProblem(f"these are fixes of shape {self.shape}", "status", advice)
+            raise InvalidProblem(f"a batch of shape {self.shape} has no single status", "status", advice)
         return Status(int(self.code))
 
     @property
@@ -345,7 +345,7 @@ class Fix:
 
     @property
     def determined(self) -> Determined | None:
-        """Return directions, ranges and curves of a single fix that the data determine, whatever its status.
+        """Return directions, ranges and curves of a single fix that the data determine, in every status.
 
         They are computed when you read them. The result is None if the fix does not hold its problem, as in batches
         with many refused fixes. `optloc.model_checks.determined(problem, fix)` then computes them.
@@ -416,7 +416,7 @@ class Fix:
 
     @property
     def answered(self) -> Array:
-        """Return a mask (...) of fixes that have a position with a covariance, whatever their findings."""
+        """Return a mask (...) of fixes that have a position with a covariance, with or without findings."""
         # A run to infinity has no finite estimate.
         return HAS_ANSWER[self.code] & np.isfinite(self.x).any(-1)
 
@@ -492,7 +492,7 @@ class Fix:
 
     def _gaussian_chart(self, level: float) -> Chart:
         if self.chart is None:
-            raise InvalidProblem("a fix that is not of one position has no chart", "fix", "see its covariance")
+            raise InvalidProblem("only a fix of a single position has a chart", "fix", "use its covariance")
         if level > TOLD and bool((self.has(Status.TAILS) & (self.chart.kind == CARTESIAN)).any()):
             told = f"some regions are valid at level {TOLD:g}, but not at {level:g}"
             raise InvalidProblem(told, "level", "take fixes without the finding 'tails'")

@@ -76,7 +76,7 @@ class Loss:
 
     @property
     def efficiency(self) -> float:
-        """Return the mean square error of least squares divided by that of this loss, for clean Gaussian data.
+        """Return the mean square error of least squares over the error of this loss, for clean Gaussian data.
 
         P. J. Huber, "Robust Statistics" (1981), eq. 3.2.13: (E psi')² / E psi².
         """
@@ -160,9 +160,9 @@ def late_loss(share: float, delay: float) -> Loss:
     """Return the loss for rows of which a share is late, with exponentially distributed delays.
 
     The residual of a row, in sigma, is normal. With probability p = `share` an exponential delay is added. Its density
-    is (1 - p) phi(u) + p g(u), where g is the density of the sum of an exponential and a normal variable (Grushka 1972,
-    equation 5). The loss is twice the negative logarithm of this density, measured from its mode, which is some
-    hundredths of sigma above zero. Early rows cost u².
+    is (1 - p) phi(u) + p g(u). Here g is the density of an exponential plus a normal variable (Grushka 1972, equation
+    5). The loss is twice the negative logarithm of this density, measured from its mode, which is some hundredths of
+    sigma above zero. Early rows cost u².
 
     Parameters
     ----------
@@ -239,7 +239,9 @@ class _Spelled(dict[str, Loss]):
 
 # Each constant gives an `efficiency` of 95 %, for the truncated loss 99 %.
 _OWN = (
-    Loss("huber", 1.345, _huber, _huber_weight, "Huber's convex loss: gross errors pull no harder than 1.3 sigma"),
+    Loss(
+        "huber", 1.345, _huber, _huber_weight, "Huber's convex loss: a gross error has no more influence than 1.3 sigma"
+    ),
     Loss("cauchy", 2.385, _cauchy, _cauchy_weight, "Cauchy's loss: the larger an error, the smaller its influence"),
     Loss("truncated", 3.368, _truncated, _truncated_weight, "least squares without rows beyond 3.4 sigma", flat=True),
     Loss(

@@ -12,8 +12,8 @@ The Fisher information of the logarithms of the amplitudes, which is independent
     T W / (pi (1 + P)) (P diag(rho) + (1 - P) / (1 + P) rho rho').
 
 An error that all stations share cancels in differences. The errors of the differences are therefore equal to
-differences of independent station errors, with variance 3 pi (1 + P) / (T W^3 P rho_i) for delays and pi (1 + P) / (T W
-P rho_i) for log-amplitudes. At equal ratios the first is equation 31 of the registration paper
+differences of independent station errors. The variance of these errors is 3 pi (1 + P) / (T W^3 P rho_i) for delays and
+pi (1 + P) / (T W P rho_i) for log-amplitudes. At equal ratios the first is equation 31 of the registration paper
 (docs/papers/registration). Equation 38 of that paper is smaller, because it assumes that the level of the signal and
 the gain of the reference are known.
 

@@ -2,7 +2,7 @@
 
 Without bounds the distribution is ``N(x + shift, covariance)``. It is truncated to the admitted points. The fix x is
 the admitted point of highest density. The distribution is integrated along rays from the fix, each up to the first
-bound. Regions and intervals are those of highest density, because an interval with equal tails never contains a target
+bound. Regions and intervals have the highest density, because an interval with equal tails never contains a target
 on the bound.
 """
 
@@ -208,7 +208,7 @@ class Truncated:
         return _Rays(lean, length, rank, middle, whitener, factor @ whitener, place, tip, weight)
 
     def exits(self, step: Array) -> Array:
-        """Return the number (k,) of steps (k, d) from the fix to the first bound; infinite if there is none."""
+        """Return the number (k,) of steps (k, d) from the fix to the first bound; infinite without a bound."""
         rate, size = step @ self.normal.T, np.sqrt((step**2).sum(-1, keepdims=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             length = np.where(rate > _EXACT * size, np.maximum(self.slack, 0.0) / rate, np.inf)

@@ -287,7 +287,7 @@ def check_unknowns(problem: Problem) -> None:
 def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
     where = f"motions[{number}]"
     if motion.order not in (0, 1, 2):
-        raise InvalidProblem(f"a motion of order {motion.order}", where, "use order 0, 1 or 2")
+        raise InvalidProblem(f"the motion has order {motion.order}", where, "use order 0, 1 or 2")
     if motion.span not in ("run", "epoch"):
         raise InvalidProblem(f"unknown span {motion.span!r}", where, "use 'run' or 'epoch'")
     if motion.reference is not None and _beyond(motion.reference)[0]:
@@ -298,11 +298,13 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
     shape = motion.known.shape
     if len(shape) < 3 or shape[-1] != problem.dimension:
         raise InvalidProblem(
-            f"known states of shape {shape}", where, f"give (epochs or 1, order + 1, {problem.dimension})"
+            f"the known states have shape {shape}", where, f"give (epochs or 1, order + 1, {problem.dimension})"
         )
     if shape[-3] not in (1, problem.epochs):
         counts = f"{problem.epochs} epoch{'s' if problem.epochs > 1 else ''}"
-        raise InvalidProblem(f"known states for {shape[-3]} epochs, not {counts}", where, "give one, or one an epoch")
+        raise InvalidProblem(
+            f"known states are for {shape[-3]} epochs, not {counts}", where, "give one, or one for each"
+        )
     bad, why = _beyond(motion.known)
     if bad.any():
         raise InvalidProblem(f"a known state is {why}", where, "give metres and metres per second")

@@ -130,9 +130,9 @@ def noise_levels(
     by : "station", "pair" or "kind"
         What has a level: each station (the error of an arrival if rows combine arrivals), each pair or each kind.
     common : "station", "pair" or "kind", optional
-        Grouping of rows that share an additional error in every epoch, for instance of an attitude, of a position taken
-        as known, or of refraction. True: the same as `by`. The data determine it if a group has several rows in an
-        epoch.
+        Grouping of rows that share an additional error in every epoch. Examples are errors of an attitude, of a
+        position taken as known, or of refraction. True: the same as `by`. The data determine it if a group has several
+        rows in an epoch.
     method : str
         Method of the fixes; see `solve`.
     fix : Fix, optional
@@ -404,8 +404,8 @@ def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
     Returns
     -------
     LateSignals
-        The share is zero in three cases: late rows explain the residuals hardly better, errors of the other sign
-        explain them as well, or all rows of a kind are late by the same amount, which is an offset.
+        The share is zero in three cases. Late rows explain the residuals hardly better. Errors of the other sign
+        explain them as well. All rows of a kind are late by the same amount, which is an offset.
 
     Raises
     ------

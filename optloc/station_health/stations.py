@@ -69,7 +69,7 @@ class Health:
     outliers : array (G,)
         Share of its measurements that are outliers: a test of one measurement exceeds three standard deviations.
     suspect : array (G,)
-        Share of its fixes in which it is a suspect; NaN if the method finds no suspects.
+        Share of its fixes in which it is a suspect; NaN if the method does not search for suspects.
     levels : NoiseLevels
         Details of the noise.
     epoch, group : int array (n,)
@@ -295,7 +295,7 @@ class Offsets:
     slope, slope_error : array (G,)
         Growth in metres per metre and its standard error; NaN if the data do not determine it.
     open : array (r, G)
-        Unit vectors of the combinations of offsets that the data do not determine. The offsets have no such component.
+        Unit vectors of the combinations of offsets that the data do not determine. Along them the offsets are zero.
     """
 
     value: Array

@@ -105,7 +105,7 @@ def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None =
 
     The structures are levels by kind, with and without a common error in each epoch, and levels by station and by pair.
     Levels by station and by pair assume independent errors. If errors last, or if rows share an error in an epoch,
-    these levels are too small for some stations, and fixes with them are wrong. Levels are then by kind.
+    these levels are too small for some stations. Fixes with them would be wrong, so levels are then by kind.
 
     Parameters
     ----------
@@ -435,7 +435,7 @@ def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float]
 def _widened(levels: NoiseLevels, lasting: dict[str, float]) -> NoiseLevels:
     """Return levels with wider intervals for lasting errors: the squares of neighbours are correlated by r^2.
 
-    The variance of their mean is (1 + r^2) / (1 - r^2) times that of independent squares (Bartlett 1946).
+    The variance of their mean is (1 + r^2) / (1 - r^2) times the variance of independent squares (Bartlett 1946).
     """
     r = np.array([lasting.get(name, 0.0) for name in levels.names])
     wider = np.sqrt((1.0 + r**2) / (1.0 - r**2))

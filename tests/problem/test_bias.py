@@ -148,7 +148,7 @@ def test_names_of_other_unknowns_are_taken(name):
 def test_a_name_is_given_once_and_a_member_touches_a_row():
     with pytest.raises(InvalidProblem, match="'clock' is used twice"):
         with_bias(with_bias(problem_of(), "clock"), "clock")
-    with pytest.raises(InvalidProblem, match="west touches no row"):
+    with pytest.raises(InvalidProblem, match="west affects no row"):
         with_bias(problem_of(measured("tdoa", a=[1, 2], b=0, sigma=1.0)), "clock", members=["north", "west"])
     mixed = problem_of(measured("range", a=[0], sigma=1.0), measured("azimuth", a=[2], sigma=0.1))
     with pytest.raises(InvalidProblem, match="different quantities; name the kind"):

@@ -33,7 +33,7 @@ BAD = {
     "times": ({"times": np.array([1.0, 1.0])}, "epoch 1 is not later than epoch 0"),
     "noise": ({"noise": Noise(GOOD.noise.blocks * 2)}, "does not cover every row exactly once"),
     "a covariance": ({"noise": SKEW}, "the covariance in noise of row 0 is not symmetric"),
-    "an order": ({"motions": (Motion(3),)}, "a motion of order 3"),
+    "an order": ({"motions": (Motion(3),)}, "the motion has order 3"),
     "a prior": ({"priors": (Prior("position", np.zeros(3), np.eye(3)),)}, "do not fit"),
     "a speed": ({"constraints": speed(3.0)}, "speed needs a target that moves"),
     "bounds": (
