@@ -239,9 +239,9 @@ def _all_of(read: Callable[[int], bytes], what: str, where: str, *, lines: bool 
     """Return all available bytes; raise InvalidProblem as soon as they exceed a limit."""
     budget = _now().budget
     limit = getattr(budget, what)
-    held, size, rows = io.BytesIO(), 0, 0
+    buffer, size, rows = io.BytesIO(), 0, 0
     while piece := read(_PIECE):
-        held.write(piece)
+        buffer.write(piece)
         size += len(piece)
         rows += piece.count(b"\n") if lines else 0
         if size > limit:
@@ -249,7 +249,7 @@ def _all_of(read: Callable[[int], bytes], what: str, where: str, *, lines: bool 
         # The first line is the header.
         if rows > budget.rows + 1:
             raise _beyond("rows", "more", budget.rows, where)
-    return held.getvalue()
+    return buffer.getvalue()
 
 
 def _open(path: Path) -> int:
@@ -258,7 +258,7 @@ def _open(path: Path) -> int:
         # Only opening the file is a reliable test. O_NONBLOCK: opening a pipe without a writer would wait for ever.
         found = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (FileNotFoundError, NotADirectoryError):
-        raise InvalidProblem("there is no such file", str(path), _like(path)) from None
+        raise InvalidProblem("there is no such file", str(path), _similar_file(path)) from None
     except OSError as error:
         if os.path.isdir(path):  # noqa: PTH112  # does not raise for a name that is too long
             raise InvalidProblem("this is a folder, not a file", str(path), "name a file in it") from None
@@ -277,7 +277,7 @@ def _open(path: Path) -> int:
     return found
 
 
-def _like(path: Path) -> str:
+def _similar_file(path: Path) -> str:
     """Return advice for a file that does not exist: a similar name in the same folder."""
     try:
         names = sorted(found.name for found in islice(path.parent.iterdir(), _NAMES))

@@ -102,11 +102,11 @@ def join(parts: Iterable[Record], count: int) -> Record:
         start += size
     assert first is not None
     changed: dict[str, Any] = {name: column.array() for name, column in whole.items()}
-    changed |= {name: join(_without_gaps(own, count), count) for name, own in pieces.items()}
+    changed |= {name: join(_fill_gaps(own, count), count) for name, own in pieces.items()}
     return replace(first, **changed)  # type: ignore[type-var]
 
 
-def _without_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
+def _fill_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
     """Yield the records in order, with records of empty entries between them, up to `count` entries in total."""
     end = 0
     for start, piece in [*pieces, (count, None)]:

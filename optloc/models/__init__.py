@@ -343,7 +343,7 @@ BETWEEN = "station to station"
 """Name of the kind for a distance between two stations, without a target, in networks with unknown stations."""
 
 
-class _Unlisted(dict[str, Model]):
+class _DerivedKinds(dict[str, Model]):
     """Table of kinds that are not listed: kinds along rays, made from their names, and distances between stations."""
 
     def __missing__(self, name: str) -> Model:
@@ -376,7 +376,7 @@ def _along_rays(name: str) -> Model:
     )
 
 
-MODELS: Registry[Model] = Registry("optloc.models", lambda value: isinstance(value, Model), _KINDS, _Unlisted)
+MODELS: Registry[Model] = Registry("optloc.models", lambda value: isinstance(value, Model), _KINDS, _DerivedKinds)
 
 
 def kind_named(word: str, where: str | None = "kind") -> str:

@@ -161,10 +161,10 @@ def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: i
     limit = AMBIGUOUS_GAP + (scene.penalty if count is not None else 0.0)
     # Upper limit of the number of emitters, from the number of rows.
     most = int(np.isfinite(scene.z).sum()) // scene.least
-    tuples, total = _keep_paying(propose(scene), limit), 0
+    tuples, total = _drop_expensive(propose(scene), limit), 0
     fresh, bound = thin(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
     for turn in range(_ROUNDS):
-        tuples = _keep_paying(merge(tuples, fresh), limit)
+        tuples = _drop_expensive(merge(tuples, fresh), limit)
         taken, cost = cheapest_sets(tuples, scene.z.shape[1], count)
         # At these prices no examined column has a negative reduced cost. The search checks all other columns.
         prices = price_rows(tuples, taken, row_worth(scene, tuples.take(taken)), count)
@@ -193,7 +193,7 @@ def _fresh_sets(scene: Scene, prices: Prices, found: PricingResult) -> Tuples:
     return merge(fresh, thin(scene, fresh))
 
 
-def _keep_paying(tuples: Tuples, limit: float) -> Tuples:
+def _drop_expensive(tuples: Tuples, limit: float) -> Tuples:
     return tuples.take(np.flatnonzero(tuples.cost < limit))
 
 
@@ -202,7 +202,7 @@ def _keep_paying(tuples: Tuples, limit: float) -> Tuples:
 
 def propose(scene: Scene, seed: int = 0) -> Tuples:
     """Return sets of rows near the closed-form fixes of d rows each: all, or a seeded sample if there are many."""
-    picks = _few(scene, np.random.default_rng(seed))
+    picks = _combinations(scene, np.random.default_rng(seed))
     if not len(picks):
         return no_sets(scene)
     problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
@@ -217,7 +217,7 @@ def propose(scene: Scene, seed: int = 0) -> Tuples:
     return sets_near(scene, x[which, slot][good], cov[good], np.zeros_like(scene.z))
 
 
-def _few(scene: Scene, rng: np.random.Generator) -> Array:
+def _combinations(scene: Scene, rng: np.random.Generator) -> Array:
     """Return sets of d rows (q, m) that determine a position."""
     d, count = scene.scan.dimension, scene.scan.count
     ends = _ends(scene)
@@ -317,9 +317,9 @@ def _verdict(
     scene: Scene, solved: Solved, fixes: tuple[Fix, ...], ghosts: tuple[Ghost, ...], costs: Array, count: int | None
 ) -> tuple[Status, str]:
     """Return the status and the reason of an assignment."""
-    heard = np.isfinite(scene.z)
+    measured = np.isfinite(scene.z)
     gaps = tuple(ghost.gap for ghost in ghosts)
-    size = int(heard.any(1).sum()), len(scene.z), scene.least
-    false = int(heard.sum()) - int((solved.tuples.picks[solved.taken] >= 0).sum())
+    size = int(measured.any(1).sum()), len(scene.z), scene.least
+    false = int(measured.sum()) - int((solved.tuples.picks[solved.taken] >= 0).sum())
     found = Assigned(fixes, gaps, costs, solved.cost, solved.bound, count, *size)
     return verdict(found, f"{spell(len(fixes))}; false rows: {false}")

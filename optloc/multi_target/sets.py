@@ -380,14 +380,14 @@ def changes(scan: Problem, slope: Array, remainder: Array, half: Array) -> Array
         Half-widths of the boxes.
     """
     radius = np.sqrt((half**2).sum(-1))
-    most = np.concatenate([_most(block, radius) for block in scan.rows], axis=-1)
+    most = np.concatenate([_greatest_change(block, radius) for block in scan.rows], axis=-1)
     with np.errstate(invalid="ignore"):
         # The smaller of two bounds: linear change plus remainder, and the greatest change of this kind of row.
         first = (np.abs(slope) * half[:, None, :]).sum(-1) + remainder
     return np.asarray(np.where(first < most, first, most))
 
 
-def _most(block: Rows, radius: Array) -> Array:
+def _greatest_change(block: Rows, radius: Array) -> Array:
     """Return a bound (q, m) of the change of the rows of a block in balls, valid without derivatives."""
     ranges = MODELS[block.kind].ranges
     # A range changes at most by the displacement of the target. An angle changes at most by half a turn.

@@ -252,20 +252,20 @@ class Chart:
         step = np.where((self.kind == INVERSE_RANGE)[..., None], bent, away)
         solved, known = linalg.solve(np.broadcast_to(self.covariance, (*step.shape, step.shape[-1])), step[..., None])
         form = (step * solved[..., 0]).sum(-1)
-        if (held := self._is_held()).any():
-            form, known = self._along_surface(step, form, known & ~held)
+        if (on_surface := self._is_singular()).any():
+            form, known = self._along_surface(step, form, known & ~on_surface)
         inverse = self.kind == INVERSE_RANGE
         behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
         form = np.array(np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan))
         away = np.broadcast_to(away, (*form.shape, away.shape[-1]))
-        for i, law in self._cut_off():
-            mine = np.zeros(self.kind.shape, dtype=bool)
-            mine[i] = True
-            mine = np.broadcast_to(mine, form.shape)
-            form[mine] = law.distance_squared(away[mine])
+        for i, law in self._truncated_fixes():
+            selected = np.zeros(self.kind.shape, dtype=bool)
+            selected[i] = True
+            selected = np.broadcast_to(selected, form.shape)
+            form[selected] = law.distance_squared(away[selected])
         return form
 
-    def _is_held(self) -> Array:
+    def _is_singular(self) -> Array:
         """Return a flag (...) for singular covariances: an equality constraint fixes the position in one direction."""
         finite = np.asarray(np.isfinite(self.covariance).all((-1, -2)))
         values = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance, np.eye(self.position.shape[-1])))
@@ -296,7 +296,7 @@ class Chart:
             return np.zeros(self.kind.shape, dtype=bool)
         return np.asarray(self.truncated.cuts & (self.kind == CARTESIAN))
 
-    def _cut_off(self) -> Iterator[tuple[tuple[int, ...], Truncated]]:
+    def _truncated_fixes(self) -> Iterator[tuple[tuple[int, ...], Truncated]]:
         """Yield the index and the truncated distribution of each fix whose distribution bounds truncate."""
         if self.truncated is not None:
             for i in zip(*np.nonzero(np.atleast_1d(self.cut_off)), strict=True):
@@ -351,7 +351,7 @@ class Chart:
         if extent in {"elevation", "height", "z"} and self.position.shape[-1] != 3:
             raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "use x, y, range or bearing")
         low, high = map(np.array, _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1)))))
-        for i, law in self._cut_off():
+        for i, law in self._truncated_fixes():
             low[i], high[i] = law.interval(self._number(extent, i), level)
         return low, high
 
@@ -362,7 +362,7 @@ class Chart:
         unknowns follows from their correlation with the position.
         """
         out, part = np.array(x), slice(start, start + self.position.shape[-1])
-        for i, law in self._cut_off():
+        for i, law in self._truncated_fixes():
             own = covariance[i]
             out[i] += own[:, part] @ np.linalg.pinv(own[part, part], hermitian=True) @ law.moments()[0]
         return out

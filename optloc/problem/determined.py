@@ -219,15 +219,15 @@ class Determined:
     def _direction(self, one: Direction) -> dict[str, Any]:
         """Return one direction as a dictionary for `to_dict`."""
         azimuth, *ends = np.degrees(one.azimuth).tolist()
-        told = {"vector": one.vector.tolist(), "azimuth_deg": azimuth, "azimuth_interval_deg": ends}
+        entries = {"vector": one.vector.tolist(), "azimuth_deg": azimuth, "azimuth_interval_deg": ends}
         if self.north:
             low, high = bearing_of(one.azimuth)[1:]
-            told |= {"bearing_deg": bearing_of(one.azimuth)[0], "bearing_interval_deg": [low, high]}
+            entries |= {"bearing_deg": bearing_of(one.azimuth)[0], "bearing_interval_deg": [low, high]}
         if one.elevation:
             elevation, *ends = np.degrees(one.elevation).tolist()
-            told |= {"elevation_deg": elevation, "elevation_interval_deg": ends}
-        told |= {"half_angles_deg": np.degrees(one.half_angles).tolist(), "outline": one.outline.tolist()}
-        return told | {
+            entries |= {"elevation_deg": elevation, "elevation_interval_deg": ends}
+        entries |= {"half_angles_deg": np.degrees(one.half_angles).tolist(), "outline": one.outline.tolist()}
+        return entries | {
             "range": _finite(one.range[0])[0],
             "range_interval": _finite(*one.range[1:]),
             "least_range": one.least_range,

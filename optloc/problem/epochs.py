@@ -377,16 +377,16 @@ def cut(problem: Problem, first: int, last: int) -> Problem:
     part = window(problem, first, last)
     if part.count == 0:
         raise InvalidProblem(f"epochs {first} to {last} hold no rows", "cut", "take a longer stretch")
-    return _begun_anew(problem, part, slice(first, last))
+    return _as_separate_run(problem, part, slice(first, last))
 
 
 def thinned(problem: Problem, epochs: Array) -> Problem:
     """Return the epochs (n,) of a run as a separate run; otherwise like `cut`."""
     part = _with_rows_of(problem, lambda epoch: np.flatnonzero(np.isin(epoch, epochs)))
-    return _begun_anew(problem, part, epochs)
+    return _as_separate_run(problem, part, epochs)
 
 
-def _begun_anew(problem: Problem, part: Problem, when: slice | Array) -> Problem:
+def _as_separate_run(problem: Problem, part: Problem, when: slice | Array) -> Problem:
     """Return `part`, the rows of some increasing epochs `when` of a run, as a run that has these epochs only."""
 
     def own(values: Array | None, core: int) -> Array | None:
@@ -457,7 +457,7 @@ def joined(problem: Problem, more: Problem) -> Problem:
     k = problem.epochs
     ours, others = _named(problem.rows), _named(more.rows)
     names = list(dict.fromkeys((*ours, *others)))
-    none = [_none_of(kind) for kind, _ in names]
+    none = [_empty_block(kind) for kind, _ in names]
     first = [ours.get(name, block) for name, block in zip(names, none, strict=True)]
     second = [others.get(name, block) for name, block in zip(names, none, strict=True)]
     rows = tuple(_append(one, replace(two, epoch=two.epoch + k)) for one, two in zip(first, second, strict=True))
@@ -499,7 +499,7 @@ def _named(rows: tuple[Rows, ...]) -> dict[tuple[str, int], Rows]:
     return {(kind, kinds[:i].count(kind)): block for i, (kind, block) in enumerate(zip(kinds, rows, strict=True))}
 
 
-def _none_of(kind: str) -> Rows:
+def _empty_block(kind: str) -> Rows:
     """Return an empty block of a kind, for the run that has no rows of this kind."""
     none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
     return Rows(kind, none, numbers, numbers, numbers, numbers, none, none)

@@ -494,8 +494,8 @@ class Fix:
         if self.chart is None:
             raise InvalidProblem("only a fix of a single position has a chart", "fix", "use its covariance")
         if level > TOLD and bool((self.has(Status.TAILS) & (self.chart.kind == CARTESIAN)).any()):
-            told = f"some regions are valid at level {TOLD:g}, but not at {level:g}"
-            raise InvalidProblem(told, "level", "take fixes without the finding 'tails'")
+            what = f"some regions are valid at level {TOLD:g}, but not at {level:g}"
+            raise InvalidProblem(what, "level", "take fixes without the finding 'tails'")
         return self.chart
 
     def require(self, allow: Iterable[Status | str] = (), *, redundancy: int = 0, level: float = 0.95) -> Fix:

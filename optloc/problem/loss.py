@@ -149,7 +149,7 @@ LATE = frozenset(("range", "toa", "range_sum"))
 """Kinds that a blocked path can only lengthen: each path has a positive sign. Differences can err either way."""
 
 # Name of a loss for late rows: late(share, mean delay in sigma).
-_SPELLED = re.compile(r"late\((?P<share>[0-9.eE+-]+),(?P<delay>[0-9.eE+-]+)\)")
+_LATE_NAME = re.compile(r"late\((?P<share>[0-9.eE+-]+),(?P<delay>[0-9.eE+-]+)\)")
 # Residual below which psi / u is replaced by its limit, and the step of the difference quotient for this limit. The
 # step is far above the rounding error of a logarithm.
 _ZERO, _STEP = 1e-6, 1e-3
@@ -227,11 +227,11 @@ def _mode(share: float, delay: float) -> float:
     return 0.5 * (low + high)
 
 
-class _Spelled(dict[str, Loss]):
+class _NamedLosses(dict[str, Loss]):
     """Table of losses that also makes losses from names such as "late(0.1,8)"."""
 
     def __missing__(self, name: str) -> Loss:
-        found = _SPELLED.fullmatch(name.replace(" ", ""))
+        found = _LATE_NAME.fullmatch(name.replace(" ", ""))
         if found is None:
             raise KeyError(name)
         return late_loss(float(found["share"]), float(found["delay"]))
@@ -254,7 +254,7 @@ _OWN = (
     ),
 )
 LOSSES: Registry[Loss] = Registry(
-    "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN}, _Spelled
+    "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN}, _NamedLosses
 )
 """Losses by name, each a stage of a method: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; Cauchy one-sided.
 

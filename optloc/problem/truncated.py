@@ -87,7 +87,7 @@ class Truncated:
         ----------
         G. M. Tallis, "The moment generating function of the truncated multi-normal distribution" (1961), for one bound.
         """
-        mean, covariance = _behind_one(self)
+        mean, covariance = _moments_behind_one_bound(self)
         finite = np.isfinite(self.slack)
         several = (finite.sum(-1) != 1) | np.isfinite(np.where(finite[..., None], self.span, np.inf)).any((-1, -2))
         for i in zip(*np.nonzero(np.atleast_1d(several & self.cuts)), strict=True):
@@ -289,7 +289,7 @@ def is_along(projector: Array, points: Array) -> Array:
     return np.asarray(off <= _BENT * np.sqrt((within**2).sum(-1)) + _ROUNDED)
 
 
-def _behind_one(law: Truncated) -> tuple[Array, Array]:
+def _moments_behind_one_bound(law: Truncated) -> tuple[Array, Array]:
     """Return mean minus fix (..., d) and covariance (..., d, d) of distributions truncated at their first bound."""
     from scipy.special import log_ndtr
 

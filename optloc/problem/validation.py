@@ -74,7 +74,7 @@ def _cut_noise(problem: Problem) -> Problem:
     return problem
 
 
-def _beyond(values: Any) -> tuple[Any, str]:
+def _out_of_range(values: Any) -> tuple[Any, str]:
     """Return a mask of values that are not finite or whose squares overflow, and words for the first such value."""
     values = np.asarray(values)
     bad = ~(np.abs(values) <= LARGEST)
@@ -83,7 +83,7 @@ def _beyond(values: Any) -> tuple[Any, str]:
 
 def _check_stations(problem: Problem) -> None:
     stations: Stations = problem.stations
-    bad, why = _beyond(stations.position)
+    bad, why = _out_of_range(stations.position)
     if bad.any():
         name = stations.names[int(np.argwhere(bad.any(-1))[0][-1])]
         raise InvalidProblem(f"the position of station {name!r} is {why}", "stations", "give metres")
@@ -122,7 +122,7 @@ def _check_moving(problem: Problem) -> None:
         if array.shape[-core] not in (1, problem.epochs):
             counts = f"{array.shape[-core]} epochs of station {name} for {problem.epochs} epochs of measurements"
             raise InvalidProblem(counts, "stations", "give one, or one for each epoch")
-        bad, why = _beyond(array)
+        bad, why = _out_of_range(array)
         if bad.any():
             label = s.names[int(np.argwhere(bad.any(tuple(range(-core + 2, 0))))[0][-1])]
             raise InvalidProblem(f"the {name} of station {label!r} is {why}", "stations", "give SI units")
@@ -181,7 +181,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         row = int(np.flatnonzero(rows.a == rows.b)[0])
         raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
     check_values(rows)
-    bad, why = _beyond(rows.correction)
+    bad, why = _out_of_range(rows.correction)
     if bad.any():
         raise InvalidProblem(f"{rows.kind} has a correction that is {why}", "correction", "give 0 where none is known")
     if not ((rows.weight >= 0.0) & (rows.weight <= 1.0)).all():
@@ -235,7 +235,7 @@ def _check_covariance(covariance: Array, what: str, names: Sequence[str] | Array
 
 def _check_times(problem: Problem) -> None:
     times = problem.times
-    if times.ndim != 1 or _beyond(times)[0].any():
+    if times.ndim != 1 or _out_of_range(times)[0].any():
         raise InvalidProblem("times are not a list of finite seconds", "times", "give one number per epoch")
     if (np.diff(times) <= 0.0).any():
         place = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
@@ -290,7 +290,7 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         raise InvalidProblem(f"the motion has order {motion.order}", where, "use order 0, 1 or 2")
     if motion.span not in ("run", "epoch"):
         raise InvalidProblem(f"unknown span {motion.span!r}", where, "use 'run' or 'epoch'")
-    if motion.reference is not None and _beyond(motion.reference)[0]:
+    if motion.reference is not None and _out_of_range(motion.reference)[0]:
         raise InvalidProblem(f"the reference time is {motion.reference}", where, "give finite seconds")
     _check_course_over(problem, motion, where)
     if motion.known is None:
@@ -305,7 +305,7 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         raise InvalidProblem(
             f"known states are for {shape[-3]} epochs, not {counts}", where, "give one, or one for each"
         )
-    bad, why = _beyond(motion.known)
+    bad, why = _out_of_range(motion.known)
     if bad.any():
         raise InvalidProblem(f"a known state is {why}", where, "give metres and metres per second")
     if shape[-3] > 1 and shape[-2] == 1:
@@ -335,7 +335,7 @@ def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
     if motion.rise.shape[-2:] != (problem.epochs, 2):
         what = f"a rise of shape {motion.rise.shape} for {problem.epochs} epochs"
         raise InvalidProblem(what, where, "give height and rate at each epoch, see optloc.constraints.reported")
-    bad, why = _beyond(motion.rise)
+    bad, why = _out_of_range(motion.rise)
     if bad.any():
         raise InvalidProblem(f"a rise is {why}", where, "give metres and metres per second")
 
@@ -351,7 +351,7 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
         bad = (index < 0) | (index >= limit)
         if bad.any():
             raise InvalidProblem(f"there is no {name} {index[bad][0]}", where, f"use 0 to {limit - 1}")
-    bad, why = _beyond(bias.coefficient)
+    bad, why = _out_of_range(bias.coefficient)
     if bad.any():
         raise InvalidProblem(f"a coefficient is {why}", where, "give numbers such as 1 and -1")
     if form.enters == "turns":
@@ -369,7 +369,7 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
                 f"{name} has {np.size(values)} entries, not {wanted}", where, "give one for each unknown"
             )
     sigma = np.asarray(bias.sigma)
-    if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or _beyond(bias.mean)[0].any():
+    if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or _out_of_range(bias.mean)[0].any():
         raise InvalidProblem("sigma is not positive or mean is not finite", where, "give true numbers, or no sigma")
 
 
@@ -415,7 +415,7 @@ def _check_prior(problem: Problem, prior: Prior) -> None:
             where,
             f"give {slot.size} entries",
         )
-    bad, why = _beyond(prior.mean)
+    bad, why = _out_of_range(prior.mean)
     if bad.any():
         raise InvalidProblem(f"the mean is {why}", where, "give SI units, or no prior")
 
@@ -491,7 +491,7 @@ def check_polygon(vertices: Array, where: str) -> None:
     if len(vertices) > _CORNERS:
         what = f"the polygon has {len(vertices)} corners, {_CORNERS} at most"
         raise InvalidProblem(what, where, "leave out corners that change the shape little")
-    bad, why = _beyond(vertices)
+    bad, why = _out_of_range(vertices)
     if bad.any():
         corner = int(np.flatnonzero(bad.any(-1))[0])
         raise InvalidProblem(f"corner {corner + 1} is {why}", where, "give two numbers")
@@ -524,7 +524,7 @@ def _crossing(v: Array, size: float) -> tuple[int, int] | None:
     straddle = np.ones(len(i), dtype=bool)
     for p, q in ((i, j), (j, i)):
         sides = _cross(along[p], a[q] - a[p]), _cross(along[p], b[q] - a[p])
-        straddle &= np.sign(_flat(sides[0], size)) * np.sign(_flat(sides[1], size)) <= 0
+        straddle &= np.sign(_rounded(sides[0], size)) * np.sign(_rounded(sides[1], size)) <= 0
     low, high = np.minimum(a, b), np.maximum(a, b)
     overlap = ((low[i] <= high[j]) & (low[j] <= high[i])).all(-1)
     # Neighbours always meet at their corner. They overlap only if one turns straight back.
@@ -533,7 +533,7 @@ def _crossing(v: Array, size: float) -> tuple[int, int] | None:
     return (int(i[bad[0]]), int(j[bad[0]])) if len(bad) else None
 
 
-def _flat(area: Array, size: float) -> Array:
+def _rounded(area: Array, size: float) -> Array:
     return np.where(np.abs(area) <= _SLIVER * size**2, 0.0, area)
 
 
@@ -558,11 +558,11 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
     given = np.shape(band.coefficients)[-1:]
     if given != (size,):
         raise InvalidProblem(f"coefficients of shape {np.shape(band.coefficients)}", where, f"give {size} numbers")
-    bad, why = _beyond(band.coefficients)
+    bad, why = _out_of_range(band.coefficients)
     if np.any(bad):
         raise InvalidProblem(f"a coefficient is {why}", where, "give numbers")
     for name, bound, absent in (("lower", band.lower, -np.inf), ("upper", band.upper, np.inf)):
-        bad = _beyond(bound)[0] & (np.asarray(bound) != absent)
+        bad = _out_of_range(bound)[0] & (np.asarray(bound) != absent)
         if np.any(bad):
             raise InvalidProblem(
                 f"the {name} bound is {np.asarray(bound)[bad][0]:g}", where, f"give a number, or {absent:g} for none"

@@ -283,15 +283,15 @@ def fitted(made: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
     with threadpool_limits(1):
         plain = fit(made, common, common)
         # The problem states no noise for common errors, so without evidence they are zero.
-        seen = _with_their_like(visible(made, plain, common), common, shared_by)
+        seen = _all_or_none(visible(made, plain, common), common, shared_by)
         found = fit(made, common & ~seen, common) if seen.any() else plain
-        while (fewer := _with_their_like(seen & (found.low > 0.0), common, shared_by)).sum() < seen.sum():
+        while (fewer := _all_or_none(seen & (found.low > 0.0), common, shared_by)).sum() < seen.sum():
             seen = fewer
             found = fit(made, common & ~seen, common) if seen.any() else plain
     return found, common & ~seen
 
 
-def _with_their_like(shown: Array, common: Array, by: By | None) -> Array:
+def _all_or_none(shown: Array, common: Array, by: By | None) -> Array:
     """Return a mask (G,) of the common errors to keep: with evidence for one station or pair, all are kept.
 
     A fix can follow as many common errors as it has unknowns. If only a few had a level, the others would count as
@@ -328,7 +328,7 @@ def _report(made: Elements, by: By, found: VarianceFit, none: Array, *, tails: b
         _ratio(stated),
         _ratio(found.tests),
         int((stated.dof > 0).sum()),
-        (*_sentences(names, found, redundancy, none), *_tails_in_words(names, wider)),
+        (*_sentences(names, found, redundancy, none), *_tail_sentences(names, wider)),
         wider[used],
     )
 
@@ -337,7 +337,7 @@ def _report(made: Elements, by: By, found: VarianceFit, none: Array, *, tails: b
 _LONG = 1.1
 
 
-def _tails_in_words(names: Array, wider: Array) -> list[str]:
+def _tail_sentences(names: Array, wider: Array) -> list[str]:
     """Return a sentence for each group whose errors have longer tails than normal errors."""
     return [
         f"errors of {name} have long tails: the sigma used is {size:.2g} times the most likely sigma"

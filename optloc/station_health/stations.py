@@ -160,9 +160,9 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     made = elements(batch.take(kept), x, by)
     _check_redundancy(made)
     # Gross errors are detected after noise and offsets are known. Otherwise a bias would be an outlier of every fix.
-    levels, offsets = _settle(made, by)
+    levels, offsets = _estimate_jointly(made, by)
     found = snooped(
-        tested(_take_out(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
+        tested(_subtract(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
     )
     item, own = np.nonzero(np.isfinite(found.sigma) & (made.of_offset >= 0))
     group = made.of_offset[item, own]
@@ -206,17 +206,17 @@ def _check_redundancy(made: Elements) -> None:
         raise InvalidProblem(what, "health", "add stations, or known values such as a height, a bias or a prior")
 
 
-def _settle(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
+def _estimate_jointly(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
     """Return noise levels and offsets that are consistent: each is estimated with the other given."""
     # Offsets first, with the stated noise, because biases in the residuals would increase the estimated noise.
     offsets = offsets_of(made, tested(made, np.ones(())))
     for _ in range(_ROUNDS):
-        levels = levels_of(_take_out(made, offsets), by, tails=False)
+        levels = levels_of(_subtract(made, offsets), by, tails=False)
         offsets = offsets_of(made, tested(made, _variance(made, levels)))
     return levels, offsets
 
 
-def _take_out(made: Elements, offsets: Offsets) -> Elements:
+def _subtract(made: Elements, offsets: Offsets) -> Elements:
     """Return the elements with the offsets subtracted from the residuals."""
     value = np.append(np.nan_to_num(offsets.value), 0.0)[made.of_offset]
     return replace(made, residual=made.residual - (made.offset @ value[..., None])[..., 0])
@@ -242,18 +242,20 @@ def _suspect_shares(batch: Problem, explained: Array | None, by: By, names: tupl
     if explained is None:
         return np.full(len(names), np.nan)
     ends = ends_of(batch, by).name
-    heard, hits = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
+    total, suspected = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
     weight = np.broadcast_to(batch.weight, (len(np.ravel(explained)), batch.count))
     for own, present in zip(np.ravel(explained), weight > 0.0, strict=True):
-        for name in {*ends[present].ravel().tolist()} & heard.keys():
-            heard[name] += 1
+        for name in {*ends[present].ravel().tolist()} & total.keys():
+            total[name] += 1
         suspects = own[0].suspects if own else ()
-        for name in {n for s in suspects for n in _groups_meant(s.name, s.group, ends[list(s.rows)], by)} & hits.keys():
-            hits[name] += 1
-    return np.array([hits[name] / max(heard[name], 1) for name in names])
+        for name in {
+            n for s in suspects for n in _suspect_groups(s.name, s.group, ends[list(s.rows)], by)
+        } & suspected.keys():
+            suspected[name] += 1
+    return np.array([suspected[name] / max(total[name], 1) for name in names])
 
 
-def _groups_meant(name: str, group: str, ends: Array, by: By) -> set[str]:
+def _suspect_groups(name: str, group: str, ends: Array, by: By) -> set[str]:
     """Return the groups of a suspect: the groups of its rows or, for a station, the groups with its name."""
     touched = {*ends.ravel().tolist()} - {""}
     if group != "station" or by != "station":
@@ -401,10 +403,10 @@ def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Arr
     values, vectors = np.linalg.eigh(scaled)
     seen = values > _UNSEEN * max(float(values[-1]), _TINY)
     half = weigh[:, None] * vectors
-    return (half[:, seen] / values[seen]) @ half[:, seen].T, _separate(vectors[:, ~seen], weigh, number > 0.0)
+    return (half[:, seen] / values[seen]) @ half[:, seen].T, _split_by_groups(vectors[:, ~seen], weigh, number > 0.0)
 
 
-def _separate(basis: Array, weigh: Array, used: Array) -> Array:
+def _split_by_groups(basis: Array, weigh: Array, used: Array) -> Array:
     """Return unit vectors (r, p) that span an undetermined space (p, r), with few groups in each vector."""
     # Every basis of the space is valid. Groups that the space does not connect get separate vectors.
     projector = basis @ basis.T * np.outer(used, used)

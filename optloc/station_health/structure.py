@@ -150,13 +150,13 @@ def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> N
 
     with threadpool_limits(1):
         # If the noise is correlated between epochs, the model has no separate error of each epoch.
-        plain = _try(batch, x, "kind", None)
-        common = plain if tied(batch) else _try(batch, x, "kind", "kind")
+        plain = _fit_structure(batch, x, "kind", None)
+        common = plain if tied(batch) else _fit_structure(batch, x, "kind", "kind")
         best = common if common.seen and common.tried.total < plain.tried.total else plain
         lasting = _lasting(batch, x, number, best)
         found = [plain, common] if common.seen else [plain]
         if best is plain and ordered and not lasting:
-            finer = [_try(batch, x, by, None) for by in _groupings(batch)]
+            finer = [_fit_structure(batch, x, by, None) for by in _groupings(batch)]
             found += [structure for structure in finer if structure.tried.levels > plain.tried.levels]
     tried = tuple(sorted((candidate.tried for candidate in found), key=lambda structure: structure.total))
     return NoiseStructure(tried, lasting, tuple(_sentences(tried, lasting, common if best is common else None)))
@@ -177,7 +177,7 @@ class _Candidate:
         return bool((self.made.common[:-1] & ~self.absent).any())
 
 
-def _try(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
+def _fit_structure(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
     """Return a structure fitted to the residuals."""
     made = elements(batch, x, by, common)
     fit, absent = fitted(made, common)
@@ -315,25 +315,27 @@ def with_estimated_noise(
         As for `noise_levels`, and if the data do not determine any level.
     """
     batch = batch_of(problem)
-    learnt = _agree(problem, batch, by or "kind", shared_grouping(by, common) if by else None, method)
+    noise_fixes = _alternate(problem, batch, by or "kind", shared_grouping(by, common) if by else None, method)
     if by is not None:
-        levels = learnt.levels(batch)
+        levels = noise_fixes.levels(batch)
         return with_noise_levels(problem, levels), levels
-    part = _stretches(len(learnt.kept))
+    part = _stretches(len(noise_fixes.kept))
     ordered = _in_order(problem)
-    found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part], ordered=ordered)
+    found = structure_at(
+        batch.take(noise_fixes.kept[part]), noise_fixes.x[part], noise_fixes.kept[part], ordered=ordered
+    )
     _check_lasting(found.lasting, {*map(str, kinds_of(batch))})
-    levels = learnt.levels(batch)
+    levels = noise_fixes.levels(batch)
     if (found.by, found.common) != ("kind", None):
-        plain, learnt = levels, _agree(problem, batch, found.by, found.common, method, learnt)
-        levels = _at_least(learnt.levels(batch), plain, found.lasting if ordered else None)
+        plain, noise_fixes = levels, _alternate(problem, batch, found.by, found.common, method, noise_fixes)
+        levels = _at_least(noise_fixes.levels(batch), plain, found.lasting if ordered else None)
     levels = _widened(levels, found.lasting)
     levels = replace(levels, sentences=(*found.sentences, *levels.sentences))
     return with_noise_levels(problem, levels), levels
 
 
 @dataclass(frozen=True, slots=True)
-class _Learnt:
+class _NoiseFixes:
     """Fixes (n,) of a batch, and the structure of the noise that was used for them."""
 
     by: By
@@ -345,12 +347,12 @@ class _Learnt:
         """Return the levels from stretches of the fixes, or from all fixes if the stretches lack some groups."""
         whole, part = batch.take(self.kept), _stretches(len(self.kept))
         some = whole.take(part)
-        if _present(some, self.by) != _present(whole, self.by):
+        if _present_groups(some, self.by) != _present_groups(whole, self.by):
             some, part = whole, np.arange(len(self.kept))
         return levels_of(elements(some, self.x[part], self.by, self.common), self.by, self.common)
 
 
-def _present(batch: Problem, by: By) -> set[str]:
+def _present_groups(batch: Problem, by: By) -> set[str]:
     """Return the names of the groups that have present rows."""
     names, weight = ends_of(batch, by).name, np.broadcast_to(batch.weight, (batch.batch_shape[0], batch.count))
     return {*names[(weight > 0.0).any(0)].ravel().tolist()} - {""}
@@ -364,9 +366,9 @@ def _stretches(count: int) -> Array:
     return np.unique(first[:, None] + np.arange(_STRETCH))
 
 
-def _agree(
-    problem: Problem, batch: Problem, by: By, common: By | None, method: str, before: _Learnt | None = None
-) -> _Learnt:
+def _alternate(
+    problem: Problem, batch: Problem, by: By, common: By | None, method: str, before: _NoiseFixes | None = None
+) -> _NoiseFixes:
     """Return fixes whose noise agrees with their residuals; the iteration starts from the fixes `before`, if given."""
     from optloc.solvers.solution import solve
 
@@ -389,7 +391,7 @@ def _agree(
             break
         factor = levels.factor
         kept, x = _fix_again(batch_of(with_noise_levels(problem, levels)), method, kept, x)
-    return _Learnt(by, common, kept, x)
+    return _NoiseFixes(by, common, kept, x)
 
 
 def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array, Array]:
