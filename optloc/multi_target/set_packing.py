@@ -58,7 +58,7 @@ class Prices:
 
 
 def incidence(tuples: Tuples, width: int) -> sparse.csc_array:
-    """Return the incidence matrix (m * width, q) of rows, from m channels with `width` values each, in sets."""
+    """Return the sparse incidence matrix (m * width, q): 1 if a row (channel * width + value) is in a set."""
     which, channel = np.nonzero(tuples.picks >= 0)
     row = channel * width + tuples.picks[which, channel]
     shape = (tuples.picks.shape[1] * width, len(tuples.cost))

@@ -87,7 +87,7 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
 
 
 def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
-    """Yield the differences of each epoch and target."""
+    """Yield the range differences of each epoch and target, grouped from the row numbers `taken`."""
     a, b, epoch, target = (
         np.concatenate([getattr(rows, name) for rows in problem.rows])[taken] for name in ("a", "b", "epoch", "target")
     )

@@ -85,7 +85,7 @@ class Signal:
 
     @property
     def _factor(self) -> Array:
-        """Return pi (1 + P) / (T W P rho) for each station, (s,)."""
+        """Return the variance of the log-amplitude of each station (s,), pi (1 + P) / (T W P rho)."""
         total = np.nansum(self.snr)
         return np.asarray(np.pi * (1.0 + total) / (self.duration * self._band * total * self.snr))
 
