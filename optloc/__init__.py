@@ -1,4 +1,4 @@
-"""optloc: fixes and registrations from passive measurements, without a guess, with a covariance and a verdict."""
+"""Position fixes and sensor registration from passive measurements: no first guess, a covariance and a status."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import os
 import signal
 import sys
 
-# The libraries of the command line take half a second to load: Ctrl-C ends it then as it does later, quietly.
+# The libraries of the command line take half a second to load. Ctrl-C in this time ends the program without a
+# traceback.
 _NAME = os.path.basename("".join(sys.argv[:1]))  # noqa: PTH119  (pathlib takes its time, too)
 _RUNS = _NAME in {"optloc", "optloc.exe", "optloc-script.py"} or (_NAME == "-m" and "optloc.cli" in sys.orig_argv)
 if _RUNS and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -21,7 +22,7 @@ from optloc.base.moved import MOVED, moved, watch_old_packages
 from optloc.problem.fix import set_renderer
 from optloc.problem.problem import Problem
 
-# Everything else loads when its name is first used: solvers, proofs and tables take half a second together.
+# All other names load at their first use: solvers, proofs and tables take half a second together.
 if TYPE_CHECKING:
     import optloc.bounds
     import optloc.engine

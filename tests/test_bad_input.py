@@ -111,7 +111,7 @@ TABLE = {
     ),
     "arrival sigma of angles": (
         lambda: problem_of(rows=measured("azimuth", [1.0], a=1, arrival_sigma=1.0)),
-        "azimuth does not add up",
+        "azimuth is not a sum",
     ),
     "negative variance": (lambda: covariance(put((3, 3), -1.0)), "row.*3|noise.*not positive"),
     "non-symmetric covariance": (lambda: covariance(put((0, 1), 0.5)), "noise.*not symmetric"),

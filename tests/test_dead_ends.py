@@ -138,7 +138,7 @@ def test_the_only_unknown_target_is_the_position(kinds, unknown):
 def test_two_unknown_targets_have_no_single_position():
     problem, places = with_known(("range",))
     fix = solve(replace(problem, motions=(optloc.Motion(), optloc.Motion(), problem.motions[2])))
-    with pytest.raises(InvalidProblem, match="no unknown is called 'position'"):
+    with pytest.raises(InvalidProblem, match="there is no unknown 'position'"):
         fix.position  # noqa: B018  (it raises)
     np.testing.assert_allclose(fix.take("position[0]"), places[0], atol=5.0)
 

@@ -427,5 +427,5 @@ def test_a_position_and_a_velocity_of_every_epoch(tmp_path):
     assert nees.mean() == pytest.approx(4.0, abs=3.0 * np.sqrt(8.0 / 60))
     # at rest nothing of the kind would be seen: without a velocity such rows are refused
     path.write_text(text.replace("free_velocity", "free"))
-    with pytest.raises(InvalidProblem, match=r"needs stations that move.*or say how the target moves"):
+    with pytest.raises(InvalidProblem, match=r"needs stations that move.*or state the motion of the target"):
         load(path)

@@ -1,1 +1,1 @@
-"""What everything stands on: types, status, units, frames, arrays, linear algebra, registries."""
+"""Basic modules of all other packages: types, status, units, frames, arrays, linear algebra, registries."""

@@ -1,7 +1,8 @@
-"""Arrays of any library that follows the array-API standard: what its subset leaves to be spelled out.
+"""Arrays of every library that follows the array-API standard, and elementary functions with reproducible bits.
 
-Index tables are numpy arrays everywhere; numbers may be arrays of numpy, JAX, PyTorch, CuPy or another library, on its
-device; what serves all of them writes into no array. `Portable` ones are numpy's, and have the same bits everywhere.
+Index tables are always NumPy arrays. Numbers can be arrays of NumPy, JAX, PyTorch, CuPy or another library, on its
+device. Code for all libraries never writes into an array, because some libraries do not allow it. The functions `sin`,
+`cos`, `atan2`, `hypot`, `log`, `exp` and `product`, and the class `Portable`, give the same bits on every processor.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from optloc.base.types import Array
 
 
 def library(array: Any) -> Any:
-    """Return the module of an array's library: numpy for numbers and numpy arrays."""
+    """Return the array module of an array: NumPy for numbers and NumPy arrays."""
     if isinstance(array, np.ndarray):
         return np
-    # PyTorch's arrays do not offer `__array_namespace__`, and its module follows the standard well enough.
+    # PyTorch arrays have no `__array_namespace__`, but the module `torch` follows the standard well enough.
     if type(array).__module__ == "torch":
         return sys.modules["torch"]
     own = getattr(array, "__array_namespace__", None)
@@ -29,40 +30,40 @@ def library(array: Any) -> Any:
 
 
 def is_other_library(array: Any) -> bool:
-    """Return whether an array belongs to another library than numpy."""
+    """Return whether an array belongs to a library other than NumPy."""
     return library(array) is not np
 
 
 def as_array_like(numbers: Any, like: Any) -> Any:
-    """Return numbers as an array of the library, device and float type of another array.
+    """Return numbers as an array of the library, device and float type of the array `like`.
 
     Parameters
     ----------
     numbers : array
-        Any shape; an array that already belongs to another library than numpy stays as it is.
+        An array of any shape. If it already belongs to a library other than NumPy, it is returned unchanged.
     like : array
-        Says where; for a numpy array the numbers stay as they are.
+        The array that determines library, device and type. If it is a NumPy array, `numbers` is returned unchanged.
     """
     xp = library(like)
     if xp is np or is_other_library(numbers):
         return numbers
-    values = np.array(numbers, dtype=np.float64)  # a copy: some libraries refuse arrays that cannot be written
-    if type(like).__module__.startswith("jax"):  # what JAX traces has no device; it places arrays itself
+    values = np.array(numbers, dtype=np.float64)  # a copy, because some libraries refuse read-only arrays
+    if type(like).__module__.startswith("jax"):  # traced arrays have no device; JAX places arrays itself
         return xp.asarray(values, dtype=like.dtype)
     return xp.asarray(values, dtype=like.dtype, device=like.device)
 
 
 def gather(array: Any, index: Array, axis: int = -1) -> Any:
-    """Return the entries of an array at an index table along one axis; the table's axes take the place of that axis.
+    """Return the entries of an array at an index table along one axis. The axes of the table replace this axis.
 
     Parameters
     ----------
     array : array (..., n, ...)
-        Of any library.
+        An array of any library.
     index : int array, any shape
-        Nonnegative.
+        Indices from 0.
     axis : int
-        Negative: counts from the end.
+        Negative axis number, counted from the end.
     """
     xp = library(array)
     if xp is np:
@@ -73,39 +74,39 @@ def gather(array: Any, index: Array, axis: int = -1) -> Any:
         flat = xp.take(array, index.reshape(-1), axis=axis)
     else:
         flat = xp.take(array, xp.asarray(index.reshape(-1), device=array.device), axis=axis)
-    # The standard takes along a flat index table only.
+    # In the standard, `take` accepts one-dimensional index tables only.
     place = array.ndim + axis
     return xp.reshape(flat, (*array.shape[:place], *index.shape, *array.shape[place + 1 :]))
 
 
 def eye(n: int, like: Any) -> Any:
-    """Return the unit matrix (n, n) in the library of an array."""
+    """Return the unit matrix (n, n) in the library of the array `like`."""
     return as_array_like(np.eye(n), like)
 
 
 def as_number(mask: Any, like: Any) -> Any:
-    """Return a mask as zeros and ones of an array's float type."""
+    """Return a mask as zeros and ones, in the float type of the array `like`."""
     xp = library(mask)
     return xp.where(mask, as_array_like(np.ones(()), like), as_array_like(np.zeros(()), like))
 
 
-# Arguments of any type become arrays of numbers, or a sentence that says which of them cannot.
+# Convert arguments of any type to arrays of numbers, or raise an error that names the argument.
 
 
 def numbers(values: Any, name: str) -> Array | None:
-    """Return values as a float array, None for None.
+    """Return values as a float array; None for None.
 
     Parameters
     ----------
     values : array_like or None
-        Anything.
+        Any value.
     name : str
-        How the caller calls it.
+        Name of the argument for messages.
 
     Raises
     ------
     InvalidProblem
-        Where they are no numbers, or a ragged list.
+        If the values are not numbers, or if the list is ragged.
     """
     if values is None:
         return None
@@ -116,13 +117,13 @@ def numbers(values: Any, name: str) -> Array | None:
 
 
 def as_integers(values: Any, name: str) -> Array | None:
-    """Return values as an integer array, None for None; refuse what would have to be rounded."""
+    """Return values as an integer array, None for None; raise if a value is not a whole number."""
     if isinstance(values, int | np.ndarray) and np.asarray(values).dtype.kind == "i":
         return np.asarray(values, dtype=np.int64)
     array = numbers(values, name)
     if array is None:
         return None
-    # Written so that NaN passes for whole numbers nowhere: NaN differs from its own floor.
+    # This comparison also rejects NaN, because NaN != floor(NaN).
     bad = array != np.floor(array)
     if bad.any():
         raise InvalidProblem(f"{array[bad][0]:g} is not a whole number", name, "give indices")
@@ -130,7 +131,7 @@ def as_integers(values: Any, name: str) -> Array | None:
 
 
 def as_deviations(values: Any, name: str, kind: str) -> Array | None:
-    """Return standard deviations as a float array, None for None; refuse one that is not positive and finite."""
+    """Return standard deviations as a float array, None for None; raise if one is not positive and finite."""
     array = numbers(values, name)
     if array is None:
         return None
@@ -142,19 +143,19 @@ def as_deviations(values: Any, name: str, kind: str) -> Array | None:
     return array
 
 
-# Elementary functions and products that have the same bits on every processor.
+# Elementary functions and products that give the same bits on every processor.
 #
-# Addition, multiplication, division and the square root are rounded as IEEE 754 orders. Sines, logarithms and matrix
-# products are not: their last bit is that of a library, of the width of the processor's registers, and of the BLAS.
-# Here they are written with those four in a fixed order, to within three units in the last place: data that are drawn
-# from a seed are then the same data everywhere.
+# IEEE 754 defines the rounding of addition, multiplication, division and square root. The last bit of sines, logarithms
+# and matrix products depends on the library, on the width of the processor's registers, and on the BLAS. The functions
+# here use only the four defined operations in a fixed order. Their error is within three units in the last place, and
+# random data from a seed are the same everywhere.
 
-# A number as the sum of two or three: the first has so few digits that small multiples of it are exact.
+# A number as a sum of two or three parts. The first part has few digits, so small multiples of it are exact.
 _HALF_PI = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
 _LOG_2 = (0.6931471804855391, 7.440617110012397e-11)
-# The nearest double, and what it lacks.
+# The nearest double, and the remainder.
 _PI = (3.141592653589793, 1.2246467991473532e-16)
-# Arc tangents of 0, 1/8, ..., 1, likewise.
+# Arc tangents of 0, 1/8, ..., 1, as nearest double and remainder.
 _ARC = np.array(
     [
         (0.0, 0.0),
@@ -168,14 +169,14 @@ _ARC = np.array(
         (0.7853981633974483, 3.061616997868383e-17),
     ]
 )
-# Taylor coefficients, as many as a double shows over the interval that is left: |r| < pi/4 of sine and cosine (20!),
-# 1/16 of the arc tangent (its 16th power), log(2)/2 of the exponential (14!), 0.172 of the logarithm (its 24th power).
+# Taylor coefficients up to double precision on the reduced interval: |r| < pi/4 for sine and cosine (20!), 1/16 for the
+# arc tangent (its 16th power), log(2)/2 for the exponential (14!), 0.172 for the logarithm (its 24th power).
 _SIN = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(1, 10))
 _COS = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(2, 11))
 _ATAN = tuple((-1.0) ** k / (2 * k + 1) for k in range(1, 8))
 _EXP = tuple(1.0 / math.factorial(k) for k in range(2, 15))
 _LOG = tuple(2.0 / (2 * k + 1) for k in range(1, 12))
-# Angles above are left to the library: multiples of the first part of pi/2, which has 33 bits, are exact up to 2^20.
+# Larger angles use NumPy's functions: multiples of the first part of pi/2, which has 33 bits, are exact up to 2^20.
 _FAR = 1.6e6
 
 
@@ -187,7 +188,7 @@ def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
 
 
 def _sin_cos(angle: Array) -> tuple[Array, Array, Array]:
-    """Return sine and cosine of what is left of angles less whole quarter turns, and how many of those, modulo 4."""
+    """Return sine and cosine of angles minus whole quarter turns, and the number of quarter turns modulo 4."""
     usable = np.abs(angle) < _FAR
     angle = np.where(usable, angle, 0.0)
     turns = np.rint(angle * (2.0 / math.pi))
@@ -195,20 +196,20 @@ def _sin_cos(angle: Array) -> tuple[Array, Array, Array]:
     square = left * left
     half = 0.5 * square
     near = 1.0 - half
-    # What the difference from one loses by rounding is added again.
+    # Add the rounding error of the subtraction from one.
     cosine = near + (((1.0 - near) - half) + square * square * _polynomial(square, _COS))
     return left + left * (square * _polynomial(square, _SIN)), cosine, turns.astype(np.int64) % 4
 
 
 def sin(angle: Array) -> Array:
-    """Return sines of angles in radians; beyond 1.6e6 those of the library."""
+    """Return the sines of angles in radians. Beyond 1.6e6 it uses NumPy's function."""
     sine, cosine, quarter = _sin_cos(angle)
     value = np.where(quarter % 2 == 0, sine, cosine) * np.where(quarter < 2, 1.0, -1.0)
     return np.where(np.abs(angle) < _FAR, value, np.sin(angle))
 
 
 def cos(angle: Array) -> Array:
-    """Return cosines of angles in radians; beyond 1.6e6 those of the library."""
+    """Return the cosines of angles in radians. Beyond 1.6e6 it uses NumPy's function."""
     sine, cosine, quarter = _sin_cos(angle)
     value = np.where(quarter % 2 == 0, cosine, sine) * np.where((quarter == 1) | (quarter == 2), -1.0, 1.0)
     return np.where(np.abs(angle) < _FAR, value, np.cos(angle))
@@ -219,7 +220,7 @@ def atan2(y: Array, x: Array) -> Array:
     rise, run = np.abs(y), np.abs(x)
     large = np.maximum(rise, run)
     with np.errstate(invalid="ignore"):
-        # Two infinities are the angle of the diagonal, two zeros that of the axis.
+        # Two infinite components give the angle of the diagonal, two zeros the angle of the axis.
         slope = np.where(np.isinf(rise) & np.isinf(run), 1.0, np.minimum(rise, run) / np.where(large > 0.0, large, 1.0))
     eighth = np.rint(8.0 * np.where(np.isnan(slope), 0.0, slope))
     arc = _ARC[eighth.astype(np.int64)]
@@ -239,7 +240,7 @@ def hypot(x: Array, y: Array) -> Array:
 
 
 def log(x: Array) -> Array:
-    """Return natural logarithms."""
+    """Return the natural logarithms of x."""
     usable = (x > 0.0) & np.isfinite(x)
     part, exponent = np.frexp(np.where(usable, x, 1.0))
     low = part < math.sqrt(0.5)
@@ -248,14 +249,14 @@ def log(x: Array) -> Array:
     square, half = ratio * ratio, 0.5 * more * more
     series = square * _polynomial(square, _LOG)
     small = half - (ratio * (half + series) + exponent * _LOG_2[1])
-    # Zero, infinity and what has no logarithm are the same in every library.
+    # Results for zero, infinity and invalid values are the same in every library.
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(usable, exponent * _LOG_2[0] - (small - more), np.log(np.where(usable, 1.0, x)))
 
 
 def exp(x: Array) -> Array:
-    """Return exponentials."""
-    # Beyond, doubles overflow, or underflow to zero.
+    """Return the exponentials of x."""
+    # Outside these limits doubles overflow, or underflow to zero.
     bounded = np.where(np.isnan(x), 0.0, np.clip(x, -750.0, 710.0))
     times = np.rint(bounded / math.log(2.0))
     left = (bounded - times * _LOG_2[0]) - times * _LOG_2[1]
@@ -264,14 +265,14 @@ def exp(x: Array) -> Array:
 
 
 def product(vector: Array, matrix: Array) -> Array:
-    """Return ``sum_k vector[..., k] * matrix[..., k, :]``, added up from the first to the last.
+    """Return ``sum_k vector[..., k] * matrix[..., k, :]``, summed in the order of k.
 
     Parameters
     ----------
     vector : array (..., r)
-        Rows.
+        Vectors of length r.
     matrix : array (..., r, q)
-        Leading axes fit those of the rows.
+        Matrices. Their leading axes broadcast against those of the vectors.
     """
     if not matrix.shape[-2]:
         return np.zeros((*np.broadcast_shapes(vector.shape[:-1], matrix.shape[:-2]), matrix.shape[-1]))
@@ -281,20 +282,20 @@ def product(vector: Array, matrix: Array) -> Array:
     return total
 
 
-# Arrays that use these functions in whatever code they are handed to.
+# Arrays for which NumPy calls use the functions above, in any code that receives them.
 
 _OWN: dict[Any, Any] = {np.sin: sin, np.cos: cos, np.arctan2: atan2, np.hypot: hypot, np.log: log, np.exp: exp}
 
 
 class Portable(np.ndarray):
-    """Numbers whose sines, cosines, angles, lengths, logarithms and exponentials are those of this file.
+    """Numbers for which NumPy's sin, cos, arctan2, hypot, log and exp use the functions of this module.
 
-    What is computed with them is such an array again. ``np.asarray(a).view(Portable)`` makes one, ``.view(np.ndarray)``
-    ends it.
+    Results of computations with them are of this class too. ``np.asarray(a).view(Portable)`` makes such an array, and
+    ``.view(np.ndarray)`` converts it back.
     """
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
-        """Return what numpy's function does, or ours of the same name."""
+        """Return the result of `ufunc`, computed by the function of this module if there is one, else by NumPy."""
         plain = [_plain(value) for value in inputs]
         own = _OWN.get(ufunc) if method == "__call__" and out is None and not options else None
         if own is not None:
@@ -311,20 +312,20 @@ def _plain(value: Any) -> Any:
     return value.view(np.ndarray) if isinstance(value, Portable) else value
 
 
-# Equal rows of tables.
+# Find equal rows of tables.
 
 
 def first_rows(*numbers: Array) -> tuple[Array, Array]:
-    """Return the first rows (n,) of all groups of rows with equal numbers, and the group of each row (m,).
+    """Return the index of the first row (n,) of each group of equal rows, and the group of each row (m,).
 
     Parameters
     ----------
     *numbers : int array (m,)
-        Numbers that are not negative, and not more than there are rows.
+        Columns of the table: integers from 0 to the number of rows.
     """
     code = np.zeros(len(numbers[0]), dtype=np.int64)
     for own in numbers:
-        # Codes stay below the square of the number of rows, which 64 bits hold.
+        # Codes stay below the square of the number of rows, which fits into 64 bits.
         code = np.unique(code * (int(own.max(initial=0)) + 1) + own, return_inverse=True)[1].ravel()
     _, first, inverse = np.unique(code, return_index=True, return_inverse=True)
     order = np.argsort(first)

@@ -1,11 +1,11 @@
-"""What is made once for problems of equal structure and kept: one type of cache for all of optloc, safe in threads.
+"""A thread-safe cache of values that problems of equal structure share, such as compiled programs and tables.
 
-Links, tables, traces, linear maps and programs of IPOPT live in caches of this type, keyed by
-`optloc.problem.problem.Problem.structure` and what else they depend on. Functions of a few plain numbers, such as the
-moments of a loss, are kept by `functools.lru_cache` instead, which is locked and bounded as well; there two threads may
-make the same value at once, which costs microseconds.
+Links, tables, traces, linear maps and programs of IPOPT are in caches of this type. Their keys are
+`optloc.problem.problem.Problem.structure` and other values on which they depend. Functions of a few plain numbers, such
+as the moments of a loss, use `functools.lru_cache` instead. It is also locked and bounded, but two threads can compute
+the same value at once, which costs microseconds.
 
-What is kept is shared by all threads: nobody writes into it.
+All threads share the cached values, so code must not modify them.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from optloc.base.threads import held_by_forks
 
 Value = TypeVar("Value")
 
-# Most entries of an array in a key: copying and hashing them takes some 30 us.
+# Maximum number of entries of an array in a key: copying and hashing this number takes about 30 us.
 _ENTRIES = 4096
-# Types of values that cannot change; equal numbers of the second ones differ as text.
+# Immutable types. Values of the second group can be equal across types, so the key contains the type.
 _ATOMS, _WHOLE = frozenset({str, bytes, float, type(None)}), frozenset({int, bool, complex})
 
-# None is a value (there are no tables for some structures), so a place that waits for its value holds this.
+# Marks an entry whose value is not computed yet. None is a valid value: some structures have no tables.
 _NOTHING = object()
 
 
 @dataclass(slots=True, eq=False)
 class _CachePlace:
-    """Where the value of a key stands; its lock is held by the thread that makes the value."""
+    """Entry of one key. The thread that computes the value holds the lock."""
 
     value: object = _NOTHING
     weight: int = 0
@@ -41,19 +41,20 @@ class _CachePlace:
 
 
 class Cache(Generic[Value]):
-    """Values by key, made when they are first asked for; those that were not used for longest leave first.
+    """Values by key, computed at the first use. If the cache is full, it drops the least recently used values.
 
-    A value is made once, whichever thread asks first: others wait for it, while values of other keys can be had and
-    made. A call that raises leaves nothing behind. To make a value may take other caches, never the same key of this.
+    A value is computed once, by the first thread that needs it. Other threads wait for it, but they can use and compute
+    values of other keys meanwhile. If the computation raises, the cache stores nothing. The computation of a value may
+    use other caches and other keys, but never its own key.
 
-    A cache lives as long as the process: it is one of a module, not of an object.
+    A cache lives as long as the process, so create it at module level, not in an object.
 
     Parameters
     ----------
     most : int
-        Bound on the sum of the weights of the values kept; a heavier value is handed out and not kept.
+        Maximum total weight of the stored values. A value with a larger weight is returned but not stored.
     weigh : callable, optional
-        Weight of a value; 1 if absent, which makes `most` a count.
+        Function that returns the weight of a value. Default: 1, so that `most` is a number of values.
     """
 
     __slots__ = ("_lock", "_most", "_places", "_total", "_weigh")
@@ -65,32 +66,33 @@ class Cache(Generic[Value]):
         held_by_forks(self._lock, self._begin_child)
 
     def _begin_child(self) -> None:
-        # The threads that make these values do not live in a forked child; who needs one makes it.
+        # The threads that compute missing values do not exist in a forked child, so the child computes them again.
         self._places = {key: place for key, place in self._places.items() if place.value is not _NOTHING}
 
     def __len__(self) -> int:
         return len(self._places)
 
     def clear(self) -> None:
-        """Forget all values."""
+        """Remove all values."""
         with self._lock:
             self._places.clear()
             self._total = 0
 
     def find(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """Return the value of a key, made by a call without arguments where it is not kept."""
+        """Return the value of a key; if it is not stored, compute it with ``make()``."""
         with self._lock:
             place = self._places.pop(key, None) or _CachePlace()
             self._places[key] = place
         if place.value is _NOTHING:
-            # Not under the lock of all: a program takes a second, and links are needed to make tables.
+            # Use the lock of the entry, not of the cache: a program takes a second, and tables need links from the
+            # cache.
             with place.lock:
                 if place.value is _NOTHING:
                     self._fill(key, place, make)
         return cast("Value", place.value)
 
     def call(self, make: Callable[..., Value], *values: Any) -> Value:
-        """Return the result of a function of values, from the cache where their content has a key."""
+        """Return ``make(*values)``, from the cache if the content of the values has a key."""
         key = key_of(*values)
         return make(*values) if key is None else self.find(key, lambda: make(*values))
 
@@ -104,7 +106,7 @@ class Cache(Generic[Value]):
             raise
         with self._lock:
             place.value, place.weight = value, 1 if self._weigh is None else self._weigh(value)
-            if self._places.get(key) is not place:  # driven out while it was made
+            if self._places.get(key) is not place:  # dropped during the computation
                 return
             if place.weight > self._most:
                 del self._places[key]
@@ -115,16 +117,16 @@ class Cache(Generic[Value]):
 
 
 class _NoKeyError(Exception):
-    """A value is too large for a key, or may change without notice."""
+    """A value has no key: it is too large, or its type can change without notice."""
 
 
 def key_of(*values: Any) -> Hashable | None:
-    """Return a key that is equal for equal content; None where a value is too large or of another type.
+    """Return a key that is equal for equal content; None if a value is too large or has an unsupported type.
 
     Parameters
     ----------
     *values : object
-        Numbers, texts, numpy arrays, and tuples, lists, dictionaries and dataclasses of these.
+        Numbers, texts, NumPy arrays, and tuples, lists, dictionaries and dataclasses of these.
     """
     try:
         return tuple([_content(value) for value in values])

@@ -1,7 +1,7 @@
-"""Exceptions of optloc: malformed input is an error, a problem without an answer is data.
+"""Exceptions of optloc: malformed input raises an error, but a problem without an answer does not.
 
-A well-posed call that finds no trustworthy answer returns a fix whose status says so; only
-``fix.require()`` turns that status into :class:`NoSolution`.
+If a valid problem has no trustworthy answer, the call returns a fix with a status that explains it. Only
+``fix.require()`` raises :class:`NoSolution` for this status.
 """
 
 from __future__ import annotations
@@ -18,26 +18,27 @@ from optloc.base.types import Status
 
 __all__ = ["NUMERICAL", "InvalidProblem", "NoSolution", "OptlocError", "nearest"]
 
-# What arithmetic raises where numbers are at fault and not the program: those of numpy and scipy, of floating point and
-# of solvers (`formulations.backend.SolverError`). All else is a programming error, and surfaces.
+# Exceptions that input numbers can cause. They come from NumPy and SciPy, from floating-point arithmetic,
+# and from solvers (`formulations.backend.SolverError`). All other exceptions are programming errors and are
+# not caught.
 NUMERICAL: tuple[type[Exception], ...] = (np.linalg.LinAlgError, ArithmeticError)
 
 
 class OptlocError(Exception):
-    """Base class of every exception that optloc raises on purpose."""
+    """Base class of all exceptions that optloc raises on purpose."""
 
 
-class InvalidProblem(OptlocError, ValueError):  # noqa: N818  (named for what the caller handed over)
-    """The input cannot be read as a problem; the message names the culprit.
+class InvalidProblem(OptlocError, ValueError):  # noqa: N818  (named after the input of the caller)
+    """The input is not a valid problem. The message names the faulty part.
 
     Parameters
     ----------
     what : str
-        What is wrong, with the offending value: ``"latitude 95 deg is outside -90 to 90 deg"``.
+        The fault, with the invalid value: ``"latitude 95 deg is outside -90 to 90 deg"``.
     where : str, optional
-        The place: a file, a file and row, a column or an argument.
+        The location: a file, a file and row, a column or an argument.
     advice : str, optional
-        What to do about it.
+        Advice how to correct it.
 
     Notes
     -----
@@ -45,80 +46,80 @@ class InvalidProblem(OptlocError, ValueError):  # noqa: N818  (named for what th
     """
 
     def __init__(self, what: str, where: str | None = None, advice: str | None = None) -> None:
-        # Only positional arguments survive pickling on their way back from a worker process.
+        # Pickling, which returns errors from worker processes, keeps positional arguments only.
         super().__init__(what, where, advice)
         self.what = what
         self.where = where
         self.advice = advice
 
     def __str__(self) -> str:
-        """Return the sentence."""
+        """Return the message: location, fault and advice in one sentence."""
         place = f"{_shown(self.where)}: " if self.where else ""
         advice = f"; {_shown(self.advice.strip().rstrip('.'), 4 * _SHOWN)}" if self.advice else ""
         return f"{place}{_shown(self.what.strip().rstrip('.'))}{advice}."
 
 
-# Characters of a place and of what is wrong there, some three lines: a file may put a megabyte where a name belongs.
-# Advice may list what is known.
+# Maximum number of characters of the location and of the fault, about three lines: a file can contain a megabyte where
+# a name belongs. The advice may be longer, because it can list valid names.
 _SHOWN = 300
 
 
 def _shown(text: str, most: int = _SHOWN) -> str:
-    """Return a text without what is in its middle, where it is long."""
+    """Return the text; if it is longer than `most` characters, without its middle."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
 
 
 class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
-    """A fix was required but its status is not a clean one, or it has too little redundancy.
+    """`fix.require()` refused a fix: its status is not `ok` or allowed, or it has too little redundancy.
 
     Parameters
     ----------
     problem : Problem
-        The problem that was to be solved.
+        The problem of the fix.
     fix : Fix
-        The fix that was refused; its status, alternatives and certificate say why.
+        The refused fix. Its status, alternatives and certificate explain the refusal.
     why : str, optional
-        Why a fix with a clean status was refused.
+        Reason for the refusal of a fix whose status is accepted.
 
     Notes
     -----
-    ``str(error)`` is `why`, or else the sentence of ``fix.status``, with its advice; a batch gives each distinct one
-    once.
+    ``str(error)`` is `why`, or otherwise the sentence of ``fix.status`` with its advice. For a batch it is the sentence
+    of each distinct status.
     """
 
     def __init__(self, problem: Any, fix: Any, why: str = "") -> None:
-        # Only positional arguments survive pickling on their way back from a worker process.
+        # Pickling, which returns errors from worker processes, keeps positional arguments only.
         super().__init__(problem, fix, why)
         self.problem = problem
         self.fix = fix
         self.why = why
 
     def __str__(self) -> str:
-        """Return why, or the sentence of the status; of a batch, one sentence a distinct status."""
+        """Return `why`, or the sentence of the status; for a batch, one sentence for each distinct status."""
         if self.why:
             return self.why
         status = getattr(self.fix, "status", None)
         if status is None:
             return "There is no fix."
-        # A dictionary instead of a set keeps the order in which the verdicts occur in the batch.
+        # A dictionary, unlike a set, keeps the order in which the statuses occur in the batch.
         verdicts = {Status(int(code)): None for code in np.ravel(status)}
         refused = [verdict.sentence for verdict in verdicts if verdict is not Status.OK]
         return " ".join(refused or [verdict.sentence for verdict in verdicts])
 
 
-# So many names are still read, and so many are looked through in the time of a keystroke.
+# Maximum number of names that a message lists, and that the search for similar names compares within a keystroke.
 _FEW, _MANY = 20, 5000
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return advice for an unknown word: the nearest known ones, then all of them where they are few.
+    """Return advice for an unknown word: the most similar valid words, then all valid words if there are few.
 
     Parameters
     ----------
     word : str
-        What the user wrote.
+        The word of the user.
     known : iterable of str
-        What would have been understood.
+        The valid words.
 
     Returns
     -------
@@ -136,7 +137,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def check_once(names: Iterable[str], what: str, where: str) -> None:
-    """Refuse names of which one is there twice; `what` says so of "{!r}"."""
+    """Raise if a name occurs twice. `what` is the message, with "{!r}" for the name."""
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InvalidProblem(what.format(twice), where, "rename one of them")
@@ -145,24 +146,24 @@ def check_once(names: Iterable[str], what: str, where: str) -> None:
 def no_station(
     name: object, where: str | None, known: Iterable[str], error: type[InvalidProblem] = InvalidProblem
 ) -> InvalidProblem:
-    """Return the error of a name that no station has, with the nearest that there are."""
+    """Return an error for a station name that does not exist, with the most similar station names as advice."""
     return error(f"there is no station {name!r}", where, nearest(str(name), known))
 
 
 def _alike(word: str, known: Iterable[str]) -> list[str]:
-    """Return up to two names that a word was perhaps meant to be; none for a single letter, which may be anything."""
+    """Return up to two names similar to a word; none for a single letter, which could mean any name."""
     names = list(known)
-    if word.strip() in names:  # it differs by case, or by blanks at its ends
+    if word.strip() in names:  # the word differs only by case, or by blanks at its ends
         return [word.strip()]
     begun = [name for name in names if len(word) > 2 and name.startswith(word)][:2]
-    # Half of the letters alike is chance, but for names of one length, such as R5 and R6.
+    # Agreement of half of the letters is chance, except for names of the same length, such as R5 and R6.
     same = [name for name in names if len(name) == len(word)]
     found = get_close_matches(word, names, n=2, cutoff=0.6) or begun or get_close_matches(word, same, n=2, cutoff=0.5)
     return found if len(word) > 1 else []
 
 
 def status_named(label: str) -> Status:
-    """Return the status of a label such as "too few rows"; raise InvalidProblem for one that there is not."""
+    """Return the status with a label such as "too few rows"; raise InvalidProblem if it does not exist."""
     wanted = label.strip().lower().replace("_", " ").replace("-", " ")
     for status in Status:
         if status.label == wanted:
@@ -170,23 +171,23 @@ def status_named(label: str) -> Status:
     raise InvalidProblem(f"there is no status {label!r}", "status", nearest(label, [one.label for one in Status]))
 
 
-# The redundancy that a fix must have.
+# The required redundancy of a fix.
 
 
 def whole_redundancy(redundancy: Any) -> int:
-    """Return a redundancy that is asked for; raise InvalidProblem where it is no whole number."""
+    """Return the required redundancy as an integer; raise InvalidProblem if it is not a whole number."""
     if isinstance(redundancy, bool) or not isinstance(redundancy, int | np.integer) or redundancy < 0:
-        raise InvalidProblem(f"{redundancy!r} is no redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")
+        raise InvalidProblem(f"{redundancy!r} is not a redundancy", "redundancy", "give a whole number: 0, 1, 2, ...")
     return int(redundancy)
 
 
 def too_weak(fix: Any, weak: Any, wanted: int) -> str:
-    """Return the sentence on fixes of a batch, by their numbers, that have too little redundancy."""
+    """Return a sentence about the fixes of a batch, with numbers `weak`, that have too little redundancy."""
     found = int(np.ravel(fix.dof)[weak[0]])
     which = "The fix" if fix.shape == () else f"Fix {int(weak[0])} of {fix.code.size}"
     more = f" ({len(weak)} fixes have less than {wanted})" if len(weak) > 1 else ""
     means = "a wrong measurement would not be noticed" if found <= 0 else "a wrong measurement could not be named"
     return (
         f"{which} has a redundancy of {found}, and {wanted} is required{more}: {means}; "
-        "add a station, a measurement or a known height."
+        "add a row, a station or a known value, such as a height."
     )

@@ -1,7 +1,8 @@
-"""Public names of a package, which load when they are first used.
+"""Lazy public names of a package: each name loads at its first use.
 
-The ``__init__`` of a package lists what it exports once, as imports for type checkers. Python reads the list from
-there, so that ``import optloc`` loads neither solvers nor tables.
+The ``__init__`` of a package lists its public names once, as imports for type checkers. `exported` reads this list, so
+that
+``import optloc`` loads neither solvers nor tables.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ def exported(package: str, file: str) -> Exported:
     Parameters
     ----------
     package, file : str
-        Its ``__name__`` and ``__file__``. All imports under ``if TYPE_CHECKING:`` of the file are exported.
+        ``__name__`` and ``__file__`` of the package. All imports under ``if TYPE_CHECKING:`` of the file are exported.
     """
     homes = dict(_imports(ast.parse(Path(file).read_text(encoding="utf-8"))))
     names = sorted(homes)
@@ -44,7 +45,7 @@ def exported(package: str, file: str) -> Exported:
 
 
 def _imports(tree: ast.Module) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield name, module and original name of the imports for type checkers."""
+    """Yield the public name, the module and the original name of each import for type checkers."""
     for block in tree.body:
         if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
             for line in block.body:

@@ -1,9 +1,9 @@
-"""Frames in which positions are given: plain Cartesian, Earth-centred Earth-fixed, local east-north-up.
+"""Coordinate frames of positions: Cartesian, Earth-centred Earth-fixed (ECEF), and local east-north-up (ENU).
 
-The ellipsoid is WGS 84 throughout; latitudes and longitudes are geodetic and in radians, heights are
-above the ellipsoid and in metres. The library pymap3d, imported where it is used, converts geodetic places.
-The inverse is Bowring's rule, by additions, products and square roots alone: they have the same bits on every
-processor, and need a tenth of the time of a fix's sines and angles.
+The ellipsoid is WGS 84. Latitudes and longitudes are geodetic, in radians. Heights are above the ellipsoid, in metres.
+The library pymap3d, imported at its first use, converts geodetic coordinates to ECEF. The inverse is Bowring's method.
+It uses only additions, products and square roots. They have the same bits on every processor, and they take a tenth of
+the time of sines and angles.
 
 Sources: NGA, World Geodetic System 1984, NGA.STND.0036 (2014), for the ellipsoid; B. R. Bowring,
 Transformation from spatial to geographical coordinates, Survey Review 23 (1976), for the inverse.
@@ -31,20 +31,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What the coordinates of stations and targets mean.
+    """Coordinate frame of stations and targets.
 
     Parameters
     ----------
     kind : {"cartesian", "ecef", "enu"}
-        Axes anywhere (2-D or 3-D), Earth-centred Earth-fixed (3-D), or east, north, up at `origin` (a
-        2-D problem lies in the plane up = 0).
+        Arbitrary Cartesian axes (2-D or 3-D), Earth-centred Earth-fixed (3-D), or east, north, up at `origin` (a 2-D
+        problem is in the plane up = 0).
     origin : tuple of float (latitude, longitude, height), optional
-        In rad, rad, m; of an ENU frame only. :meth:`enu` takes degrees.
+        In rad, rad, m; for an ENU frame only. :meth:`enu` takes degrees.
 
     Raises
     ------
     InvalidProblem
-        Unknown kind, an origin too many or missing, or one outside its range.
+        For an unknown kind, for an origin that is missing, not allowed, or outside its range.
     """
 
     kind: Literal["cartesian", "ecef", "enu"]
@@ -61,22 +61,22 @@ class Frame:
 
     @classmethod
     def enu(cls, *, lat_deg: float, lon_deg: float, height: Amount = 0.0) -> Frame:
-        """Return the east-north-up frame at a geodetic point: degrees, and metres or text such as "1640 ft"."""
+        """Return the east-north-up frame at a geodetic point: degrees; height in metres or text such as "1640 ft"."""
         metres = float(in_si(height, "length", "height", place=True))
         return cls("enu", (math.radians(lat_deg), math.radians(lon_deg), metres))
 
     @property
     def geodetic(self) -> bool:
-        """Whether positions have a latitude, a longitude and a height."""
+        """Return whether positions have a latitude, a longitude and a height."""
         return self.kind != "cartesian"
 
     def rotation_to_ecef(self) -> Array:
-        """Return the rotation R of ``p_ecef = R p + o``.
+        """Return the rotation matrix R of ``p_ecef = R p + o``.
 
         Returns
         -------
         ndarray, shape (3, 3)
-            Its columns are this frame's axes in ECEF.
+            The columns are the axes of this frame in ECEF.
         """
         return _turn_at(self._place())
 
@@ -85,7 +85,7 @@ class Frame:
         return _start_at(self._place())
 
     def to_ecef(self, position: ArrayLike) -> Array:
-        """Convert positions of this frame to ECEF.
+        """Return positions of this frame as ECEF positions.
 
         Parameters
         ----------
@@ -100,25 +100,26 @@ class Frame:
         return product(self._spatial(position), self.rotation_to_ecef().T) + self.origin_ecef()
 
     def from_ecef(self, position: ArrayLike) -> Array:
-        """Convert ECEF positions, shape (..., 3) in metres, to this frame."""
-        # Subtracted before it is turned: turned numbers of the Earth's size are rounded to a nanometre.
+        """Return ECEF positions, shape (..., 3) in metres, as positions of this frame."""
+        # Subtract before the rotation, because rotated coordinates with the size of the Earth are rounded to a
+        # nanometre.
         return product(_vectors(position, (3,)) - self.origin_ecef(), self.rotation_to_ecef())
 
     def to_geodetic(self, position: ArrayLike) -> tuple[Array, Array, Array]:
-        """Convert positions of this frame to latitude, longitude (rad) and height (m), each of shape (...)."""
+        """Return latitude, longitude (rad) and height (m), each of shape (...), of positions of this frame."""
         return ecef_to_geodetic(self.to_ecef(position))
 
     def from_geodetic(
         self, lat: ArrayLike, lon: ArrayLike, height: ArrayLike, *, where: str = "position", first_row: int = 0
     ) -> Array:
-        """Convert geodetic points to this frame.
+        """Return geodetic points as positions of this frame.
 
         Parameters
         ----------
         lat, lon, height : array_like, shape (...)
             Radians, radians, metres.
         where, first_row
-            As in :func:`check_geodetic`.
+            As for :func:`check_geodetic`.
 
         Returns
         -------
@@ -131,9 +132,8 @@ class Frame:
     def enu_axes(self, position: ArrayLike) -> Array:
         """Return the local east, north and up axes at points of this frame.
 
-        These are the axes of a station that states none, and turn a fix's covariance C into
-        ``A @ C @ A.T`` along east, north and up. In plain Cartesian frames, and in two dimensions, they
-        are the frame's own axes.
+        Stations without stated axes use them. They convert the covariance C of a fix to ``A @ C @ A.T`` along east,
+        north and up. In Cartesian frames, and in two dimensions, they are the axes of the frame.
 
         Parameters
         ----------
@@ -147,13 +147,13 @@ class Frame:
         """
         p = _vectors(position, (2, 3))
         d = p.shape[-1]
-        # In the plane the frame's own axes are meant, as they are where there is no Earth.
+        # Without an Earth, and in two dimensions, the local axes are the axes of the frame.
         if not self.geodetic or (self.kind == "enu" and d == 2):
             return np.broadcast_to(np.eye(d), (*p.shape, d)).copy()
         return product(_axes_in_ecef(*_directions(self.to_ecef(p))), self.rotation_to_ecef())
 
     def _place(self) -> tuple[float, float, float] | None:
-        """Return the origin, None for ECEF; a frame without a place on Earth is refused."""
+        """Return the origin, None for ECEF; raise for a Cartesian frame, which has no place on Earth."""
         if not self.geodetic:
             raise InvalidProblem(
                 "a cartesian frame has no place on Earth", "frame", "use the frame 'ecef', or 'enu' with its origin"
@@ -166,24 +166,24 @@ class Frame:
 
 
 CARTESIAN: Final = Frame("cartesian")
-"""Axes that are nowhere in particular."""
+"""Arbitrary Cartesian axes, without a place on Earth."""
 
 ECEF: Final = Frame("ecef")
 """Earth-centred, Earth-fixed, WGS 84."""
 
 
 def geodetic_to_ecef(lat: ArrayLike, lon: ArrayLike, height: ArrayLike) -> Array:
-    """Convert latitude, longitude (rad) and height (m), each of shape (...), to ECEF metres (..., 3)."""
+    """Return ECEF positions (..., 3), metres, of latitude, longitude (rad) and height (m), each of shape (...)."""
     from pymap3d import geodetic2ecef
 
     given = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (lat, lon, height)))
-    # Scenes on Earth are drawn too: their last bit must not be that of a processor's sine.
+    # Simulated scenes on Earth must have the same bits everywhere, so `Portable` computes the sines.
     place = geodetic2ecef(*(v.view(Portable) for v in given), deg=False)
     return np.stack(np.broadcast_arrays(*map(np.asarray, place)), axis=-1)
 
 
 def ecef_to_geodetic(position: ArrayLike) -> tuple[Array, Array, Array]:
-    """Convert ECEF positions to latitude, longitude and height.
+    """Return latitude, longitude and height of ECEF positions.
 
     Parameters
     ----------
@@ -206,25 +206,26 @@ def ecef_to_geodetic(position: ArrayLike) -> tuple[Array, Array, Array]:
 # Semi-axes of WGS 84, metres, and its squared eccentricity.
 _MAJOR, _MINOR = 6378137.0, 6356752.31424518
 _FLAT = 1.0 - (_MINOR / _MAJOR) ** 2
-# Steps of Bowring's rule from the direction of the Earth's centre: rounding remains at all heights above -6000 km.
+# Iterations of Bowring's method from the geocentric direction: only rounding error remains at all heights above -6000
+# km.
 _STEPS = 3
 
 
 def _directions(position: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return sine and cosine (...) of latitude and of longitude at ECEF positions (..., 3), without an angle."""
+    """Return sine and cosine (...) of latitude, and of longitude, of ECEF positions (..., 3), without angles."""
     x, y, z = np.moveaxis(position, -1, 0)
     axial = np.sqrt(x * x + y * y)
     rise, run = z, axial
     for _ in range(_STEPS):
         sine, cosine = _unit(_MINOR * rise, _MAJOR * run)
         rise = z + _FLAT * _MAJOR**2 / _MINOR * (sine * sine * sine)
-        # Not negative: within 43 km of the centre several latitudes fit.
+        # Clipped at zero: within 43 km of the centre several latitudes are possible.
         run = np.maximum(axial - _FLAT * _MAJOR * (cosine * cosine * cosine), 0.0)
     return _unit(rise, run), _unit(y, x)
 
 
 def _unit(y: Array, x: Array) -> tuple[Array, Array]:
-    """Return sine and cosine of the angles of vectors (x, y); the angle of a vector of length zero is zero."""
+    """Return sine and cosine of the angles of vectors (x, y); a vector of length zero has the angle zero."""
     length = np.sqrt(x * x + y * y)
     zero = length == 0.0
     length = length + zero
@@ -234,29 +235,29 @@ def _unit(y: Array, x: Array) -> tuple[Array, Array]:
 def check_geodetic(
     lat: ArrayLike, lon: ArrayLike, height: ArrayLike = 0.0, *, where: str = "position", first_row: int = 0
 ) -> None:
-    """Refuse points that are not on Earth.
+    """Raise if a point is not on Earth.
 
     Parameters
     ----------
     lat, lon, height : array_like, shape (...)
         Radians, radians, metres.
     where : str
-        File or argument to name.
+        File or argument that messages name.
     first_row : int
-        Number of the first row as the user counts.
+        Number of the first row in the user's count.
 
     Raises
     ------
     InvalidProblem
-        The first point whose latitude is outside -90 to 90 deg, whose longitude is outside -180 to 360 deg,
-        or that has a coordinate that is not finite.
+        For the first point with a latitude outside -90 to 90 deg, a longitude outside -180 to 360 deg, or a coordinate
+        that is not finite.
     """
-    slack = 1e-9  # a right angle converted from degrees may exceed pi / 2 by rounding
-    # Longitudes come as -180 to 180 and as 0 to 360 deg; both mean the same place.
+    slack = 1e-9  # a right angle that was converted from degrees can exceed pi / 2
+    # Both conventions of longitude are valid: -180 to 180 deg and 0 to 360 deg.
     ranges = {"latitude": (lat, -90.0, 90.0), "longitude": (lon, -180.0, 360.0)}
     for name, (values, low, high) in ranges.items():
         degrees = np.degrees(np.asarray(values, dtype=np.float64)).ravel()
-        # Written so that NaN is outside as well.
+        # This comparison also rejects NaN.
         outside = np.flatnonzero(~((degrees >= low - slack) & (degrees <= high + slack)))
         if outside.size:
             row = outside[0]
@@ -273,7 +274,7 @@ def _row(where: str, row: np.intp, column: Array, first_row: int) -> str:
     return where if column.size == 1 else f"{where}, row {row + first_row}"
 
 
-# Of a frame both are always the same, and constraints ask at every step.
+# Rotation and origin of a frame are constant, and constraints need them at every step, so they are cached.
 
 
 @lru_cache(maxsize=64)
@@ -290,13 +291,13 @@ def _start_at(place: tuple[float, float, float] | None) -> Array:
 
 
 def _fixed(array: Array) -> Array:
-    """Return an array that nobody can write to, because others read it."""
+    """Return the array as a read-only array, because the cache shares it."""
     array.flags.writeable = False
     return array
 
 
 def _axes_in_ecef(lat: tuple[Array, Array], lon: tuple[Array, Array]) -> Array:
-    """Return east, north, up as rows in ECEF, shape (..., 3, 3), from sines and cosines (...) of the angles."""
+    """Return east, north, up as rows in ECEF (..., 3, 3), from (sine, cosine) of latitude and of longitude."""
     (sine, cosine), (y, x) = lat, lon
     rows = ((-y, x, np.zeros_like(x)), (-sine * x, -sine * y, cosine), (cosine * x, cosine * y, sine))
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
@@ -306,6 +307,6 @@ def _vectors(position: ArrayLike, lengths: tuple[int, ...]) -> Array:
     p = np.asarray(position, dtype=np.float64)
     if p.ndim == 0 or p.shape[-1] not in lengths:
         allowed = " or ".join(str(n) for n in lengths)
-        what = f"positions of shape {p.shape} have no last axis of {allowed} coordinates"
-        raise InvalidProblem(what, "position", "give x, y or x, y, z of each in its last axis")
+        what = f"positions of shape {p.shape} do not have a last axis of {allowed} coordinates"
+        raise InvalidProblem(what, "position", "give x, y or x, y, z in the last axis")
     return p

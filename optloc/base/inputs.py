@@ -1,7 +1,8 @@
-"""What is read from outside: regular files within a budget, and nothing beyond the folder of the file that names them.
+"""Reading of input files: only regular files, within size limits, and only below the folder of the naming file.
 
-Files come from other people. Every one is opened here, so that a device, a pipe, a bomb or a path to somewhere else
-is one sentence, and so that what a run has read is known when it writes.
+Files can come from untrusted sources, so this module opens all of them. A device, a pipe, an oversized file or a path
+to another folder raises an error with one sentence. The module also records the files that a run has read, so that
+outputs do not overwrite them.
 """
 
 from __future__ import annotations
@@ -40,32 +41,32 @@ __all__ = [
 ]
 
 STANDARD_INPUT = Path("-")
-"""Name of standard input where a command takes it in the place of a file."""
+"""Name of standard input in commands that accept it instead of a file."""
 
-# Read at a time: large enough that system calls do not count, small enough that a file that is too long is noticed.
+# Bytes per read: large enough that system calls cost little, small enough that an oversized file is detected early.
 _PIECE = 1 << 22
-# What is repeated of a word that is refused.
+# Characters of a refused word that a message repeats.
 _WORD = 40
-# Names in a folder that are looked through for one like that of a missing file.
+# Maximum number of file names in a folder that are compared with the name of a missing file.
 _NAMES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How much a file may hold, so that reading it takes seconds and a few gigabytes at most.
+    """Size limits of an input file, so that reading it takes at most seconds and a few gigabytes.
 
     Parameters
     ----------
     bytes : int
-        Of a table (CSV, Parquet: as it is stored, and as it declares itself unpacked) or a file of a data set.
+        Size of a table (CSV, Parquet; stored size and declared unpacked size) or of a file of a data set.
     text : int
-        Bytes of a document (TOML, JSON, GeoJSON), which is parsed as a whole, some 1 MB a second.
+        Bytes of a document (TOML, JSON, GeoJSON). It is parsed as a whole, at about 1 MB per second.
     rows, columns, cells : int
-        Of a table.
+        Size of a table.
     nesting : int
-        Tables and lists within each other in a document.
+        Depth of nested tables and lists in a document.
     unknowns : int
-        That all epochs of a problem file share: places of targets, biases, offsets of stations.
+        Number of unknowns that all epochs of a problem file share: positions of targets, biases, offsets of stations.
     """
 
     bytes: int = 1 << 28
@@ -79,16 +80,16 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """What may be read.
+    """Permissions for reading files, and a record of the files that were read.
 
     Parameters
     ----------
     budget : Budget
-        How much.
+        Size limits.
     outside : bool
-        Whether a file may name files that are not beneath its own folder.
+        Whether a file may name files outside its own folder.
     read : set of Path
-        Resolved paths of what was read.
+        Resolved paths of the files that were read.
     """
 
     budget: Budget = field(default_factory=Budget)
@@ -96,7 +97,7 @@ class Access:
     read: set[Path] = field(default_factory=set, compare=False)
 
 
-# Of a thread, or of a task: whoever reads for somebody else says so here, and nobody passes it through ten functions.
+# Permissions of the current thread or task. A context variable avoids passing them through many functions.
 _ACCESS: ContextVar[Access | None] = ContextVar("access", default=None)
 
 
@@ -106,16 +107,16 @@ def _now() -> Access:
 
 @contextmanager
 def access(*, outside: bool | None = None, budget: Budget | None = None, anew: bool = False) -> Iterator[Access]:
-    """Let what is read meanwhile be more, or less, than by default.
+    """Change the permissions for reading files within a `with` block.
 
     Parameters
     ----------
     outside : bool, optional
-        Whether files may name files that are not beneath their own folders; None: as before.
+        Whether files may name files outside their own folders. None: unchanged.
     budget : Budget, optional
-        How much they may hold; None: as before.
+        Size limits. None: unchanged.
     anew : bool
-        Whether the list of what was read, and all that is None, begins anew.
+        Whether to start with an empty record of read files, and with the defaults for arguments that are None.
     """
     old = Access() if anew else _now()
     new = replace(
@@ -129,27 +130,27 @@ def access(*, outside: bool | None = None, budget: Budget | None = None, anew: b
 
 
 def relax_budget(*, outside: bool | None = None, budget: Budget | None = None) -> None:
-    """Do as `access` for the rest of the one that is open; a command line learns of its options one by one."""
+    """Change the permissions for the rest of the open `access` block. A command line sets them option by option."""
     old = _now()
     more = {key: value for key, value in (("outside", outside), ("budget", budget)) if value is not None}
     _ACCESS.set(replace(old, **more))  # type: ignore[arg-type]  # each has the type of its field
 
 
 def files_read() -> frozenset[Path]:
-    """Return the resolved paths of all files that were read in the access that is open; none outside of one."""
+    """Return the resolved paths of all files that were read in the open `access` block; empty outside a block."""
     found = _ACCESS.get()
     return frozenset() if found is None else frozenset(found.read)
 
 
 def budget_of(text: str, where: str) -> Budget:
-    """Return a budget in words, such as ``rows=2e7,bytes=4e9``; what is not named is as by default.
+    """Return the budget that a text such as ``rows=2e7,bytes=4e9`` describes. Other limits have their defaults.
 
     Parameters
     ----------
     text : str
-        Names and whole numbers.
+        Names of limits with whole numbers.
     where : str
-        Place to name.
+        Location that error messages name.
     """
     known = [entry.name for entry in fields(Budget)]
     found = {}
@@ -161,15 +162,15 @@ def budget_of(text: str, where: str) -> Budget:
             value = float(number)
         except ValueError:
             value = float("nan")
-        # no file system has more bytes than 2^63, and nothing can be limited to less than one
+        # Each limit is at least one. No file system can store more than 2^63 bytes.
         if not 1.0 <= value < 2.0**63:
-            raise InvalidProblem(f"{number!r} is no number of {name}", where, f"write {name}=1e8")
+            raise InvalidProblem(f"{number!r} is not a number of {name}", where, f"write {name}=1e8")
         found[name] = int(value)
     return Budget(**found)
 
 
 def check_budget(what: str, count: int, where: str) -> None:
-    """Raise InvalidProblem where a count is above the budget of its name: "rows", "columns", "cells" ..."""
+    """Raise InvalidProblem if a count is above the limit with this name: "rows", "columns", "cells" ..."""
     limit = getattr(_now().budget, what)
     if count > limit:
         raise _beyond(what, f"{count}", limit, where)
@@ -178,7 +179,7 @@ def check_budget(what: str, count: int, where: str) -> None:
 def _beyond(what: str, count: str, limit: int, where: str) -> InvalidProblem:
     name = {"text": "bytes of text", "nesting": "levels of nesting"}.get(what, what)
     by = f"--budget {what}=NUMBER, in Python with budget=optloc.files.Budget({what}=NUMBER)"
-    advice = f"make it smaller, or allow more with {by}"
+    advice = f"make it smaller, or raise the limit with {by}"
     found = (
         f"there are {count} {name} than {limit}" if count == "more" else f"there are {count} {name}, {limit} at most"
     )
@@ -191,22 +192,22 @@ def within(folder: Path, name: str, where: str) -> Path:
     Parameters
     ----------
     folder : Path
-        Folder of the file that names it.
+        Folder of the other file.
     name : str
-        Its path relative to that folder, as written.
+        Path relative to this folder, as written in the other file.
     where : str
-        Place of the name.
+        Location that error messages name.
 
     Raises
     ------
     InvalidProblem
-        Where it is not beneath the folder, links followed, and that is not allowed.
+        If the path, with links resolved, is outside the folder, and this is not allowed.
     """
     path = folder / name
     try:
         inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
-    except ValueError:  # a name with a zero in it is none
-        raise InvalidProblem(f"{name!r} is no name of a file", where, "correct it") from None
+    except ValueError:  # a name with a zero character is not valid
+        raise InvalidProblem(f"{name!r} is not a file name", where, "correct it") from None
     if not (inside or _now().outside):
         advice = "move it there, or allow it with --outside, in Python with outside=True"
         raise InvalidProblem(f"{name!r} is outside the folder of the file that names it", where, advice)
@@ -214,57 +215,57 @@ def within(folder: Path, name: str, where: str) -> Path:
 
 
 def read_bytes(path: Path, what: str = "bytes", *, lines: bool = False) -> bytes:
-    """Return what a file holds.
+    """Return the content of a file.
 
     Parameters
     ----------
     path : Path
         A regular file, or a link to one.
     what : "bytes" or "text"
-        The budget that it has.
+        Name of the size limit.
     lines : bool
-        Whether its lines are rows, and have their budget too.
+        Whether lines count as rows, which have their own limit.
 
     Raises
     ------
     InvalidProblem
-        Where it is missing, a folder, a device or a pipe, must not be read or holds more than its budget.
+        If it is missing, a folder, a device or a pipe, if it is not readable, or if it exceeds a limit.
     """
     with os.fdopen(_open(path), "rb", buffering=0) as file:
         return _all_of(file.read, what, str(path), lines=lines)
 
 
 def _all_of(read: Callable[[int], bytes], what: str, where: str, *, lines: bool = False) -> bytes:
-    """Return all that can be read, or raise InvalidProblem as soon as it is more than the budget."""
+    """Return all available bytes; raise InvalidProblem as soon as they exceed a limit."""
     budget = _now().budget
     limit = getattr(budget, what)
-    held, size, rows = io.BytesIO(), 0, 0
+    buffer, size, rows = io.BytesIO(), 0, 0
     while piece := read(_PIECE):
-        held.write(piece)
+        buffer.write(piece)
         size += len(piece)
         rows += piece.count(b"\n") if lines else 0
         if size > limit:
             raise _beyond(what, "more", limit, where)
-        # one line is the header
+        # The first line is the header.
         if rows > budget.rows + 1:
             raise _beyond("rows", "more", budget.rows, where)
-    return held.getvalue()
+    return buffer.getvalue()
 
 
 def _open(path: Path) -> int:
-    """Return a descriptor of a regular file; raise InvalidProblem for all else."""
+    """Return a file descriptor of a regular file; raise InvalidProblem for anything else."""
     try:
-        # Opening is the only sure test. Without waiting: a pipe that nobody writes to would hold it for ever.
+        # Only opening the file is a reliable test. O_NONBLOCK: opening a pipe without a writer would wait for ever.
         found = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (FileNotFoundError, NotADirectoryError):
-        raise InvalidProblem("there is no such file", str(path), _like(path)) from None
+        raise InvalidProblem("there is no such file", str(path), _similar_file(path)) from None
     except OSError as error:
-        if os.path.isdir(path):  # noqa: PTH112  # it does not raise for a name that is too long
+        if os.path.isdir(path):  # noqa: PTH112  # does not raise for a name that is too long
             raise InvalidProblem("this is a folder, not a file", str(path), "name a file in it") from None
         what = f"the file cannot be opened ({error.strerror})"
         raise InvalidProblem(what, str(path), "check its permissions and links") from None
     except ValueError:
-        raise InvalidProblem("this is no name of a file", repr(str(path)), "correct it") from None
+        raise InvalidProblem("this is not a file name", repr(str(path)), "correct it") from None
     mode = os.fstat(found).st_mode
     if not stat.S_ISREG(mode):
         os.close(found)
@@ -276,57 +277,60 @@ def _open(path: Path) -> int:
     return found
 
 
-def _like(path: Path) -> str:
-    """Return advice for a name that is not there."""
+def _similar_file(path: Path) -> str:
+    """Return advice for a file that does not exist: a similar name in the same folder."""
     try:
         names = sorted(found.name for found in islice(path.parent.iterdir(), _NAMES))
     except OSError:
         names = []
     near = nearest(path.name, names)
-    return near.partition("?")[0] + "?" if "?" in near else "check the name; it is taken relative to the file it is in"
+    return (
+        near.partition("?")[0] + "?" if "?" in near else "check the name; it is relative to the file that contains it"
+    )
 
 
 # Documents.
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a document, of standard input where the path is "-"; raise InvalidProblem where it is none."""
+    """Return the text of a document, or of standard input for "-"; raise InvalidProblem if it is unreadable."""
     if path == STANDARD_INPUT:
         return decoded(_all_of(sys.stdin.buffer.read, "text", "standard input"), "standard input")
     return decoded(read_bytes(path, "text"), path.name)
 
 
 def decoded(data: bytes, source: str) -> str:
-    """Return bytes as text; raise InvalidProblem where they are not UTF-8, naming the line."""
+    """Return bytes as text; raise InvalidProblem with the line number if they are not UTF-8."""
     try:
-        # Editors of Windows begin files with a byte order mark.
+        # Editors on Windows write a byte order mark at the start of files.
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise InvalidProblem("the text is not UTF-8", f"{source}, line {line}", "save it as UTF-8") from None
 
 
-# What a dotted key is cut from its neighbours by. The parser takes the square of a key's parts as long: 0.7 ms for 300,
-# hours for a million. No table is nested so deep; that of fewer is told when it is read.
+# Characters that separate a dotted key from other text, and the maximum number of its parts. The time of the TOML
+# parser grows with the square of the number of parts: 0.7 ms for 300, hours for a million. No table is nested so
+# deeply. For keys with fewer parts, the limit on nesting applies after parsing.
 _KEYS, _PARTS = re.compile(r"[=,{}\[\]\n]"), 300
 
 
 def toml_of(text: str, source: str) -> dict[str, Any]:
-    """Return TOML as data; raise InvalidProblem where it is none, naming the line.
+    """Return the content of a TOML text; raise InvalidProblem with the line number if the text is not valid TOML.
 
     Parameters
     ----------
     text : str
         The document.
     source : str
-        Place to name.
+        Location that error messages name.
     """
     if max(key.count(".") for key in _KEYS.split(text)) > _PARTS:
         raise _beyond("nesting", "more", _now().budget.nesting, source)
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        # tomllib has the place in its message only.
+        # tomllib gives the position in its message only.
         what, _, place = str(error).partition(" (at ")
         line = place.rstrip(")").partition(",")[0] if place else None
         where = ", ".join(part for part in (source, line) if part)
@@ -338,9 +342,10 @@ def toml_of(text: str, source: str) -> dict[str, Any]:
 
 
 def json_of(text: str, source: str, parse_float: Callable[[str], Any] | None = None) -> Any:
-    """Return JSON as data; raise InvalidProblem where it is none, naming the line; arguments as `toml_of`.
+    """Return the content of a JSON text; raise InvalidProblem with the line number if the text is not valid JSON.
 
-    `parse_float` makes something else of a number with a decimal point, such as one that keeps all its digits.
+    The arguments are as for `toml_of`. `parse_float` converts numbers with a decimal point, for instance to a type
+    that keeps all digits.
     """
     try:
         data = json.loads(text, parse_float=parse_float)
@@ -356,25 +361,25 @@ def json_of(text: str, source: str, parse_float: Callable[[str], Any] | None = N
 def _refused(error: Exception, language: str, source: str) -> InvalidProblem:
     if isinstance(error, RecursionError):
         return _beyond("nesting", "more", _now().budget.nesting, source)
-    # What is left is a whole number that Python does not read: of more than 4300 digits.
-    what = f"this {language} holds a number of more digits than can be read"
-    return InvalidProblem(what, source, "write numbers with 17 digits at most")
+    # The other cause is a whole number with more than 4300 digits, which Python refuses.
+    what = f"this {language} contains a number with too many digits"
+    return InvalidProblem(what, source, "write numbers with at most 17 digits")
 
 
-# Characters that move a terminal's cursor, end its lines or turn its writing round, and halves of characters, which no
-# file can hold; breaks and tabs are text.
+# Characters that move the cursor of a terminal, end lines or reverse the writing direction, and surrogates, which no
+# file can contain. Line breaks and tabs are allowed.
 _CONTROLS = re.compile(
     "[\\x00-\\x08\\x0b\\x0c\\x0e-\\x1f\\x7f-\\x9f\\u2028\\u2029\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff]"
 )
 
 
 def has_controls(text: str) -> bool:
-    """Return whether a text holds characters that are no writing: names are printed on terminals."""
+    """Return whether a text contains control characters. Names must not, because they are printed on terminals."""
     return _CONTROLS.search(text) is not None
 
 
 def _check_data(data: Any, source: str) -> None:
-    """Refuse data that are nested too deep, whose words hold control characters or whose numbers are too large."""
+    """Raise if data are nested too deeply, contain control characters, or contain numbers that are too large."""
     level, depth = [data], 0
     while level:
         check_budget("nesting", depth, source)
@@ -385,7 +390,7 @@ def _check_data(data: Any, source: str) -> None:
             elif isinstance(outer, list):
                 inner += outer
             elif isinstance(outer, str) and has_controls(outer):
-                raise InvalidProblem(f"{outer[:_WORD]!r} holds control characters", source, "leave them out")
+                raise InvalidProblem(f"{outer[:_WORD]!r} contains control characters", source, "remove them")
             elif isinstance(outer, int | float) and LARGEST < abs(outer) < inf:
                 given = f"{outer:.10g}" if isinstance(outer, float) else f"{str(outer)[:_WORD]}..."
                 raise InvalidProblem(f"the number {given} is beyond {LARGEST:g}", source, "use another unit")

@@ -1,4 +1,4 @@
-"""Small symmetric positive definite systems in batches: one singular item never disturbs the others."""
+"""Batched linear algebra for small symmetric positive definite systems. A singular item does not affect the others."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from optloc.base import arrays
 from optloc.base.types import Array
 
 PIVOT = 1e-15
-"""Share of its diagonal that a pivot must exceed: five units in the last place, below which no digit of it is known."""
+"""Minimum ratio of a pivot to its diagonal: five units in the last place, below which no digit is significant."""
 
-# Rows from which on those that are absent are taken out before a covariance is factored: time goes with the third power
-# of their number, and each epoch of a file has the rows of all epochs, most of them absent.
+# Number of rows above which absent rows are removed before a covariance is factored. The time grows with the cube of
+# the number of rows. Each epoch of a file has the rows of all epochs, most of them absent.
 _MANY = 16
 
 
@@ -26,18 +26,18 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     matrix : array (..., n, n)
         Symmetric matrices.
     least : float
-        Share of its diagonal that a pivot must exceed.
+        Minimum ratio of a pivot to its diagonal element.
 
     Returns
     -------
     lower : array (..., n, n)
-        Lower factors; meaningless where not ok.
+        Lower factors; not valid where `ok` is false.
     ok : bool array (...)
         Whether the matrix is numerically positive definite.
     """
     n = matrix.shape[-1]
     if arrays.is_other_library(matrix):
-        # Arrays of some libraries cannot be written; in numpy, writing column by column is the quicker way.
+        # Arrays of some libraries are read-only. NumPy is faster with writing column by column.
         return _factor(matrix, least)
     lower = np.zeros(matrix.shape)
     ok = np.ones(matrix.shape[:-2], dtype=bool)
@@ -47,16 +47,16 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
         pivot = column[..., 0]
         positive = pivot > least * np.abs(matrix[..., j, j])
         ok &= positive
-        # An item that is not definite goes on with a pivot of one: its numbers stay finite, and mean nothing.
+        # An item that is not definite continues with a pivot of one: its numbers stay finite, but are not valid.
         lower[..., j:, j] = column / np.sqrt(np.where(positive, pivot, 1.0))[..., None]
     return lower, ok
 
 
 def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
-    """Return what `factor` does without writing into an array: column by column, the rest less what each explains."""
+    """Return the result of `factor` for arrays that are read-only: column by column, from the remaining matrix."""
     xp, n = arrays.library(matrix), matrix.shape[-1]
     below = arrays.as_array_like(np.tril(np.ones((n, n))), matrix)
-    # The first comparison makes a mask of the batch's shape on the array's own device; a NaN there is not ok.
+    # This comparison makes a mask with the shape of the batch on the device of the array. NaN is not ok.
     rest, columns, ok = matrix, [], matrix[..., 0, 0] == matrix[..., 0, 0]
     for j in range(n):
         pivot = rest[..., j, j]
@@ -69,10 +69,10 @@ def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
 
 
 def factor_semidefinite(covariance: Array) -> Array:
-    """Return lower triangular L with ``L L'`` a covariance, which may be singular.
+    """Return lower triangular L with ``L L'`` equal to a covariance, which may be singular.
 
-    Cholesky's columns in the order of the rows, without pivots; a row whose error is a combination of those before it
-    has a column of zeros.
+    It is a Cholesky factorisation in the order of the rows, without pivoting. If the error of a row is a linear
+    combination of the errors of earlier rows, its column is zero.
 
     Parameters
     ----------
@@ -81,11 +81,11 @@ def factor_semidefinite(covariance: Array) -> Array:
     """
     size = covariance.shape[-1]
     rest, lower = np.array(covariance, dtype=float), np.zeros(covariance.shape)
-    # Each step rounds a diagonal by half a unit; a remainder of that size may be anything, its sign included.
+    # Each step rounds a diagonal element by half a unit. The sign of a remainder of this size is not significant.
     least = 4.0 * size * np.finfo(float).eps * np.abs(np.diagonal(rest, axis1=-2, axis2=-1))
     for j in range(size):
         pivot = rest[..., j, j]
-        # Written so that NaN is no remainder: a covariance without a number gives no draw without noise.
+        # With this comparison NaN does not count as zero, so a covariance with NaN does not give samples without noise.
         nothing = pivot <= least[..., j]
         column = rest[..., j:, j] / np.sqrt(np.where(nothing, 1.0, pivot))[..., None]
         column = np.where(nothing[..., None], 0.0, column)
@@ -95,7 +95,7 @@ def factor_semidefinite(covariance: Array) -> Array:
 
 
 def _substitute(lower: Any, right: Any, order: range) -> Array:
-    """Return the solution of a triangular system whose rows are solved in a given order; it writes into no array."""
+    """Return the solution of a triangular system; `order` is the order of the rows. It writes into no array."""
     xp, rows = arrays.library(lower), dict[int, Any]()
     for j in order:
         left = right[..., j, :]
@@ -129,7 +129,7 @@ def _backward(lower: Array, right: Array) -> Array:
 def solve(matrix: Array, right: Array, least: float = PIVOT) -> tuple[Array, Array]:
     """Return the solution of ``matrix @ x = right`` for symmetric positive definite matrices.
 
-    The matrix is first scaled to a unit diagonal (Jacobi).
+    The matrix is first scaled to a unit diagonal (Jacobi scaling).
 
     Parameters
     ----------
@@ -138,19 +138,19 @@ def solve(matrix: Array, right: Array, least: float = PIVOT) -> tuple[Array, Arr
     right : array (..., n, q)
         Right-hand sides.
     least : float
-        Share of its diagonal that a pivot must exceed.
+        Minimum ratio of a pivot to its diagonal element.
 
     Returns
     -------
     x : array (..., n, q)
-        Solutions; zero where not ok.
+        Solutions; zero where `ok` is false.
     ok : bool array (...)
         Whether the matrix is numerically positive definite.
     """
     xp = arrays.library(matrix)
     diagonal = xp.linalg.diagonal(matrix)
     good = diagonal > 0.0
-    # Metres beside radians and seconds: scaled, a pivot says how much of its unknown is known, whatever its unit.
+    # Unknowns have different units, such as metres and radians. After scaling, pivots do not depend on the units.
     scale = 1.0 / xp.sqrt(xp.where(good, diagonal, 1.0))
     lower, ok = factor(matrix * scale[..., :, None] * scale[..., None, :], least)
     ok = ok & xp.all(good, axis=-1)
@@ -160,65 +160,65 @@ def solve(matrix: Array, right: Array, least: float = PIVOT) -> tuple[Array, Arr
 
 
 def inverse(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
-    """Return inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
+    """Return the inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
     xp = arrays.library(matrix)
     out, ok = solve(matrix, xp.broadcast_to(arrays.eye(matrix.shape[-1], matrix), matrix.shape), least)
-    # Rounding of the two substitutions differs across the diagonal; covariances are symmetric to the last bit.
+    # The rounding of the two substitutions is not symmetric, but a covariance must be symmetric to the last bit.
     return xp.where(ok[..., None, None], 0.5 * (out + out.mT), xp.nan), ok
 
 
 def root(matrix: Array, cut: float = 1e-12) -> tuple[Array, Array]:
-    """Return A with ``A A'`` the pseudo-inverse of symmetric positive semidefinite matrices.
+    """Return A with ``A A'`` equal to the pseudo-inverse of symmetric positive semidefinite matrices.
 
     Parameters
     ----------
     matrix : array (..., n, n)
         Symmetric matrices.
     cut : float
-        Directions with less than this share of the largest eigenvalue, columns scaled, count as nothing.
+        Directions with less than this share of the largest eigenvalue, after scaling of the columns, count as zero.
 
     Returns
     -------
     root : array (..., n, n)
-        Zero columns for directions of nothing.
+        The columns of zero directions are zero.
     regular : bool array (...)
-        Whether there are none.
+        Whether there is no zero direction.
     """
     xp = arrays.library(matrix)
     diagonal = xp.linalg.diagonal(matrix)
     scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
-    # LAPACK refuses a matrix with a NaN, and with it the whole batch: such an item is handed zeros, and keeps no
-    # direction.
+    # LAPACK refuses the whole batch if one matrix contains NaN. Such a matrix is replaced by zeros, so that all its
+    # directions are zero.
     finite = xp.all(xp.isfinite(scaled), axis=(-1, -2))
     values, vectors = xp.linalg.eigh(xp.where(finite[..., None, None], scaled, 0.0))
     largest = values[..., -1:]
-    # Of a matrix of zeros nothing is kept: the largest counts as no less than the cut.
+    # For a zero matrix no direction is kept, because the largest eigenvalue counts as at least `cut`.
     kept = values > cut * xp.where(largest > cut, largest, cut)
     inverse = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
     return scale[..., :, None] * vectors * inverse[..., None, :], xp.all(kept, axis=-1)
 
 
 def whitening(covariance: Array) -> Array:
-    """Return W with ``W' W`` the inverse of a covariance, or a generalised inverse where it is singular.
+    """Return W with ``W' W`` equal to the inverse of a covariance, or to a generalised inverse if it is singular.
 
     The generalised inverse is the scaled pseudo-inverse of the correlation matrix.
 
     Parameters
     ----------
     covariance : array (..., r, r)
-        Symmetric positive semidefinite; a row and column of zeros is absent.
+        Symmetric positive semidefinite. A row and column of zeros means an absent row.
 
     Returns
     -------
     array (..., r, r)
-        Lower triangular where the covariance of the rows present is regular; its rank is that of the covariance, and
-        rows beyond it, like the columns of absent rows, are exactly zero.
+        Lower triangular if the covariance of the present rows is regular. Its rank is the rank of the covariance.
+        Surplus rows, and the columns of absent rows, are exactly zero.
     """
     xp = arrays.library(covariance)
     diagonal = xp.linalg.diagonal(covariance)
     absent = diagonal == 0.0
-    # Independent rows are the usual case, and a square root is all that they need.
+    # Independent rows are the usual case. They need only a square root.
     if covariance.shape[-1] == 1:
         single: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
         return single
@@ -230,14 +230,14 @@ def whitening(covariance: Array) -> Array:
     unit = covariance * scale[..., :, None] * scale[..., None, :]
     eye = xp.broadcast_to(arrays.eye(covariance.shape[-1], covariance), covariance.shape)
     lower, ok = factor(xp.where(absent[..., None], eye, unit))
-    # A pivot of a millionth (its square 1e-12) is left of a loop of rows whose errors cancel: only the eigenvalues
-    # tell what of it is noise.
+    # If the errors of a loop of rows cancel, rounding leaves a pivot of about 1e-6 (its square is 1e-12). Only
+    # eigenvalues can then separate noise from rounding.
     ok = ok & xp.all(xp.linalg.diagonal(lower) > 1e-6, axis=-1)
     matrix = _forward(xp.where(ok[..., None, None], lower, eye), eye)
     if not bool(xp.all(ok)):
         values, vectors = xp.linalg.eigh(xp.where(xp.isfinite(unit), unit, 0.0))
-        # Rounding leaves eigenvalues of some 1e-15 to directions without noise; sigmas up to 1e5 times smaller than
-        # others are meant.
+        # Rounding leaves eigenvalues of about 1e-15 in directions without noise. The limit admits standard deviations
+        # that are up to 1e5 times smaller than others.
         kept = values > 1e-10 * values[..., -1:]
         roots = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
         matrix = xp.where(ok[..., None, None], matrix, roots[..., :, None] * vectors.mT)
@@ -246,8 +246,8 @@ def whitening(covariance: Array) -> Array:
 
 
 def _whitening_of_present(covariance: Array, absent: Array, most: int) -> Array:
-    """Return the same as `whitening` from the rows that are present, at most so many of each item."""
-    # stable: they stay in their order, so that the matrix stays triangular
+    """Return the result of `whitening`, computed from the present rows only, of which each item has at most `most`."""
+    # A stable sort keeps the order of the rows, so that the matrix stays triangular.
     kept = np.argsort(absent, axis=-1, kind="stable")[..., :most]
     rows, columns = kept[..., :, None], kept[..., None, :]
     own = np.take_along_axis(np.take_along_axis(covariance, rows, -2), columns, -1)
@@ -263,7 +263,7 @@ def _whitening_of_present(covariance: Array, absent: Array, most: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Tangent:
-    """Directions along which equalities hold to first order, and the directions across.
+    """Directions along which equalities hold to first order (tangent), and directions across them.
 
     Parameters
     ----------
@@ -278,26 +278,26 @@ class Tangent:
 
 
 def tangent(gradients: Array, scale: Array) -> Tangent:
-    """Return the tangent space of equalities.
+    """Return the tangent space of equality constraints.
 
     Parameters
     ----------
     gradients : array (N, c, n)
         Gradients of the equalities.
     scale : array (N, n)
-        Typical size of each unknown: decides what "shortest" means.
+        Typical size of each unknown, which defines the length of a step.
     """
     c = gradients.shape[-2]
-    # Columns of the scaled gradients: their QR factors split the space into across (first c) and along.
+    # The QR factors of the scaled gradients split the space: the first c columns are across, the others along.
     scaled = np.swapaxes(gradients * scale[:, None], -1, -2)
     scaled = np.where(np.isfinite(scaled), scaled, 0.0)
     q, r = np.linalg.qr(scaled, mode="complete")
     size = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-    # Four digits above rounding; 1e-300 keeps gradients of zero from being their own scale.
+    # Four digits above rounding error. The limit 1e-300 is for gradients that are all zero.
     regular = size > 1e-12 * np.maximum(size.max(-1, keepdims=True), 1e-300)
     lower = np.swapaxes(r[:, :c], -1, -2)
     restore = np.zeros_like(lower)
-    for i in range(c):  # inverse of the small triangle, column by column; a dependent equality restores nothing
+    for i in range(c):  # invert the small triangle by columns; the column of a dependent equality is zero
         for j in range(c):
             known = (lower[:, i, :i] * restore[:, :i, j]).sum(-1)
             value = (float(i == j) - known) / np.where(regular[:, i], lower[:, i, i], 1.0)
@@ -306,9 +306,9 @@ def tangent(gradients: Array, scale: Array) -> Tangent:
 
 
 def solve_within(information: Array, vector: Array, along: Array) -> tuple[Array, Array]:
-    """Return the step (..., n) along a basis (..., n, q) that solves normal equations, and where it exists (...)."""
+    """Return the step (..., n) along a basis (..., n, q) that solves normal equations, and whether it exists (...)."""
     if along.shape[-1] == 0:
-        # As many equalities as unknowns leave no step, which is an answer and no failure.
+        # If the number of equalities equals the number of unknowns, the step is zero, which is a valid result.
         return np.zeros_like(vector), np.ones(vector.shape[:-1], dtype=bool)
     transposed = np.swapaxes(along, -1, -2)
     part, ok = solve(transposed @ information @ along, transposed @ vector[..., None])
@@ -316,7 +316,7 @@ def solve_within(information: Array, vector: Array, along: Array) -> tuple[Array
 
 
 def inverse_within(information: Array, along: Array) -> tuple[Array, Array]:
-    """Return the covariance (N, n, n) along a basis (N, n, q), zero across it, and where it exists (N,)."""
+    """Return the covariance (N, n, n) along a basis (N, n, q), zero across it, and whether it exists (N,)."""
     if along.shape[-1] == 0:
         return np.zeros_like(information), np.ones(len(information), dtype=bool)
     transposed = np.swapaxes(along, -1, -2)
@@ -324,24 +324,24 @@ def inverse_within(information: Array, along: Array) -> tuple[Array, Array]:
     return along @ inner @ transposed, ok
 
 
-# Points: their centre and spread, error ellipses and ellipsoids of covariances.
+# Points: centre and spread. Covariances: error ellipses and ellipsoids.
 
 
 def centre_of_points(points: Array, inside: Array) -> Array:
-    """Return the mean (..., d) of those points (..., s, d) that count, (..., s); the mean of none is the origin."""
+    """Return the mean (..., d) of the points (..., s, d) that `inside` (..., s) selects; zero if it selects none."""
     total = np.einsum("...s,...sd->...d", inside.astype(float), points)
     return np.asarray(total / np.maximum(inside.sum(-1), 1)[..., None])
 
 
 def centre_and_spread(points: Array, inside: Array | None = None) -> tuple[Array, Array]:
-    """Return the mean (..., d) of points (..., s, d) and their greatest distance from it (...).
+    """Return the mean (..., d) of points (..., s, d) and their greatest distance (...) from the mean.
 
     Parameters
     ----------
     points : array (..., s, d)
-        Finite, those that are left out too.
+        Finite points, including those that `inside` leaves out.
     inside : bool array (..., s), optional
-        Which of them count; all if absent. The mean of none is the origin.
+        Points that count; default: all. If no point counts, the mean is the origin.
     """
     if inside is None:
         inside = np.ones(points.shape[:-1], dtype=bool)
@@ -351,19 +351,19 @@ def centre_and_spread(points: Array, inside: Array | None = None) -> tuple[Array
 
 
 def error_ellipse(covariance: Array, probability: float = 0.95) -> tuple[Array, Array]:
-    """Return the ellipse or ellipsoid that holds a Gaussian with a given probability.
+    """Return the ellipse or ellipsoid that contains a Gaussian variable with a given probability.
 
     Parameters
     ----------
     covariance : array (..., d, d)
-        Square metres; NaN where there is none.
+        Square metres; NaN if there is no covariance.
     probability : float
         Between 0 and 1.
 
     Returns
     -------
     semi_axes : array (..., d)
-        Lengths in metres, ascending; NaN where there is no covariance.
+        Lengths in metres, ascending; NaN if there is no covariance.
     directions : array (..., d, d)
         Unit vectors of the axes in columns.
     """
@@ -371,42 +371,42 @@ def error_ellipse(covariance: Array, probability: float = 0.95) -> tuple[Array, 
 
     known = np.asarray(np.isfinite(covariance).all((-1, -2)))
     values, vectors = np.linalg.eigh(np.where(known[..., None, None], covariance, 0.0))
-    # The quantile of chi-square by the incomplete gamma function: `scipy.stats` takes a second to load.
+    # The chi-square quantile from the incomplete gamma function, because `scipy.stats` takes a second to load.
     scale = np.sqrt(2.0 * gammaincinv(covariance.shape[-1] / 2, probability))
     axes = scale * np.sqrt(np.maximum(values, 0.0))
     return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
 
 
 def project_out(unknowns: Array, values: Array) -> Array:
-    """Return values (..., q, p) less their projection onto the span of unknowns (..., q, n)."""
+    """Return values (..., q, p) minus their projection onto the span of unknowns (..., q, n)."""
     if not unknowns.shape[-1]:
         return values
     basis = span_of(unknowns)
-    # Twice: what rounding leaves of the first projection is as large as the values, and they may be large.
+    # Project twice: the rounding error of the first projection is proportional to the values, which can be large.
     once = values - basis @ (np.swapaxes(basis, -1, -2) @ values)
     return np.asarray(once - basis @ (np.swapaxes(basis, -1, -2) @ once))
 
 
 def span_of(unknowns: Array) -> Array:
-    """Return orthonormal columns (..., q, n) of the span of unknowns (..., q, n); zeros where some are dependent.
+    """Return orthonormal columns (..., q, n) of the span of unknowns (..., q, n); zero columns if some are dependent.
 
-    Columns are scaled to one length first; what then is shorter than 1e-12 counts as dependent.
+    Columns are first scaled to unit length. Singular values below 1e-12 of the largest then count as dependent.
     """
     length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
     u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
-    # The rounding of a column that is a sum of others is some thousandth of that; what is dependent changes nothing.
+    # The rounding error of a dependent column is about 1e-15. Dropping dependent columns does not change the span.
     return np.asarray(u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :])
 
 
 def normalised(vector: Array) -> Array:
-    """Return unit vectors (..., d); the first axis for vectors without length."""
+    """Return the vectors (..., d) scaled to unit length; the first axis for vectors of length zero."""
     length = np.sqrt((vector**2).sum(-1, keepdims=True))
     first = np.eye(vector.shape[-1])[0]
     return np.where(length > 0.0, vector / np.where(length > 0.0, length, 1.0), first)
 
 
 def spread_directions(count: int, d: int) -> Array:
-    """Return unit vectors (count, d) spread evenly: on the circle, or on a spiral of the golden angle on the sphere."""
+    """Return evenly distributed unit vectors (count, d): on a circle, or on a golden-angle spiral on the sphere."""
     number = np.arange(count) + 0.5
     if d == 2:
         turn = 2.0 * np.pi * number / count

@@ -1,4 +1,4 @@
-"""Names and packages of version 0.1 that have another place: they work with a warning for one version."""
+"""Old names of version 0.1 that have moved. They work with a deprecation warning until version 0.2."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-# Names that were attributes of optloc, by the package that exports them now.
+# Names that were attributes of `optloc`, by the package that exports them now.
 _NAMES = {
     "optloc.bounds": "Course Observability crlb_course observability",
     "optloc.engine": "Linear Normal gauss_newton linearise normal predict reduce",
@@ -37,7 +37,7 @@ _NAMES = {
     ),
     "optloc.uncertainty": "Accuracy Arc Mixture Region Samples accuracy likelihood_region mixture samples trace_arc",
 }
-# Modules that were attributes of optloc.
+# Modules that were attributes of `optloc`.
 _MODULES = {"epochs": "optloc.problem.epochs", "frames": "optloc.base.frames", "noise": "optloc.problem.noise"}
 _RENAMED = {"Plan": "optloc.sites.placement.SiteSelection", "wander": "optloc.engine.simulate_walks"}
 _PLACES = (
@@ -45,9 +45,9 @@ _PLACES = (
 )
 
 MOVED = frozenset(_PLACES)
-"""All names that have moved."""
+"""All old names."""
 
-# Packages, and where they are inside optloc now.
+# Old names of packages, and their new places inside `optloc`.
 _PACKAGES = {
     "adequacy": "model_checks",
     "calibration": "sites.calibration",
@@ -62,12 +62,12 @@ _PACKAGES = {
     "study": "lab.study",
 }
 
-# Modules that are public by a shorter path; they import by it without a warning.
+# Modules with a shorter public path. They can be imported by it without a warning.
 _SHORT = {"constraints": "linear.constraints", "datasets": "lab.datasets", "units": "base.units"}
 
 
 def moved(name: str) -> Any:
-    """Return the object of an old name of optloc, with a warning."""
+    """Return the object of an old name of `optloc`, with a deprecation warning."""
     place = _PLACES[name]
     _warn(f"optloc.{name}", place, 4)
     package, _, inner = place.rpartition(".")
@@ -79,13 +79,13 @@ def _warn(old: str, new: str, level: int) -> None:
 
 
 class _Alias(Loader):
-    """Loads a module by an old name: the module of the new name."""
+    """Loader that replaces a module with an old name by the module with the new name."""
 
     def __init__(self, place: str) -> None:
         self._place = place
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """Return None: Python makes an empty module."""
+        """Return None, so that Python makes an empty module."""
         return None
 
     def exec_module(self, module: ModuleType) -> None:
@@ -94,12 +94,12 @@ class _Alias(Loader):
 
 
 class _OldPackages(MetaPathFinder):
-    """Finds packages and their modules by old names."""
+    """Finder of packages and their modules by old names."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a spec that loads the present module; None for all other names."""
+        """Return a spec that loads the module with the new name; None for all other names."""
         root, _, rest = fullname.partition(".")
         old, _, inner = rest.partition(".")
         if root == "optloc" and old == "track":
@@ -115,6 +115,6 @@ class _OldPackages(MetaPathFinder):
 
 
 def watch_old_packages() -> None:
-    """Let Python find packages by their old names."""
+    """Register the finder of packages with old names."""
     if not any(isinstance(finder, _OldPackages) for finder in sys.meta_path):
         sys.meta_path.insert(0, _OldPackages())  # first, so that no module is loaded twice under two names

@@ -1,7 +1,7 @@
-"""Every file that optloc writes: refused where it would hurt, made beside its place, given its name when it is whole.
+"""Writing of output files: checked before the work, written to a temporary file, renamed when complete.
 
-A file that exists is replaced by library calls, as `numpy.save` does; the command line asks for ``--force``. What is
-written never lies half done under its name: a full disk or Ctrl-C leaves what was there before.
+Library calls replace an existing file, as `numpy.save` does; the command line requires ``--force``. No incomplete file
+ever has the final name: after a full disk or Ctrl-C the old file is still there.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import files_read
 
 _REPLACES: ContextVar[bool] = ContextVar("_REPLACES", default=True)
-# Temporary file, place and the name it was asked by, of files that wait for others that belong to them.
+# Temporary file, final path and requested path of files that wait until all files of a group are complete.
 _WAITING: ContextVar[list[tuple[Path, Path, Path]] | None] = ContextVar("_WAITING", default=None)
-# Temporary files of this process that have no name yet: whoever ends it at once removes them first.
+# Temporary files of this process. Code that ends the process immediately removes them first.
 _UNNAMED: set[Path] = set()
-# Other names of what is open already: what stands behind them may be a file, which is not to be replaced.
+# Names of open streams. The stream can be a file, which must not be replaced.
 _OPEN = ("/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
 
 
 def visible(text: str) -> str:
-    """Return text in which everything but line ends is seen: what would steer a terminal, or hide, is spelled."""
-    if text.isprintable():  # most texts, in a hundredth of the time
+    """Return the text with every control or invisible character except line ends replaced by an escape sequence."""
+    if text.isprintable():  # true for most texts, and a hundred times faster
         return text
     return "".join(c if c == "\n" or category(c)[0] != "C" else c.encode("unicode_escape").decode() for c in text)
 
 
 def replace_files(wanted: bool) -> bool:
-    """Say whether files that exist may be replaced, from here on in this context; return the same."""
+    """Set whether existing files may be replaced, from now on in this context; return the argument."""
     _REPLACES.set(wanted)
     return wanted
 
 
 def unwritable(path: Path, error: OSError) -> InvalidProblem:
-    """Return what is said of a file that cannot be written."""
+    """Return the error for a file that cannot be written."""
     return InvalidProblem(f"the file cannot be written ({error.strerror or error})", str(path), "choose another place")
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it; raise InvalidProblem where the system refuses."""
+    """Make a folder and its parents; raise InvalidProblem if the system refuses."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -55,7 +55,7 @@ def make_folder(path: Path) -> None:
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether a name is that of a pipe, a terminal or the like, which is written to and has no ending."""
+    """Return whether a path is a pipe, a terminal or another stream, which has no file ending and is not replaced."""
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -64,34 +64,34 @@ def is_stream(path: Path) -> bool:
 
 
 def claim(*paths: Path | None, inputs: Iterable[Path] = ()) -> None:
-    """Refuse places that cannot or must not be written, before there is work to lose.
+    """Raise if an output path is not allowed, before the work that produces the output.
 
     Parameters
     ----------
     *paths : Path, optional
-        The files that one command is to write; None and "-", standard output, are passed over.
+        Files that one command writes. None, and "-" for standard output, are ignored.
     inputs : iterable of Path
-        Files that it reads, beside those that were read already.
+        Files that the command reads, in addition to files that were read already.
 
     Raises
     ------
     InvalidProblem
-        Where a file exists and may not be replaced, is an input, is named twice (also by another spelling), is a
-        folder, or has no folder.
+        If a file exists and may not be replaced, is an input, is named twice (in any spelling), is a folder, or is in a
+        folder that does not exist.
     """
     read, seen = tuple(inputs), set[str]()
     for path in paths:
         if path is None or str(path) == "-" or is_stream(path):
             continue
-        # Names that differ in case are one file on some systems: a command that works is to work on all.
+        # Some systems ignore case in file names. A command must work on all systems, so names must differ in more.
         name = str(_place(path, read)).casefold()
         if name in seen:
-            raise InvalidProblem("two outputs have this name", str(path), "give each a name of its own")
+            raise InvalidProblem("two outputs have this name", str(path), "give each output a different name")
         seen.add(name)
 
 
 def _place(path: Path, inputs: Iterable[Path] = ()) -> Path:
-    """Return where a file is to be written: a link is followed, and stays; raise InvalidProblem where it must not."""
+    """Return the path to write, with links resolved; raise InvalidProblem if it is not allowed."""
     try:
         place = Path(os.path.realpath(path))
         if place.name != place.name.encode(errors="replace").decode():
@@ -112,24 +112,24 @@ def _place(path: Path, inputs: Iterable[Path] = ()) -> Path:
 
 
 def _refuse(path: Path, place: Path, inputs: Iterable[Path]) -> None:
-    """Raise InvalidProblem where a file that exists must not be replaced."""
+    """Raise InvalidProblem if an existing file must not be replaced."""
     if not place.is_file():
-        raise InvalidProblem("it is no file that can be replaced", str(path), "choose another name")
+        raise InvalidProblem("it is not a file that can be replaced", str(path), "choose another name")
     for one in (*inputs, *files_read()):
         if one.exists() and place.samefile(one):
-            raise InvalidProblem("it would replace a file that is read here", str(path), "choose another name")
+            raise InvalidProblem("it would replace an input file", str(path), "choose another name")
     if not _REPLACES.get():
-        raise InvalidProblem("there is such a file already", str(path), "choose another name, or add --force")
+        raise InvalidProblem("the file already exists", str(path), "choose another name, or add --force")
 
 
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """Yield where a file is to be written; it gets its name when the block ends, and is removed where that fails.
+    """Yield a temporary path to write. It gets the name `path` at the end of the block, or is removed after an error.
 
     Parameters
     ----------
     path : Path
-        The file. What stands there, or where a link leads that does, is replaced; a pipe or a device is written to.
+        The file. An existing file, or the file that a link leads to, is replaced. A pipe or device is written directly.
 
     Yields
     ------
@@ -139,7 +139,7 @@ def written(path: Path) -> Iterator[Path]:
     Raises
     ------
     InvalidProblem
-        As `claim` does, and where the system refuses: a full disk, for instance.
+        As for `claim`, and if the system refuses, for instance because the disk is full.
     """
     if is_stream(path):
         with _sentence(path):
@@ -151,7 +151,7 @@ def written(path: Path) -> Iterator[Path]:
     _UNNAMED.add(temporary)
     try:
         with _sentence(path):
-            # The rights that a new file has, or those of the old one.
+            # Permissions of a new file, or of the file that it replaces.
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             if place.exists():
                 temporary.chmod(stat.S_IMODE(place.stat().st_mode))
@@ -166,14 +166,14 @@ def written(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8, as `written` does; what is no Unicode, of a file's name, becomes a question mark."""
+    """Write a UTF-8 text file through `written`. Characters that are not Unicode, as in file names, become "?"."""
     with written(path) as file:
         file.write_text(text, encoding="utf-8", errors="replace")
 
 
 @contextmanager
 def replace_together() -> Iterator[None]:
-    """Give the files that are written in the block their names at its end, when all are whole; none where one fails."""
+    """Give all files written in the block their final names at its end, if all are complete; otherwise remove them."""
     waiting: list[tuple[Path, Path, Path]] = []
     outer = _WAITING.set(waiting)
     try:
@@ -186,7 +186,7 @@ def replace_together() -> Iterator[None]:
 
 
 def _give_names(waiting: list[tuple[Path, Path, Path]]) -> None:
-    """Move files to their places; those that are moved leave the list."""
+    """Rename temporary files to their final paths, and remove them from the list."""
     while waiting:
         temporary, place, path = waiting[0]
         with _sentence(path):
@@ -200,7 +200,7 @@ def _sentence(path: Path) -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
-        raise  # the reader of a pipe has gone, which is no error
+        raise  # the reader closed the pipe, which is not an error
     except OSError as error:
         raise unwritable(path, error) from None
 
@@ -211,23 +211,23 @@ def _remove(temporary: Path) -> None:
 
 
 def remove_unnamed() -> None:
-    """Remove the files that have no name yet: the process ends at once."""
+    """Remove all temporary files, because the process is about to end."""
     for temporary in tuple(_UNNAMED):
         _remove(temporary)
 
 
 class GrowingFile:
-    """A file that grows beside its place and gets its name at the end: what a killed run had stays readable.
+    """An output file that grows. It has a temporary name until it is complete, so an interrupted run stays readable.
 
     Parameters
     ----------
     path : Path
-        The file; what it has so far stands in one of this name with ``.partial`` behind it.
+        The final path. Until the end the data are in a file with the same name plus ``.partial``.
 
     Raises
     ------
     InvalidProblem
-        As `claim` does; also where a stopped run has left such a file.
+        As for `claim`, and if an interrupted run has left a ``.partial`` file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -236,26 +236,26 @@ class GrowingFile:
         self._begun = self._whole = False
 
     def append(self, data: bytes) -> None:
-        """Write behind what is there, at once; raise InvalidProblem where that fails."""
+        """Append data immediately; raise InvalidProblem if this fails."""
         how = "ab" if self._begun else "wb" if _REPLACES.get() else "xb"
         self._begun, self._whole = True, False
-        # one write without a buffer: whenever the run is killed, whole lines are there
+        # One write without a buffer, so that an interrupted run leaves complete lines.
         with _sentence(self.partial), self.partial.open(how, buffering=0) as file:
             while data:
                 data = data[file.write(data) :]
         self._whole = True
 
     def finish(self) -> None:
-        """Give the file its name, unless something could not be written; raise InvalidProblem where that fails."""
+        """Give the file its final name, unless a write failed; raise InvalidProblem if renaming fails."""
         if self._whole:
             _give_names([(self.partial, _place(self.path), self.path)])
 
     def discard(self) -> None:
-        """Remove the file: what it holds stands elsewhere."""
+        """Remove the file, because its content is stored elsewhere."""
         self.partial.unlink(missing_ok=True)
 
 
 def partial_of(path: Path) -> Path:
-    """Return the name under which a file grows: that of the file, or of what a link leads to, and ``.partial``."""
+    """Return the temporary path of a growing file: the path, with links resolved, plus ``.partial``."""
     place = Path(os.path.realpath(path))
     return place.with_name(f"{place.name}.partial")

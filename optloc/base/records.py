@@ -1,8 +1,8 @@
-"""Records: frozen dataclasses of arrays that share batch axes, and what is done to all of these at once.
+"""Records: frozen dataclasses of arrays with common batch axes, and functions to slice, merge and join them.
 
-Each field of arrays says once how it is laid out: how many axes follow the batch axes, whether the first of these are
-slots whose number differs from record to record, and what an empty entry holds. Slicing, merging and joining follow
-from that, so that a new field of a `Fix` or a `Pool` is typed in one place.
+The annotation of each array field states its layout: the number of axes after the batch axes and the value of an empty
+entry. It also states whether the first of these axes counts slots, whose number can differ between records. The
+functions of this module use these annotations, so a new field of a `Fix` or a `Pool` is declared in one place.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ Record = TypeVar("Record")
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """How an array of a record is laid out: ``x: Annotated[Array, Axes(1)]``.
+    """Layout of an array field of a record: ``x: Annotated[Array, Axes(1)]``.
 
     Parameters
     ----------
     core : int
-        Axes behind the batch axes.
+        Number of axes after the batch axes.
     slots : bool
-        Whether the first of them counts slots.
+        Whether the first of these axes counts slots.
     empty : object
-        What stands in an entry that nobody has filled.
+        Value of an empty entry.
     """
 
     core: int
@@ -39,28 +39,28 @@ class Axes:
 
 
 def change(record: Record, function: Callable[[Array, int], Array]) -> Record:
-    """Return a record whose every array is mapped by ``(array, axes behind the batch axes) -> array``."""
+    """Return the record with ``function(array, number of axes after the batch axes)`` applied to every array."""
     changed = {name: function(value, layout.core) for name, value, layout in _arrays(record) if value is not None}
     changed |= {name: change(value, function) for name, value in _parts(record)}
     return replace(record, **changed)  # type: ignore[type-var]
 
 
 def take(record: Record, items: Any) -> Record:
-    """Return some entries of a flat batch, by an index or a slice."""
+    """Return the entries of a flat batch at an index or a slice."""
     return change(record, lambda array, core: array[items])
 
 
 def overwrite(record: Record, items: Array, other: Record) -> Record:
-    """Return a flat batch in which other records take the place of some; what the batch has beside arrays stays.
+    """Return a flat batch in which the entries at `items` are replaced. Fields without arrays do not change.
 
     Parameters
     ----------
     record : record
-        N entries.
+        A batch of N entries.
     items : int array (q,)
-        Which are replaced.
+        Numbers of the entries to replace.
     other : record
-        The q entries that take their place.
+        The q new entries.
     """
     changed: dict[str, Any] = {}
     for (name, mine, layout), (_, theirs, _) in zip(_arrays(record), _arrays(other), strict=True):
@@ -78,17 +78,17 @@ def overwrite(record: Record, items: Array, other: Record) -> Record:
 
 
 def join(parts: Iterable[Record], count: int) -> Record:
-    """Return records of flat batches one behind the other as one; what they have beside arrays is the first's.
+    """Return flat batches as one batch, in their order. Fields without arrays come from the first part.
 
-    Each part is copied into place as it comes and may be forgotten: memory beyond the answers does not grow with the
-    batch. An array that all entries of all parts share stays one row; entries of a part that lacks one are empty.
+    Each part is copied when it arrives and can then be freed, so extra memory does not grow with the batch. An array
+    that all entries of all parts share stays one row. If a part lacks a field, its entries are empty.
 
     Parameters
     ----------
     parts : iterable of records
-        At least one.
+        At least one part.
     count : int
-        Entries of all of them.
+        Total number of entries.
     """
     whole: dict[str, _Column] = {}
     pieces: dict[str, list[tuple[int, Any]]] = {}
@@ -102,12 +102,12 @@ def join(parts: Iterable[Record], count: int) -> Record:
         start += size
     assert first is not None
     changed: dict[str, Any] = {name: column.array() for name, column in whole.items()}
-    changed |= {name: join(_without_gaps(own, count), count) for name, own in pieces.items()}
+    changed |= {name: join(_fill_gaps(own, count), count) for name, own in pieces.items()}
     return replace(first, **changed)  # type: ignore[type-var]
 
 
-def _without_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
-    """Yield records with where each begins, and empty ones for the entries between them, of so many."""
+def _fill_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
+    """Yield the records in order, with records of empty entries between them, up to `count` entries in total."""
     end = 0
     for start, piece in [*pieces, (count, None)]:
         if start > end:
@@ -118,7 +118,7 @@ def _without_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
 
 
 def _blank(record: Record, count: int) -> Record:
-    """Return so many entries that nobody has filled, of records like another."""
+    """Return a record with `count` empty entries and the fields of `record`."""
     changed: dict[str, Any] = {
         name: _empty((count, *value.shape[1:]), layout, value.dtype)
         for name, value, layout in _arrays(record)
@@ -129,11 +129,11 @@ def _blank(record: Record, count: int) -> Record:
 
 
 class _Column:
-    """One array of all entries, filled part by part."""
+    """One array field of all entries, filled part by part."""
 
     def __init__(self, layout: Axes, count: int) -> None:
         self.layout, self.count = layout, count
-        self.parts: list[tuple[slice, Array]] = []  # slots differ in number, and shared rows wait for another
+        self.parts: list[tuple[slice, Array]] = []  # parts that cannot be copied yet: slots, or one row for all entries
         self.whole: Array | None = None
         self.lacking: list[slice] = []
 
@@ -162,11 +162,11 @@ class _Column:
         return whole
 
     def _shares(self, value: Array) -> bool:
-        """Return whether a part is one row for all, the same as of the parts before."""
+        """Return whether a part is one row for all its entries, equal to the row of the earlier parts."""
         return value.strides[0] == 0 and all(_is_equal(own[:1], value[:1]) for _, own in self.parts[:1])
 
     def _is_shared(self) -> bool:
-        """Return whether all parts are one row for all entries."""
+        """Return whether all entries of all parts share one row."""
         own = [value for _, value in self.parts]
         if sum(map(len, own)) < self.count or len({value.shape[1:] for value in own}) > 1:
             return False
@@ -182,14 +182,14 @@ class _Column:
 
 
 def _is_equal(a: Array, b: Array) -> bool:
-    # NaN is not equal to itself, but what lies at the same place is
+    # NaN differs from itself, but arrays in the same memory are equal.
     same = a.ctypes.data == b.ctypes.data and (a.shape, a.strides, a.dtype) == (b.shape, b.strides, b.dtype)
     return same or np.array_equal(a, b)
 
 
 @cache
 def _layouts(kind: Any) -> dict[str, Axes]:
-    """Return the layout of every field of arrays of a record, by its annotation."""
+    """Return the layout of every array field of a record type, from its annotations."""
     hints = get_type_hints(kind, include_extras=True)
     return {
         name: note
@@ -207,7 +207,7 @@ def _arrays(record: Any) -> Iterator[tuple[str, Array | None, Axes]]:
 
 
 def _parts(record: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the fields that are records themselves."""
+    """Yield the names and values of fields that are records."""
     kind: Any = type(record)
     for name in _others(kind):
         value = getattr(record, name)
@@ -218,7 +218,7 @@ def _parts(record: Any) -> Iterator[tuple[str, Any]]:
 
 @cache
 def _others(kind: Any) -> tuple[str, ...]:
-    """Return the fields of a record that hold no arrays."""
+    """Return the names of the fields of a record type that are not arrays."""
     return tuple(each.name for each in fields(kind) if each.name not in _layouts(kind))
 
 
@@ -233,7 +233,7 @@ def _count(record: Any) -> int:
 
 
 def _filled(record: Any, array: Array | None, like: Array | None, layout: Axes) -> Array:
-    """Return an array of a record, or where it has none empty entries that look like another's."""
+    """Return an array of a record or, if it is None, empty entries with the shape of `like`."""
     if array is not None:
         return array
     assert like is not None
@@ -241,7 +241,7 @@ def _filled(record: Any, array: Array | None, like: Array | None, layout: Axes) 
 
 
 def _widen(array: Array, layout: Axes, width: int) -> Array:
-    """Return an array with at least so many slots; the new ones are empty."""
+    """Return an array with at least `width` slots; the new slots are empty."""
     if not layout.slots or array.shape[1] >= width:
         return array
     more = _empty((len(array), width - array.shape[1], *array.shape[2:]), layout, array.dtype)
@@ -255,6 +255,6 @@ def _empty(shape: tuple[int, ...], layout: Axes, dtype: Any) -> Array:
 
 
 def present(entries: Array) -> Array:
-    """Return which entries (N,) of an array of objects are not None."""
-    # By identity: `entries != None` asks every record whether it is equal to None.
+    """Return a mask (N,) of the entries of an object array that are not None."""
+    # By identity, because `entries != None` would call the comparison of every record.
     return np.array([entry is not None for entry in entries], dtype=bool)

@@ -1,4 +1,4 @@
-"""Tables that others extend by entry points: a package names its group and what it adds, and nothing here changes."""
+"""Tables that other packages can extend through entry points, without a change in optloc."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ T = TypeVar("T")
 
 
 class Registry(MutableMapping[str, T]):
-    """A table by name, of what optloc has and of what installed packages add.
+    """A table by name: the entries of optloc and of installed packages.
 
-    The entry points are read when a name is asked for that optloc does not have, or when all names are: that costs some
-    ten milliseconds. An entry point that cannot be used is left out with a warning that names its package.
+    Entry points are read at the first request for a name that optloc does not have, or for all names. This takes about
+    ten milliseconds. An entry point that cannot be used is ignored, with a warning that names its package.
 
     Parameters
     ----------
     group : str
         Group of the entry points, for instance "optloc.models".
     fits : callable
-        Whether an object may stand in the table.
+        Function that returns whether an object is a valid entry.
     own : dict
-        What optloc has. No package replaces it.
+        Entries of optloc. Other packages cannot replace them.
     derived : callable, optional
-        Returns entries that follow from other tables, for names that stand nowhere else.
+        Function that returns further entries, computed from other tables, for names that are in neither table.
     """
 
     __slots__ = ("_derived", "_fits", "_found", "_group", "_own")
@@ -46,7 +46,7 @@ class Registry(MutableMapping[str, T]):
         self._group, self._fits, self._own, self._derived = group, fits, own, derived or dict
         self._found: dict[str, T] | None = None
 
-    # What optloc has is found without looking for entry points, which takes some ten milliseconds.
+    # Entries of optloc are found without reading entry points, which takes about ten milliseconds.
     def __getitem__(self, name: str) -> T:
         if name in self._own:
             return self._own[name]
@@ -68,32 +68,32 @@ class Registry(MutableMapping[str, T]):
         return f"{type(self).__name__}({self._group!r}: {', '.join(self)})"
 
     def forget(self) -> None:
-        """Look for entry points anew at the next use: for a package that was installed meanwhile."""
+        """Read entry points again at the next use, for instance after a package was installed."""
         self._found = None
 
     @property
     def _added(self) -> dict[str, T]:
         if self._found is None:
-            self._found = {}  # a package may look at the table while it is loaded
+            self._found = {}  # set first, because a package may use the table while it loads
             for entry in entry_points(group=self._group):
                 self._take(entry, self._found)
         return self._found
 
     def _take(self, entry: EntryPoint, found: dict[str, T]) -> None:
-        """Put what an entry point names among what was found, or say why not."""
-        # No package replaces what optloc has, nor what another package added first.
+        """Add the object of an entry point to `found`, or warn why it is not added."""
+        # A package cannot replace an entry of optloc, or of a package that was read earlier.
         if entry.name in self._own or entry.name in found:
             self._refuse(entry, f"the name {entry.name!r} is taken")
             return
         try:
             value = entry.load()
-        except Exception as error:  # noqa: BLE001  # whatever it is that a foreign package raises
+        except Exception as error:  # noqa: BLE001  # an external package can raise anything
             self._refuse(entry, f"{entry.value} does not load: {type(error).__name__}: {error}")
             return
         if self._fits(value):
             found[entry.name] = cast("T", value)
         else:
-            self._refuse(entry, f"{entry.value} is {type(value).__name__}, which does not belong there")
+            self._refuse(entry, f"{entry.value} is {type(value).__name__}, which is not valid there")
 
     def _refuse(self, entry: EntryPoint, why: str) -> None:
         package = "an unnamed package" if entry.dist is None else f"the package {entry.dist.name!r}"
@@ -101,29 +101,29 @@ class Registry(MutableMapping[str, T]):
         warnings.warn(what, RuntimeWarning, stacklevel=2)
 
 
-# Plugins that somebody names on a command line: with entry points the only ways in which foreign code comes in.
+# Plugins named on a command line. They and entry points are the only ways to load external code.
 
 _PLUGINS: list[str] = []
 
 
 def plugins() -> tuple[str, ...]:
-    """Return the plugins that were loaded by name: what another process needs to know the same."""
+    """Return the names of the loaded plugins, which another process needs to load too."""
     return tuple(_PLUGINS)
 
 
 def load_plugin(name: str) -> None:
-    """Run a Python file or module that adds to the tables, such as ``optloc.models.MODELS["mine"] = ...``, once.
+    """Run once a Python file or module that adds entries to tables, such as ``optloc.models.MODELS["mine"] = ...``.
 
     Parameters
     ----------
     name : str
-        Path of a file that ends in .py, or name of an installed module. It may do whatever Python can: it must come
-        from the user, never from a file that is read.
+        Path of a file that ends in .py, or name of an installed module. The code can do anything, so the name must come
+        from the user, never from an input file.
 
     Raises
     ------
     InvalidProblem
-        Where there is none, or it fails; with what it says.
+        If it does not exist, or if it raises an error; the message contains this error.
     """
     path, known = Path(name), _known(name)
     if known in _PLUGINS:
@@ -140,7 +140,7 @@ def load_plugin(name: str) -> None:
 
 
 def plugin_module(name: str) -> ModuleType | None:
-    """Return a plugin that was loaded, by the name that it was loaded by; None where there is none."""
+    """Return the module of a loaded plugin by its name on loading; None if it was not loaded."""
     known = _known(name)
     if known not in _PLUGINS:
         return None
@@ -156,13 +156,13 @@ def _key(path: Path) -> str:
 
 
 def _run_file(path: Path) -> None:
-    # By its path: two plugins may have one file name, and neither hides a module of that name.
+    # The key contains the path: two plugins can have the same file name, and neither hides a module with this name.
     key = _key(path)
     found = importlib.util.spec_from_file_location(key, path)
     assert found is not None
     assert found.loader is not None
     module = importlib.util.module_from_spec(found)
-    sys.modules[key] = module  # what it defines can then be pickled by name
+    sys.modules[key] = module  # so that its classes can be pickled by name
     try:
         found.loader.exec_module(module)
     except BaseException:

@@ -1,4 +1,4 @@
-"""Work spread over plain threads: for code that releases the interpreter lock (compiled kernels, Clarabel)."""
+"""Parallel work in threads, for code that releases the interpreter lock (compiled kernels, Clarabel)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from typing import TypeVar
 from optloc.base.errors import InvalidProblem
 
 _VARIABLE = "OPTLOC_THREADS"
-# Seconds of a call below which threads that pass the interpreter lock to and fro gain nothing.
+# Duration of a call, seconds, below which threads gain nothing, because they wait for the interpreter lock.
 WORTH = 2.5e-4
 
-# How many threads what runs in a thread may use itself, where the work was shared out before.
+# Number of threads that the current thread may use, if the work was already divided among threads.
 _SHARE: ContextVar[int | None] = ContextVar("share", default=None)
 
 _Item = TypeVar("_Item")
@@ -25,9 +25,9 @@ _Result = TypeVar("_Result")
 
 
 def thread_count() -> int:
-    """Return how many threads a batch may use: the variable OPTLOC_THREADS, else the processors of this process.
+    """Return the number of threads for a batch: the variable OPTLOC_THREADS, or the number of available processors.
 
-    Within a part of a batch whose parts are worked on side by side (`flow`) it is the share of that part.
+    Inside `flow`, whose parts run in parallel, it is the share of the current part.
 
     Returns
     -------
@@ -46,19 +46,19 @@ def thread_count() -> int:
     if not given:
         return _processors()
     if not given.isdecimal() or int(given) < 1:
-        raise InvalidProblem(f"{given!r} is no number of threads", _VARIABLE, "give a whole number of at least 1")
+        raise InvalidProblem(f"{given!r} is not a number of threads", _VARIABLE, "give a whole number of at least 1")
     return int(given)
 
 
 def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> LockType:
-    """Return a lock that nobody else holds while the process forks, so that the child finds it open.
+    """Register a lock so that it is free in a forked child, and return it. A fork first acquires the lock.
 
     Parameters
     ----------
     lock : threading.Lock
         A lock that lives as long as the process.
     begin : callable
-        What is done first in the child.
+        Function that the child calls first.
     """
 
     def child() -> None:
@@ -73,38 +73,38 @@ def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> L
 def map_on_threads(
     function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int | None = None, *, least: float = 0.0
 ) -> list[_Result]:
-    """Return the function of every item, in the order of the items whatever the number of threads.
+    """Return the results of a function for all items, in the order of the items for every number of threads.
 
     Parameters
     ----------
     function : callable
-        Called once for each item, from several threads at a time; state that it changes must be its thread's own.
+        Function of one item. Several threads call it at the same time, so it must not change shared state.
     items : iterable
-        The work; each item should take far longer than a thread takes to pick it up (20 us).
+        The items. Each should take far longer than the start of an item in a thread (20 us).
     threads : int, optional
-        At most so many at a time; `thread_count` if absent. One runs in the calling thread.
+        Maximum number of threads; default: `thread_count`. With one, the work runs in the calling thread.
     least : float
-        Seconds that an item must take to be worth a thread, by the quicker of the first two; all run in the calling
-        thread where it takes less.
+        Minimum duration of an item, seconds, for the use of threads. The faster of the first two items is compared. If
+        it is shorter, all items run in the calling thread.
 
     Returns
     -------
     list
-        The results. If a call raises, the error of the earliest such item is raised.
+        The results. If calls raise, the error of the first such item is raised.
     """
     work = list(items)
-    # A single item, or a single thread, runs where it is called: no pool, plain tracebacks.
+    # A single item or thread runs in the calling thread: without a pool, and with simple tracebacks.
     count = min(thread_count() if threads is None else max(threads, 1), len(work))
     if count <= 1:
         return [function(item) for item in work]
     if least > 0.0:
-        # Two, because the first call may build what the others share; the quicker one tells.
+        # Two items, because the first call may build values that the others share. The faster one counts.
         begun, seconds = _time(function, work[:2])
         some = map_on_threads(function, work[2:], 1 if seconds < least else count)
         return begun + some
     results: dict[int, _Result] = {}
     errors: dict[int, BaseException] = {}
-    queue = iter(range(len(work)))  # drawn from by all threads: a task of its own for each item costs 40 us
+    queue = iter(range(len(work)))  # shared by all threads, because one task per item costs 40 us
 
     def run() -> None:
         for i in queue:
@@ -115,9 +115,9 @@ def map_on_threads(
             if errors:
                 return
 
-    # The calling thread is one of them: no processor has two to serve, and one less is begun.
+    # The calling thread works too, so the pool has one thread less.
     with ThreadPoolExecutor(count - 1, thread_name_prefix="optloc") as pool:
-        # What holds for the caller, such as a chosen back end, holds for its threads.
+        # The context of the caller, such as a chosen back end, also applies in the threads.
         others = [pool.submit(copy_context().run, run) for _ in range(count - 1)]
         run()
         wait(others)
@@ -127,15 +127,16 @@ def map_on_threads(
 
 
 def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
-    """Yield the function of every item in their order, several worked on side by side: for large parts of a batch.
+    """Yield the results of a function for all items in their order, with several running in parallel.
 
-    Unlike `mapped` it serves work whose Python takes as long as its machine code, since one part's is done while the
-    other's runs; and what is yielded may be forgotten: one part more is held than there are threads, at most.
+    It is for large parts of a batch. Unlike `mapped` it suits work in which Python takes as long as machine code: the
+    Python code of one part runs while the machine code of another runs. Results can be freed after each step: at most
+    one more than the number of threads is stored.
 
     Parameters
     ----------
     function : callable
-        As of `mapped`; the threads that it asks for itself are its share of all.
+        Function of one item, as for `mapped`. Its own calls of `thread_count` return its share of the threads.
     items : sequence
         The parts.
     """
@@ -164,7 +165,7 @@ def map_in_order(function: Callable[[_Item], _Result], items: Sequence[_Item]) -
 
 
 def _time(function: Callable[[_Item], _Result], work: list[_Item]) -> tuple[list[_Result], float]:
-    """Return the results of a few items, and the time of the quickest: the first may build what others share."""
+    """Return the results of a few items, and the time of the fastest, because the first may build shared values."""
     results, times = [], []
     for item in work:
         began = perf_counter()
@@ -174,7 +175,7 @@ def _time(function: Callable[[_Item], _Result], work: list[_Item]) -> tuple[list
 
 
 def _processors() -> int:
-    """Return the processors this process may use; os.process_cpu_count where Python has it (3.13)."""
+    """Return the number of processors that this process may use, by os.process_cpu_count in Python 3.13 and later."""
     own = getattr(os, "process_cpu_count", None)
     if own is not None:
         return own() or 1

@@ -1,4 +1,4 @@
-"""The values of an estimation problem, and the words of a verdict: frozen, SI units and radians, leading axes batch."""
+"""Data types of a problem, its status and its certificate: frozen, in SI units and radians, batch axes first."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 Array = np.ndarray[Any, np.dtype[Any]]
 
 Whole = int | Sequence[int] | Array
-"""Whole numbers, one or one for each row."""
+"""One whole number, or one for each row."""
 
 Amount = float | str
 """A number in SI units, or text with a unit such as "20 ns"."""
@@ -25,26 +25,28 @@ FormName = Literal["offset", "scale", "drift", "rotation", "time", "walk", "spli
 
 @dataclass(frozen=True, slots=True)
 class Stations:
-    """Where the stations are.
+    """Positions, velocities, axes and position errors of stations.
 
     Parameters
     ----------
     position : array (..., k or 1, s, d)
-        Metres, in the problem's frame; one entry along the epoch axis for stations that stay.
+        Metres, in the frame of the problem. The epoch axis has length one for fixed stations.
     names : tuple of s str
         Unique names.
     velocity : array (..., k or 1, s, d), optional
         Metres per second.
     axes : array (..., k or 1, s, d, d), optional
-        Rows are the unit vectors of each station's own axes, in the problem's frame; None: the frame's axes.
+        Axes of each station in the frame of the problem: the rows of each matrix are unit vectors. None: the axes of
+        the frame.
     covariance : array (..., s, d, d), optional
         Covariance of the position errors, square metres; None: surveyed exactly.
     span : "epoch", "run" or "noise"
-        An error of position or velocity is an unknown of each epoch, or one that lasts the whole run; or it is drawn
-        anew at each epoch and not estimated: it enlarges the noise of the rows that the station takes part in.
+        How the errors of positions and velocities are treated. "epoch": as unknowns of each epoch. "run": as unknowns
+        of the whole run. "noise": they are not estimated, are independent at each epoch, and add to the noise of all
+        rows of the station.
     velocity_covariance : array (..., s, d, d), optional
-        Covariance of the velocity errors, square metres per second squared, independent of those of the positions;
-        None: known exactly. They enter the kinds that depend on velocities: range rates and their differences.
+        Covariance of the velocity errors, (m/s)^2, independent of the position errors. None: velocities are exact.
+        These errors matter for kinds that depend on velocities: range rates and their differences.
     """
 
     position: Array
@@ -57,18 +59,18 @@ class Stations:
 
     @property
     def errors(self) -> tuple[tuple[str, str, Array], ...]:
-        """Return name, SI unit and covariance (..., s, d, d) of the errors there are, in the order of their slots."""
+        """Return name, SI unit and covariance (..., s, d, d) of the existing errors, in the order of their slots."""
         both = (("stations", "m", self.covariance), ("station velocities", "m/s", self.velocity_covariance))
         return tuple((name, unit, covariance) for name, unit, covariance in both if covariance is not None)
 
     @property
     def unknown_for(self) -> Literal["epoch", "run"] | None:
-        """Return the span of errors that are unknowns; None for noise, and for stations without errors."""
+        """Return the span of errors that are unknowns; None for errors treated as noise, and for exact stations."""
         return self.span if self.span != "noise" and self.errors else None
 
     @property
     def weighed(self) -> bool:
-        """Return whether errors of positions or velocities are noise of each epoch."""
+        """Return whether errors of positions or velocities are treated as noise of each epoch."""
         return self.span == "noise" and bool(self.errors)
 
     @property
@@ -76,17 +78,17 @@ class Stations:
         """Return whether the errors of each position are equally large in all directions."""
         if self.covariance is None:
             return True
-        # Nine digits: variances may come from conversions of units.
+        # A relative tolerance of 1e-9, because variances can come from unit conversions.
         equal = np.eye(self.dimension) * self.covariance[..., :1, :1]
         return bool((np.abs(self.covariance - equal) <= 1e-9 * equal).all())
 
     def with_noise(self) -> Stations:
-        """Return the stations with errors of each epoch as noise of its rows: no other epoch shares them."""
+        """Return the stations with errors of span "epoch" changed to noise, because no other epoch shares them."""
         return replace(self, span="noise") if self.unknown_for == "epoch" else self
 
     @property
     def dimension(self) -> int:
-        """Return 2 or 3."""
+        """Return the dimension, 2 or 3."""
         return int(self.position.shape[-1])
 
     @property
@@ -96,7 +98,7 @@ class Stations:
 
     @property
     def places(self) -> Array:
-        """Return where stations are at any epoch, (..., k * s, d): moving ones span what they pass."""
+        """Return all positions of the stations at all epochs, (..., k * s, d)."""
         return self.position.reshape(*self.position.shape[:-3], -1, self.dimension)
 
 
@@ -111,15 +113,15 @@ class Rows:
     z : array (..., m)
         Measured values, SI units or radians.
     a, b : int array (m,)
-        Stations of each row; -1 where the kind takes none.
+        Station numbers of each row; -1 if the kind does not use the station.
     epoch : int array (m,)
         Index into the problem's times.
     target : int array (m,)
         Index of the target; -1 for an unlabelled row.
     weight : array (..., m)
-        1 for a row as measured, 0 for an absent one; between, its own variance is divided by the weight.
+        1 for a present row, 0 for an absent one. For values between, the variance of the row is divided by the weight.
     correction : array (..., m)
-        Known amount by which the measurement exceeds the model, for instance refraction.
+        Known error of the measurement (measured minus modelled), for instance refraction.
     """
 
     kind: str
@@ -138,17 +140,17 @@ class Rows:
 
     @property
     def sense(self) -> float:
-        """Return the sign of errors of `z` in reports of biases, residuals and suspects: -1 of compass bearings."""
+        """Return the sign of errors of `z` in reports: -1 for compass bearings (clockwise errors), else 1."""
         return 1.0
 
     def clockwise(self) -> Rows:
-        """Return the same rows as compass bearings, whose errors are reported clockwise, as they were read."""
+        """Return the same rows as compass bearings, whose errors are reported clockwise, like the readings."""
         return CompassRows(*(getattr(self, one.name) for one in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
 class CompassRows(Rows):
-    """Azimuths that were read clockwise from north: `z` is anticlockwise from the first axis all the same."""
+    """Azimuths that were read clockwise from north. As in `Rows`, `z` is anticlockwise from the first axis."""
 
     @property
     def sense(self) -> float:
@@ -158,24 +160,24 @@ class CompassRows(Rows):
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How one target moves: a polynomial in time over the whole run, or a free state at each epoch, or known.
+    """Motion model of one target: a polynomial in time over the run, a free state at each epoch, or a known motion.
 
     Parameters
     ----------
     order : 0, 1 or 2
         Position only; position and velocity; position, velocity and acceleration.
     span : "run" or "epoch"
-        One state for the run, or an independent one at every epoch.
+        One state for the run, or an independent state at each epoch.
     known : array (..., k or 1, order + 1, d), optional
-        The target's true state at each epoch (calibration); it is then not estimated.
+        Known true state of the target at each epoch, for calibration. It is then not estimated.
     reference : float, optional
-        Time at which the state of a run holds, seconds; None: the first epoch.
+        Reference time of the state of a run, seconds. None: the first epoch.
     over : "space" or "ground"
-        The course of a run is a polynomial in space, or it follows the Earth: along a great circle with that way, at
-        a height that is a polynomial of that order (`optloc.models.course`).
+        "space": the course is a polynomial in space. "ground": it follows the Earth. The way along a great circle and
+        the height are then polynomials in time (`optloc.models.course`).
     rise : array (..., k, 2), optional
-        Height at each epoch beyond that polynomial, metres, and its rate, metres per second: the known shape of a
-        height that was reported. Zero at the reference time.
+        Known height profile: height above the polynomial at each epoch, metres, and its rate, metres per second. It
+        comes from reported heights and is zero at the reference time.
     """
 
     order: int = 0
@@ -188,35 +190,36 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Bias:
-    """A family of unknown systematic errors that share a name and a form, one per member.
+    """A family of unknown systematic errors with a common name and form, one error per member.
 
     Parameters
     ----------
     name : str
         Name of the family, for instance "clock".
     members : tuple of q str
-        Names of its members, for instance the stations.
+        Names of the members, for instance the stations.
     row, member : int array (n,)
-        Sparse design: which global rows are touched, and by which member.
+        Sparse design matrix: global numbers of the affected rows, and the numbers of the members that affect them.
     coefficient : float array (n,)
-        Sign or size of each touch, for instance +1 for station a and -1 for station b. Of compass bearings -1: their
-        bias is clockwise, like the readings.
+        Coefficient of each entry, for instance +1 for station a and -1 for station b. It is -1 for compass bearings,
+        because their bias is clockwise like the readings.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
-        Added to the measurement; times the measured quantity; times seconds since the first target's reference time
-        (by default the first epoch); or a turn of
-        the station's axes (one angle in the plane, a rotation vector in space; a member is then a station's mount); or
-        the seconds by which a station is further along its course (coefficient 1 where it is the row's first, -1 where
-        it is the second); or added, another value at each epoch: a random walk, or a smooth function of time.
+        How the error enters the measurement. "offset": it is added. "scale": it is multiplied by the measured quantity.
+        "drift": it is multiplied by the seconds since the reference time of the first target (default: the first
+        epoch). "rotation": it turns the axes of the station, by one angle in the plane or a rotation vector in space; a
+        member is the mount of a station. "time": the station is ahead on its course by this number of seconds
+        (coefficient 1 for the first station of the row, -1 for the second). "walk": an added error that is a random
+        walk over the epochs. "spline": an added error that is a smooth function of time.
     mean : float array (q,) or (q, c)
-        Prior mean, in the unit of the form; of a walk that of its value at the first epoch, of a spline that of each of
-        its coefficients, which have the unit of the rows.
+        Prior mean, in the unit of the form. For a walk it applies to the value at the first epoch. For a spline it
+        applies to each coefficient, in the unit of the rows.
     sigma : float array like `mean`, optional
-        Prior standard deviation; None: unknown.
+        Prior standard deviation. None: there is no prior.
     density : float array (q, 1 or 2), optional
-        Of a walk: spectral density of the white noise that it is the sum of, unit of the rows squared per second; and
-        of that which its rate is the sum of, per second cubed (`optloc.problem.clocks.process`).
+        For a walk: spectral density of the white noise that drives the error, squared unit of the rows per second; and
+        of the white noise that drives its rate, per second cubed (`optloc.problem.clocks.process`).
     knots : float array (p,), optional
-        Of a spline: times between which it is a cubic polynomial, seconds.
+        For a spline: times of the knots, seconds. Between two knots it is a cubic polynomial.
     """
 
     name: str
@@ -225,7 +228,7 @@ class Bias:
     member: Array
     coefficient: Array
     form: FormName = "offset"
-    # One zero stands for all members; an array of its own for each bias, for arrays can be written into.
+    # A single zero applies to all members. Each bias gets a new array, because arrays are writable.
     mean: Array = field(default_factory=lambda: np.zeros(1))
     sigma: Array | None = None
     density: Array | None = None
@@ -234,22 +237,23 @@ class Bias:
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """A quantity of a target that must lie between two values, or equal one.
+    """A constraint: a quantity of a target must be between two values, or equal to one.
 
     Parameters
     ----------
     kind : str
         A key of `optloc.models.surfaces.SURFACES`, for instance "height".
     lower, upper : array (...)
-        Bounds in SI units; equal for an equality, infinite for none.
+        Bounds in SI units; equal for an equality, infinite for no bound.
     coefficients : array (..., c)
-        What the quantity is made of, for instance the normal of a plane.
+        Parameters of the quantity, for instance the normal of a plane.
     name : str
-        How reports call it.
+        Name in reports.
     target : int
-        Which target.
+        Number of the target.
     along : bool
-        Whether it holds at every epoch of a run, less the known `rise` of a height, or at the reference time alone.
+        Whether the constraint applies at every epoch of a run (for a height, minus its known `rise`), or at the
+        reference time only.
     """
 
     kind: str
@@ -263,16 +267,16 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """A region of the plan (first two coordinates) that must contain a target.
+    """A constraint: a polygon in the horizontal plane (first two coordinates) that contains the target.
 
     Parameters
     ----------
     vertices : array (v, 2)
-        Corners in order, metres; the polygon is simple, convex or not.
+        Corners in order, metres. The polygon is simple; it need not be convex.
     name : str
-        How reports call it.
+        Name in reports.
     target : int
-        Which target.
+        Number of the target.
     """
 
     vertices: Array
@@ -282,7 +286,7 @@ class Polygon:
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Gaussian prior knowledge of one named part of the parameter vector.
+    """Gaussian prior of one named part of the parameter vector.
 
     Parameters
     ----------
@@ -291,7 +295,7 @@ class Prior:
     mean : array (..., n)
         Mean in SI units.
     covariance : array (..., n, n)
-        Covariance.
+        Covariance, squared SI units.
     """
 
     name: str
@@ -299,13 +303,13 @@ class Prior:
     covariance: Array
 
 
-# Verdicts: is there an answer, and how sure is it the best one?
+# Status: is there an answer? Certificate: is it the best one?
 
 
 class Status(IntEnum):
-    """Whether a fix holds an answer; every member carries a sentence with advice."""
+    """Status or finding of a fix. Every member has a sentence with advice."""
 
-    # The numbers stand in stored studies: a new member takes the next one, none changes.
+    # The numbers are stored with studies: a new member gets the next number, and no number changes.
     OK = 0
     AMBIGUOUS = 1
     SEARCHED = 2
@@ -330,74 +334,70 @@ class Status(IntEnum):
     RESCALED = 21
 
     def __str__(self) -> str:
-        """Return the label: what `print` shows."""
+        """Return the label, which `print` shows."""
         return self.label
 
     def __format__(self, spec: str) -> str:
-        """Return the label, or the number where a format asks for one."""
+        """Return the label, or the number if the format specification is for a number."""
         return format(int(self), spec) if spec else self.label
 
     @property
     def sentence(self) -> str:
-        """Return what happened and what to do about it."""
+        """Return a sentence about the result, with advice."""
         return _SENTENCES[self]
 
     @property
     def label(self) -> str:
-        """Return the member's name as people and files spell it, for instance "too few rows"."""
+        """Return the name as users and files write it, for instance "too few rows"."""
         return self.name.lower().replace("_", " ")
 
     @property
     def mark(self) -> int:
-        """Return the bit that stands for the status where all that applies to a fix is kept in one number."""
+        """Return the bit of this status in the `marks` of a fix, which store all its findings in one integer."""
         return 1 << int(self)
 
 
-# The result, then the next step: users read these sentences in every output.
+# Each sentence states first what happened, then what helps. Users read it without any code.
 _SENTENCES: dict[Status, str] = {
-    Status.OK: "Use it: the residuals fit the stated noise, no other position fits, and the error ellipse is valid.",
-    Status.AMBIGUOUS: "Several positions fit the data about equally well; see the alternatives, and add a station, a "
-    "measurement or a known height that decides.",
-    Status.SEARCHED: "No safe start is known for these kinds of measurements; this is the best position of a seeded "
-    "search, and a better one is not excluded.",
-    Status.MAX_ITERATIONS: "The iterations did not converge; check units, signs and station positions with "
-    "'optloc check'.",
-    Status.STALLED: "The refinement stopped before the minimum: its steps no longer lower chi-square, but the gradient "
-    "is not zero; check units and noise with 'optloc check'.",
-    Status.SINGULAR_GEOMETRY: "The measurements leave one direction of the answer undetermined; add a station in "
-    "another direction.",
-    Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add measurements or fix an unknown.",
-    Status.INFEASIBLE: "No position meets the constraints; check their limits.",
-    Status.UNBOUNDED: "The target is too far for these stations: the data give a direction and a minimum range; add a "
-    "distant station, a bearing or a known height.",
+    Status.OK: "The data do not reject the model, no other position explains them about as well, and the covariance "
+    "covers as it promises.",
+    Status.AMBIGUOUS: "Several positions explain the data about equally well; see the alternatives, or add a row, a "
+    "station or a known height that tells them apart.",
+    Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search, and "
+    "nothing proves that no other position explains the data as well.",
+    Status.MAX_ITERATIONS: "The iterations ended before they converged; check the units, the signs and the "
+    "places of the stations with 'optloc check'.",
+    Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",
+    Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off it.",
+    Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add rows or fix an unknown.",
+    Status.INFEASIBLE: "No position meets the constraints.",
+    Status.UNBOUNDED: "Positions ever farther away explain the data about as well: they say a direction and a least "
+    "range; add a station farther off, a bearing or a known height.",
     Status.NUMERICAL: "A solver failed, and the reason names it; check the scale and the units of the input, or choose "
     "another solver.",
     Status.REJECTED: "A measurement is not a finite number; remove the row or give it weight zero.",
-    Status.UNAVAILABLE: "The method has no start for these measurements; see the reason, or use 'auto', which accepts "
-    "all kinds.",
-    Status.DISCONNECTED: "The station pairs form groups without a common station, so no closed form gives a start; use "
-    "'auto', which searches, or add a pair that links the groups.",
-    Status.CONTRADICTORY: "The measurements contradict each other or the constraints, even without a few of them; "
-    "check station positions, clocks, noise levels and bounds.",
-    Status.MISFIT: "Do not use it: the residuals are larger than the stated noise allows; run 'optloc check', find the "
-    "wrong row with the method 'robust', or correct the noise.",
-    Status.UNPROVEN: "The position is refined, but another position is not excluded, as the certificate explains; try "
-    "the method 'auto', or accept this status with 'allow'.",
-    Status.CURVED: "The position is right, but the error ellipse in metres is not valid; use the fix's chart, its "
-    "interval, or optloc.uncertainty.likelihood_region.",
-    Status.UNREFINED: "This is the estimate of a start, without refinement and verdict; append '+lsr+certify' to the "
-    "method.",
-    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a station, a measurement or a "
-    "known height.",
-    Status.TAILS: "Repeats of the measurement confirm the 95 % figures, but not the 99.9 % region.",
-    Status.ROBUST: "The rows that keep their weight prove the position; that no other choice of rejected rows explains "
-    "the data is searched, not proven.",
-    Status.RESCALED: "The fixes of the batch show larger noise than stated; chi-square and covariance use the larger "
-    "noise.",
+    Status.UNAVAILABLE: "The method gives no start for these rows; the reason says why, and 'auto' takes all kinds.",
+    Status.DISCONNECTED: "The station pairs fall into groups without a common station: no closed form starts from "
+    "them; take 'auto', which searches, or add a pair that links them.",
+    Status.CONTRADICTORY: "The measurements contradict each other, and leaving few of them out does not help, or they "
+    "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
+    Status.MISFIT: "The residuals are larger than the stated noise allows, so position and covariance are refuted; see "
+    "'optloc check', look for a wrong row with the method 'robust', or state the noise as it is.",
+    Status.UNPROVEN: "Refined, but nothing proves that no other position explains the data about as well; the method "
+    "'auto' tries to, the certificate says what is missing, and whoever can do without allows this status.",
+    Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
+    "optloc.uncertainty.likelihood_region.",
+    Status.UNREFINED: "The estimate of a start, neither refined nor judged: put '+lsr+certify' behind the method.",
+    Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a row, a station or what is known.",
+    Status.TAILS: "The 95 % figures hold, as repeats of the measurement show; the 99.9 % region does not.",
+    Status.ROBUST: "The rows that keep their weight prove the position; a search, not a proof, found no other rows to "
+    "reject that explain the data.",
+    Status.RESCALED: "The fixes of the batch show that the noise is larger than stated; cost and covariance use the "
+    "larger noise.",
 }
 
 PRECEDENCE = (
-    # those without a finished answer exclude each other
+    # Statuses without a finished answer exclude each other.
     Status.REJECTED,
     Status.TOO_FEW_ROWS,
     Status.DISCONNECTED,
@@ -409,7 +409,8 @@ PRECEDENCE = (
     Status.STALLED,
     Status.MAX_ITERATIONS,
     Status.CONTRADICTORY,
-    # gaps between minima mean nothing under noise that is refuted, and a rival does not close an open region
+    # If the stated noise is refuted, cost gaps between minima have no meaning. An alternative does not close an open
+    # region.
     Status.MISFIT,
     Status.UNBOUNDED,
     Status.AMBIGUOUS,
@@ -418,10 +419,10 @@ PRECEDENCE = (
     Status.CURVED,
     Status.OK,
 )
-"""Which of all that applies to a fix is its status: the first of these."""
+"""Statuses in the order of precedence: the first among the findings of a fix is its status."""
 
 NOTES = (Status.UNCHECKED, Status.TAILS, Status.ROBUST, Status.RESCALED)
-"""Findings that are never a status: they stand beside one, `ok` included."""
+"""Findings that are never the status. They occur together with any status, including `ok`."""
 
 ANSWERED = (
     Status.OK,
@@ -432,17 +433,17 @@ ANSWERED = (
     Status.UNBOUNDED,
     Status.MISFIT,
 )
-"""Statuses of fixes that have a position with a covariance, as far as there is a finite one."""
+"""Statuses of fixes that have a position with a covariance, if these are finite."""
 
 HAS_ANSWER = np.isin(np.arange(1 + max(Status)), ANSWERED)
-"""The same by status number: a search takes 30 us, and the text of a fix needs five."""
+"""The same as an array by status number, because a search in a tuple takes 30 us and the text of a fix only five."""
 
 
 def first_status(marks: Array) -> Array:
-    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing but notes does."""
+    """Return the status numbers (...) of findings `marks` (...); `ok` if the marks contain notes only."""
     marks = np.asarray(marks)
     code = np.full(marks.shape, int(Status.OK), dtype=np.int8)
-    anywhere = int(np.bitwise_or.reduce(marks, axis=None))  # few statuses occur in a batch
+    anywhere = int(np.bitwise_or.reduce(marks, axis=None))  # a batch has few different statuses
     for status in reversed(PRECEDENCE):
         if anywhere & status.mark:
             code[marks & status.mark != 0] = int(status)
@@ -450,7 +451,7 @@ def first_status(marks: Array) -> Array:
 
 
 def statuses_of(code: Array) -> Array:
-    """Return the members (...), objects, of status numbers (...)."""
+    """Return an object array (...) of `Status` members for status numbers (...)."""
     numbers = np.asarray(code, dtype=np.intp)
     out = np.empty(numbers.shape, dtype=object)
     for number in np.unique(numbers):
@@ -460,32 +461,32 @@ def statuses_of(code: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """How sure it is that a fix is the best one.
+    """How far it is proven that a fix has the least cost of all positions.
 
     Parameters
     ----------
     proof : "global", "region", "local" or "unknown"
-        What has been proven about the maximum-likelihood cost: no position costs less, none of a region does, none
-        nearby does, or nothing.
+        Where no position has a lower maximum-likelihood cost: everywhere, in a region, or near the fix. "unknown":
+        nothing is proven.
     reason : str
-        What is claimed in a sentence, and why it is this and not more.
+        A sentence that states what is proven, and why not more.
     method : str
-        What was done to find out.
+        Method of the proof or of the search.
     bound : float
-        Lower bound of the maximum-likelihood cost over all positions, or over the region; NaN where none was computed.
+        Lower bound of the maximum-likelihood cost over all positions, or over the region; NaN if it was not computed.
     gap : float
-        Cost less bound.
+        Cost minus bound.
     unique : bool
-        Whether it is proven too that no other minimum costs less than `margin` more, but for listed alternatives;
-        otherwise other minima were searched for, not excluded.
+        Whether it is also proven that every other minimum, except listed alternatives, costs at least `margin` more.
+        If not, other minima were searched for, but are not excluded.
     margin : float
-        Cost beyond that of the fix below which no other minimum is left; 0 where uniqueness is not proven.
+        Proven difference between the cost of other minima and the cost of the fix; 0 if uniqueness is not proven.
     boxes : int
-        How many boxes a proof by branch and bound looked at; where it was not finished, in all attempts.
+        Number of boxes that branch and bound examined; for an unfinished proof, the sum over all attempts.
     region : tuple of (lower, upper), optional
-        Corners of the region of the claim, each d coordinates in the problem's frame, metres.
+        Corners of the region of the proof, each d coordinates in the frame of the problem, metres.
     asked : bool
-        Whether the claim is limited to that region because somebody asked for it, not because more could not be proven.
+        Whether the proof is limited to this region on request, and not because a larger proof failed.
     """
 
     proof: str

@@ -1,15 +1,15 @@
-"""Units of files and tables, converted to SI and radians at the border only.
+"""Units of files and tables. They are converted to SI units and radians on input, and back on output.
 
-Inside optloc every length is in metres, angle in radians, time in seconds and speed in metres per
-second. Three conversions are more than a factor:
+Inside optloc lengths are in metres, angles in radians, times in seconds and speeds in metres per second. Three
+conversions are more than a factor:
 
-* A propagation time (``ns``) is a length once multiplied by the propagation speed: light in vacuum
-  unless told otherwise, some 343 m/s for sound in air.
-* A gain ratio in ``dB`` is a ratio of ranges. Amplitude falls with ``1 / r``, so the level at
-  station b above the level at station a, ``20 log10(A_b / A_a)``, is ``20 log10(r_a / r_b)``. Decibels of
-  power, ``10 log10(P_b / P_a)``, are the same number. A quantity that is itself a level stays in decibels.
-* A frequency in ``Hz``, less its carrier, is a range rate: a receding emitter lowers the received
-  frequency, ``f = f_c (1 - r' / c)``, so ``r_a' = -(c / f_c) (f_a - f_c)``, and a difference of two frequencies is
+* A propagation time (``ns``) becomes a length by multiplication with the propagation speed. The default is the speed of
+  light in vacuum; sound in air has about 343 m/s.
+* A gain ratio in ``dB`` becomes a ratio of ranges. The amplitude is proportional to ``1 / r``. The level at station b
+  relative to station a, ``20 log10(A_b / A_a)``, is therefore ``20 log10(r_a / r_b)``. In decibels of power,
+  ``10 log10(P_b / P_a)``, it is the same number. A quantity that is a level stays in decibels.
+* A frequency in ``Hz`` minus its carrier becomes a range rate. A receding emitter lowers the received frequency,
+  ``f = f_c (1 - r' / c)``, so ``r_a' = -(c / f_c) (f_a - f_c)``. A difference of two frequencies becomes
   ``r_a' - r_b' = -(c / f_c) (f_a - f_b)``.
 
 Sources: BIPM, The International System of Units, 9th edition (2019), sections 2.3.1 and 4, for c, the
@@ -45,21 +45,21 @@ __all__ = [
 ]
 
 Quantity = Literal["length", "angle", "ratio", "level", "speed", "time", "frequency", "power", "plain"]
-"""What a number measures; it decides which units make sense."""
+"""Physical quantity of a number. It determines the valid units."""
 
 AzimuthConvention = Literal["east-counterclockwise", "north-clockwise", "north-counterclockwise"]
-"""Where azimuth zero is and which way it grows; the first is the one used in memory."""
+"""Zero direction and sense of azimuths. The first convention is used inside optloc."""
 
 SPEED_OF_LIGHT: Final = 299_792_458.0
 """Speed of light in vacuum in m/s (exact, SI)."""
 
 LARGEST: Final = 1e30
-"""What no number is beyond that a file or a problem holds, in any unit: the visible universe is 1e27 m wide, and a
-tenth power is still no overflow. As spread, no number is below its inverse."""
+"""Largest absolute value of a number in a file or a problem, in any unit. The visible universe is 1e27 m wide, and a
+tenth power of this number does not overflow. A standard deviation must not be below its inverse."""
 
-# Apart, because a length may be given as a time too: it is multiplied by the speed of propagation.
+# Separate, because a length can be given as a time, which is multiplied by the propagation speed.
 _TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12}
-# Exact by definition since 1959, as the nautical mile since 1929, in metres.
+# Metres. The foot is exact by definition since 1959, the nautical mile since 1929.
 _FOOT: Final = 0.3048
 _NAUTICAL_MILE: Final = 1852.0
 
@@ -84,7 +84,7 @@ UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = MappingProxyType(
             "arcsec": math.pi / 648_000,
         },
         "ratio": {"1": 1.0, "dB": 1.0},
-        # A neper is a factor e of amplitudes, 20 log10(e) decibels.
+        # One neper is a factor e in amplitude, which is 20 log10(e) decibels.
         "level": {"dB": 1.0, "Np": 20.0 / math.log(10)},
         "speed": {
             "m/s": 1.0,
@@ -101,25 +101,25 @@ UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = MappingProxyType(
         "plain": {"1": 1.0},
     }
 )
-"""Known units of each quantity and their size in SI; times that stand for lengths are in seconds,
-``Hz`` in 1/s and ``dB`` of a ratio, or of a ratio of powers, is logarithmic (see the module's text)."""
+"""Known units of each quantity and their size in SI. Units of time for lengths are in seconds, ``Hz`` is in 1/s.
+``dB`` for a ratio, or for a ratio of powers, is logarithmic (see the module docstring)."""
 
 SI_UNIT: Final[Mapping[Quantity, str]] = MappingProxyType({q: next(iter(table)) for q, table in UNITS.items()})
-"""The unit of each quantity in memory; levels are in decibels, which SI accepts."""
+"""Unit of each quantity inside optloc. Levels are in decibels, which SI accepts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """The map from numbers in a file to numbers in memory: ``offset + factor * u``, or a decibel.
+    """Conversion from a unit of a file to SI: ``offset + factor * u``, or a decibel conversion.
 
     Parameters
     ----------
     factor : float
-        SI units in one unit of the file, with sign; for decibels, nepers in one decibel.
+        SI units per unit of the file, with sign. For decibels: nepers per decibel.
     offset : float
-        Value in SI of the file's zero.
+        SI value of zero in the file.
     logarithmic : bool
-        Whether the file holds a logarithm: memory then holds ``exp(factor * u)``.
+        Whether the file has logarithms. The SI value is then ``exp(factor * u)``.
     """
 
     factor: float
@@ -127,37 +127,37 @@ class Conversion:
     logarithmic: bool = False
 
     def to_si(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Convert values of any shape to SI.
+        """Return values (...) of the file as SI values.
 
         Angles are not wrapped: 350 deg stays above pi.
         """
         u = np.asarray(values, dtype=np.float64)
         if self.logarithmic:
-            # What is too large becomes infinite, and is refused where its row is known.
+            # Values that overflow become infinite. A later check rejects them and names their row.
             with np.errstate(over="ignore"):
                 return np.exp(self.factor * u)
         return self.offset + self.factor * u
 
     def from_si(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Convert SI values of any shape to the file's unit."""
+        """Return SI values (...) in the unit of the file."""
         z = np.asarray(values, dtype=np.float64)
         return np.log(z) / self.factor if self.logarithmic else (z - self.offset) / self.factor
 
     def slope(self, values_si: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Return d(SI) / d(file unit), with sign.
+        """Return the derivative d(SI) / d(file unit), with sign.
 
-        A covariance C in file units becomes ``slope[:, None] * C * slope`` in SI. The sign matters for
-        the cross terms of clockwise azimuths and frequency differences.
+        A covariance C in file units becomes ``slope[:, None] * C * slope`` in SI. The sign matters for the off-diagonal
+        terms of clockwise azimuths and frequency differences.
 
         Parameters
         ----------
         values_si : array_like, shape (...), optional
-            The measured values in SI; a logarithmic unit needs them.
+            The measured values in SI, which a logarithmic unit needs.
 
         Returns
         -------
         ndarray, shape (...) or ()
-            Slope, to first order at `values_si`.
+            The derivative at `values_si`.
         """
         if not self.logarithmic:
             return np.asarray(self.factor)
@@ -165,12 +165,12 @@ class Conversion:
             raise InvalidProblem(
                 "an error in dB has no fixed size as a ratio",
                 "sigma",
-                "give the measured values with it, or state the error in unit '1'",
+                "give the measured values too, or state the error in unit '1'",
             )
         return self.factor * np.asarray(values_si, dtype=np.float64)
 
     def sigma_to_si(self, sigma: ArrayLike, values_si: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Convert standard deviations to SI, to first order at the measured values."""
+        """Return standard deviations (...) in SI, to first order at the measured values."""
         scaled: NDArray[np.float64] = np.abs(self.slope(values_si)) * np.asarray(sigma, dtype=np.float64)
         return scaled
 
@@ -184,41 +184,41 @@ def conversion(
     convention: AzimuthConvention = "east-counterclockwise",
     where: str | None = None,
 ) -> Conversion:
-    """Look up how a unit becomes SI.
+    """Return the conversion of a unit to SI.
 
     Parameters
     ----------
     unit : str
         One of ``UNITS[quantity]``.
     quantity : {"length", "angle", "ratio", "level", "speed", "time", "frequency", "power", "plain"}
-        What the numbers measure.
+        Physical quantity of the numbers.
     propagation_speed : float
-        Speed in m/s that turns propagation times into lengths and frequencies into speeds.
+        Speed in m/s that converts propagation times to lengths and frequencies to speeds.
     carrier : float, optional
-        Carrier frequency in Hz; needed when a speed is given in Hz.
+        Carrier frequency in Hz, required for a speed in Hz.
     convention : {"east-counterclockwise", "north-clockwise", "north-counterclockwise"}
-        For azimuths: a compass bearing A is ``pi / 2 - A`` in memory, an angle A anticlockwise from north
+        Convention of azimuths. A compass bearing A becomes ``pi / 2 - A``, an angle A anticlockwise from north
         ``pi / 2 + A``.
     where : str, optional
-        Place to name when something is wrong.
+        Location that error messages name.
 
     Returns
     -------
     Conversion
-        The map between file and memory.
+        Conversion from the file to SI.
 
     Raises
     ------
     InvalidProblem
-        Unknown unit, quantity or convention; a speed or carrier that is not positive.
+        For an unknown unit, quantity or convention, and for a speed or carrier that is not positive.
     """
     _check_options(unit, quantity, propagation_speed, convention, where)
     factor = UNITS[quantity][unit]
-    # A travel time stands for the way that it takes.
+    # A propagation time becomes the path length.
     if quantity == "length" and unit in _TIME:
         return Conversion(factor * propagation_speed)
     if unit == "dB" and quantity == "ratio":
-        # Amplitude falls with the range, so that 20 decibels are a factor of ten in range.
+        # The amplitude is inversely proportional to the range, so 20 decibels are a factor of ten in range.
         return Conversion(math.log(10) / 20, logarithmic=True)
     if unit == "dB" and quantity == "power":
         return Conversion(math.log(10) / 10, logarithmic=True)
@@ -228,12 +228,12 @@ def conversion(
             raise InvalidProblem(
                 f"the carrier frequency {given}",
                 where,
-                "a frequency in Hz is a speed only beside its carrier",
+                "a frequency in Hz needs its carrier to give a speed",
             )
-        # Negative: a receding emitter is heard at a lower frequency.
+        # Negative, because the received frequency of a receding emitter is lower.
         return Conversion(-propagation_speed / carrier)
     if quantity == "angle" and convention != "east-counterclockwise":
-        # North is a quarter turn from the x axis; a compass turns the other way.
+        # North is a quarter turn from the x axis. A compass counts clockwise.
         return Conversion(-factor if convention == "north-clockwise" else factor, offset=math.pi / 2)
     return Conversion(factor)
 
@@ -248,7 +248,7 @@ def to_si(
     convention: AzimuthConvention = "east-counterclockwise",
     where: str | None = None,
 ) -> NDArray[np.float64]:
-    """Convert values of any shape to SI; the options are those of :func:`conversion`."""
+    """Return values of any shape in SI; the options are those of :func:`conversion`."""
     return conversion(
         unit, quantity, propagation_speed=propagation_speed, carrier=carrier, convention=convention, where=where
     ).to_si(values)
@@ -264,10 +264,10 @@ def sigma_to_si(
     carrier: float | None = None,
     where: str | None = None,
 ) -> NDArray[np.float64]:
-    """Convert standard deviations of any shape to SI.
+    """Return standard deviations of any shape in SI.
 
-    The options are those of :func:`conversion`; decibels also need the measured values in SI, since a
-    sigma of s dB is, to first order, a sigma of ``ratio * s * ln(10) / 20``.
+    The options are those of :func:`conversion`. Decibels also need the measured values in SI: to first order, a
+    standard deviation of s dB is ``ratio * s * ln(10) / 20``.
     """
     return conversion(unit, quantity, propagation_speed=propagation_speed, carrier=carrier, where=where).sigma_to_si(
         sigma, values_si
@@ -275,14 +275,14 @@ def sigma_to_si(
 
 
 def split_amount(value: float | str, quantity: Quantity, where: str) -> tuple[float, str]:
-    """Return the number and the unit of an amount such as ``"30 ns"``; the unit of a bare number is empty.
+    """Return the number and the unit of an amount such as ``"30 ns"``; the unit is empty for a number without a unit.
 
     Raises
     ------
     InvalidProblem
-        Where there is no number, or it is beyond `LARGEST`.
+        If there is no number, or if it is beyond `LARGEST`.
     """
-    # A number that TOML read is spelled again: one way for both.
+    # A number from a TOML file is converted to text first, so that both cases use the same code.
     text, _, unit = str(value).strip().partition(" ")
     try:
         number = float(text)
@@ -295,35 +295,36 @@ def split_amount(value: float | str, quantity: Quantity, where: str) -> tuple[fl
 
 
 def example_of(number: float, text: str, quantity: Quantity) -> str:
-    """Return an amount with its SI unit to be copied: the number that was written, if it is one."""
+    """Return an amount with its SI unit as an example, with the number of the user if it is valid."""
     return f'"{text if abs(number) <= LARGEST else 1.5} {SI_UNIT[quantity]}"'
 
 
 def _holds_text(value: Any) -> bool:
-    """Return whether a list, or a list in it, holds text."""
+    """Return whether a list, or a nested list, contains text."""
     return isinstance(value, list | tuple) and any(isinstance(each, str) or _holds_text(each) for each in value)
 
 
 def in_si(value: Any, quantity: Quantity, where: str, *, deviation: bool = False, place: bool = False) -> Any:
-    """Return numbers in SI units, where a number may be text with a unit.
+    """Return numbers in SI units. Each number may be given as text with a unit.
 
     Parameters
     ----------
     value : array_like, str, or sequence of str
-        Bare numbers are in SI units. ``"20 ns"`` of a length is multiplied by the speed of light.
+        Numbers without a unit are in SI units. ``"20 ns"`` for a length is multiplied by the speed of light.
     quantity : Quantity
-        What the numbers measure.
+        Physical quantity of the numbers.
     where : str
-        Argument to name.
+        Argument that error messages name.
     deviation : bool
-        The numbers are standard deviations: decibels of a ratio are refused, because their size depends on the ratio.
+        Whether the numbers are standard deviations. Decibels of a ratio are then refused, because their size depends on
+        the ratio.
     place : bool
-        The numbers are coordinates or heights: units of time are refused.
+        Whether the numbers are coordinates or heights. Units of time are then refused.
 
     Returns
     -------
     float, array (...) or the value
-        The value itself where no part of it is text.
+        The value itself if it contains no text.
 
     Raises
     ------
@@ -344,21 +345,21 @@ def in_si(value: Any, quantity: Quantity, where: str, *, deviation: bool = False
         try:
             return np.array(numbers, dtype=float)
         except ValueError:
-            raise InvalidProblem("the numbers are not an array", where, "give numbers of one shape") from None
+            raise InvalidProblem("the numbers do not form an array", where, "give numbers of one shape") from None
     if isinstance(value, np.ndarray) and value.dtype.kind == "U":
         numbers = [in_si(str(each), quantity, where, deviation=deviation, place=place) for each in value.flat]
         return np.reshape(numbers, value.shape)
     return value
 
 
-# Where sound is slow or quick: the temperatures, salinities and depths that the formulas were made for.
+# Ranges of validity of the formulas for the speed of sound: temperatures, salinity and depth.
 _AIR, _WATER, _SALT, _DEEP = (-60.0, 60.0), (-2.0, 40.0), (0.0, 45.0), (0.0, 1000.0)
 
 
 def sound_in_air(celsius: float) -> float:
-    """Return the speed of sound in dry air, m/s: that of an ideal gas, 331.3 m/s at 0 deg C.
+    """Return the speed of sound in dry air, m/s, for an ideal gas with 331.3 m/s at 0 deg C.
 
-    Moist air is quicker, by 0.35 % at the most at 20 deg C: the speed may be left open by a bias of the form "scale".
+    In moist air it is at most 0.35 % higher at 20 deg C. A bias of the form "scale" can estimate this difference.
 
     Raises
     ------
@@ -379,12 +380,12 @@ def sound_in_water(celsius: float, salinity: float = 35.0, depth: float = 0.0) -
     salinity : float
         Grams of salt in a kilogram of water, 0 to 45; 35 in the sea, 0 in fresh water.
     depth : float
-        Metres below the surface, 0 to 1000.
+        Depth below the surface, 0 to 1000 metres.
 
     Raises
     ------
     InvalidProblem
-        Outside these.
+        For values outside these ranges.
 
     References
     ----------
@@ -400,7 +401,7 @@ def sound_in_water(celsius: float, salinity: float = 35.0, depth: float = 0.0) -
 def _within(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
     if not ends[0] <= value <= ends[1]:
         what = f"{name} is {value:g} {unit}, outside {ends[0]:g} to {ends[1]:g}"
-        raise InvalidProblem(what, "propagation speed", "give the speed itself, metres per second")
+        raise InvalidProblem(what, "propagation speed", "give the speed as a number, in metres per second")
 
 
 def _check_options(unit: str, quantity: str, propagation_speed: float, convention: str, where: str | None) -> None:

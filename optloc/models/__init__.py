@@ -1,7 +1,7 @@
-"""Measurement kinds: every h(x) is written here, once, elementwise.
+"""Measurement kinds: the function h(x) of every kind, written once and elementwise.
 
-The same entry serves numbers (NumPy), symbols (CasADi) and derivatives (Jet). To add a kind, add one entry, or from
-another package an entry point of the group ``optloc.models``.
+The same function works on numbers (NumPy), on symbols (CasADi) and on derivatives (Jet). To add a kind, add an entry to
+the table, or declare an entry point of the group ``optloc.models`` in another package.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class LiftedRow:
-    """A measurement as a row linear in position and ranges: ``x.position + ra r_a + rb r_b + constant = 0``.
+    """A measurement as an equation linear in position and ranges: ``x.position + ra r_a + rb r_b + constant = 0``.
 
     Parameters
     ----------
     x : tuple of d numbers, or None
-        Coefficients of the target's position (1); None where the row has ranges only.
+        Coefficients of the target's position (1); None if the equation has ranges only.
     ra, rb : number
         Coefficients of the ranges to the first and second station.
     constant : number
         Constant term, metres.
     factor : callable of (t, a, b)
-        Derivative of the row with respect to the measured value: turns measurement noise into row noise.
+        Derivative of the left side with respect to the measured value. It converts measurement noise to equation noise.
     """
 
     x: Components | None
@@ -72,50 +72,51 @@ class LiftedRow:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A measurement kind.
+    """A measurement kind: its function h(x) and its properties.
 
     Parameters
     ----------
     h : callable of (t, a, b)
         The measurement of target `t` by stations `a` and `b`, elementwise on `Point` components, SI units and radians.
     quantity : str
-        What it measures, a key of `optloc.base.units.UNITS`: "length", "angle", "ratio", "level" (decibels), "speed" or
-        "plain" (a number); decides which units a file may use.
+        Physical quantity of the measurement, a key of `optloc.base.units.UNITS`: "length", "angle", "ratio", "level"
+        (decibels), "speed" or "plain" (a number). It decides which units a file may use.
     stations : int
-        How many stations it takes: 0, 1 or 2.
+        Number of stations of a row: 0, 1 or 2.
     summary : str
         One line for listings.
     ranges : (ra, rb), optional
-        Set where ``h = ra r_a + rb r_b`` exactly.
+        Given if ``h = ra r_a + rb r_b`` exactly.
     signs : (sa, sb), optional
-        Set where ``h = sa q_a + sb q_b`` of something that each station measures by itself: rows that share a station
-        share its error (`arrival_sigma`). That of ranges is `ranges`.
+        Given if ``h = sa q_a + sb q_b``, where each station measures one q. Rows that share a station then share its
+        error (`arrival_sigma`). Default: `ranges`.
     nodes : tuple of (factor, node)
-        What a proof takes h for where it is no sum of ranges: ``h = sum of factor phi``, each phi a node
-        (`optloc.proof.nodes.node.Node`) or the name of one that optloc has; with `signs`, that of q. Empty: nothing is
-        proven of such rows.
+        Form of h in proofs if it is not a sum of ranges: ``h`` is the sum of ``factor phi`` over the nodes phi. Each
+        phi is a node (`optloc.proof.nodes.node.Node`) or the name of a node of optloc. With `signs` the sum is q
+        instead of h. Empty: proofs do not cover rows of this kind.
     lifted : callable of (m, a, b), optional
-        The `LiftedRow` of a measured value m, where there is one that is not a sum of ranges.
+        Function that returns the `LiftedRow` of a measured value m. Only kinds that are not a sum of ranges need it.
     period : float, optional
-        Period of an angle, radians; the residual is wrapped.
+        Period of an angle, radians, with which the residual is wrapped.
     ray : callable of (t, a, b), optional
-        The measurement along the rays of a medium, which the points carry (`optloc.models.medium`); None where it is
-        not known what rays that bend do to it. ``MODELS["ray_" + kind]`` is the kind that is measured so.
+        The measurement along the rays of a medium, which the points contain (`optloc.models.medium`). None: there is no
+        model for bent rays. ``MODELS["ray_" + kind]`` is the kind with this measurement.
     straight : str, optional
-        Of a kind along rays: the name of the kind that it is where waves come straight. Starts take that one.
+        For a kind along rays: the name of the same kind with straight rays, from which the search for a solution
+        starts.
     emission : bool
-        True where an unknown emission time (times c, metres) of the epoch is added.
+        Whether an unknown emission time of the epoch (times c, metres) is added.
     velocity, axes, ecef : bool
-        What the points must carry beyond their position.
+        Whether points need a velocity, axes or ECEF coordinates.
     dimensions : tuple of int
-        Dimensions in which the kind makes sense.
+        Dimensions in which the kind is defined.
     aliases : tuple of str
-        Other words for the kind, which are read wherever its name is; see `kind_named`.
+        Other names of the kind, which are accepted everywhere; see `kind_named`.
 
     Raises
     ------
     InvalidProblem
-        For an unknown quantity or a number of stations that no row can name.
+        For an unknown quantity, or a number of stations other than 0, 1 or 2.
     """
 
     h: Callable[[Point, Point, Point], Any]
@@ -140,7 +141,7 @@ class Model:
         if self.quantity not in UNITS:
             raise InvalidProblem(f"unknown quantity {self.quantity!r}", "quantity", nearest(self.quantity, list(UNITS)))
         if self.stations not in (0, 1, 2):
-            raise InvalidProblem(f"a row cannot name {self.stations} stations", "stations", "give 0, 1 or 2")
+            raise InvalidProblem(f"a row cannot have {self.stations} stations", "stations", "give 0, 1 or 2")
         if self.signs is None:
             object.__setattr__(self, "signs", self.ranges)
 
@@ -150,7 +151,7 @@ def _azimuth(line: Components) -> Any:
 
 
 def _elevation(line: Components) -> Any:
-    # By both legs: the arcsine of a ratio loses its digits overhead.
+    # By the arctangent, because the arcsine of a ratio loses digits near the zenith.
     xp = namespace(line[2])
     return xp.atan2(line[2], xp.hypot(line[0], line[1]))
 
@@ -163,9 +164,10 @@ def _height(t: Point, a: Point, b: Point) -> Any:
 def rss_difference(exponent: float = 2.0) -> Model:
     """Return the kind "difference of received signal strengths" for a path-loss exponent.
 
-    Power falls with ``r^-exponent``: ``h = 10 exponent log10(r_b / r_a)`` decibels, positive where a hears more.
-    A measured z means ``r_a = 10^(-z / (10 exponent)) r_b``, which is linear in the ranges. The table has the kind for
-    free space, 2; values and standard deviations of another exponent n times ``2 / n`` are of that kind.
+    Received power is proportional to ``r^-exponent``. The measurement is ``h = 10 exponent log10(r_b / r_a)`` decibels,
+    positive if station a receives more. A measured z means ``r_a = 10^(-z / (10 exponent)) r_b``, which is linear in
+    the ranges. The table contains this kind for free space, exponent 2. To use it for an exponent n, multiply the
+    values and standard deviations by ``2 / n``.
 
     Parameters
     ----------
@@ -202,12 +204,12 @@ def _basis(a: Point) -> tuple[Components, ...]:
 def _lifted_azimuth(m: Any, a: Point, b: Point) -> LiftedRow:
     xp = namespace(m)
     basis = _basis(a)
-    # The normal of the vertical plane through the station that the azimuth names: the target lies in it.
+    # Normal of the vertical plane through the station at this azimuth. The target is in this plane.
     across = tuple(xp.cos(m) * v - xp.sin(m) * u for u, v in zip(basis[0], basis[1], strict=True))
 
     def horizontal(t: Point, a: Point, b: Point) -> Any:
         line = local(t, a)
-        # An error of the angle moves the row by the horizontal range.
+        # An error of the angle changes the equation by error times horizontal range.
         return -1.0 * namespace(line[0]).hypot(line[0], line[1])
 
     return LiftedRow(across, 0.0, 0.0, -1.0 * dot(across, a.position), horizontal)
@@ -222,12 +224,12 @@ def _lifted_elevation(m: Any, a: Point, b: Point) -> LiftedRow:
 
 
 BEARING = "bearing"
-"""The word for an azimuth that is a compass bearing wherever nothing else is said: degrees from north, clockwise."""
+"""Name for an azimuth that is by default a compass bearing: in degrees, clockwise from north."""
 
 RAY = "ray_"
-"""What the name of a kind begins with that is measured along the rays of a medium."""
+"""Prefix of the names of kinds that are measured along the rays of a medium."""
 
-# Signs and units are those of files after conversion: metres, radians; a is the first station named.
+# Signs and units are those after conversion: metres and radians; a is the first named station.
 _KINDS: dict[str, Model] = {
     "tdoa": Model(
         lambda t, a, b: distance(t, a) - distance(t, b),
@@ -254,7 +256,7 @@ _KINDS: dict[str, Model] = {
         "range r_a",
         ranges=(1, 0),
         ray=lambda t, a, b: path(t, a),
-        # no "rtt": a round trip is two ranges
+        # Not "rtt", because a round trip is two ranges.
         aliases=("distance", "twr", "tof", "slant_range", "dme"),
     ),
     "toa": Model(
@@ -338,11 +340,11 @@ _KINDS: dict[str, Model] = {
 
 
 BETWEEN = "station to station"
-"""The kind of a distance between two stations, which no target enters: of networks whose stations are unknown."""
+"""Name of the kind for a distance between two stations, without a target, in networks with unknown stations."""
 
 
-class _Unlisted(dict[str, Model]):
-    """Kinds that are listed nowhere: those along rays, made of what their names say, and distances of stations."""
+class _DerivedKinds(dict[str, Model]):
+    """Table of kinds that are not listed: kinds along rays, made from their names, and distances between stations."""
 
     def __missing__(self, name: str) -> Model:
         if name == BETWEEN:
@@ -358,7 +360,7 @@ def _along_rays(name: str) -> Model:
     model = MODELS[kind]
     if model.ray is None:
         raise KeyError(name)
-    # Nothing is linear there, and nothing proven.
+    # Kinds along rays have no linear form, and proofs do not cover them.
     return replace(
         model,
         h=model.ray,
@@ -374,16 +376,16 @@ def _along_rays(name: str) -> Model:
     )
 
 
-MODELS: Registry[Model] = Registry("optloc.models", lambda value: isinstance(value, Model), _KINDS, _Unlisted)
+MODELS: Registry[Model] = Registry("optloc.models", lambda value: isinstance(value, Model), _KINDS, _DerivedKinds)
 
 
 def kind_named(word: str, where: str | None = "kind") -> str:
-    """Return the kind of measurement that a word stands for: its name, or one of its aliases, in any case.
+    """Return the name of the measurement kind for a word: a name or an alias, in upper or lower case.
 
     Raises
     ------
     InvalidProblem
-        For a word that is none, with the kinds whose names or aliases are spelled alike.
+        For an unknown word; the message lists similar names and all kinds.
     """
     if word in MODELS:
         return word
@@ -394,12 +396,13 @@ def kind_named(word: str, where: str | None = "kind") -> str:
     raise InvalidProblem(f"unknown kind {word!r}", where, _likely_kind(folded, words))
 
 
-# Words of the field for quantities that no kind is: differences of angles and of phases, round trips, received power.
+# Terms for quantities that are not kinds of optloc: differences of angles and phases, round trips, received power.
 _FOREIGN = {"adoa", "pdoa", "poa", "rtt", "rss", "rssi", "csi", "snr"}
 
 
 def _likely_kind(word: str, words: dict[str, str]) -> str:
-    # Spelled alike is not meant alike: slips of the pen are guessed, one letter of four and not the first.
+    # Only a likely typing error is corrected: one letter of four, not the first. Other similar words have other
+    # meanings.
     alike = [known for known in words if known[:1] == word[:1]]
     close = [] if word in _FOREIGN else get_close_matches(word, alike, n=1, cutoff=0.75)
     known = f"known are {', '.join(sorted(MODELS))}; 'optloc list kinds' has their other names"
@@ -407,25 +410,25 @@ def _likely_kind(word: str, words: dict[str, str]) -> str:
 
 
 def bent(kind: str) -> str:
-    """Return the kind that a kind is along the rays of a medium; the same where it does not depend on waves.
+    """Return the kind along the rays of a medium for a kind; the same name if the kind does not depend on waves.
 
     Raises
     ------
     InvalidProblem
-        For kinds of which it is not known what rays that bend do to them.
+        For kinds without a model for bent rays.
     """
     model = MODELS[kind]
     if model.straight is not None or not model.stations:
         return kind
     if model.ray is None:
         known = ", ".join(name for name, other in _KINDS.items() if other.ray is not None)
-        what = f"what bent rays do to {kind} rows is not known"
-        raise InvalidProblem(what, kind, f"leave them out, or the medium; known are {known}")
+        what = f"{kind} rows have no model for bent rays"
+        raise InvalidProblem(what, kind, f"leave out these rows or the medium; kinds with a model are {known}")
     return RAY + kind
 
 
 def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:
-    """Return the row of a measured value that is linear in position and ranges, or None where there is none.
+    """Return the equation of a measured value that is linear in position and ranges; None if it does not exist.
 
     Parameters
     ----------
@@ -434,9 +437,9 @@ def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:
     m : number or array
         Measured value, SI units or radians.
     a, b : Point
-        Its stations.
+        Stations of the row.
     """
     if model.ranges is not None:
-        # Sums of ranges are linear in them as they are; an error of the measurement is one of the row.
+        # A sum of ranges is already linear. An error of the measurement is an error of the equation.
         return LiftedRow(None, float(model.ranges[0]), float(model.ranges[1]), -1.0 * m, lambda t, a, b: -1.0)
     return None if model.lifted is None else model.lifted(m, a, b)

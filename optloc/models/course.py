@@ -1,4 +1,4 @@
-"""Courses that follow the Earth: ways over ground as great circles, and heights that are kept exactly."""
+"""Courses over ground: the path follows a great circle, and the height is exact."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from optloc.models.primitives import (
     subtract,
 )
 
-# Added to the squared angle of a way, so that a target at rest has a derivative: it shortens a way by 2e-15 of it.
+# Added to the squared angle, so that a target at rest has a derivative. It shortens a path by a share of 2e-15.
 _STILL = 1e-14
 
 
 def carry(start: Components, straight: Components, rise: Any) -> Components:
-    """Return the place on a course over ground that a straight line would have left.
+    """Return the position on a course over ground that starts like a given straight course.
 
-    The straight way is parted at its start into what is upward and what is level. The level part is gone along a great
-    circle of the sphere that fits the ellipsoid there (Gauss's mean radius, and the height of the start), and the place
-    is then moved along the normal of WGS 84, on which its latitude and longitude stay, to the height of the start plus
-    the upward part plus `rise`: to rounding (4e-9 m). Of the geodesic that keeps its speed the course is off by
-    s^3 / 1800 R^2 at most, 1.4 cm after 100 km and 1.7 m after 500 km.
+    The straight displacement is split at its start into an upward and a horizontal part. The horizontal part becomes a
+    path along a great circle. Its sphere fits the ellipsoid there: the radius is Gauss's mean radius plus the height of
+    the start. The point is then moved along the normal of WGS 84, which keeps latitude and longitude. Its height
+    becomes the height of the start plus the upward part plus `rise`, up to rounding (4e-9 m). After a distance s the
+    error relative to the geodesic with the same speed is at most s^3 / 1800 R^2: 1.4 cm after 100 km and 1.7 m after
+    500 km.
 
     Parameters
     ----------
     start : tuple of 3 numbers
-        Where the state holds, ECEF, metres: arrays, jets or symbols.
+        Position at the reference time of the state, ECEF, metres: arrays, jets or symbols.
     straight : tuple of 3 numbers
-        Where the same position, velocity and acceleration lead in space, ECEF, metres.
+        Position that the same state reaches on a straight course in space, ECEF, metres.
     rise : number
-        Height beyond the start's and the upward part, metres.
+        Additional height, metres.
 
     Returns
     -------
@@ -57,7 +58,7 @@ def carry(start: Components, straight: Components, rise: Any) -> Components:
     squared = dot(level, level)
     half = 0.5 * xp.sqrt(squared / (radius * radius) + _STILL)
     share = xp.sin(half) / half
-    # with the angle w: sin w / w of the way, and (1 - cos w) / w^2 of its square over the radius downwards
+    # With the angle w: sin w / w of the displacement, and downwards (1 - cos w) / w^2 of its square over the radius.
     along, drop = share * xp.cos(half), 0.5 * share * share * squared / radius
     place = tuple(s + along * v - drop * u for s, v, u in zip(start, level, up, strict=True))
     short = height + climb + rise - geodetic_height(place)

@@ -1,4 +1,4 @@
-"""Speeds over depth, and the rays through them: constant or straight-line speeds in layers, first arrivals."""
+"""Layered media: speed as a function of depth (constant or linear in each layer), and first arrivals of the rays."""
 
 from __future__ import annotations
 
@@ -14,45 +14,46 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.models.primitives import Components, Jet, Point, differential, subtract
 
-# Parts of a layer's turning rays in each of which at most one root is looked for: eight find the first arrivals that a
-# search a hundred times finer does, but for 1 of 2 000 places at the edge of a shadow (tests/models/test_layers.py).
+# Number of parts of the turning rays of a layer, in each of which at most one root is searched. Eight parts find the
+# same first arrivals as a search that is a hundred times finer. The exception is 1 of 2 000 positions, at the edge of a
+# shadow (tests/models/test_layers.py).
 _PARTS = 8
-# Newton steps, most of them for rays that leave nearly level: the tangent of their angle doubles at each.
+# Maximum number of Newton steps. Nearly horizontal rays need most: each step doubles the tangent of their angle.
 _STEPS = 60
-# Relative change of a ray's angle at which it has arrived, and relative miss of its distance that is none: the travel
-# time is right to the square of both.
+# Relative change of the ray angle at convergence, and largest accepted relative error of the distance. The error of the
+# travel time is of the order of their squares.
 _ARRIVED, _MISSED = 1e-13, 1e-7
-# Below this the series of asinh(u) / u is exact to rounding.
+# Below this value the series of asinh(u) / u is exact up to rounding.
 _SMALL = 0.03
 
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """Speeds of sound or of seismic waves over depth, below a level surface: a medium.
+    """A medium with a speed of sound or of seismic waves that depends on the depth below a horizontal surface.
 
-    Rays are direct paths: they go up or down, or turn once where the speed grows, and nothing reflects them. Of several
-    the first arrival is the measurement. A place that no direct ray leads to, or that the table does not reach, has
-    none: its measurement is NaN.
+    Rays are direct paths, without reflections: they go up or down, or turn once where the speed increases. If there are
+    several rays, the measurement is the first arrival. If no direct ray reaches a position, or if it is outside the
+    table, the measurement is NaN.
 
     Parameters
     ----------
     depth : tuple of float
-        Metres below the surface, growing: of the points between which speeds are straight lines, or of the tops of
-        layers of constant speed. The last such layer has no bottom.
+        Metres below the surface, increasing. With "linear" these are the points between which the speed is linear; with
+        "constant", the tops of layers of constant speed. The last constant layer has no bottom.
     speed : tuple of float
         Metres per second, one for each depth.
     between : "linear" or "constant"
-        What holds between the depths.
+        Speed profile between the depths.
     surface : float
         Third coordinate of depth zero in the frame of the problem, metres upwards.
     reference : float, optional
-        Speed by which travel times became metres, metres per second: a measurement in metres is the travel time times
-        it. By default the mean of the table: its depth over the time straight down.
+        Speed that converts travel times to metres, metres per second: a measurement in metres is travel time times this
+        speed. Default: the mean speed of the table, its depth divided by the vertical travel time.
 
     Raises
     ------
     InvalidProblem
-        For depths that do not grow, speeds that are not positive, or too few of either.
+        For depths that do not increase, for speeds that are not positive, or for too few of them.
 
     References
     ----------
@@ -75,53 +76,54 @@ class Layers:
 
     @property
     def unit_speed(self) -> float:
-        """Return the speed by which travel times became metres, metres per second."""
+        """Return the speed that converts travel times to metres, metres per second."""
         assert self.reference is not None
         return self.reference
 
     @property
     def straight(self) -> float:
-        """Return metres of a straight path for one metre of a measurement: what starts without a ray take."""
+        """Return the metres of a straight path per metre of a measurement, for starts without rays."""
         return _mean(self) / self.unit_speed
 
     @property
     def words(self) -> str:
-        """Return what the table is in a few words."""
+        """Return a short description of the table."""
         shape = "straight lines between" if self.between == "linear" else "layers from"
         speeds = f"{min(self.speed):.6g} to {max(self.speed):.6g} m/s"
         return f"{speeds}, {shape} {len(self.depth)} depths; times are metres at {self.unit_speed:.6g} m/s"
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Return the lowest and the highest third coordinate that has a speed, metres."""
+        """Return the lowest and the highest third coordinate for which the table gives a speed, metres."""
         bottom = np.inf if self.between == "constant" else self.depth[-1]
         return self.surface - bottom, self.surface - self.depth[0]
 
     def path(self, t: Point, a: Point) -> Any:
-        """Return the travel time of the first arrival times `unit_speed`, metres."""
+        """Return the travel time of the first arrival, multiplied by `unit_speed`, in metres."""
         ray, c = self._ray(t, a), self.unit_speed
         dx, dy = subtract(t.position[:2], a.position[:2])
         parts: list[tuple[Any, Any]] = [(dx, ray.share * _value(dx)), (dy, ray.share * _value(dy))]
         parts += [(t.position[2], ray.at_t), (a.position[2], ray.at_a)]
-        # By Fermat's principle a path grows by the slowness along the ray when an end moves, whatever the ray does.
+        # By Fermat's principle, the derivative of the path at an end is the slowness along the ray, for every change of
+        # the ray.
         return differential(c * ray.time, [(end, c * slope) for end, slope in parts])
 
     def gradients(self, t: Point, a: Point) -> tuple[Components, Components]:
-        """Return the gradients of `path` at both points: slowness vectors times `unit_speed`, which point away."""
+        """Return the gradients of `path` at both points: slowness times `unit_speed`, away from the other point."""
         ray, c = self._ray(t, a), self.unit_speed
         dx, dy = subtract(t.position[:2], a.position[:2])
         x, y, zt, za = _value(dx), _value(dy), t.position[2], a.position[2]
         away = np.where(ray.across > 0.0, ray.across, 1.0)
-        # How the ray parameter grows with each coordinate; straight overhead it is zero, and has no direction.
+        # Derivatives of the ray parameter. For a vertical ray it is zero and has no direction.
         grows = [(dx, ray.by_across * x / away), (dy, ray.by_across * y / away), (zt, ray.by_t), (za, ray.by_a)]
-        # Horizontal slowness over horizontal distance is smooth overhead too.
+        # The quotient of horizontal slowness and horizontal distance is smooth, also for a vertical ray.
         own = [(end, slope / away) for end, slope in grows]
         own += [(d, -ray.share * v / away**2) for d, v in ((dx, x), (dy, y))]
         share = differential(c * ray.share, [(end, np.where(ray.across > 0.0, c * slope, 0.0)) for end, slope in own])
         ups = []
         for end, at, bends in ((zt, ray.at_t, ray.bends_t), (za, ray.at_a, ray.bends_a)):
             # at^2 = 1 / c^2 - p^2
-            with np.errstate(all="ignore"):  # level at an end the ray's slope has no derivative
+            with np.errstate(all="ignore"):  # a ray horizontal at an end has no derivative of its slope
                 pulls = [*((other, -ray.p * slope / at) for other, slope in grows), (end, bends / at)]
             ups.append(differential(c * at, [(other, c * slope) for other, slope in pulls]))
         return (share * dx, share * dy, ups[0]), (-1.0 * share * dx, -1.0 * share * dy, ups[1])
@@ -140,14 +142,14 @@ class Layers:
 def _value(component: Any) -> Any:
     value = component.value if isinstance(component, Jet) else component
     if not isinstance(value, np.ndarray | float | int | np.number):
-        # Symbols of IPOPT, arrays of other libraries; a tape of machine code is then not made.
-        what = "rays through layers are traced with numbers of numpy alone"
-        raise InvalidProblem(what, "medium", "give numpy arrays, and leave out the stage 'nlp': 'lsr' refines them")
+        # CasADi symbols and arrays of other libraries end here. No machine code is made for these rows.
+        what = "rays through layers need NumPy arrays"
+        raise InvalidProblem(what, "medium", "give numpy arrays, and replace the stage 'nlp' by 'lsr'")
     return value
 
 
 def as_number(given: Any) -> float:
-    """Return a number, NaN for what is none."""
+    """Return the value as a float; NaN if it is not a number."""
     try:
         return float(given)
     except (TypeError, ValueError):
@@ -158,7 +160,7 @@ def _numbers(given: Any, name: str) -> tuple[float, ...]:
     try:
         return tuple(float(v) for v in given)
     except (TypeError, ValueError):
-        raise InvalidProblem(f"the {name} is no list of numbers", name, "give one number for each depth") from None
+        raise InvalidProblem(f"the {name} is not a list of numbers", name, "give one number for each depth") from None
 
 
 def _check(table: Layers) -> None:
@@ -168,10 +170,10 @@ def _check(table: Layers) -> None:
     least = 2 if table.between == "linear" else 1
     if len(depth) != len(speed) or len(depth) < least:
         what = f"there are {len(depth)} depths and {len(speed)} speeds"
-        raise InvalidProblem(what, "depth", f"give as many of both, at least {least}")
+        raise InvalidProblem(what, "depth", f"give the same number of both, at least {least}")
     bad = np.flatnonzero(~(np.diff(depth, prepend=-np.inf) > 0.0) | ~np.isfinite(depth))
     if len(bad):
-        what = f"depth {bad[0] + 1}, {depth[bad[0]]:g} m, is not below the one before"
+        what = f"depth {bad[0] + 1}, {depth[bad[0]]:g} m, is not below depth {bad[0]}"
         raise InvalidProblem(what, "depth", "sort the table downwards, one line for each depth")
     bad = np.flatnonzero(~((speed > 0.0) & np.isfinite(speed)))
     if len(bad):
@@ -183,7 +185,7 @@ def _check(table: Layers) -> None:
 
 
 def _mean(table: Layers) -> float:
-    """Return the depth of the table over the time straight down; a layer without a bottom is as deep as the rest."""
+    """Return the mean speed, m/s: depth over vertical travel time. A bottomless layer counts as deep as the rest."""
     y0, y1, c0, c1 = _layers(table)
     span = np.where(np.isfinite(y1), y1 - y0, max(y0[-1] - y0[0], 1.0))
     u = np.log(c1 / c0)
@@ -193,19 +195,20 @@ def _mean(table: Layers) -> float:
 
 @lru_cache(maxsize=64)
 def _layers(table: Layers) -> tuple[Array, Array, Array, Array]:
-    """Return top, bottom, and the speeds there, of each layer (L,)."""
+    """Return the top, the bottom, and the speeds at both, of each layer (L,)."""
     depth, speed = np.array(table.depth), np.array(table.speed)
     if table.between == "linear":
         return depth[:-1], depth[1:], speed[:-1], speed[1:]
     return depth, np.append(depth[1:], np.inf), speed, speed
 
 
-# Rays: the ray parameter p is the horizontal slowness, which Snell's law keeps; w is the cosine of the angle from
-# the vertical, sqrt(1 - p^2 c^2). A leg is a part of a ray within one layer, from speed c1 to speed c2 over a height h.
+# Rays. The ray parameter p is the horizontal slowness, which is constant along a ray (Snell's law). w is the cosine of
+# the angle from the vertical, sqrt(1 - p^2 c^2). A leg is the part of a ray in one layer, of height h, with speeds c1
+# and c2.
 
 
 class Ray(NamedTuple):
-    """First arrivals, each an array of one shape; NaN where there is none.
+    """First arrivals. All arrays have the same shape. The time is NaN if there is no ray.
 
     Parameters
     ----------
@@ -216,13 +219,13 @@ class Ray(NamedTuple):
     p : array
         Ray parameter, seconds per metre.
     share : array
-        p over the horizontal distance, and its limit overhead.
+        p divided by the horizontal distance, or its limit for a vertical ray.
     at_t, at_a : array
-        Derivatives of the time to the third coordinates of both ends, upwards, seconds per metre.
+        Derivatives of the time with respect to the third coordinate (upwards) of both ends, seconds per metre.
     by_across, by_t, by_a : array
-        Derivatives of p to the horizontal distance and to the third coordinates of both ends.
+        Derivatives of p with respect to the horizontal distance and to the third coordinates of both ends.
     bends_t, bends_a : array
-        Half the derivative of 1 / c^2 to the third coordinate at both ends.
+        Half of the derivative of 1 / c^2 with respect to the third coordinate at both ends.
     """
 
     time: Array
@@ -239,20 +242,20 @@ class Ray(NamedTuple):
 
 
 class _Legs(NamedTuple):
-    """Rays between n pairs of points that pass the same layers, each known by its angle where it is the most level.
+    """Rays between n pairs of points through the same layers. The parameter of a ray is its angle at the top speed.
 
     Parameters
     ----------
     h, c1, c2 : array (L, n)
-        Heights of legs, and speeds at their ends.
+        Heights of the legs, and speeds at their ends.
     times : array (L, 1)
-        How often each is passed.
+        Number of passes through each leg.
     short1, short2 : array (L, n)
-        By what share the squares of those speeds are below that of the top speed.
+        Relative difference of the squared speeds from the squared top speed.
     top : array (n,)
-        Greatest speed of the legs: there the angle is counted.
+        Greatest speed of the legs, at which the angle is defined.
     turn, slope : array (n,)
-        Speed at which the leg that turns begins, and its growth with each metre; NaN where nothing turns.
+        Speed at the start of the turning leg, and its increase per metre; NaN without a turning leg.
     """
 
     h: Array
@@ -267,28 +270,28 @@ class _Legs(NamedTuple):
 
     @classmethod
     def of(cls, parts: tuple[Array, Array, Array], times: Array, top: Array, turn: Array, slope: Array) -> _Legs:
-        """Return legs of heights and speeds."""
+        """Return legs from their heights and speeds."""
         h, c1, c2 = parts
         short1, short2 = ((top - c) * (top + c) / top**2 for c in (c1, c2))
         return cls(h, c1, c2, times, short1, short2, top, turn, slope)
 
     def take(self, index: Array) -> _Legs:
-        """Return those of some of the pairs."""
+        """Return the legs of the selected pairs."""
         return _Legs(*(part if part is self.times else part[..., index] for part in self))
 
     def cosines(self, sine: Array, cosine: Array) -> tuple[Array, Array]:
-        """Return w at both ends of all legs, without a difference of numbers that are all but equal."""
-        # Rounding may leave the top speed a little below one that equals it.
+        """Return w at both ends of all legs, computed without a difference of nearly equal numbers."""
+        # By rounding, the top speed can be slightly below a speed that equals it.
         first, second = (np.sqrt(np.maximum(cosine**2 + sine**2 * v, 0.0)) for v in (self.short1, self.short2))
         return first, second
 
     def turning(self, sine: Array, cosine: Array) -> Array:
-        """Return w where the leg that turns begins."""
+        """Return w at the start of the turning leg."""
         square = cosine**2 + sine**2 * (self.top - self.turn) * (self.top + self.turn) / self.top**2
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
     def distance(self, sine: Array, cosine: Array) -> Array:
-        """Return horizontal distances (n,)."""
+        """Return the horizontal distances (n,), metres."""
         w1, w2 = self.cosines(sine, cosine)
         p = sine / self.top
         distance = p * _sum(np.where(self.h > 0.0, self.times * (self.c1 + self.c2) * self.h / (w1 + w2), 0.0))
@@ -297,7 +300,7 @@ class _Legs(NamedTuple):
         return np.asarray(distance + 2.0 * self.turning(sine, cosine) / (p * self.slope))
 
     def across(self, sine: Array, cosine: Array) -> tuple[Array, Array]:
-        """Return horizontal distances (n,) and their derivatives to p."""
+        """Return the horizontal distances (n,) and their derivatives with respect to p."""
         w1, w2 = self.cosines(sine, cosine)
         p, own = sine / self.top, np.where(self.h > 0.0, self.times * (self.c1 + self.c2) * self.h / (w1 + w2), 0.0)
         bends = ((1.0 - self.short1) / w1 + (1.0 - self.short2) / w2) / (w1 + w2)
@@ -308,7 +311,7 @@ class _Legs(NamedTuple):
         return p * _sum(own) + 2.0 * w / (p * self.slope), derivative - 2.0 / (self.slope * p**2 * w)
 
     def time(self, sine: Array, cosine: Array, logarithm: _Function) -> Array:
-        """Return travel times (n,): along an arc of a circle 2 / g asinh(g chord / (2 sqrt(c1 c2)))."""
+        """Return the travel times (n,), seconds: 2 / g asinh(g chord / (2 sqrt(c1 c2))) along an arc of a circle."""
         p = sine / self.top
         w1, w2 = self.cosines(sine, cosine)
         h, mean = np.where(self.h > 0.0, self.h, 1.0), np.sqrt(self.c1 * self.c2)
@@ -325,7 +328,7 @@ _Function = Callable[[Any], Any]
 
 
 def _sum(parts: Array) -> Array:
-    # One after the other: the same bits on every processor.
+    # Summed in order, so that the bits are the same on every processor.
     total = np.zeros(parts.shape[1:])
     for part in parts:
         total = total + part
@@ -333,7 +336,7 @@ def _sum(parts: Array) -> Array:
 
 
 def _asinh_over(u: Array, logarithm: _Function) -> Array:
-    """Return asinh(u) / u of numbers that are not negative."""
+    """Return asinh(u) / u for u >= 0."""
     v, small = u * u, u < _SMALL
     series = 1.0 - v / 6.0 * (1.0 - v * 9.0 / 20.0 * (1.0 - v * 25.0 / 42.0 * (1.0 - v * 49.0 / 72.0)))
     large = np.where(small, 1.0, u)
@@ -342,33 +345,33 @@ def _asinh_over(u: Array, logarithm: _Function) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _FoundRay:
-    """Rays that arrive, all (k,): of which pair, sine and cosine of the angle at the top speed, and where they turn."""
+    """Rays (k,) that reach their targets: pair numbers, sine and cosine of the angle at the top speed, and turns."""
 
     index: Array
     legs: _Legs
     sine: Array
     cosine: Array
-    # 0: they do not; 1: below both ends; -1: above both
+    # 0: no turn; 1: turn below both ends; -1: turn above both ends.
     turns: Array
 
 
 _Layered = tuple[Array, Array, Array, Array]
 
 
-@np.errstate(all="ignore")  # rays that do not exist have no numbers
+@np.errstate(all="ignore")  # rays that do not exist give NaN
 def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm: _Function = np.log) -> Ray:
-    """Return the first arrivals between points.
+    """Return the first arrivals between pairs of points.
 
     Parameters
     ----------
     table : Layers
-        The speeds.
+        Table of speeds.
     across : array (n,)
         Horizontal distances, metres.
     yt, ya : array (n,)
         Depths of both ends, metres.
     logarithm : callable
-        The natural logarithm that is used.
+        Natural logarithm, of NumPy or with reproducible bits.
     """
     layers = _layers(table)
     known = np.isfinite(across)
@@ -384,7 +387,7 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
             continue
         reached, rate = found.legs.across(found.sine, found.cosine)
         p, own = found.sine / found.legs.top, distance[found.index]
-        # What the ray misses costs p of time a metre.
+        # Correct the time to first order for the error of the distance: its derivative is p.
         time = found.legs.time(found.sine, found.cosine, logarithm) + p * (own - reached)
         good = np.abs(own - reached) <= _MISSED * own
         _offer(best, which[found.index], np.stack([np.where(good, time, np.nan), p, 1.0 / rate, found.turns]))
@@ -392,14 +395,14 @@ def first_arrival(table: Layers, across: Array, yt: Array, ya: Array, logarithm:
 
 
 def _offer(best: Array, index: Array, found: Array) -> None:
-    """Write time, p, dp / dX and turns (4, k) of rays that arrive before those that were found for their pairs."""
-    order = np.argsort(-found[0], kind="stable")  # several of one pair: the first arrival is written last
+    """Write the rays `found` (4, k), as time, p, dp / dX and turns, into `best` if they arrive earlier."""
+    order = np.argsort(-found[0], kind="stable")  # for several rays of a pair, the first arrival is written last
     order = order[found[0, order] < best[0, index[order]]]
     best[:, index[order]] = found[:, order]
 
 
 def _speed(layers: _Layered, y: Array) -> tuple[Array, Array]:
-    """Return speeds at depths (n,) within the table, and their growth with each metre down."""
+    """Return the speeds at depths (n,) within the table, and their increase per metre of depth."""
     y0, y1, c0, c1 = layers
     j = np.clip(np.searchsorted(y0, y, side="right") - 1, 0, len(y0) - 1)
     slope = (c1[j] - c0[j]) / (y1[j] - y0[j])
@@ -407,7 +410,7 @@ def _speed(layers: _Layered, y: Array) -> tuple[Array, Array]:
 
 
 def _between(layers: _Layered, high: Array, low: Array) -> tuple[Array, Array, Array]:
-    """Return heights and speeds (L, n) of the legs between depths."""
+    """Return the heights, and the speeds at both ends, (L, n), of the legs between two depths."""
     y0, y1, c0, c1 = (part[:, None] for part in layers)
     upper, lower, slope = np.clip(high, y0, y1), np.clip(low, y0, y1), (c1 - c0) / (y1 - y0)
     h = np.where(lower > upper, lower - upper, 0.0)
@@ -420,14 +423,14 @@ def _fastest(h: Array, c1: Array, c2: Array) -> Array:
 
 
 def _level(layers: _Layered, across: Array, high: Array, low: Array) -> Array:
-    """Return what `_offer` takes of rays that stay at their depth: both ends in a layer of constant speed."""
+    """Return the rays (4, n), as for `_offer`, that stay at one depth: both ends are in a layer of constant speed."""
     c, slope = _speed(layers, high)
     time = np.where((high == low) & (slope == 0.0), across / c, np.nan)
     return np.stack([time, 1.0 / c, np.zeros_like(c), np.zeros_like(c)])
 
 
 def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
-    """Return the rays that go up or down all the way: there is one at most."""
+    """Return the rays that only go up or only go down; each pair has at most one."""
     h, c1, c2 = _between(layers, high, low)
     top = _fastest(h, c1, c2)
     index = np.flatnonzero(top > 0.0)
@@ -435,7 +438,8 @@ def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundR
         return None
     nan = np.full(len(top), np.nan)
     legs, distance = _Legs.of((h, c1, c2), np.ones((len(h), 1)), top, nan, nan).take(index), across[index]
-    # With the tangent t of the angle at the top speed distances are concave: Newton's steps from below stay below.
+    # As a function of the tangent t of the angle at the top speed, the distance is concave. Newton steps from below
+    # stay below.
     t = distance * legs.top / legs.across(np.zeros(len(index)), np.ones(len(index)))[1]
     left, own = np.arange(len(index)), legs
     for _ in range(_STEPS):
@@ -452,7 +456,7 @@ def _direct(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundR
 
 
 class _Bracket(NamedTuple):
-    """Turning rays of which one arrives between two cotangents of their angle: see `_within`, each (k,)."""
+    """Turning rays (k,), each with an interval of the cotangent of its angle that contains one arrival (`_within`)."""
 
     pair: Array
     legs: _Legs
@@ -465,7 +469,7 @@ class _Bracket(NamedTuple):
 def _turning(layers: _Layered, across: Array, high: Array, low: Array) -> _FoundRay | None:
     """Return the rays that turn once, below both ends or above both."""
     found: list[_Bracket] = []
-    # What is above in a table is below in its mirror image.
+    # A mirrored table converts rays that turn above to rays that turn below.
     mirrored = (-layers[1][::-1], -layers[0][::-1], layers[3][::-1], layers[2][::-1])
     for own, upper, lower, turns in ((layers, high, low, 1.0), (mirrored, -low, -high, -1.0)):
         slope = (own[3] - own[2]) / (own[1] - own[0])
@@ -485,7 +489,7 @@ def _turning(layers: _Layered, across: Array, high: Array, low: Array) -> _Found
 def _turning_in(
     layers: _Layered, j: int, slope: float, pairs: tuple[Array, Array, Array], turns: float
 ) -> Iterator[_Bracket]:
-    """Yield where rays arrive that turn in layer j, below pairs of which distance, upper and lower depth are given."""
+    """Yield intervals that contain rays which turn in layer j, below pairs of given distance, upper and lower depth."""
     across, high, low = pairs
     begins = np.maximum(low, layers[0][j])
     h, c1, c2 = _between(layers, high, low)
@@ -498,7 +502,7 @@ def _turning_in(
     times = np.repeat([1.0, 2.0], len(h))[:, None]
     both = (np.concatenate([h, more]), np.concatenate([c1, d1]), np.concatenate([c2, d2]))
     legs = _Legs.of(both, times, top, turn, np.full(len(top), slope)).take(index)
-    # By the cotangent of the angle at the top speed: of the turning leg alone the distance is linear in it.
+    # In terms of the cotangent of the angle at the top speed, the distance in the turning leg is linear.
     most, distance = np.sqrt((leaves - legs.top) * (leaves + legs.top)) / legs.top, across[index]
     marks = [most * part / _PARTS for part in range(_PARTS + 1)]
     short = [legs.distance(*_of_cotangent(k)) <= distance for k in marks]
@@ -515,7 +519,7 @@ def _of_cotangent(k: Array) -> tuple[Array, Array]:
 
 
 def _within(legs: _Legs, distance: Array, low: Array, high: Array, rising: Array) -> Array:
-    """Return the cotangents (n,) between bounds at which rays arrive, by Newton's steps, halved where they leave."""
+    """Return the cotangents (n,) of arriving rays in intervals, by Newton steps, or bisection outside the interval."""
     k, left = 0.5 * (low + high), np.arange(len(low))
     for _ in range(_STEPS):
         here = k[left]
@@ -534,13 +538,13 @@ def _within(legs: _Legs, distance: Array, low: Array, high: Array, rising: Array
 
 
 def _ends(layers: _Layered, across: Array, yt: Array, ya: Array, best: Array) -> Ray:
-    """Return rays with what they are at their ends."""
+    """Return the rays with their derivatives at both ends."""
     time, p, by_across, turns = best
     time = np.where(np.isfinite(time), time, np.nan)
     parts = []
     for own, other in ((yt, ya), (ya, yt)):
         c, slope = _speed(layers, own)
-        # A path grows where its end moves away along the ray: up from the deeper end it shortens.
+        # The path grows if its end moves away along the ray. Upward motion of the deeper end shortens it.
         sign = np.where(turns == 0.0, np.where(own > other, -1.0, np.where(own < other, 1.0, 0.0)), turns)
         at = sign * np.sqrt(np.maximum((1.0 / c - p) * (1.0 / c + p), 0.0))
         by = np.where((p == 0.0) | (sign == 0.0), 0.0, -p / at * by_across)
@@ -548,5 +552,5 @@ def _ends(layers: _Layered, across: Array, yt: Array, ya: Array, best: Array) ->
     share = np.where(across > 0.0, p / np.where(across > 0.0, across, 1.0), by_across)
     (at_t, by_t, bends_t), (at_a, by_a, bends_a) = parts
     slopes = (p, share, at_t, at_a, by_across, by_t, by_a, bends_t, bends_a)
-    # Where no ray arrives the time alone is NaN: a row that is absent there must not spoil the others.
+    # Without a ray only the time is NaN, so that an absent row does not make the derivatives of others NaN.
     return Ray(time, across, *(np.where(np.isfinite(time), slope, 0.0) for slope in slopes))

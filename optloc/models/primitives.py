@@ -1,4 +1,4 @@
-"""What measurement functions are written with, elementwise: components of points, elementary functions, derivatives."""
+"""Elements of measurement functions: components of points, elementary functions, and forward-mode derivatives."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 from optloc.base.arrays import library
 
-# One place that finds the elementary functions for a number: NumPy, CasADi, a Jet or an array-API library.
+# The function `namespace` selects the elementary functions for a value: of NumPy, CasADi, Jet or an array-API library.
 
 
 def namespace(value: Any) -> Any:
-    """Return the module that offers ``sqrt sin cos atan2 hypot`` for a value.
+    """Return the module with ``sqrt sin cos atan2 hypot`` for a value.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ _E2 = WGS84_F * (2.0 - WGS84_F)
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A target or a station as component tuples; only what a measurement kind asks for is filled in.
+    """A target or a station as tuples of components. Only the fields that a measurement kind needs are set.
 
     Parameters
     ----------
@@ -58,9 +58,9 @@ class Point:
     ecef : tuple of 3 numbers, optional
         The same position, Earth-centred Earth-fixed, metres.
     up : tuple of 3 numbers, optional
-        Unit normal of the ellipsoid there, in the problem's frame.
+        Unit normal of the ellipsoid at the position, in the problem's frame.
     medium : Layers or Air, optional
-        What the waves come through (`optloc.models.medium`).
+        Medium of the waves (`optloc.models.medium`).
     """
 
     position: Components
@@ -104,27 +104,28 @@ def range_rate(t: Point, a: Point) -> Any:
 
 
 def local(t: Point, a: Point) -> Components:
-    """Return the line of sight from station to target in the station's own axes, metres."""
+    """Return the vector from station to target in the axes of the station, metres."""
     return within(subtract(t.position, a.position), a)
 
 
 def within(line: Components, a: Point) -> Components:
-    """Return a vector of the problem's frame in the station's own axes."""
+    """Return a vector of the problem's frame in the axes of the station."""
     return line if a.axes is None else tuple(dot(axis, line) for axis in a.axes)
 
 
 def wrap(angle: Any) -> Any:
     """Return an angle wrapped to (-pi, pi], radians."""
     xp = namespace(angle)
-    # Remainders mean different things in different libraries, and jump for symbols; this is smooth but at the seam.
+    # Remainders differ between libraries, and symbolic remainders are not smooth. This form is smooth except at the
+    # seam.
     return xp.atan2(xp.sin(angle), xp.cos(angle))
 
 
 def rotate(axes: tuple[Components, ...], turn: Components) -> tuple[Components, ...]:
     """Return axes turned by a small rotation vector given in those axes.
 
-    The rotation is the unit quaternion ``(1, turn / 2) / norm``: exact to third order, smooth everywhere. In the plane
-    `turn` has one component.
+    The rotation is the unit quaternion ``(1, turn / 2) / norm``. It agrees with the rotation vector up to third order
+    and is smooth everywhere. In two dimensions `turn` has one component.
 
     Parameters
     ----------
@@ -146,7 +147,7 @@ def rotate(axes: tuple[Components, ...], turn: Components) -> tuple[Components, 
             (2.0 * (x * y - z) * scale, (1.0 + yy - xx - zz) * scale, 2.0 * (y * z + x) * scale),
             (2.0 * (x * z + y) * scale, 2.0 * (y * z - x) * scale, (1.0 + zz - xx - yy) * scale),
         )
-    # Rows of the matrix times the axes: each new axis is a combination of the old ones.
+    # Rows of the matrix times the axes: each new axis is a linear combination of the old axes.
     columns = tuple(zip(*axes, strict=True))
     return tuple(tuple(dot(row, column) for column in columns) for row in matrix)
 
@@ -154,9 +155,9 @@ def rotate(axes: tuple[Components, ...], turn: Components) -> tuple[Components, 
 def geodetic_height(ecef: Components) -> Any:
     """Return the height above the WGS 84 ellipsoid, metres.
 
-    Bowring's parametric latitude with two fixed steps: exact to 1e-11 m from -5 km to 1 000 km, to which doubles add
-    4e-9 m; no test, so that it serves symbols as well as numbers. The height
-    ``h = p cos(phi) + z sin(phi) - a sqrt(1 - e2 sin(phi)^2)`` is stationary in phi: its gradient is the normal.
+    The method is Bowring's parametric latitude with two fixed steps. Its error is 1e-11 m from -5 km to 1 000 km;
+    rounding of doubles adds 4e-9 m. It has no branches, so it works for symbols as well as numbers. The height
+    ``h = p cos(phi) + z sin(phi) - a sqrt(1 - e2 sin(phi)^2)`` is stationary in phi, so its gradient is the normal.
 
     References
     ----------
@@ -169,9 +170,10 @@ def geodetic_height(ecef: Components) -> Any:
 
 
 def geodetic_normal(ecef: Components) -> Components:
-    """Return the unit normal of the WGS 84 ellipsoid at a point, which is the gradient of its height.
+    """Return the unit normal of the WGS 84 ellipsoid at a point, which is the gradient of the height.
 
-    It turns with the meridian's radius of curvature to north and south, and with the distance from the axis around it.
+    Its derivatives depend on the meridian radius of curvature (north-south) and on the distance from the axis
+    (east-west).
     """
     if (place := _values(ecef)) is not None:
         normal = geodetic_normal(place)
@@ -182,14 +184,14 @@ def geodetic_normal(ecef: Components) -> Components:
 
 
 def _turning(ecef: Components) -> tuple[Components, ...]:
-    """Return the derivatives of the normal: a row for each of its components, also on the axis."""
+    """Return the derivatives of the normal with respect to the position, one row per component, also on the axis."""
     x, y, _ = ecef
     p, sin_phi, cos_phi = _latitude(ecef)
     left = 1.0 - _E2 * sin_phi * sin_phi
-    # of the latitude along the meridian; the radius of curvature is that at the height
+    # Derivative of the latitude along the meridian: one over the meridian radius of curvature plus the height.
     north = 1.0 / (WGS84_A * (1.0 - _E2) / (left * namespace(p).sqrt(left)) + geodetic_height(ecef))
     around = cos_phi / p
-    # outwards the latitude falls, and so does `around` with the distance from the axis
+    # The latitude decreases with the distance from the axis, and so does `around`.
     bend = (sin_phi * sin_phi * north - around) / (p * p)
     side = -sin_phi * cos_phi * north / p
     return (
@@ -200,13 +202,13 @@ def _turning(ecef: Components) -> tuple[Components, ...]:
 
 
 def _latitude(ecef: Components) -> tuple[Any, Any, Any]:
-    """Return distance from the axis, and sine and cosine of the geodetic latitude."""
+    """Return the distance from the axis, and sine and cosine of the geodetic latitude."""
     x, y, z = ecef
     xp = namespace(x)
     b = WGS84_A * (1.0 - WGS84_F)
     p = xp.sqrt(x * x + y * y + 1e-12)  # a micrometre off the axis, so that the poles have a derivative
     sin_u, cos_u = _direction(z * WGS84_A, p * b)
-    # Two steps of Bowring, from the parametric latitude on: see `geodetic_height` for what is left.
+    # Two steps of Bowring's method from the parametric latitude; `geodetic_height` gives the remaining error.
     for _ in range(2):
         up = z + (_E2 / (1.0 - _E2)) * b * sin_u * sin_u * sin_u
         out = p - _E2 * WGS84_A * cos_u * cos_u * cos_u
@@ -220,12 +222,12 @@ def _direction(rise: Any, run: Any) -> tuple[Any, Any]:
     return rise / length, run / length
 
 
-# Forward-mode differentiation: a value with its sparse partial derivatives, batched over arrays.
+# Forward-mode differentiation: values with sparse partial derivatives, batched over arrays.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Jet:
-    """A number and its partial derivatives with respect to named seeds.
+    """A value and its partial derivatives with respect to numbered independent variables (seeds).
 
     Parameters
     ----------
@@ -269,7 +271,7 @@ class Jet:
         value, theirs = _parts(other)
         ratio = self.value / value
         inverse = 1.0 / value
-        # (u / v)' = u' / v - (u / v) v' / v: the ratio is at hand, and no square is formed that could overflow.
+        # (u / v)' = u' / v - (u / v) v' / v: this form uses the known ratio and has no square that could overflow.
         return Jet(ratio, _sum(_scale(self.partials, inverse), _scale(theirs, -ratio * inverse)))
 
     def __rtruediv__(self, other: Any) -> Jet:
@@ -278,30 +280,30 @@ class Jet:
 
 
 def sqrt(u: Jet) -> Jet:
-    """Return the square root."""
+    """Return the square root of u."""
     root = namespace(u.value).sqrt(u.value)
     return Jet(root, _scale(u.partials, 0.5 / root))
 
 
 def sin(u: Jet) -> Jet:
-    """Return the sine."""
+    """Return the sine of u."""
     xp = namespace(u.value)
     return Jet(xp.sin(u.value), _scale(u.partials, xp.cos(u.value)))
 
 
 def cos(u: Jet) -> Jet:
-    """Return the cosine."""
+    """Return the cosine of u."""
     xp = namespace(u.value)
     return Jet(xp.cos(u.value), _scale(u.partials, -xp.sin(u.value)))
 
 
 def log(u: Jet) -> Jet:
-    """Return the natural logarithm."""
+    """Return the natural logarithm of u."""
     return Jet(namespace(u.value).log(u.value), _scale(u.partials, 1.0 / u.value))
 
 
 def exp(u: Jet) -> Jet:
-    """Return the exponential."""
+    """Return the exponential of u."""
     value = namespace(u.value).exp(u.value)
     return Jet(value, _scale(u.partials, value))
 
@@ -309,7 +311,7 @@ def exp(u: Jet) -> Jet:
 def hypot(u: Any, v: Any) -> Jet:
     """Return ``sqrt(u^2 + v^2)``."""
     (p, du), (q, dv) = _parts(u), _parts(v)
-    # The derivative is the unit vector; at the origin it is NaN, as it should be.
+    # The derivative is the unit vector. At the origin it is undefined, so NaN is correct.
     length = namespace(p).hypot(p, q)
     return Jet(length, _sum(_scale(du, p / length), _scale(dv, q / length)))
 
@@ -322,14 +324,14 @@ def atan2(u: Any, v: Any) -> Jet:
 
 
 def differential(value: Any, parts: Sequence[tuple[Any, Any]]) -> Any:
-    """Return a value that was found by other means than arithmetic, with its derivatives by the chain rule.
+    """Return a value that was computed numerically, with its derivatives by the chain rule.
 
     Parameters
     ----------
     value : array
         The value.
     parts : sequence of (number or Jet, array)
-        What it depends on, and its derivative to each.
+        Quantities on which the value depends, and the derivative with respect to each.
     """
     jets = [(part, slope) for part, slope in parts if isinstance(part, Jet)]
     total: dict[int, Any] = {}
@@ -339,7 +341,7 @@ def differential(value: Any, parts: Sequence[tuple[Any, Any]]) -> Any:
 
 
 def _values(numbers: Components) -> Components | None:
-    """Return the values of numbers of which some are jets, or None where none is."""
+    """Return the values of numbers if at least one of them is a Jet, otherwise None."""
     return tuple(_parts(one)[0] for one in numbers) if any(isinstance(one, Jet) for one in numbers) else None
 
 
@@ -352,7 +354,7 @@ def _scale(partials: dict[int, Any], factor: Any) -> dict[int, Any]:
 
 
 def _sum(left: dict[int, Any], right: dict[int, Any]) -> dict[int, Any]:
-    # Most operands are constants or single seeds: dictionaries are copied where both have entries only.
+    # Most operands are constants or single seeds. The dictionary is copied only if both operands have derivatives.
     if not right:
         return left
     total = dict(left)

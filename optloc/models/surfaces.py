@@ -1,4 +1,4 @@
-"""Quantities of a target that a constraint may bound, written once and elementwise like the measurement kinds."""
+"""Quantities of a target that a constraint can bound, written once and elementwise like the measurement kinds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from optloc.models.primitives import Components, Point, dot, geodetic_height, ge
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A bounded quantity.
+    """A quantity that a constraint can bound.
 
     Parameters
     ----------
@@ -22,9 +22,9 @@ class Surface:
     unit : str
         SI unit of g.
     coefficients : int
-        How many coefficients it takes; -1 for as many as the problem has dimensions.
+        Number of coefficients; -1 for the dimension of the problem.
     velocity, ecef : bool
-        What the target must carry beyond its position.
+        Whether the target needs a velocity or ECEF coordinates.
     """
 
     g: Callable[[Point, Components], Any]
@@ -43,7 +43,7 @@ def _height(t: Point, c: Components) -> Any:
 def _visible(t: Point, c: Components) -> Any:
     assert t.ecef is not None
     line = subtract(c, t.ecef)
-    # The sine and not the angle: it is smooth, and grows with it from nadir to zenith.
+    # The sine instead of the angle, because it is smooth and increases with the angle from nadir to zenith.
     return dot(line, geodetic_normal(t.ecef)) / norm(line)
 
 
@@ -52,7 +52,7 @@ def _speed(t: Point, c: Components) -> Any:
     return norm(t.velocity)
 
 
-# Each is smooth where targets are, so that an answer can be held on it by its gradient.
+# Each quantity is smooth at usual positions of targets, so its gradient can keep an estimate on the constraint.
 SURFACES: dict[str, Surface] = {
     "plane": Surface(lambda t, c: dot(c, t.position), "linear form c . x of the position", "m", -1),
     "height": Surface(_height, "height above the WGS 84 ellipsoid", "m", ecef=True),

@@ -1,4 +1,4 @@
-"""Several emitters at once: which rows of an epoch are whose, how many emitters there are, and where each is."""
+"""Several emitters in one epoch: the number of emitters, the position of each, and the assignment of rows to them."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""What is said of the emitters of one epoch."""
+"""The result for the emitters of one epoch, and a model of evenly distributed false rows."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from optloc.tracking.associate import Clutter
 
 @dataclass(frozen=True, slots=True)
 class Ghost:
-    """A place that is no emitter in the best assignment, but in one that fits about as well.
+    """A position that is not an emitter in the best assignment, but in another assignment with about the same cost.
 
     Parameters
     ----------
     position : array (d,)
         Metres.
     rows : int array (n,)
-        Global rows that meet there.
+        Global numbers of the rows that this emitter would have.
     gap : float
-        Cost of the best assignment with an emitter there less that of the best one.
+        Cost of the best assignment with this emitter minus the cost of the best assignment.
     """
 
     position: Array
@@ -35,31 +35,32 @@ class Ghost:
 
 @dataclass(frozen=True, slots=True)
 class Emitters:
-    """The emitters of one epoch, and whose rows are whose.
+    """The emitters of one epoch, and the assignment of its rows to them.
 
     Parameters
     ----------
     fixes : tuple of Fix
-        Of each emitter, the one whose rows speak loudest for it first; each is the fix of its own rows.
+        Fix of each emitter from its rows, in the order of decreasing evidence.
     assignment : int array (m,)
-        Emitter of each row of the problem; -1 for a false one, and for rows of other epochs.
+        Emitter number of each row of the problem; -1 for false rows, and for rows of other epochs.
     cost : float
-        Sum of the costs of the emitters: twice the negative logarithm of the likelihood ratio against all rows being
-        false, penalties included.
+        Sum of the costs of the emitters: twice the negative logarithm of the likelihood ratio of this assignment to one
+        in which all rows are false, with penalties.
     bound : float
-        No assignment of emitters in the region costs less.
+        Lower bound of the cost of all assignments with emitters in the region.
     costs : array (n + 2,)
-        Least cost found with 0, 1, ... n + 1 emitters; infinite where there is no such assignment among those found.
+        Least cost found with 0, 1, ... n + 1 emitters; infinite if no assignment with this number was found.
     margin : float
-        Cost of the best assignment found with another number of emitters, or with one at another place, less `cost`.
+        Difference between `cost` and the cost of the best assignment with another number of emitters or another
+        position.
     ghosts : tuple of Ghost
-        Places that fit about as well, the best first.
+        Other positions with about the same cost, the best first.
     status : Status
-        ok, or why not.
+        The status: `ok`, or the most serious finding.
     reason : str
-        The status in a sentence.
+        The reason for the status, as a sentence.
     boxes : int
-        How many boxes of places the bound took.
+        Number of boxes of positions that branch and bound examined.
     """
 
     fixes: tuple[Fix, ...]
@@ -80,7 +81,7 @@ class Emitters:
 
     @property
     def gap(self) -> float:
-        """Return the cost less its lower bound."""
+        """Return the cost minus its lower bound."""
         return self.cost - self.bound
 
     @property
@@ -89,27 +90,27 @@ class Emitters:
         return np.array([fix.position for fix in self.fixes])
 
     def rows(self, emitter: int) -> Array:
-        """Return the global rows of an emitter."""
+        """Return the global numbers of the rows of an emitter."""
         return np.flatnonzero(self.assignment == emitter)
 
 
 def evenly(problem: Problem, detection: float, false: float) -> Clutter:
-    """Return the density of false rows that lie anywhere a true one can: as many in each channel, spread evenly.
+    """Return a clutter model with the same mean number of false rows in each channel, evenly distributed.
 
     Parameters
     ----------
     problem : Problem
-        Differences of ranges lie between plus and minus the stations' distance, azimuths in the full circle,
-        elevations in half of it.
+        The problem, which determines the ranges of values. Range differences are between plus and minus the distance of
+        the stations. Azimuths cover the full circle, elevations half a circle.
     detection : float
-        Probability that an emitter is seen in a channel.
+        Probability that an emitter gives a row in a channel.
     false : float
-        Mean number of false rows of a channel and epoch, above 0.
+        Mean number of false rows per channel and epoch, above 0.
 
     Raises
     ------
     InvalidProblem
-        For kinds without bounds, and numbers out of range.
+        For kinds with unlimited values, and for numbers out of range.
     """
     if not 0.0 < false < np.inf:
         raise InvalidProblem(f"{false} false rows in a channel", "false", "give a mean number above 0")
@@ -117,10 +118,10 @@ def evenly(problem: Problem, detection: float, false: float) -> Clutter:
     for block in problem.rows:
         width = value_width(problem, block)
         if width is None:
-            what = f"there is no end to possible values of {block.kind}"
+            what = f"values of {block.kind} have no limit"
             raise InvalidProblem(what, "false", "give the density of false rows, optloc.multi_target.Clutter")
         if block.count:
-            # One density for a kind: pairs of stations differ in width, and the mean keeps the mean number of false
-            # rows.
+            # A kind has one density. Intervals differ between pairs of stations, and their mean keeps the mean number
+            # of false rows.
             density[block.kind] = float(false / np.mean(width))
     return Clutter(detection, density)

@@ -1,4 +1,4 @@
-"""Tell the rows of several emitters apart: sets of rows as columns, prices, and a proof that no column is missing."""
+"""Assignment of rows to several emitters by column generation: columns are sets of rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.multi_target.answer import Emitters, Ghost
-from optloc.multi_target.assignment_findings import Assigned, count_in_words, verdict
+from optloc.multi_target.assignment_findings import Assigned, verdict
 from optloc.multi_target.pricing_search import TOLERANCE, PricedRegion, PricingResult, search
 from optloc.multi_target.set_packing import Prices, cheapest_sets, price_rows
 from optloc.multi_target.sets import (
@@ -37,18 +37,18 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
 from optloc.solvers.solution import solve
 from optloc.tracking.associate import Clutter
 
-# Fixes of few rows that are tried, and those that are followed: one batch. What they miss the
-# search finds, box by box.
+# Maximum number of closed-form fixes of few rows, and of fixes that are refined, which are one batch. The
+# branch-and-bound search finds sets that these fixes miss.
 _TRIED, _FOLLOWED = 800, 800
-# Chi-square above which a point of a closed form is none that the rows have in common: d rows fit their fix exactly,
-# and what remains is rounding near a station or a branch with a negative range.
+# Chi-square above which a point of a closed form is not a common position of its rows. d rows fit their fix exactly;
+# the rest is rounding near a station, or a branch with a negative range.
 _FITS = 100.0
-# Ghosts that are listed at most; squared distance from which a place is another one, four sigmas.
+# Maximum number of listed ghosts, and squared distance above which a position counts as different: four sigmas.
 _LISTED, _APART = 12, 16.0
-# Turns of prices and searches; and those after which a number of emitters that nobody found is given up: four times
-# the best columns of the whole region did not make it possible.
+# Maximum number of iterations of prices and searches, and the number after which a count of emitters without an
+# assignment is given up: four times the best columns of the whole region did not make it possible.
 _ROUNDS, _HOPELESS = 80, 4
-# Sets with a row left out that the first turn begins with: neighbours of the cheapest.
+# Number of cheapest sets from which the first iteration also tries subsets with one row less.
 _PROMISING = 40
 
 
@@ -61,30 +61,30 @@ def separate(
     penalty: float | None = None,
     boxes: int = 400_000,
 ) -> tuple[Emitters, ...]:
-    """Return the emitters of each epoch of a problem whose rows do not say whose they are, without a guess.
+    """Return the emitters of each epoch of a problem with unlabelled rows, without a first guess.
 
-    Each emitter gives at most one row to a channel (a kind at its stations), and a row is at most one emitter's. Of
-    all assignments the one with the greatest likelihood is sought, every emitter at the best place for its own rows,
-    and with as many emitters as pay their penalty: see `optloc.multi_target.sets.Scene`. Sets of rows are columns of a
-    set packing; they are proposed by closed-form fixes of as few rows as it takes, and branch and bound over all places
-    of the region adds columns until no other can lower the cost.
+    Each emitter gives at most one row in a channel (a kind at its stations), and a row belongs to at most one emitter.
+    The result is the assignment with the greatest likelihood. Each emitter is at the best position for its rows, and
+    the number of emitters is limited by a penalty for each, see `optloc.multi_target.sets.Scene`. The problem is a set
+    packing whose columns are sets of rows. Closed-form fixes of as few rows as possible propose sets. Branch and bound
+    over all positions of the region then adds columns until no other column can lower the cost.
 
     Parameters
     ----------
     problem : Problem
-        Rows of kinds tdoa, azimuth, elevation, range or range_sum, with no batch axes and no unknowns but positions;
-        their targets do not matter.
+        Rows of kinds tdoa, azimuth, elevation, range or range_sum, without batch axes and with positions as the only
+        unknowns. The targets of its rows are ignored.
     clutter : Clutter
-        Probability of detection and density of false rows.
+        Probability of detection, and density of false rows.
     count : int, optional
         Number of emitters; None: the most likely.
     region : (lower, upper), optional
-        Corners of the box, d coordinates each, in which emitters are sought; by default the box of the stations,
-        wider by its greatest side on every side.
+        Corners of the box, d coordinates each, that contains the emitters. Default: the box of the stations, extended
+        on every side by its longest side.
     penalty : float, optional
-        What an emitter pays for being one, in twice a log-likelihood; None: what its d most telling rows are worth.
+        Cost of each emitter, in units of twice a log-likelihood. None: the value of its d most informative rows.
     boxes : int
-        Boxes of places that each search looks at before it gives up; the bound is then lower.
+        Maximum number of boxes of positions in each search. If it is reached, the bound is lower.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def separate(
     Raises
     ------
     InvalidProblem
-        For kinds, unknowns, noise or arguments that sets of rows cannot be scored with.
+        For kinds, unknowns, noise or arguments for which sets of rows have no score.
 
     References
     ----------
@@ -104,9 +104,9 @@ def separate(
     Control 22 (1977).
     """
     if count is not None and count < 0:
-        raise InvalidProblem(f"a count of {count}", "count", "give the number of emitters, or None")
+        raise InvalidProblem(f"the count is {count}", "count", "give the number of emitters, or None")
     if penalty is not None and not np.isfinite(penalty):
-        raise InvalidProblem(f"a penalty of {penalty}", "penalty", "give a finite number, or None")
+        raise InvalidProblem(f"the penalty is {penalty}", "penalty", "give a finite number, or None")
     within = _region(problem, region)
     return tuple(
         emitters_of(problem, scene, _solve_epoch(scene, within, count, boxes), count)
@@ -115,7 +115,7 @@ def separate(
 
 
 def _region(problem: Problem, given: Sequence[Any] | None) -> PricedRegion:
-    """Return the region given, or one around the stations."""
+    """Return the given region, or a region around the stations."""
     if given is None:
         position = problem.stations.position.reshape(-1, problem.dimension)
         lower, upper = position.min(0), position.max(0)
@@ -125,7 +125,7 @@ def _region(problem: Problem, given: Sequence[Any] | None) -> PricedRegion:
     good = lower.shape == upper.shape == (problem.dimension,) and np.isfinite(lower).all() and np.isfinite(upper).all()
     if not good or not (lower < upper).all():
         advice = f"give two corners of {problem.dimension} finite coordinates, the lower one first"
-        raise InvalidProblem(f"a region from {lower} to {upper}", "region", advice)
+        raise InvalidProblem(f"the region from {lower} to {upper} is not a box", "region", advice)
     return PricedRegion(lower, upper)
 
 
@@ -136,15 +136,15 @@ class Solved:
     Parameters
     ----------
     tuples : Tuples
-        All sets of rows that were looked at.
+        All sets of rows that were examined.
     taken : int array (n,)
-        Those of the assignment.
+        Numbers of the sets of the assignment.
     prices : Prices
-        Of the rows, with which no set that was looked at has a negative reduced cost.
+        Prices of the rows. With them no examined set has a negative reduced cost.
     cost, bound : float
-        Its cost, and a lower bound of that of any.
+        Cost of the assignment, and a lower bound of the cost of all assignments.
     boxes : int
-        How many boxes the bound took.
+        Number of boxes that the searches examined.
     """
 
     tuples: Tuples
@@ -156,21 +156,21 @@ class Solved:
 
 
 def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: int) -> Solved:
-    """Return the best assignment: columns are added while the search finds one that is worth its price."""
-    # Sets that do not pay by themselves are kept where they may have to be taken, or be listed as ghosts.
+    """Return the best assignment. Columns are added while the search finds one with a negative reduced cost."""
+    # Sets with a positive cost are kept if the assignment may need them, or if they may be listed as ghosts.
     limit = AMBIGUOUS_GAP + (scene.penalty if count is not None else 0.0)
-    # No assignment has more emitters than its rows can speak for.
+    # Upper limit of the number of emitters, from the number of rows.
     most = int(np.isfinite(scene.z).sum()) // scene.least
-    tuples, total = _keep_paying(propose_sets(scene), limit), 0
+    tuples, total = _drop_expensive(propose_sets(scene), limit), 0
     fresh, bound = without_one_row(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
     for turn in range(_ROUNDS):
-        tuples = _keep_paying(merge(tuples, fresh), limit)
+        tuples = _drop_expensive(merge(tuples, fresh), limit)
         taken, cost = cheapest_sets(tuples, scene.z.shape[1], count)
-        # Prices at which no column looked at so far pays: the search asks whether any other does.
+        # At these prices no examined column has a negative reduced cost. The search checks all other columns.
         prices = price_rows(tuples, taken, row_worth(scene, tuples.take(taken)), count)
         found = search(scene, prices, region, boxes)
         total += found.boxes
-        # Every turn gives a valid bound; the best one stays.
+        # Every iteration gives a valid bound, so keep the best.
         bound = max(bound, prices.bound(count, most, found.floor))
         fresh = _fresh_sets(scene, prices, found)
         if not len(fresh.cost) or (turn >= _HOPELESS and not np.isfinite(cost)):
@@ -179,56 +179,56 @@ def _solve_epoch(scene: Scene, region: PricedRegion, count: int | None, boxes: i
 
 
 def _fresh_sets(scene: Scene, prices: Prices, found: PricingResult) -> Tuples:
-    """Return the sets found, and others near their places, that are worth more than their price."""
+    """Return the sets that the search found, and others near their positions, that have a negative reduced cost."""
     if not len(found.places):
         return no_sets(scene)
     d = scene.scan.dimension
     more = sets_near(scene, found.places, np.zeros((len(found.places), d, d)), prices.row)
-    # Cheapest row by row at one place: fewer than d of them have no place of their own.
+    # The rows were chosen one by one for a position. With fewer than d rows they do not determine a position.
     enough = (found.picks >= 0).sum(-1) >= d
     own = refine_sets(scene, found.picks[enough], found.places[enough])[0]
     sets = merge(own, more)
     fresh = sets.take(prices.reduced(sets) < -0.5 * TOLERANCE)
-    # Prices that are too high for one set are too high for its neighbours as well.
+    # If the price of a set is too high, the prices of its neighbours probably are too.
     return merge(fresh, without_one_row(scene, fresh))
 
 
-def _keep_paying(tuples: Tuples, limit: float) -> Tuples:
+def _drop_expensive(tuples: Tuples, limit: float) -> Tuples:
     return tuples.take(np.flatnonzero(tuples.cost < limit))
 
 
-# Places where emitters may be: closed-form fixes of as few rows as it takes.
+# Candidate positions of emitters: closed-form fixes of as few rows as possible.
 
 
 def propose_sets(scene: Scene, seed: int = 0) -> Tuples:
-    """Return sets of rows around the closed-form fixes of d rows each; all of them, or a seeded draw where many."""
-    picks = _few(scene, np.random.default_rng(seed))
+    """Return sets of rows near the closed-form fixes of d rows each: all, or a seeded sample if there are many."""
+    picks = _combinations(scene, np.random.default_rng(seed))
     if not len(picks):
         return no_sets(scene)
     problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
     fix = solve(problem, "roots", refine=False)
-    # All roots of the closed form: d rows may meet in several places.
+    # All roots of the closed form, because d rows can have several common positions.
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     which, slot = np.nonzero(np.isfinite(x).all(-1))
-    with np.errstate(all="ignore"):  # some points of the closed form are stations
+    with np.errstate(all="ignore"):  # some points of the closed form coincide with stations
         equations = equations_at(problem.take(which), x[which, slot])
         cov = covariance(equations)[0]
     good = np.flatnonzero(np.isfinite(cov).all((-1, -2)) & (equations.cost < _FITS))[:_FOLLOWED]
     return sets_near(scene, x[which, slot][good], cov[good], np.zeros_like(scene.z))
 
 
-def _few(scene: Scene, rng: np.random.Generator) -> Array:
-    """Return sets of d rows (q, m) that place an emitter."""
+def _combinations(scene: Scene, rng: np.random.Generator) -> Array:
+    """Return sets of d rows (q, m) that determine a position."""
     d, count = scene.scan.dimension, scene.scan.count
     ends = _ends(scene)
     values = [np.flatnonzero(np.isfinite(channel)) for channel in scene.z]
     present = [i for i in range(count) if len(values[i])]
     subsets = [subset for subset in combinations(present, d) if _form_tree([ends[i] for i in subset])]
     picks = []
-    # A seeded draw, so that a table does not depend on the machine.
+    # A seeded sample, so that results do not depend on the machine.
     for number in rng.permutation(len(subsets)):
         subset = subsets[number]
-        # One value of each channel of the subset: all of them, as nobody knows whose a row is.
+        # All combinations of one value from each channel of the subset, because rows are unlabelled.
         for chosen in product(*(values[i] for i in subset)):
             one = np.full(count, -1)
             one[list(subset)] = chosen
@@ -239,7 +239,7 @@ def _few(scene: Scene, rng: np.random.Generator) -> Array:
 
 
 def _ends(scene: Scene) -> list[tuple[int, int] | None]:
-    """Return the stations of each channel of two, None for channels of one."""
+    """Return the two stations of each channel; None for channels with one station."""
     found: list[tuple[int, int] | None] = []
     for block in scene.scan.rows:
         two = MODELS[block.kind].stations > 1
@@ -248,7 +248,7 @@ def _ends(scene: Scene) -> list[tuple[int, int] | None]:
 
 
 def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
-    """Return whether pairs of stations form one tree: only then do they fix a place in closed form."""
+    """Return whether pairs of stations form one tree, which is necessary for a closed-form position."""
     own = [set(pair) for pair in pairs if pair is not None]
     while len(own) > 1:
         joined = next((other for other in own[1:] if own[0] & other), None)
@@ -258,12 +258,12 @@ def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
     return True
 
 
-# From the best assignment to the emitters: fixes, ghosts, and how sure their number is.
+# From the best assignment to the result: fixes, ghosts, and the margin of the number of emitters.
 
 
 def emitters_of(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
     """Return the emitters of an assignment of one epoch."""
-    # The emitter whose rows speak loudest first.
+    # Sort the emitters by evidence: the lowest cost first.
     taken = solved.taken[np.argsort(solved.tuples.cost[solved.taken], kind="stable")]
     best, width = solved.tuples.take(taken), scene.z.shape[1]
     fixes = fix_sets(scene, best.picks)
@@ -280,7 +280,7 @@ def emitters_of(problem: Problem, scene: Scene, solved: Solved, count: int | Non
 
 
 def fix_sets(scene: Scene, picks: Array) -> tuple[Fix, ...]:
-    """Return the fixes of sets of rows (n, m)."""
+    """Return the fixes of sets of rows with picks (n, m)."""
     if not len(picks):
         return ()
     fix = solve(scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float)))
@@ -288,10 +288,10 @@ def fix_sets(scene: Scene, picks: Array) -> tuple[Fix, ...]:
 
 
 def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, count: int | None) -> tuple[Ghost, ...]:
-    """Return the places of other sets that an assignment of nearly the least cost takes."""
+    """Return the positions of other sets that belong to an assignment with nearly the least cost."""
     tuples, found = solved.tuples, list[Ghost]()
     known = [(fix.position, _information(fix.covariance())) for fix in fixes]
-    # A reduced cost is a lower bound of what it costs to take a set.
+    # The reduced cost is a lower bound of the additional cost of an assignment with this set.
     lowest = solved.prices.reduced(tuples)
     for i in np.argsort(lowest, kind="stable"):
         if len(found) == _LISTED or lowest[i] >= LISTED_GAP:
@@ -309,17 +309,17 @@ def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, co
 
 
 def _information(cov: Array) -> Array:
-    """Return the inverse of a covariance, zero where there is none: everything is then near."""
+    """Return the inverse of a covariance; zero if it is not finite, so that all positions count as near."""
     return np.linalg.pinv(cov) if np.isfinite(cov).all() else np.zeros_like(cov)
 
 
 def _verdict(
     scene: Scene, solved: Solved, fixes: tuple[Fix, ...], ghosts: tuple[Ghost, ...], costs: Array, count: int | None
 ) -> tuple[Status, str]:
-    """Return status and reason."""
-    heard = np.isfinite(scene.z)
+    """Return the status and the reason of an assignment."""
+    measured = np.isfinite(scene.z)
     gaps = tuple(ghost.gap for ghost in ghosts)
-    size = int(heard.any(1).sum()), len(scene.z), scene.least
-    false = int(heard.sum()) - int((solved.tuples.picks[solved.taken] >= 0).sum())
+    size = int(measured.any(1).sum()), len(scene.z), scene.least
+    false = int(measured.sum()) - int((solved.tuples.picks[solved.taken] >= 0).sum())
     found = Assigned(fixes, gaps, costs, solved.cost, solved.bound, count, *size)
     return verdict(found, f"{count_in_words(len(fixes))}; false rows: {false}")

@@ -1,4 +1,4 @@
-"""Findings against an assignment of rows to emitters: one table of status, test and sentence."""
+"""Findings about an assignment of rows to emitters: a table of statuses, tests and sentences."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from optloc.problem.fix import Fix
 from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.verdict.findings import Finding, objections
 
-# Cost above its bound from which an assignment is not called proven. The tolerance of the search leaves less for dozens
-# of emitters, and the gap of an ambiguity is far larger.
+# Difference between cost and bound above which an assignment does not count as proven. The tolerance of the search is
+# smaller even with dozens of emitters, and the gap of an ambiguity is far larger.
 _PROVEN = 2.0
 
 
 class Assigned(NamedTuple):
-    """The numbers that decide about an assignment.
+    """The numbers that decide the status of an assignment.
 
     Parameters
     ----------
     fixes : tuple of Fix
         Fixes of the emitters.
     gaps : tuple of float
-        Costs of other places less the cost of the assignment, ascending.
+        Costs of other positions minus the cost of the assignment, ascending.
     costs : array (n,)
         Least cost with 0, 1, 2 ... emitters.
     cost, bound : float
         Cost of the assignment, and a lower bound of the cost of all others.
     wanted : int, optional
-        The number of emitters, where it is given.
+        The given number of emitters; None if it is free.
     present, channels, least : int
-        Channels with a row, all channels, and the channels of an emitter at least.
+        Number of channels with a row, number of all channels, and least number of channels of an emitter.
     """
 
     fixes: tuple[Fix, ...]
@@ -47,23 +47,23 @@ class Assigned(NamedTuple):
 
 
 def verdict(found: Assigned, clean: str) -> tuple[Status, str]:
-    """Return status and reason of an assignment; `clean` is the reason if nothing is found."""
+    """Return the status and the reason of an assignment; `clean` is the reason if there is no finding."""
     against = objections(_FINDINGS, found)
     if not against:
         return Status.OK, clean
-    # Nothing else counts where there is no assignment.
+    # Without an assignment other findings are not relevant.
     status = against[0][0]
     alone = status in (Status.INFEASIBLE, Status.TOO_FEW_ROWS) and not found.fixes
     return status, against[0][1] if alone else "; ".join(words for _, words in against)
 
 
 def count_in_words(emitters: int) -> str:
-    """Return a number of emitters in words."""
+    """Return a number of emitters as a phrase."""
     return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")
 
 
 def _near(found: Assigned) -> list[str]:
-    """Return sentences on other numbers of emitters and other places within the gap of an ambiguity."""
+    """Return sentences about other numbers of emitters, and other positions, within the ambiguity gap."""
     n = len(found.fixes)
     words = [
         f"{count_in_words(k)} would cost only {found.costs[k] - found.cost:.1f} more"
@@ -71,16 +71,16 @@ def _near(found: Assigned) -> list[str]:
         if found.wanted is None and k >= 0 and found.costs[k] - found.cost < AMBIGUOUS_GAP
     ]
     near = [gap for gap in found.gaps if gap < AMBIGUOUS_GAP]
-    return [*words, f"another place costs only {near[0]:.1f} more, {len(near)} such in all"] if near else words
+    return [*words, f"another position costs only {near[0]:.1f} more ({len(near)} in total)"] if near else words
 
 
 def _too_few(found: Assigned) -> list[str]:
-    what = "none can" if found.least > found.channels else f"an emitter takes {found.least}"
-    return [f"rows in {found.present} channels cannot tell an emitter from false rows: {what}"]
+    what = "no emitter can have enough" if found.least > found.channels else f"an emitter needs {found.least}"
+    return [f"rows in {found.present} channels cannot separate an emitter from false rows: {what}"]
 
 
 def _of_emitters(status: Status) -> Finding:
-    """Return the finding that an emitter has a status: it counts against all of them together."""
+    """Return the finding that an emitter has this status, which then applies to all emitters together."""
     return Finding(
         status,
         lambda found: any(fix.status == status for fix in found.fixes),
@@ -103,4 +103,4 @@ _FINDINGS = (
         lambda found: [f"not proven: another assignment may cost {found.cost - found.bound:.1f} less"],
     ),
 )
-"""All findings against an assignment."""
+"""All findings about an assignment."""

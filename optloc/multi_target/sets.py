@@ -1,4 +1,4 @@
-"""One epoch of rows that do not say whose they are, and what a set of them costs as one emitter."""
+"""Unlabelled rows of one epoch, and the cost of a set of rows as one emitter."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from optloc.tracking.associate import Clutter, offsets
 from optloc.tracking.several_targets import candidates, channels_of
 from optloc.tracking.track import State
 
-# Share of its variance that a row must have of its own, or the likelihood of sets of rows is endless; below it the
-# eigenvalue is rounding.
+# Minimum share of its variance that the error of a row has independently of the others. Below it the eigenvalue is
+# rounding error, and the likelihood of sets of rows is unbounded.
 _OWN = 1e-9
-# Turns of choosing rows and refining: each lowers the truncated cost, so few are needed; the number ends ties.
+# Maximum number of alternations of row selection and refinement. Each lowers the truncated cost, so few are enough; the
+# limit ends ties.
 _PASSES = 4
-# Share of what a row is worth that it keeps however badly it fits: a price that is zero would divide by nothing.
+# Minimum share of the worth of a row that remains for a bad fit, to avoid a division by zero in the prices.
 _LEAST = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The values measured in each channel (a kind at its stations) of one epoch, and the prices of sets of them.
+    """The measured values in each channel (a kind at its stations) of one epoch, and the cost of sets of them.
 
-    A set T of values, one or none of each channel, costs as one emitter, against all of them being false, ::
+    The cost of a set T of values, at most one of each channel, as one emitter instead of false rows is ::
 
-        c(T) = min_x chi2(T, x) + ln|2 pi R_T| - sum_T 2 ln(pd / density) - (m - |T|) 2 ln(1 - pd) + penalty,
+        c(T) = min_x chi2(T, x) + ln|2 pi R_T| - sum_T 2 ln(pd / density) - (m - |T|) 2 ln(1 - pd) + penalty.
 
-    twice the negative logarithm of the generalised likelihood ratio of Deb et al. (1997), and a penalty.
-    The penalty is what the d most telling rows are worth: a position is stated by d numbers, and d rows fit it
-    whatever they read, so that only rows beyond them speak for an emitter. In other words, the d rows that place an
-    emitter are taken to read anything as readily as false ones do (Rissanen 1978: a parameter costs the logarithm of
-    its range over its precision).
+    It is twice the negative logarithm of the generalised likelihood ratio of Deb et al. (1997), plus a penalty.
+    The penalty is the worth of the d most informative rows. A position has d coordinates, and d rows always fit it, so
+    only further rows are evidence of an emitter. In other words, the d rows that determine an emitter count as likely
+    as false rows (Rissanen 1978: a parameter costs the logarithm of its range over its precision).
 
     Parameters
     ----------
     scan : Problem
-        One row for each channel; the only unknown is the position.
+        One row for each channel. The position is the only unknown.
     z : array (m, c)
-        Values, known corrections taken off; NaN where there are fewer than c.
+        Measured values minus known corrections; NaN in unused entries.
     row : int array (m, c)
-        Global row of each value in the problem; -1 where there is none.
+        Global row number of each value in the problem; -1 in unused entries.
     R : array (m, m)
-        Covariance of one row of each channel.
+        Covariance of one row from each channel.
     gain : array (m,)
         2 ln(pd / density) of each channel.
     missed : float
-        -2 ln(1 - pd), what an emitter pays for a channel without it.
+        -2 ln(1 - pd), the cost of a channel without a row of the emitter.
     penalty : float
-        What an emitter pays for being one.
+        Cost of each emitter.
 
     References
     ----------
@@ -81,7 +81,7 @@ class Scene:
 
     @property
     def periodic(self) -> Array:
-        """Return which channels are angles, (m,)."""
+        """Return a mask (m,) of the channels that are angles."""
         return np.concatenate([np.full(b.count, MODELS[b.kind].period is not None) for b in self.scan.rows])
 
     @property
@@ -91,55 +91,55 @@ class Scene:
 
     @property
     def least(self) -> int:
-        """Return the least number of rows that can speak for an emitter, more than there are channels if none can."""
-        # What each row says for an emitter where it fits perfectly, the most telling first: as many as outweigh the
-        # rest.
+        """Return the least number of rows that are evidence of an emitter; above the number of channels if none are."""
+        # Worth of each row if it fits perfectly, the most informative first. The least number outweighs the penalty and
+        # the missing rows.
         worth = np.sort(self.missed + self.gain - np.log(2.0 * np.pi * own_variance(self.R)))[::-1]
         best = self.penalty + self.missed * len(worth) - np.cumsum(worth)
         return int(np.argmax(best < 0.0)) + 1 if (best < 0.0).any() else len(worth) + 1
 
     def determinant(self, picks: Array) -> Array:
-        """Return ln|2 pi R_T| (q,) of the sets of given picks (q, m)."""
+        """Return ln|2 pi R_T| (q,) of the sets with picks (q, m)."""
         used = picks >= 0
         both = used[:, :, None] & used[:, None, :]
-        # Rows that are not in a set stand as ones on the diagonal: one call for sets of all sizes.
+        # Rows outside a set are replaced by ones on the diagonal, so that one call handles sets of all sizes.
         matrix = np.where(both, 2.0 * np.pi * self.R, np.eye(len(self.R)))
         return np.asarray(np.linalg.slogdet(matrix)[1])
 
     def constant(self, picks: Array) -> Array:
-        """Return what sets (q, m) cost beyond their chi-square, (q,)."""
+        """Return the cost (q,) of sets with picks (q, m) without their chi-square."""
         used = picks >= 0
         rows = used @ -self.gain + self.missed * (~used).sum(-1)
         return np.asarray(self.determinant(picks) + rows + self.penalty)
 
 
 def own_variance(R: Array) -> Array:
-    """Return the variance (m,) that each row has of its own once all others are known."""
+    """Return the conditional variance (m,) of the error of each row, given the errors of all others."""
     return np.asarray(np.diagonal(R) / np.diagonal(np.linalg.inv(correlation(R))))
 
 
 def correlation(R: Array) -> Array:
-    """Return the correlation of a covariance (m, m): its eigenvalues do not depend on units."""
+    """Return the correlation matrix of a covariance (m, m). Its eigenvalues do not depend on units."""
     scale = np.sqrt(np.diagonal(R))
     return np.asarray(R / scale / scale[:, None])
 
 
 def scenes(problem: Problem, clutter: Clutter, penalty: float | None) -> Iterator[Scene]:
-    """Yield the epochs of a problem without batch axes that have channels, in their order.
+    """Yield a scene for each epoch of a problem that has channels, in order. The problem has no batch axes.
 
     Parameters
     ----------
     problem : Problem
-        Rows of several emitters; whose they are said to be does not matter.
+        Rows of several emitters. Their target numbers are ignored.
     clutter : Clutter
-        Detection and false rows.
+        Probability of detection, and density of false rows.
     penalty : float or None
-        See `Scene`; None for the value told there.
+        Cost of each emitter; None for the default of `Scene`.
 
     Raises
     ------
     InvalidProblem
-        For kinds, unknowns or noise that sets of rows cannot be scored with.
+        For kinds, unknowns or noise for which sets of rows have no score.
     """
     _check(problem)
     given = candidates(problem)
@@ -158,10 +158,10 @@ def _scene(scan: Problem, z: Array, row: Array, clutter: Clutter, penalty: float
     R = noises.dense(scan.noise, np.arange(scan.count))
     variance, density = np.diagonal(R), clutter.of(scan)
     if not np.linalg.eigvalsh(correlation(R))[0] > _OWN:
-        advice = "give each row an error of its own as well (sigma beside arrival_sigma), or leave out rows that repeat"
+        advice = "give each row an independent error too (sigma with arrival_sigma), or leave out redundant rows"
         raise InvalidProblem("some rows of an epoch are exact sums of others", "noise", advice)
     worth = np.sort(-2.0 * np.log(density) - np.log(2.0 * np.pi * variance))[::-1]
-    # A row that says nothing (worth below zero) places an emitter for nothing.
+    # A row with negative worth carries no information, so it does not add to the penalty.
     own = float(np.maximum(worth, 0.0)[: scan.dimension].sum()) if penalty is None else float(penalty)
     gain = 2.0 * np.log(clutter.detection / density)
     return Scene(scan, z, row, R, gain, -2.0 * float(np.log1p(-clutter.detection)), own)
@@ -172,7 +172,7 @@ def _check(problem: Problem) -> None:
         raise InvalidProblem("the problem has batch axes", "problem", "give its problems one by one")
     for block in problem.rows:
         if block.kind not in bounded_kinds():
-            raise InvalidProblem(f"{block.kind} rows cannot be told apart", "kind", f"use {', '.join(bounded_kinds())}")
+            raise InvalidProblem(f"{block.kind} rows cannot be separated", "kind", f"use {', '.join(bounded_kinds())}")
     for name, given in (
         ("biases", problem.biases),
         ("priors", problem.priors),
@@ -180,25 +180,25 @@ def _check(problem: Problem) -> None:
         ("stations", bool(problem.stations.errors)),
     ):
         if given:
-            advice = "leave them out: here positions are all that is unknown, and a region is given beside the problem"
-            raise InvalidProblem(f"{name} with unknowns or limits of their own", name, advice)
+            advice = "leave them out: positions are the only unknowns here, and a region is a separate argument"
+            raise InvalidProblem(f"{name} add unknowns or limits", name, advice)
 
 
-# Sets of rows of one emitter: their maximum-likelihood places, what they cost, and better ones near a place.
+# Sets of rows of one emitter: maximum-likelihood positions, costs, and better sets near a position.
 
 
 @dataclass(frozen=True, slots=True)
 class Tuples:
-    """Sets of rows with their places.
+    """Sets of rows with their positions.
 
     Parameters
     ----------
     picks : int array (q, m)
-        Which value of each channel a set holds, or -1.
+        Number of the value that a set takes from each channel; -1 for none.
     x : array (q, d)
-        Place of least chi-square found, metres.
+        Position of least chi-square found, metres.
     cost : array (q,)
-        See `optloc.multi_target.sets.Scene`.
+        Cost, see `optloc.multi_target.sets.Scene`.
     """
 
     picks: Array
@@ -206,62 +206,63 @@ class Tuples:
     cost: Array
 
     def take(self, index: Array) -> Tuples:
-        """Return some of the sets."""
+        """Return the selected sets."""
         return Tuples(self.picks[index], self.x[index], self.cost[index])
 
     def prices(self, price: Array) -> Array:
-        """Return the sum (q,) of the prices (m, c) of each set's rows."""
+        """Return the sum (q,) of the prices (m, c) of the rows of each set."""
         return np.asarray(of_picks(price, self.picks).sum(-1))
 
 
 def of_picks(values: Array, picks: Array) -> Array:
-    """Return the values (..., m, c) that picks (q, m) take, (q, m); zero where they take none."""
+    """Return the values (q, m) that picks (q, m) select from values (..., m, c); zero for pick -1."""
     found = values[np.arange(len(values)), np.maximum(picks, 0)]
     return np.asarray(np.where(picks >= 0, found, 0.0))
 
 
 def merge(*parts: Tuples) -> Tuples:
-    """Return all sets, the cheapest first, each once, at the cheapest of its places."""
+    """Return all sets, sorted by cost, each once with its cheapest position."""
     picks, x, cost = (np.concatenate([getattr(part, name) for part in parts]) for name in ("picks", "x", "cost"))
     order = np.argsort(cost, kind="stable")
-    # unique keeps the first of equal sets, which after sorting is the cheapest.
+    # `np.unique` keeps the first of equal sets, which is the cheapest after sorting.
     _, first = np.unique(picks[order], axis=0, return_index=True)
     kept = order[np.sort(first)]
     return Tuples(picks[kept], x[kept], cost[kept])
 
 
 def no_sets(scene: Scene) -> Tuples:
-    """Return no sets."""
+    """Return an empty list of sets."""
     return Tuples(np.zeros((0, scene.scan.count), dtype=np.int64), np.zeros((0, scene.scan.dimension)), np.zeros(0))
 
 
 def refine_sets(scene: Scene, picks: Array, start: Array) -> tuple[Tuples, Array]:
-    """Return sets (q, m) refined from starts (q, d), and the covariances (q, d, d) of their places."""
+    """Return sets with picks (q, m), refined from starts (q, d), and the position covariances (q, d, d), m^2."""
     if not len(picks):
         return no_sets(scene), np.zeros((0, scene.scan.dimension, scene.scan.dimension))
     problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
     done = refine(problem, start)
-    # A set that does not converge has no place, so no cost that an assignment could pay.
+    # A set that does not converge has no position, so its cost is infinite.
     cost = np.where(np.isfinite(done.cost), done.cost, np.inf) + scene.constant(picks)
     return Tuples(picks, done.x, cost), covariance(done.equations)[0]
 
 
 def sets_near(scene: Scene, x: Array, cov: Array, price: Array) -> Tuples:
-    """Return the best sets of rows near places, found by turns of choosing rows and refining.
+    """Return the best sets of rows near positions, by alternating selection of rows and refinement.
 
-    A row is chosen by its distance from what is expected at a place with an error of its own, and after that once more
-    at the place as it is, until the choice stays: each turn lowers the truncated cost sum_i min(row_i, missed).
+    Rows are first selected by their distance from the prediction, with the uncertainty of the position. They are then
+    selected without this uncertainty until the selection is stable. Each pass lowers the truncated cost sum_i
+    min(row_i, missed).
 
     Parameters
     ----------
     scene : Scene
         One epoch.
     x : array (q, d)
-        Places, metres.
+        Positions, metres.
     cov : array (q, d, d)
-        How uncertain they are; zero for not at all.
+        Covariance of the positions, square metres; zero for exact positions.
     price : array (m, c)
-        What each row costs beyond its likelihood.
+        Additional cost of each row.
     """
     found = [no_sets(scene)]
     for blur in (1.0, 0.0):
@@ -270,7 +271,7 @@ def sets_near(scene: Scene, x: Array, cov: Array, price: Array) -> Tuples:
             picks = _choose(scene, x, blur * cov, price)
             if last is not None and np.array_equal(picks, last):
                 break
-            # Fewer rows than coordinates have no place of their own.
+            # Fewer rows than coordinates do not determine a position.
             enough = (picks >= 0).sum(-1) >= scene.scan.dimension
             picks, x, cov = picks[enough], x[enough], cov[enough]
             if not len(picks):
@@ -284,10 +285,10 @@ def sets_near(scene: Scene, x: Array, cov: Array, price: Array) -> Tuples:
 
 
 def _choose(scene: Scene, x: Array, cov: Array, price: Array) -> Array:
-    """Return the picks (q, m) that fit best at places x (q, d) of covariance (q, d, d), channel by channel."""
+    """Return the picks (q, m) that fit best at positions x (q, d) with covariances (q, d, d), channel by channel."""
     if not len(x):
         return np.zeros((0, scene.scan.count), dtype=np.int64)
-    # A place with a covariance is a predicted target: the same gates as in a track.
+    # A position with a covariance is a predicted target, so the gates are the same as in a tracker.
     apart, S = offsets(scene.scan, State(0.0, x, cov), scene.z)
     s = np.diagonal(S, axis1=-2, axis2=-1)[..., None]
     with np.errstate(invalid="ignore"):
@@ -296,7 +297,7 @@ def _choose(scene: Scene, x: Array, cov: Array, price: Array) -> Array:
 
 
 def cheapest_rows(scene: Scene, option: Array) -> Array:
-    """Return picks (q, m): of each channel the cheapest of options (q, m, c), none where missing it costs less."""
+    """Return picks (q, m): the cheapest option (q, m, c) of each channel, or -1 if no detection costs less."""
     option = np.where(np.isnan(option), np.inf, option)
     best = option.argmin(-1)
     seen = np.take_along_axis(option, best[..., None], axis=-1)[..., 0] < scene.missed
@@ -304,7 +305,7 @@ def cheapest_rows(scene: Scene, option: Array) -> Array:
 
 
 def without_one_row(scene: Scene, tuples: Tuples) -> Tuples:
-    """Return sets with each one of their rows left out."""
+    """Return the sets that result from leaving out one row of each given set."""
     which, channel = np.nonzero(tuples.picks >= 0)
     picks = tuples.picks[which]
     picks[np.arange(len(which)), channel] = -1
@@ -313,7 +314,7 @@ def without_one_row(scene: Scene, tuples: Tuples) -> Tuples:
 
 
 def row_worth(scene: Scene, tuples: Tuples) -> Array:
-    """Return by how much each row (m, c) lowers the cost of its set, at its place; 1 for rows of no set."""
+    """Return the decrease (m, c) of the cost of its set due to each row; 1 for rows without a set."""
     out = np.ones_like(scene.z)
     variance = scene.sigma**2
     most = scene.missed + scene.gain - np.log(2.0 * np.pi * variance)
@@ -325,20 +326,20 @@ def row_worth(scene: Scene, tuples: Tuples) -> Array:
     return out
 
 
-# How far measurements can be from their values at the centre of a box of positions.
+# Bounds of the change of measurements within a box of positions, relative to the centre.
 
 
 def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array, Array, Array]:
     """Return values, derivatives and remainders of the rows of a scan in balls.
 
-    Within the ball |h(x) - h - J (x - centre)| <= remainder: half the squared radius times a bound of the second
-    derivatives there, which are 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation, with r_h the
-    distance from the station's vertical.
+    In the ball |h(x) - h - J (x - centre)| <= remainder. The remainder is half the squared radius times a bound of the
+    second derivatives. This bound is 1/r for a range, 1/r_h^2 for an azimuth and 1/(r r_h) for an elevation. Here r_h
+    is the distance from the vertical line through the station.
 
     Parameters
     ----------
     scan : Problem
-        Kinds of `served`; the position is all that is unknown.
+        Rows of the kinds of `served`, with the position as the only unknown.
     centre : array (q, d)
         Centres, metres.
     radius : array (q,)
@@ -349,11 +350,11 @@ def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array,
     value : array (q, m)
         h at the centres.
     slope : array (q, m, d)
-        J; not finite at a station.
+        J; not finite if the centre is at a station.
     remainder : array (q, m)
-        Infinite where the ball holds a station.
+        Infinite if the ball contains a station.
     """
-    # At a station itself derivatives are not finite: bounds are infinite, and the box is halved.
+    # At a station the derivatives are not finite. The bounds are then infinite, and the box is halved.
     with np.errstate(all="ignore"):
         residual, slope = differentiate(scan.with_rows(z=np.zeros(scan.count)), centre)
         value, steep = -residual, np.sqrt((slope**2).sum(-1))
@@ -367,35 +368,35 @@ def values_in_balls(scan: Problem, centre: Array, radius: Array) -> tuple[Array,
 
 
 def value_changes(scan: Problem, slope: Array, remainder: Array, half: Array) -> Array:
-    """Return how far the rows can be from their values at the centres of boxes, (q, m).
+    """Return the greatest change (q, m) of the rows in boxes, relative to their values at the centres.
 
     Parameters
     ----------
     scan : Problem
-        Of `around`.
+        The scan of `around`.
     slope, remainder : array (q, m, d) and (q, m)
-        From `around`, for the balls about the boxes.
+        Results of `around` for the balls around the boxes.
     half : array (q, d)
         Half-widths of the boxes.
     """
     radius = np.sqrt((half**2).sum(-1))
-    most = np.concatenate([_most(block, radius) for block in scan.rows], axis=-1)
+    most = np.concatenate([_greatest_change(block, radius) for block in scan.rows], axis=-1)
     with np.errstate(invalid="ignore"):
-        # Whichever is less: the linear change with its remainder, or what such rows can change at all.
+        # The smaller of two bounds: linear change plus remainder, and the greatest change of this kind of row.
         first = (np.abs(slope) * half[:, None, :]).sum(-1) + remainder
     return np.asarray(np.where(first < most, first, most))
 
 
-def _most(block: Rows, radius: Array) -> Array:
-    """Return how far the rows of one block can be from their values at the centres of balls in any case, (q, m)."""
+def _greatest_change(block: Rows, radius: Array) -> Array:
+    """Return a bound (q, m) of the change of the rows of a block in balls, valid without derivatives."""
     ranges = MODELS[block.kind].ranges
-    # A range changes by no more than the target moves; an angle is half a turn away at most.
+    # A range changes at most by the displacement of the target. An angle changes at most by half a turn.
     limit = sum(map(abs, ranges)) * radius if ranges is not None else np.full(len(radius), np.pi)
     return np.repeat(limit[:, None], block.count, axis=-1)
 
 
 def _curvature(scan: Problem, block: Rows, centre: Array, radius: Array, value: Array, steep: Array) -> Array:
-    """Return a bound (q, m) of the second derivatives of one block within balls."""
+    """Return a bound (q, m) of the second derivatives of the rows of a block in balls."""
     ranges = MODELS[block.kind].ranges
     if ranges is None:
         return _ANGLES[block.kind].bend(value, steep, radius[:, None])
@@ -409,22 +410,22 @@ def _curvature(scan: Problem, block: Rows, centre: Array, radius: Array, value: 
 
 @dataclass(frozen=True, slots=True)
 class Angle:
-    """What is known of an angle.
+    """Properties of a kind of angle.
 
     Parameters
     ----------
     width : float
-        Length of the interval of its values.
+        Length of the interval of its values, radians.
     bend : callable
-        Bound (q, m) of its second derivatives in balls, from values and slopes at their centres (q, m) and the radii
-        (q, 1). The slope of an azimuth is 1/r_h, that of an elevation 1/r.
+        Returns a bound (q, m) of its second derivatives in balls, from values and slopes at the centres (q, m) and the
+        radii (q, 1). The slope of an azimuth is 1/r_h, that of an elevation 1/r.
     """
 
     width: float
     bend: Callable[[Array, Array, Array], Array]
 
 
-# An azimuth is anywhere on a circle, an elevation on half of one; 1/r_h^2 and 1/(r r_h) bound how they bend.
+# Azimuths cover a full circle, elevations half a circle. 1/r_h^2 and 1/(r r_h) bound their second derivatives.
 _ANGLES = {
     "azimuth": Angle(2.0 * np.pi, lambda value, steep, radius: 1.0 / np.maximum(1.0 / steep - radius, 0.0) ** 2),
     "elevation": Angle(
@@ -437,18 +438,18 @@ _ANGLES = {
 
 
 def value_width(problem: Problem, block: Rows) -> Array | None:
-    """Return the length of the interval of possible values of each row, None where it has no end."""
+    """Return the length of the interval of possible values of each row; None if it is unbounded."""
     if block.kind in _ANGLES:
         return np.asarray(_ANGLES[block.kind].width)
     if sum(MODELS[block.kind].ranges or (1,)):
         return None
-    # A difference of ranges lies between plus and minus the distance of its stations.
+    # A range difference is between plus and minus the distance of its stations.
     place = problem.stations.position[..., 0, :, :]
     apart = place[..., block.a, :] - place[..., block.b, :]
     return np.asarray(2.0 * np.sqrt((apart**2).sum(-1)))
 
 
 def bounded_kinds() -> list[str]:
-    """Return the kinds whose curvature is bounded here: sums of ranges without an emission time, and the two angles."""
+    """Return the supported kinds: sums of ranges without an emission time, and the two angles."""
     sums = [kind for kind, model in MODELS.items() if model.ranges is not None and not model.emission]
     return [*sums, *_ANGLES]

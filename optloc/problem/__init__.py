@@ -1,4 +1,4 @@
-"""One estimation problem and its answer as values."""
+"""Public types and functions of one estimation problem and its fix, such as `Problem`, `assemble` and `Fix`."""
 
 from typing import TYPE_CHECKING
 

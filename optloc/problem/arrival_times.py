@@ -1,8 +1,8 @@
-"""Differences of arrival times as arrival times: one row for each station, whose errors are independent.
+"""Conversion of range differences to arrival times: one row per station, with independent errors.
 
-Rows z = D tau + n that difference the arrivals tau = r + e of one emission e at several stations, with
-cov n = D diag(v) D', are equivalent to the rows tau_s = r_s + e with independent variances v_s and e unknown: for every
-position the least cost over e is the same. What is wrong with one station is then wrong with one row.
+Range differences z = D tau + n combine the arrivals tau = r + e of one emission e at several stations. If their
+covariance is cov n = D diag(v) D', the rows tau_s = r_s + e are equivalent. These have independent variances v_s and an
+unknown e, and at every position the least cost over e is the same. An error of one station then affects one row only.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from optloc.problem.layout import Layout
 from optloc.problem.noise import Block, Noise, dense, group
 from optloc.problem.problem import Problem
 
-# Relative error of a covariance that is taken for D diag(v) D': rounding is below it, noise of another form far above.
+# Relative error up to which a covariance counts as D diag(v) D'. Rounding is smaller, any other form is far larger.
 _EXACT = 1e-9
-# Variance, as a share of the mean, of an arrival that the differences take for exact: the least that solvers bear.
+# Least variance of an arrival, as a share of the mean variance: smaller values make the solvers inaccurate.
 _LEAST = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """A problem whose range differences were replaced by arrival times.
+    """A problem in which arrival times replace the range differences.
 
     Parameters
     ----------
     problem : Problem
-        Flat batch of N problems; the arrival times are its first rows.
+        Flat batch of N problems. Its first rows are the arrival times.
     origin : tuple of int arrays
-        For each of its rows the global numbers of the rows of the problem it was made from.
+        For each row of `problem`, the global numbers of the original rows from which it was computed.
     """
 
     problem: Problem
@@ -41,7 +41,7 @@ class Arrivals:
 
 @dataclass(frozen=True, slots=True)
 class _Sighting:
-    """The differences of one epoch and target: their rows (r,), stations (s,) and D (r, s)."""
+    """The range differences of one epoch and target: row numbers (r,), station numbers (s,) and matrix D (r, s)."""
 
     rows: Array
     stations: Array
@@ -51,25 +51,25 @@ class _Sighting:
 
 
 def as_arrivals(problem: Problem) -> Arrivals | None:
-    """Return a flat batch of problems with arrival times for range differences, or None where that is not the same.
+    """Return the problem with arrival times instead of range differences, or None if the two are not equivalent.
 
     Parameters
     ----------
     problem : Problem
-        N problems. Their differences must have the noise that combined arrivals have, link all stations of an epoch,
-        and be touched by no bias; which rows are present must be the same in all problems.
+        N problems. Three conditions apply to the range differences: their noise comes from combined arrivals, they link
+        all stations of an epoch, and no bias affects them. The same rows must be present in all problems.
 
     Returns
     -------
     Arrivals or None
-        Rows that are absent everywhere are no part of it.
+        A flat batch of problems. It omits rows that are absent in all problems.
     """
     numbers = [np.arange(start, start + r.count) for r, start in zip(problem.rows, problem.starts, strict=True)]
     differences = [own for own, rows in zip(numbers, problem.rows, strict=True) if rows.kind == "tdoa"]
     if not differences or problem.biases or problem.emitting:
         return None
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
-    # one set of arrivals for the batch: rows that are absent, or of less weight, in some problems forbid it
+    # The batch shares one set of arrivals, so each row must be present with weight 1 in all problems, or absent in all.
     present = weight[0] > 0.0
     taken = np.concatenate(differences)
     if ((weight > 0.0) != present).any() or (weight[:, taken[present[taken]]] != 1.0).any():
@@ -87,7 +87,7 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
 
 
 def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
-    """Yield the differences of each epoch and target."""
+    """Yield the range differences of each epoch and target, grouped from the row numbers `taken`."""
     a, b, epoch, target = (
         np.concatenate([getattr(rows, name) for rows in problem.rows])[taken] for name in ("a", "b", "epoch", "target")
     )
@@ -101,9 +101,9 @@ def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
 
 
 def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | None:
-    """Return arrival times (N, s), up to a common one, and variances (N or 1, s); None where they do not exist."""
+    """Return arrival times (N, s), up to a common offset, and variances (N or 1, s); None if they do not exist."""
     design, s = one.design, len(one.stations)
-    # fewer differences than stations less one fall into groups, each with a common arrival of its own
+    # With fewer differences the stations fall into groups, and the arrivals of each group have a separate offset.
     if np.linalg.matrix_rank(design) < s - 1:
         return None
     covariance = dense(problem.noise, one.rows)
@@ -116,12 +116,12 @@ def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | No
     if not same.all() or (variance < -_EXACT * scale).any():
         return None
     variance = np.maximum(variance, _LEAST * variance.mean(-1, keepdims=True))
-    # the least-squares arrivals of mean zero: redundant differences agree, since their noise is that of arrivals
+    # Least-squares arrivals of mean zero. Redundant differences agree, because their noise is a difference of arrivals.
     return problem.observed[:, one.rows] @ np.linalg.pinv(design).T, variance.reshape(-1, s)
 
 
 def _are_apart(noise: Noise, sightings: list[_Sighting], absent: Array) -> bool:
-    """Return whether the differences of each sighting are correlated with nothing else."""
+    """Return whether the differences of each epoch and target are uncorrelated with all other rows."""
     for one in sightings:
         for block in noise.blocks:
             inside = np.isin(block.row, one.rows)
@@ -132,7 +132,7 @@ def _are_apart(noise: Noise, sightings: list[_Sighting], absent: Array) -> bool:
 
 
 def _assemble(problem: Problem, sightings: list[_Sighting], z: Array, variance: Array) -> Arrivals:
-    """Return the problem of the arrival times and of the rows of other kinds that are present."""
+    """Return the problem that consists of the arrival times and the present rows of other kinds."""
     sizes = [len(one.stations) for one in sightings]
     station = np.concatenate([one.stations for one in sightings])
     ones = np.ones(len(station))
@@ -146,7 +146,7 @@ def _assemble(problem: Problem, sightings: list[_Sighting], z: Array, variance: 
         ones,
         0.0 * ones,
     )
-    # an arrival is made from all differences of its station
+    # Each arrival depends on all differences that involve its station.
     origin = [one.rows[column != 0.0] for one in sightings for column in one.design.T]
     rows, number = [arrival], np.full(problem.count, -1)
     count = len(station)
@@ -163,7 +163,7 @@ def _assemble(problem: Problem, sightings: list[_Sighting], z: Array, variance: 
 
 
 def _keep_noise(noise: Noise, number: Array) -> Iterator[Block]:
-    """Yield the noise of the rows of other kinds, numbered anew."""
+    """Yield the noise blocks of the rows of other kinds, with the new row numbers."""
     for block in noise.blocks:
         kept = (number[block.row] >= 0).all(1)
         if kept.any():
@@ -172,7 +172,10 @@ def _keep_noise(noise: Noise, number: Array) -> Iterator[Block]:
 
 
 def restore_order(layout: Layout, other: Layout, x: Array) -> Array:
-    """Return vectors (..., size) in the order of a layout whose unknowns another layout has too, perhaps among more."""
+    """Return parameter vectors x (..., size) of layout `other` in the order of `layout`.
+
+    `other` contains all unknowns of `layout` and may contain more.
+    """
     shared, local = other.split(x)
     columns = []
     for slot in layout.local:
@@ -183,6 +186,6 @@ def restore_order(layout: Layout, other: Layout, x: Array) -> Array:
 
 
 def shared_places(layout: Layout, other: Layout) -> Array:
-    """Return where the shared unknowns of a layout stand in another that has them too, (n,)."""
+    """Return the indices (n,) in layout `other` of the shared unknowns of `layout`."""
     starts = ((other.find(slot.name)[0].start, slot.size) for slot in layout.shared)
     return np.concatenate([np.arange(0), *(np.arange(start, start + size) for start, size in starts)])

@@ -1,4 +1,4 @@
-"""Families of systematic errors by name: one for each station, group of stations, pair or kind."""
+"""Systematic errors (biases): families with one unknown for each station, group of stations, pair, kind or target."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from optloc.problem.validation import check_unknowns
 Per = Literal["station", "pair", "kind", "target"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
-# Slots of the layout that are not biases: a bias of such a name would hide one.
+# Names of other unknowns in the layout. A bias with one of these names would hide that unknown.
 _TAKEN = ("position", "velocity", "acceleration", "emission", "stations", "station velocities")
 
 
@@ -40,47 +40,52 @@ def with_bias(
     rate_density: ArrayLike | None = None,
     knots: int | ArrayLike | None = None,
 ) -> Problem:
-    """Return the problem with one more family of unknown systematic errors.
+    """Return the problem with one more family of unknown systematic errors (biases).
 
     Parameters
     ----------
     problem : Problem
-        A problem; its earlier biases stay.
+        A problem. Its existing biases stay.
     name : str
         Name of the family, for instance "clock".
     per : "station", "pair", "kind" or "target"
-        Who has an error of its own: a station, entering with the sign of its arrival; a pair of stations; all rows of
-        a kind together; or all rows of a target, such as the frequency of an emitter.
+        Which rows share one error. "station": all rows of a station; the error has the sign with which the station's
+        arrival enters the row. "pair": all rows of a pair of stations. "kind": all rows of a kind. "target": all rows
+        of a target, for instance the frequency offset of an emitter.
     form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
-        Added to the measurement; times the measured quantity; times the seconds since the first epoch; a turn of the
-        station's axes; the seconds by which the station is further along its course than its positions say; or added,
-        and another at each epoch: a random walk, as of a clock, or a smooth function of time.
+        How the error enters the measurement. "offset": the error is added. "scale": the error is multiplied by the
+        measured quantity. "drift": the error is multiplied by the seconds since the first epoch. "rotation": the axes
+        of the station are turned. "time": the station is ahead on its course by this number of seconds. "walk": an
+        added error that changes between epochs as a random walk, for instance a clock. "spline": an added error that is
+        a smooth function of time.
     kind : str, optional
-        Kind of the rows that are touched; all by default, for a rotation all that are measured in axes of stations, for
-        a time all that have stations.
+        Kind of the affected rows. Default: all kinds; for a rotation all kinds that are measured in station axes, for a
+        time all kinds that involve stations.
     members : sequence of str, or mapping of str to sequence of str, optional
-        Stations (or pairs, "A-B", or targets, "0") that have one, all that measure by default; or groups of stations
-        that share one, by the name of the group. Of differences alone, leave out the reference: what all stations
-        share has no effect.
+        Stations (or pairs, "A-B", or targets, "0") that have an error; by default all that measure. A mapping gives
+        groups of stations that share one error, by group name. If all rows are differences, leave out the reference
+        station: an error that all stations share has no effect.
     mean : float, str or array (q,) or (q, 3)
-        Prior mean of each member, or text such as "20 ns". Bare numbers are in the SI unit of the measurements, 1 for a
-        scale, unit per second for a drift, radians for a rotation (three angles in space), seconds for a time.
+        Prior mean of each member, or text such as "20 ns". The unit of bare numbers is the SI unit of the measurements;
+        1 for a scale, unit per second for a drift, radians for a rotation (three angles in space), seconds for a time.
     sigma : float, str or array like `mean`, optional
-        Prior standard deviation; None: unknown. Of a walk they are those of its value at the first epoch.
+        Prior standard deviation. None: there is no prior. For a walk, mean and sigma apply to the value at the first
+        epoch.
     density : float or array (q,), optional
-        Of a walk: spectral density of the white noise that it is the sum of, square of the unit of the rows per second:
-        after t seconds it has gone ``sqrt(density * t)``.
+        For a walk: spectral density of its white noise, in the squared unit of the rows per second. After t seconds the
+        standard deviation of the change is ``sqrt(density * t)``.
     rate_density : float or array (q,), optional
-        Of a walk with a rate: density of the noise which that is the sum of, per second cubed. Clocks have both:
-        `optloc.problem.clock_densities` makes them of Allan deviations.
+        For a walk with a rate: spectral density of the white noise of the rate, squared unit per second cubed. Clocks
+        have both densities; `optloc.problem.clock_densities` computes them from Allan deviations.
     knots : int or array (p,), optional
-        Of a spline: times in seconds between which it is a cubic polynomial, or how many evenly spaced ones.
+        For a spline: times of the knots in seconds, or the number of evenly spaced knots. Between two knots the spline
+        is a cubic polynomial.
 
     Raises
     ------
     InvalidProblem
-        Naming the bias and what is wrong: a name that is taken, an unknown kind or member, a member that touches no
-        row, rows of several quantities, a rotation of rows without axes, a prior that does not fit.
+        For a name in use, an unknown kind or member, or a member without rows. For rows of several quantities, a
+        rotation of rows without axes, or a prior that does not fit.
     """
     where = f"bias {name!r}"
     bias = family(problem.rows, problem.stations.names, name, per=per, form=form, kind=kind, members=members)
@@ -99,7 +104,7 @@ def with_bias(
 
 
 def _quantity(problem: Problem, bias: Bias) -> Quantity:
-    """Return the quantity of the values of a bias; plain where they have no unit, or are angles per second."""
+    """Return the physical quantity of the values of a bias; "plain" if they have no unit or are angles per second."""
     form = form_of(bias)
     if form.quantity is not None:
         return form.quantity
@@ -121,10 +126,10 @@ def family(
     targets: Sequence[str] | None = None,
     where: str | None = None,
 ) -> Bias:
-    """Return a bias without prior over the rows of a problem; arguments as `with_bias`.
+    """Return a bias without a prior over the given rows; other arguments as for `with_bias`.
 
-    A bias of azimuths that were all read clockwise is clockwise: its coefficients are negative. A time along a course
-    has no such sense.
+    If all azimuths that the bias affects were read clockwise, its values are clockwise too: its coefficients are
+    negative. A bias of the form "time" has no sense of rotation.
 
     Parameters
     ----------
@@ -135,20 +140,20 @@ def family(
     targets : sequence of str, optional
         Names of the targets; their numbers by default.
     where : str, optional
-        Place that complaints name; the bias by default.
+        Location that error messages name. Default: the name of the bias.
     """
     where = where or f"bias {name!r}"
     if not name or name.partition("[")[0] in _TAKEN:
-        advice = f"other unknowns are called {', '.join(_TAKEN)}"
+        advice = f"choose another name; reserved are {', '.join(_TAKEN)}"
         raise InvalidProblem(f"the name {name!r} is taken" if name else "the name is empty", where, advice)
     for value, known, what in ((per, get_args(Per), "per"), (form, tuple(FORMS), "form")):
         if value not in known:
             raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
-    # Who has an error decides how members are named, and with which sign a row feels it.
+    # `per` decides the names of the members and the sign with which each row depends on them.
     found = FORMS[form]
     touched = _select_rows(rows, found, kind, where)
     if not found.of_readings and per != "station":
-        raise InvalidProblem("a time along a course is one of a station", where, "use per = 'station', or groups")
+        raise InvalidProblem("a time along a course belongs to one station", where, "use per = 'station', or groups")
     if per == "kind":
         if members is not None:
             raise InvalidProblem("a kind has no members", where, "leave members out, or use per = 'station'")
@@ -160,19 +165,19 @@ def family(
     else:
         names, touches = _by_station(touched, found, stations, members, where)
     row, member, coefficient = (np.concatenate(parts) for parts in zip(*touches, strict=True))
-    # A member without a row would be an unknown that nothing determines.
+    # No measurement would determine a member without rows.
     idle = sorted(set(range(len(names))) - set(member.tolist()))
     if idle:
-        raise InvalidProblem(f"{names[idle[0]]} touches no row", f"{where}, members", "leave it out")
+        raise InvalidProblem(f"{names[idle[0]]} affects no row", f"{where}, members", "leave it out")
     if found.of_readings:
         coefficient = coefficient * _sense(rows, row)
     return Bias(name, names, row, member, coefficient, form, np.zeros(1))
 
 
 def _sense(rows: Sequence[Rows], touched: Array) -> float:
-    """Return the sense of a bias that touches rows of given global numbers: -1 where all their azimuths are clockwise.
+    """Return -1 if all azimuths among the rows with these global numbers were read clockwise, otherwise 1.
 
-    Elevations beside them have no sense of their own.
+    Elevations among these rows do not affect the result.
     """
     ends = np.cumsum([block.count for block in rows])
     blocks = [rows[i] for i in np.unique(np.searchsorted(ends, touched, side="right"))]
@@ -181,7 +186,7 @@ def _sense(rows: Sequence[Rows], touched: Array) -> float:
 
 
 def _select_rows(rows: Sequence[Rows], form: BiasForm, kind: str | None, where: str) -> list[tuple[Rows, int]]:
-    """Return the blocks of rows that a bias may touch, each with the global number of its first row."""
+    """Return the blocks of rows that a bias can affect, each with the global number of its first row."""
     starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
     kinds = [block.kind for block in rows]
     if kind is not None and kind not in kinds:
@@ -196,14 +201,14 @@ def _select_rows(rows: Sequence[Rows], form: BiasForm, kind: str | None, where: 
         raise InvalidProblem(f"no rows depend on the {of}", where, "leave the bias out")
     if form.enters == "turns" and not MODELS[chosen[0][0].kind].axes:
         raise InvalidProblem(f"{kind} has no axes that could be turned", where, "use the form offset")
-    # One number cannot be metres for one row and radians for another.
+    # One value cannot be in metres for one row and in radians for another.
     if form.of_readings and len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
-        raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
+        raise InvalidProblem("the rows measure different quantities", where, "name the kind of the rows")
     return chosen
 
 
 def _touch(row: Array, member: Array, sign: float) -> _Touch:
-    """Return row, member and coefficient where there is a member."""
+    """Return row numbers, member numbers and coefficients of the entries that have a member (member >= 0)."""
     inside = member >= 0
     return row[inside], member[inside], np.full(int(inside.sum()), sign)
 
@@ -217,8 +222,8 @@ def _by_kind(touched: list[tuple[Rows, int]]) -> list[_Touch]:
 def _by_pair(
     touched: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Touch]]:
-    named = (*stations, "")  # index -1, no station, is the last
-    # A pair as one number; a missing second station (-1) counts as the unnamed one behind the others.
+    named = (*stations, "")  # the last entry is index -1, no station
+    # Each pair has one number. A missing second station (-1) counts as an extra station with an empty name.
     codes = [block.a * len(named) + block.b % len(named) for block, _ in touched]
     found = np.unique(np.concatenate(codes))
     present = tuple("-".join(filter(None, (named[i // len(named)], named[i % len(named)]))) for i in found.tolist())
@@ -238,11 +243,11 @@ def _by_target(
     found = np.unique(np.concatenate([block.target for block, _ in touched]))
     present = {int(i): str(i) if targets is None else targets[i] for i in found if i >= 0}
     if isinstance(members, Mapping) or not present:
-        what = "no row says whose it is" if not present else "targets have no groups"
+        what = "no row has a target" if not present else "targets have no groups"
         raise InvalidProblem(what, f"{where}, members", "name the targets")
     known = tuple(present.values())
     names = known if members is None else _check_names(members, known, "target", where)
-    # rows without a target have none of these errors: index -1 is the last
+    # Rows without a target (-1) index the last entry, so they have no error.
     place = np.full(max(present, default=0) + 2, -1)
     for i, label in present.items():
         place[i] = names.index(label) if label in names else -1
@@ -260,7 +265,7 @@ def _by_station(
         used = [stations[i] for i in measuring.tolist() if i >= 0]
         names = tuple(used) if members is None else _check_names(members, stations, "station", where)
         owner = {name: i for i, name in enumerate(names)}
-    place = np.array([*(owner.get(name, -1) for name in stations), -1])  # index -1, no station, is the last
+    place = np.array([*(owner.get(name, -1) for name in stations), -1])  # the last entry is index -1, no station
     return names, [
         _touch(start + np.arange(block.count), place[index], float(sign))
         for block, start in touched
@@ -270,7 +275,7 @@ def _by_station(
 
 
 def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where: str) -> Iterator[tuple[str, int]]:
-    """Yield each station of a group with the number of its group."""
+    """Yield each station of a group with the number of the group."""
     seen: set[str] = set()
     for i, (group, names) in enumerate(members.items()):
         for name in _check_names(names, stations, "station", f"{where}, {group!r}"):
@@ -281,7 +286,7 @@ def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where
 
 
 def _check_names(given: Sequence[str], known: Sequence[str], what: str, where: str) -> tuple[str, ...]:
-    """Return names that are known and differ."""
+    """Return the given names as a tuple; raise if the list is empty, or if a name is unknown or repeated."""
     names = (given,) if isinstance(given, str) else tuple(given)
     place = f"{where}, members"
     unknown = [name for name in names if name not in known]
@@ -289,12 +294,14 @@ def _check_names(given: Sequence[str], known: Sequence[str], what: str, where: s
         raise InvalidProblem(f"there is no {what} {unknown[0]!r}", place, nearest(unknown[0], list(known)))
     if not names or len(set(names)) < len(names):
         twice = next((name for name in names if names.count(name) > 1), None)
-        raise InvalidProblem("no one is named" if twice is None else f"{twice} is named twice", place, "name each once")
+        raise InvalidProblem(
+            "no name is given" if twice is None else f"{twice} is named twice", place, "name each once"
+        )
     return names
 
 
 def _each(values: Any, shape: tuple[int, ...], where: str, what: str) -> Array:
-    """Return one value for each member (and angle) of what may be one for all, or one for each member."""
+    """Return the values as an array of the given shape. The input has one value for all members, or one for each."""
     array = np.asarray(numbers(values, f"{where}, {what}"))
     if array.shape == shape[:1]:
         array = array.reshape(*array.shape, *(1,) * (len(shape) - 1))
@@ -302,38 +309,39 @@ def _each(values: Any, shape: tuple[int, ...], where: str, what: str) -> Array:
         array = array.reshape(shape)
     if array.ndim and array.shape[0] != shape[0]:
         raise InvalidProblem(
-            f"{what} has {array.size} entries for {shape[0]} members", where, "give one, or one for each member"
+            f"{what} has {array.size} entries for {shape[0]} members", where, "give one value, or one for each member"
         )
     return np.array(np.broadcast_to(array, shape))
 
 
-# Biases that were learnt elsewhere: taken as known, they leave the problem.
+# Biases that an earlier run determined: with known values they are no longer unknowns of the problem.
 
 
 def with_known_bias(problem: Problem, name: str, values: ArrayLike | Mapping[str, float]) -> Problem:
-    """Return the problem with one of its families of biases taken as known.
+    """Return the problem with one family of biases fixed at known values.
 
-    Learn on one run, apply to another: ``with_known_bias(later, "clock", fix.take("clock"))``.
+    Estimate a bias in one run and apply it to another: ``with_known_bias(later, "clock", fix.take("clock"))``.
 
     Parameters
     ----------
     problem : Problem
-        Has the family among its biases.
+        A problem that has this family of biases.
     name : str
         Name of the family.
     values : array (q,) or (q, 3), or mapping of str to number
-        Value of each member in the order of the family, in its unit (radians for a rotation, seconds for a time), or by
-        the name of the member; members that a mapping lacks have none.
+        Value of each member in the order of the family, in its unit (radians for a rotation, seconds for a time). A
+        mapping gives the values by member name; members that it lacks get zero.
 
     Returns
     -------
     Problem
-        Without the family: its rows are corrected, the axes of its stations turned, or these moved along.
+        The problem without the family. Its rows are corrected, or the axes of its stations turned, or its stations
+        moved along their courses.
 
     Raises
     ------
     InvalidProblem
-        Where there is no such family or member, or values do not fit.
+        If there is no such family or member, or if the values do not fit.
     """
     names = [bias.name for bias in problem.biases]
     if name not in names:
@@ -347,7 +355,7 @@ def with_known_bias(problem: Problem, name: str, values: ArrayLike | Mapping[str
 
 
 def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
-    """Return values of a shape in the order of the members."""
+    """Return the values as an array of the given shape, in the order of the members."""
     where = f"values of {bias.name!r}"
     if isinstance(values, Mapping) and form_of(bias).steps is not None:
         raise InvalidProblem("a walk has values at every epoch", where, f"give an array of shape {shape}")
@@ -360,19 +368,19 @@ def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
     if array.size != np.prod(shape):
         raise InvalidProblem(f"there are {array.size} values", where, f"give an array of shape {shape}")
     if not np.isfinite(array).all():
-        raise InvalidProblem("a value is not finite", where, "take the biases of a fix that has an answer")
+        raise InvalidProblem("a value is not finite", where, "use the biases of a fix that has an answer")
     return array.reshape(shape)
 
 
 def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
-    """Return the problem with offsets, drifts or scales in the known corrections of its rows."""
+    """Return the problem with known offsets, drifts or scales added to the corrections of its rows."""
     form, amount, epoch = form_of(bias), np.zeros(problem.count), problem.epoch[bias.row]
     entry, factor = form.effects(bias, problem.times, problem.origin, epoch)
     values = known.ravel()[entry] if form.steps is None else known[epoch[:, None], entry]
     np.add.at(amount, bias.row, (factor * values).sum(1))
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
-        # What the measurement exceeds the model by; for a scale it depends on the measurement: z = h (1 + s).
+        # The correction is measured minus modelled. For a scale, z = h (1 + s), it depends on the measurement.
         own: Any = amount[start : start + block.count]
         if form.enters == "scales":
             own = (block.z - block.correction) * own / (1.0 + own)
@@ -381,14 +389,14 @@ def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
 
 
 def _turn(problem: Problem, bias: Bias, known: Array) -> Problem:
-    """Return the problem with the axes of its stations turned."""
+    """Return the problem with the axes of its stations turned by the known angles."""
     d, stations = problem.dimension, problem.stations
     turn = np.zeros((stations.count, 1 if d == 2 else 3))
     first = np.concatenate([block.a for block in problem.rows])[bias.row]
     turn[first] = bias.coefficient[:, None] * known.reshape(len(known), -1)[bias.member]
     axes = np.eye(d) + np.zeros((1, stations.count, d, d)) if stations.axes is None else stations.axes
     own = tuple(tuple(axes[..., i, c] for c in range(d)) for i in range(d))
-    # `rotate` is the function that rows of an unknown turn are modelled with, so that known and unknown agree.
+    # The model of rows with unknown turns uses the same `rotate`, so known and estimated turns agree.
     rows = rotate(own, tuple(turn[:, c] for c in range(turn.shape[1])))
     return replace(
         problem, stations=replace(stations, axes=np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))
@@ -396,7 +404,7 @@ def _turn(problem: Problem, bias: Bias, known: Array) -> Problem:
 
 
 def _move(problem: Problem, bias: Bias, known: Array) -> Problem:
-    """Return the problem with stations further along their courses."""
+    """Return the problem with its stations moved along their courses by the known times."""
     stations, seconds = problem.stations, np.zeros((problem.stations.count, 1))
     for index, side in (("a", 1.0), ("b", -1.0)):
         here = bias.coefficient == side
@@ -409,22 +417,22 @@ def _move(problem: Problem, bias: Bias, known: Array) -> Problem:
     return replace(problem, stations=moved)
 
 
-# Stations that are further along their courses than is said.
+# Stations that are further along their courses than their stated positions.
 
-# Of the Earth (WGS 84): m^3/s^2, rad/s, m; and metres above it from which what moves falls freely.
+# Earth constants (WGS 84): m^3/s^2, rad/s, m. Last: the altitude in metres above which a station counts as a satellite.
 _GM, _TURN, _RADIUS, _SKY = 3.986004418e14, 7.292115e-5, 6378137.0, 1e5
 
 
 def course(problem: Problem) -> tuple[Array, Array]:
-    """Return velocity and acceleration (k or 1, s, d) of the stations.
+    """Return the velocity and the acceleration (k or 1, s, d) of the stations, m/s and m/s^2.
 
-    What is above the air falls freely around the turning Earth, its flattening left out (0.02 of 8 m/s^2 in a low
-    orbit); all else keeps its velocity for the second or so that a station may be further along.
+    A station more than 100 km above the Earth is in free fall around the rotating Earth; the flattening is ignored
+    (0.02 of 8 m/s^2 in a low orbit). All other stations keep their velocity: a time error is only about a second.
 
     Parameters
     ----------
     problem : Problem
-        Its stations have velocities, the same in all problems of a batch.
+        A problem whose stations have velocities, the same in all problems of a batch.
 
     References
     ----------
@@ -445,26 +453,26 @@ def course(problem: Problem) -> tuple[Array, Array]:
     return velocity, np.where(away > _RADIUS + _SKY, fall @ turn, 0.0)
 
 
-# A speed that is not quite known: the times are too long or too short by one factor, whose error is a scale.
+# Unknown propagation speed: all times have the same relative error, which is a scale bias.
 
 SPEED = "speed"
-"""Name of the scale of times by the stated speed."""
+"""Name of the scale bias for a propagation speed with a stated sigma."""
 
 
 def scale_of(speed: float, sigma: float, rows: Sequence[Array], place: str) -> Bias:
-    """Return the scale of times for a stated speed with a sigma, with its prior.
+    """Return the scale bias, with its prior, for a propagation speed with a stated sigma.
 
-    Times multiplied by the stated speed are ranges times the stated over the true speed. This factor less one is the
-    scale. Its member has the name of the stated speed.
+    A time multiplied by the stated speed is the range multiplied by stated speed / true speed. The scale is this
+    quotient minus one. The name of its only member is the stated speed.
 
     Parameters
     ----------
     speed, sigma : float
-        The stated speed and its standard deviation, metres per second.
+        Stated speed and its standard deviation, metres per second.
     rows : sequence of int array (m,)
-        Global numbers of the rows that are times.
+        Global numbers of the rows that were measured as times.
     place : str
-        Place to name.
+        Location that error messages name.
     """
     touched = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
     if not len(touched):
@@ -474,12 +482,12 @@ def scale_of(speed: float, sigma: float, rows: Sequence[Array], place: str) -> B
 
 
 def estimated_speed(name: str, member: str, value: float, sigma: float) -> tuple[float, float] | None:
-    """Return the speed and its sigma, metres per second, from the estimate of a scale by `scale_of`; None for others.
+    """Return the speed and its sigma, m/s, from the estimate of a bias by `scale_of`; None for other biases.
 
     Parameters
     ----------
     name, member : str
-        Of a bias and of its member.
+        Names of the bias and of its member.
     value, sigma : float
         The estimated scale and its standard deviation.
     """

@@ -1,4 +1,4 @@
-"""Put a problem together from arrays: stations, a few lines of measurements, noise."""
+"""Build a problem from arrays: `measured` makes rows of one kind, `assemble` joins rows, stations and noise."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from optloc.problem.validation import check_values, checked
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Rows of one kind together with their noise, before they are put into a problem.
+    """Rows of one kind with their noise, as input of `assemble`.
 
     Parameters
     ----------
     rows : Rows
-        The rows.
+        The measurements.
     variance : array (..., m), optional
         Independent variance of each row.
     arrival : array (..., s) or (), optional
-        Variance of what each station measures by itself; rows that share a station and an epoch are then correlated.
-        It adds to `variance`.
+        Variance of the quantity that each station measures, such as its arrival time. Rows that share a station and an
+        epoch are then correlated. It is added to `variance`.
     covariance : array (..., m, m), optional
         Full covariance of these rows.
     signal : Signal, optional
-        What their noise follows from.
+        Signal parameters from which the noise follows.
     """
 
     rows: Rows
@@ -124,45 +124,45 @@ def measured(
     kind : str
         A key of `optloc.models.MODELS`, for instance "tdoa", or one of its aliases.
     z : array (..., m), optional
-        Measured values: metres, metres per second, radians or ratios, or texts with a unit such as "20 ns"; None to be
-        simulated. A time is multiplied by the speed of light.
+        Measured values in metres, metres per second, radians or ratios, or texts with a unit such as "20 ns". A time is
+        multiplied by the speed of light. None for rows that are simulated later.
     a, b : int array (m,) or int
         Stations of each row, as indices.
     sigma : float, str or array (..., m), optional
-        Standard deviation of each row, in SI units or text such as "20 ns"; rows are then independent.
+        Standard deviation of each row, in SI units or text such as "20 ns". Rows are independent.
     arrival_sigma : float, str or array (..., s), optional
-        Standard deviation of what each station measures by itself, in the unit of z: its arrival time (times c), its
-        range rate; rows get the covariance D diag(sigma^2) D'. With `sigma` as well, the two add.
+        Standard deviation of the quantity that each station measures, in the unit of z: its arrival time (times c) or
+        its range rate. Rows then have the covariance D diag(sigma^2) D'. With `sigma` as well, the two covariances add.
     covariance : array (..., m, m), optional
-        Full covariance of these rows, in the place of both.
+        Full covariance of these rows. It replaces `sigma` and `arrival_sigma`.
     signal : Signal, optional
-        Signal-to-noise ratios, bandwidth and duration from which the noise of time differences and gain ratios
-        follows, in the place of all three.
+        Signal-to-noise ratios, bandwidth and duration that determine the noise of time differences and gain ratios. It
+        replaces `sigma`, `arrival_sigma` and `covariance`.
     epoch, target : int array (m,) or int
         Epoch and target of each row.
     weight : float or array (..., m)
-        1 for a row as measured, 0 for an absent one.
+        1 for a present row, 0 for an absent one.
     correction : float or array (..., m)
-        Known amount by which the measurement exceeds the model.
+        Known error of the measurement: measured minus modelled.
 
     Returns
     -------
     Measured
-        To be given to `assemble`.
+        Input of `assemble`.
 
     Raises
     ------
     InvalidProblem
-        For an unknown kind, missing stations or a noise given not exactly once.
+        For an unknown kind, for missing stations, or unless exactly one description of the noise is given.
     """
     if str(kind).strip().lower() == BEARING:
         advice = "use optloc.locate(bearings=...), or 'azimuth' in radians from the first axis towards the second"
-        raise InvalidProblem("a bearing is degrees from north, and measurements in memory are not", "kind", advice)
+        raise InvalidProblem("a bearing is in degrees from north, and arrays are in radians", "kind", advice)
     kind = kind_named(kind)
     model = MODELS[kind]
     quantity = cast("Quantity", model.quantity)
     correction = in_si(correction, quantity, "correction")
-    # Everything becomes arrays first, so that what follows speaks of shapes and never of types.
+    # All values become arrays here, so that the code below handles shapes only and no other types.
     z, sigma, arrival_sigma = (
         numbers(in_si(z, quantity, "z"), "z"),
         as_deviations(in_si(sigma, quantity, "sigma", deviation=True), "sigma", kind),
@@ -205,14 +205,14 @@ def measured(
 
 
 def _filled(values: Any, shape: tuple[int, ...], dtype: Any = float) -> Array:
-    """Return a copy of values as an array of a shape: a caller may write into its own arrays afterwards."""
+    """Return a new array of the given shape with these values: a copy, since callers may change their arrays."""
     out = np.empty(shape, dtype)
     out[...] = values
     return out
 
 
 def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> None:
-    """Refuse all but one of: a covariance; a signal; standard deviations, of rows, of arrivals, or of both."""
+    """Raise unless the noise is given exactly once: by a covariance, a signal, or standard deviations."""
     if sum((covariance is not None, signal is not None, deviations)) != 1:
         advice = "give covariance, or signal, or sigma, or arrival_sigma, or the last two together"
         raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
@@ -221,16 +221,18 @@ def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> N
 
 
 def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:
-    """Return the number of rows of measurements; refuse arguments that disagree about it."""
+    """Return the number of rows; raise if the arguments have different numbers of rows."""
     sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
-    # A single number stands for all rows; without any array there is one row.
+    # A single number applies to all rows. Without any array there is one row.
     count = max(sizes, default=1)
     if covariance is not None and covariance.shape[-2:] != (count, count):
         raise InvalidProblem(
             f"the covariance of {kind} has shape {covariance.shape}", "covariance", f"give one of {count} x {count}"
         )
     if any(size not in (1, count) for size in sizes):
-        raise InvalidProblem(f"arguments of {kind} have {sorted(set(sizes))} rows", where=kind, advice="give one each")
+        raise InvalidProblem(
+            f"arguments of {kind} have {sorted(set(sizes))} rows", where=kind, advice="give arrays of equal length"
+        )
     return count
 
 
@@ -246,14 +248,14 @@ def assemble(
     constraints: Sequence[Band | Polygon | Sequence[Band | Polygon]] = (),
     medium: Medium | None = None,
 ) -> Problem:
-    """Return a problem, or a batch of problems where arrays have leading axes.
+    """Return a problem, or a batch of problems if the arrays have leading axes.
 
     Parameters
     ----------
     stations : Stations, or array (s, d), or array (..., k, s, d)
         Positions in metres.
     *measurements : Measured
-        One or more of `measured`.
+        One or more results of `measured`.
     times : array (k,), optional
         Seconds of each epoch; 0, 1, 2 ... by default.
     motions : sequence of Motion
@@ -263,22 +265,22 @@ def assemble(
     priors : sequence of Prior
         Prior knowledge of named unknowns.
     frame : Frame
-        What the coordinates mean.
+        Coordinate frame.
     covariance : array (..., m, m), optional
-        Covariance of all rows together, across kinds; replaces what the measurements say.
+        Joint covariance of all rows, across kinds. It replaces the noise of the measurements.
     constraints : sequence of Band, Polygon or tuples of them
-        What the answer must meet, see `optloc.linear.constraints`.
+        Conditions that the answer must meet, see `optloc.linear.constraints`.
     medium : Layers or Atmosphere, optional
-        What the waves come through where their speed is not one number: rows are then measured along its rays.
+        Medium of the waves if their speed is not constant. Rows are then measured along rays of the medium.
 
     Raises
     ------
     InvalidProblem
-        Naming the argument, row or station that cannot be right.
+        If the input is not a valid problem. The message names the argument, row or station.
     """
     if not measurements:
         raise InvalidProblem("there are no measurements", where="measurements", advice="give at least one")
-    # Epochs without rows are epochs all the same where later ones have some.
+    # Epochs without rows count if a later epoch has rows.
     epochs = 1 + max(int(m.rows.epoch.max(initial=0)) for m in measurements)
     made = Problem(
         stations if isinstance(stations, Stations) else station_array(stations),
@@ -304,25 +306,25 @@ def assemble(
 
 
 class _Template(NamedTuple):
-    """Checked noise and indices, the same for all problems that differ in their measurements alone."""
+    """Checked noise and derived indices that problems share if they differ only in their measured values."""
 
     noise: noises.Noise
     derived: dict[str, Any]
 
     @property
     def size(self) -> int:
-        """Return about how many numbers it takes: 500 for objects, its covariances, and ten a row for the key."""
+        """Return the approximate size in numbers: 500 for objects, the covariances, and ten per row for the key."""
         return 500 + sum(10 * block.row.size + block.covariance.size for block in self.noise.blocks)
 
 
-# 8 MB of numbers: some 2 000 structures of few rows.
+# 8 MB of numbers: about 2 000 structures with few rows.
 _TEMPLATES = Cache[_Template](2**20, lambda template: template.size)
-# Cached properties of a problem, none of which depends on its measurements.
+# Cached properties of a problem. None of them depends on the measured values.
 _DERIVED = ("starts", "layout", "batch_shape", "structure")
 
 
 def _key(made: Problem, measurements: Sequence[Measured], full: Array | None, medium: Medium | None) -> Any:
-    """Return a key of everything in a problem except the values of its measurements; None for large problems."""
+    """Return a key of all content of a problem except its measured values; None for large problems."""
     rows = [(r.kind, r.z.shape, r.a, r.b, r.epoch, r.target, r.weight, r.correction) for r in made.rows]
     noise = [(m.variance, m.arrival, m.covariance, m.signal) for m in measurements]
     rest = (made.times, made.motions, made.biases, made.priors, made.frame, made.constraints)
@@ -330,13 +332,13 @@ def _key(made: Problem, measurements: Sequence[Measured], full: Array | None, me
 
 
 def _template(made: Problem) -> _Template:
-    # Copies: a covariance may be the caller's array.
+    # Copied, because a covariance may be the caller's array.
     noise = noises.Noise(tuple(noises.Block(b.row, np.array(b.covariance)) for b in made.noise.blocks))
     return _Template(noise, {name: getattr(made, name) for name in _DERIVED})
 
 
 def _complete(made: Problem, measurements: Sequence[Measured], full: Array | None, medium: Medium | None) -> Problem:
-    """Return a problem with its noise and medium; raise InvalidProblem where it cannot be right."""
+    """Return the problem with its noise and medium; raise InvalidProblem if the input is invalid."""
     if full is None:
         parts = zip(measurements, made.starts, strict=True)
         noise = noises.group([block for m, start in parts for block in _noise(m, start, made.stations.count)])
@@ -357,23 +359,23 @@ def station_array(
     velocity: ArrayLike | None = None,
     axes: ArrayLike | None = None,
 ) -> Stations:
-    """Return stations.
+    """Return stations from arrays of positions, velocities and axes.
 
     Parameters
     ----------
     position : array (s, d), or (..., k, s, d)
-        Metres; with an axis of epochs where they move or differ from problem to problem.
+        Metres. The epoch axis k is needed if stations move, or if positions differ between problems.
     names : sequence of s str, optional
         Unique names; S0, S1, ... by default.
     velocity : array (s, d), or (..., k, s, d), optional
-        Metres per second; range rates need it of stations that move.
+        Metres per second. Range rates need it if stations move.
     axes : array (s, d, d), or (..., k, s, d, d), optional
-        Rows are the unit vectors of each station's own axes; the frame's axes by default.
+        Axes of each station: the rows of each matrix are unit vectors. Default: the axes of the frame.
 
     Raises
     ------
     InvalidProblem
-        Where positions are no such array, or numbers are none.
+        If the positions do not have such a shape, or if values are not numbers.
     """
     array = np.asarray(numbers(in_si(position, "length", "stations", place=True), "stations"))
     if array.ndim < 2 or array.shape[-1] not in (2, 3):
@@ -382,7 +384,7 @@ def station_array(
         )
     labels = tuple(names) if names is not None else tuple(f"S{i}" for i in range(array.shape[-2]))
     rates, own = (None if v is None else np.asarray(numbers(v, "stations")) for v in (velocity, axes))
-    # Stations that stay have an epoch axis of length one.
+    # For stations at rest the epoch axis has length one.
     return Stations(_dated(array, 2), labels, _dated(rates, 2), _dated(own, 3))
 
 
@@ -412,22 +414,25 @@ def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
 def _signal_blocks(m: Measured, start: int, stations: int, signal: Signal) -> list[noises.Block]:
     if len(signal.snr) != stations:
         what = f"there are {len(signal.snr)} signal-to-noise ratios for {stations} stations"
-        raise InvalidProblem(what, "signal", "give one for each station, NaN for those that take no part")
+        raise InvalidProblem(what, "signal", "give one for each station, NaN for stations that do not take part")
     rows = m.rows
     groups = noises.group_members(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target)
     return [noises.Block(start + g, signal.covariance(rows.kind, rows.a[g], rows.b[g])) for g in groups]
 
 
 def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Block]:
-    """Return one block for each epoch and target: its rows combine the same arrivals, and have noise of their own."""
+    """Return one noise block for each epoch and target, because its rows combine the same arrivals.
+
+    The block is the covariance of the arrivals plus the independent variance of each row.
+    """
     rows, signs = m.rows, MODELS[m.rows.kind].signs
     if signs is None:
-        what = f"{rows.kind} does not add up what single stations measure"
+        what = f"{rows.kind} is not a sum of measurements of single stations"
         raise InvalidProblem(what, "arrival_sigma", "give sigma or covariance")
     blocks = []
-    # Each epoch and target has arrivals of its own; a key for each pair of them, -1 (no target) included.
+    # Arrivals of different epochs or targets are independent. The key is unique for each pair, and -1 is no target.
     for members in noises.group_members(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target):
-        # D diag(sigma^2) D' of the members: a station that two rows share correlates them, by the product of its
+        # D diag(sigma^2) D' of these rows: two rows that share a station are correlated, with the product of the two
         # signs.
         covariance = noises.arrivals([(rows.a[members], signs[0]), (rows.b[members], signs[1])], variance)
         if m.variance is not None:

@@ -1,8 +1,9 @@
-"""Where a fix is Gaussian: in metres, or in the inverse of the distance from the stations' middle, or in neither.
+"""Coordinates in which the error of a fix is Gaussian: metres, or inverse range, or neither.
 
-Seen from the middle c of the stations the position is ``x = c + (r / w)(u0 + B p)``: r and u0 are distance and
-direction of the fix, B spans what is across u0, p is a direction and w an inverse range. The fix is p = 0, w = 1;
-infinity is w = 0, a point like others. A distant emitter is curved in metres and Gaussian in ``y = (p, w)``.
+With the mean c of the stations as origin, a position is ``x = c + (r / w)(u0 + B p)``. Here r and u0 are the distance
+and the direction of the fix. The columns of B are orthogonal to u0. p is a direction and w an inverse range. The fix is
+p = 0, w = 1. Infinity is w = 0, a regular point. The error of a distant emitter is curved in metres and Gaussian in
+``y = (p, w)``.
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ from optloc.models.primitives import wrap
 from optloc.problem.truncated import HELD, Truncated, is_along
 
 CARTESIAN, INVERSE_RANGE, CURVED = range(3)
-"""Kinds of a chart: the Gaussian in metres covers, the one in (p, w) does, neither does."""
+"""Kinds of a chart, by the valid Gaussian: in metres, in y = (p, w), or neither."""
 
 NAMES = ("cartesian", "inverse range", "curved")
-"""What the kinds are called, in the order of their numbers."""
+"""Names of the kinds, in the order of their numbers."""
 
 TRUNCATED = "truncated"
-"""Name of a Cartesian chart where bounds cut the law off."""
+"""Name of a Cartesian chart if bounds truncate the distribution."""
 
 Extent = Literal["range", "bearing", "elevation", "height", "x", "y", "z"]
 
-# The region shows what a Gaussian cannot: a function of a higher floor, so the advice names it.
-_ADVICE = "ask `optloc.uncertainty.likelihood_region(problem, fix)` for the region that the data allow"
+# The advice names a function, because a module of a higher layer computes the region.
+_ADVICE = "use `optloc.uncertainty.likelihood_region(problem, fix)` for the region of the target"
 
 
 def distance_and_direction(position: Array, centre: Array) -> tuple[Array, Array]:
-    """Return distance r (...), metres, and direction u0 (..., d) of positions from centres, both (..., d).
+    """Return the distance r (...), metres, and the direction u0 (..., d) of positions (..., d) from centres (..., d).
 
-    At the centre itself, where r = 0, the direction is the first axis.
+    If the position is at the centre (r = 0), the direction is the first axis.
     """
     away = np.asarray(position - centre)
     r = np.sqrt((away**2).sum(-1))
@@ -47,7 +48,7 @@ def distance_and_direction(position: Array, centre: Array) -> tuple[Array, Array
 
 
 def basis(direction: Array) -> Array:
-    """Return orthonormal vectors (..., d, d - 1), in columns, across unit vectors (..., d) of two or three dimensions.
+    """Return d - 1 orthonormal vectors (..., d, d - 1), in columns, orthogonal to unit vectors (..., d), d = 2 or 3.
 
     References
     ----------
@@ -71,12 +72,13 @@ def to_chart(points: Array, position: Array, centre: Array) -> Array:
     points : array (..., d)
         Metres.
     position, centre : array (..., d)
-        The fix, which is p = 0 and w = 1, and the middle of the stations; they broadcast against the points.
+        The fix, at p = 0 and w = 1, and the mean of the stations. Both broadcast against the points.
 
     Returns
     -------
     array (..., d)
-        NaN where the fix is at the centre; w is negative for points behind the centre, infinite level with it.
+        NaN if the fix is at the centre. w is negative for points behind the centre, and infinite for points whose
+        direction from the centre is orthogonal to u0.
     """
     r, u0 = distance_and_direction(position, centre)
     away = points - centre
@@ -86,14 +88,14 @@ def to_chart(points: Array, position: Array, centre: Array) -> Array:
 
 
 def to_position(y: Array, position: Array, centre: Array) -> Array:
-    """Return the positions (..., d), metres, that have chart coordinates y (..., d); see `to_chart`."""
+    """Return the positions (..., d), metres, of chart coordinates y (..., d); see `to_chart`."""
     r, u0 = distance_and_direction(position, centre)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(centre + (r / y[..., -1])[..., None] * _ray(y, u0))
 
 
 def jacobian(y: Array, position: Array, centre: Array) -> Array:
-    """Return dx/dy (..., d, d) at chart coordinates y (..., d): at the fix it is [r B, -r u0]; see `to_chart`."""
+    """Return the Jacobian dx/dy (..., d, d) at chart coordinates y (..., d); at the fix it is [r B, -r u0]."""
     r, u0 = distance_and_direction(position, centre)
     shape = np.broadcast_shapes(y.shape, u0.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -111,12 +113,12 @@ def log_volume(y: Array, position: Array, centre: Array) -> Array:
 
 
 def _ray(y: Array, u0: Array) -> Array:
-    """Return u0 + B p."""
+    """Return the vectors u0 + B p (..., d) for chart coordinates y (..., d) and directions u0 (..., d)."""
     return np.asarray(u0 + (basis(u0) * y[..., None, :-1]).sum(-1))
 
 
 def quantile(probability: float, dimension: int) -> float:
-    """Return the quantile of chi-square with so many degrees of freedom.
+    """Return the quantile of the chi-square distribution with `dimension` degrees of freedom.
 
     Parameters
     ----------
@@ -133,7 +135,7 @@ def quantile(probability: float, dimension: int) -> float:
 
 
 def tail_probability(cost: Array, dof: Array) -> Array:
-    """Return the chi-square probability (...) of a cost at least this large; NaN without redundancy or cost."""
+    """Return the p-value (...), the chi-square probability of a cost at least this large; NaN without redundancy."""
     from scipy.special import gammaincc
 
     redundant = (dof > 0) & np.isfinite(cost)
@@ -142,23 +144,24 @@ def tail_probability(cost: Array, dof: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """The coordinates in which fixes are Gaussian.
+    """Coordinates in which the errors of fixes are Gaussian, with the parameters of the distribution.
 
     Parameters
     ----------
     kind : int8 array (...)
-        `CARTESIAN`: in metres, with `position` and `covariance`. `INVERSE_RANGE`: in the chart, with `mean` and
-        `spread`. `CURVED`: in neither, or there is no covariance.
+        `CARTESIAN`: Gaussian in metres, with `position` and `covariance`. `INVERSE_RANGE`: Gaussian in chart
+        coordinates, with `mean` and `spread`. `CURVED`: in neither, or there is no covariance.
     position : array (..., d)
         The fixes, metres.
     covariance : array (..., d, d)
-        The inverse of their information, square metres.
+        Inverse of the information matrix of the fixes, square metres.
     centre : array (..., d)
         Mean of the stations, metres.
     truncated : Truncated, optional
-        The normal laws that bounds cut off: for fixes in metres they replace `covariance`.
+        Normal distributions that bounds truncate. For Cartesian fixes they replace `covariance`.
     inflation : array (...), optional
-        Factors of the covariances of fixes with the finding `tails`, with which trackers start from them; else 1.
+        Factors by which trackers multiply the covariances when they start from the fixes: above 1 for fixes with the
+        finding `tails`, otherwise 1.
     """
 
     kind: Annotated[Array, Axes(0, empty=CURVED)]
@@ -170,9 +173,9 @@ class Chart:
 
     @property
     def name(self) -> Any:
-        """Return the name of the kind of a single fix, or an array (...) of names of a batch.
+        """Return the name of the kind of a single fix, or an array (...) of names for a batch.
 
-        Where bounds cut off the law of a fix in metres it is "truncated".
+        If bounds truncate the distribution of a Cartesian fix, its name is "truncated".
         """
         names = np.array([*NAMES, TRUNCATED])
         return names[self.kind] if self.truncated is None else np.where(self.cut_off, TRUNCATED, names[self.kind])[()]
@@ -189,7 +192,7 @@ class Chart:
 
     @property
     def basis(self) -> Array:
-        """Return B (..., d, d - 1): unit vectors across the direction, in columns."""
+        """Return B (..., d, d - 1): unit vectors, in columns, that are orthogonal to the direction."""
         return basis(self.direction)
 
     @property
@@ -208,7 +211,7 @@ class Chart:
     def spread(self) -> Array:
         """Return the covariance (..., d, d) of the chart coordinates at the fixes; infinite or NaN at the centre."""
         r, u0 = distance_and_direction(self.position, self.centre)
-        # The axes are orthonormal up to the length r: the inverse of the gradient is its transpose over r squared.
+        # The columns of the gradient are orthogonal with length r, so its inverse is its transpose over r squared.
         axes = np.concatenate([basis(u0), -u0[..., None]], axis=-1)
         turned = (self.covariance[..., :, :, None] * axes[..., None, :, :]).sum(-2)
         form = (axes[..., :, :, None] * turned[..., :, None, :]).sum(-3)
@@ -228,7 +231,7 @@ class Chart:
         return log_volume(np.asarray(y), self.position, self.centre)
 
     def distance_squared(self, points: Array) -> Array:
-        """Return squared distances of points from the fixes in standard deviations, in the coordinates that cover.
+        """Return squared distances of points from the fixes, in standard deviations, in the coordinates of the chart.
 
         Parameters
         ----------
@@ -238,40 +241,41 @@ class Chart:
         Returns
         -------
         array (...)
-            Chi-square distributed for the truth; infinite behind the centre in the inverse-range chart, NaN for
-            curved fixes. Where bounds cut the law off it is the chi-square value of the region of highest density
-            through the point, infinite beyond the bounds.
+            Chi-square distributed for the true position. Infinite for points behind the centre in the inverse-range
+            chart, NaN for curved fixes. If bounds truncate the distribution, the result is the chi-square value of the
+            highest-density region whose edge contains the point, and infinity outside the bounds.
         """
         away = np.asarray(points) - self.position
         dy = self.to_chart(points) - self.mean
-        # dy' G'A G dy: a step of the chart is one of metres by the gradient at the fix.
+        # dy' G'A G dy: the gradient at the fix converts a step in chart coordinates to metres.
         bent = (self.gradient * np.where(np.isfinite(dy), dy, 0.0)[..., None, :]).sum(-1)
         step = np.where((self.kind == INVERSE_RANGE)[..., None], bent, away)
         solved, known = linalg.solve(np.broadcast_to(self.covariance, (*step.shape, step.shape[-1])), step[..., None])
         form = (step * solved[..., 0]).sum(-1)
-        if (held := self._is_held()).any():
-            form, known = self._along_surface(step, form, known & ~held)
+        if (on_surface := self._is_singular()).any():
+            form, known = self._along_surface(step, form, known & ~on_surface)
         inverse = self.kind == INVERSE_RANGE
         behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
         form = np.array(np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan))
         away = np.broadcast_to(away, (*form.shape, away.shape[-1]))
-        for i, law in self._cut_off():
-            mine = np.zeros(self.kind.shape, dtype=bool)
-            mine[i] = True
-            mine = np.broadcast_to(mine, form.shape)
-            form[mine] = law.distance_squared(away[mine])
+        for i, law in self._truncated_fixes():
+            selected = np.zeros(self.kind.shape, dtype=bool)
+            selected[i] = True
+            selected = np.broadcast_to(selected, form.shape)
+            form[selected] = law.distance_squared(away[selected])
         return form
 
-    def _is_held(self) -> Array:
-        """Return a flag (...) for covariances without a width in a direction: an equality holds the fix there."""
+    def _is_singular(self) -> Array:
+        """Return a flag (...) for singular covariances: an equality constraint fixes the position in one direction."""
         finite = np.asarray(np.isfinite(self.covariance).all((-1, -2)))
         values = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance, np.eye(self.position.shape[-1])))
         return np.asarray(values[..., 0] <= HELD * values[..., -1])
 
     def _along_surface(self, step: Array, form: Array, known: Array) -> tuple[Array, Array]:
-        """Return squared distances (...) of steps (..., d), along the surfaces of equalities too, and whether known.
+        """Return squared distances (...) of steps (..., d), also for singular covariances, and valid flags (...).
 
-        A surface has fewer degrees of freedom. The distance has the same probability in space.
+        A surface has fewer degrees of freedom than space. The returned distance has, with d degrees of freedom, the
+        same probability as the distance on the surface. Steps that leave the surface get infinity.
         """
         from scipy.special import gammainc, gammaincinv
 
@@ -287,20 +291,20 @@ class Chart:
 
     @property
     def cut_off(self) -> Array:
-        """Return a flag (...) for each fix in metres whose law is cut off at bounds."""
+        """Return a flag (...) for each Cartesian fix whose distribution is truncated at bounds."""
         if self.truncated is None:
             return np.zeros(self.kind.shape, dtype=bool)
         return np.asarray(self.truncated.cuts & (self.kind == CARTESIAN))
 
-    def _cut_off(self) -> Iterator[tuple[tuple[int, ...], Truncated]]:
-        """Yield the indices of fixes whose laws bounds cut off, and these."""
+    def _truncated_fixes(self) -> Iterator[tuple[tuple[int, ...], Truncated]]:
+        """Yield the index and the truncated distribution of each fix whose distribution bounds truncate."""
         if self.truncated is not None:
             for i in zip(*np.nonzero(np.atleast_1d(self.cut_off)), strict=True):
                 index = tuple(map(int, i)) if self.kind.shape else ()
                 yield index, take(self.truncated, index)
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
-        """Return whether points (..., d), metres, lie in the regions that hold the truth with a given probability.
+        """Return whether points (..., d), metres, are in the regions that contain the target with a given probability.
 
         Parameters
         ----------
@@ -312,24 +316,25 @@ class Chart:
         Returns
         -------
         bool array (...)
-            Whether a point is in the ellipsoid, or in the one of the chart.
+            Whether a point is in the error ellipsoid: in metres, or in chart coordinates.
         """
         self._demand("region")
         with np.errstate(invalid="ignore"):
             return np.asarray(self.distance_squared(points) <= quantile(level, self.position.shape[-1]))
 
     def interval(self, extent: Extent, level: float = 0.95) -> tuple[Array, Array]:
-        """Return the ends of an interval that holds one number of the truth with a given probability.
+        """Return the ends of an interval that contains one coordinate of the true position with a given probability.
 
         Parameters
         ----------
         extent : str
-            "range": distance from the centre along the direction of the fix, metres; the far end is infinite where
-            infinity is not excluded. "bearing": from the centre, radians from the first axis towards the second; the
-            ends are not wrapped, and a turn apart where nothing is known. "elevation": radians above the plane of the
-            first two axes. "height": the last coordinate of three, metres. "x", "y", "z": a coordinate, metres.
+            "range": distance from the centre along the direction of the fix, metres; the far end is infinite if the
+            data do not exclude infinity. "bearing": angle at the centre, radians from the first axis towards the
+            second; the ends are not wrapped, and they are a full turn apart if every bearing is possible. "elevation":
+            radians above the plane of the first two axes. "height": the third coordinate, metres. "x", "y", "z": a
+            coordinate, metres.
         level : float
-            Probability that the interval contains the truth.
+            Probability that the interval contains the true value.
 
         Returns
         -------
@@ -338,31 +343,32 @@ class Chart:
 
         Notes
         -----
-        Where the fix is Gaussian in metres its range is so to first order only: beside the centre it is rough.
+        For a Cartesian fix the range interval is a first-order approximation. It is rough near the centre.
         """
         if extent not in _EXTENTS:
             raise InvalidProblem(f"there is no interval of {extent!r}", "extent", nearest(str(extent), _EXTENTS))
         self._demand(f"interval of the {extent}")
         if extent in {"elevation", "height", "z"} and self.position.shape[-1] != 3:
-            raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "ask for x, y, range or bearing")
+            raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "use x, y, range or bearing")
         low, high = map(np.array, _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1)))))
-        for i, law in self._cut_off():
+        for i, law in self._truncated_fixes():
             low[i], high[i] = law.interval(self._number(extent, i), level)
         return low, high
 
     def mean_of(self, x: Array, covariance: Array, start: int) -> Array:
-        """Return the means (..., n) of the laws of fixes x (..., n) with covariances (..., n, n).
+        """Return the means (..., n) of the distributions of fixes x (..., n) with covariances (..., n, n).
 
-        The position begins at entry `start`. The other unknowns follow it.
+        Truncation at bounds shifts the mean. The position is entries `start` to `start + d`. The mean of the other
+        unknowns follows from their correlation with the position.
         """
         out, part = np.array(x), slice(start, start + self.position.shape[-1])
-        for i, law in self._cut_off():
+        for i, law in self._truncated_fixes():
             own = covariance[i]
             out[i] += own[:, part] @ np.linalg.pinv(own[part, part], hermitian=True) @ law.moments()[0]
         return out
 
     def _number(self, extent: Extent, i: tuple[int, ...]) -> Callable[[Array], Array]:
-        """Return the function from points, metres from fix i, to the number of an interval."""
+        """Return the function that maps points, in metres relative to fix i, to the coordinate of an interval."""
         start, centre = self.position[i], self.centre[i]
         if extent in _COORDINATES:
             j = _COORDINATES[extent]
@@ -380,7 +386,7 @@ class Chart:
         return bearing
 
     def _demand(self, what: str) -> None:
-        """Raise where no Gaussian covers."""
+        """Raise if a fix is curved, because no Gaussian is valid for it."""
         curved = int((self.kind == CURVED).sum())
         if curved:
             whose = "this fix is" if self.kind.ndim == 0 else f"{curved} of {self.kind.size} fixes are"
@@ -388,7 +394,7 @@ class Chart:
 
 
 def _range(chart: Chart, z: float) -> tuple[Array, Array]:
-    """Return r / (1 +- z sigma_w), or r -+ z sigma_r in metres."""
+    """Return the ends of the range, metres: r / (1 +- z sigma_w) in inverse range, r -+ z sigma_r in metres."""
     r, step = chart.distance, z * np.sqrt(chart.spread[..., -1, -1])
     with np.errstate(divide="ignore", invalid="ignore"):
         far = np.where(step < 1.0, r / (1.0 - step), np.inf)
@@ -434,10 +440,14 @@ _EXTENTS: dict[Extent, Callable[[Chart, float], tuple[Array, Array]]] = {
 
 
 def _sides(chart: Chart) -> tuple[Array, Array, Array]:
-    """Return unit vectors (..., d): level and across the direction, upwards and across it, and level along it."""
+    """Return three unit vectors (..., d) for the direction u0.
+
+    The first is horizontal and orthogonal to u0. The second points upward and is orthogonal to u0. The third is the
+    horizontal component of u0.
+    """
     u0 = chart.direction
     size = np.hypot(u0[..., 0], u0[..., 1])
-    # Of a direction straight up any bearing is as good.
+    # For a vertical direction the bearing is arbitrary.
     c = np.where(size > 0.0, u0[..., 0] / np.where(size > 0.0, size, 1.0), 1.0)
     s = np.where(size > 0.0, u0[..., 1] / np.where(size > 0.0, size, 1.0), 0.0)
     if u0.shape[-1] == 2:
@@ -448,10 +458,10 @@ def _sides(chart: Chart) -> tuple[Array, Array, Array]:
 
 
 def _turn(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[Array, Array]:
-    """Return the least and greatest angle (...) from `ahead` towards `side`, both unit vectors (..., d).
+    """Return the least and the greatest angle (...), radians, from `ahead` towards `side`, both unit vectors (..., d).
 
-    The tangent of the angle is a quotient of two Gaussian numbers, of mean zero above and m below: by Fieller its
-    interval holds all t with ``(t m)^2 <= z^2 var(above - t below)``.
+    The tangent of the angle is a quotient of two Gaussian numbers. The numerator has mean zero, the denominator mean m.
+    By Fieller, its interval is all t with ``(t m)^2 <= z^2 var(numerator - t denominator)``.
 
     References
     ----------
@@ -459,7 +469,7 @@ def _turn(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[Array, Arr
     """
     u0, r = chart.direction, chart.distance
     middle = r * (ahead * u0).sum(-1)
-    # In the chart only what is across the direction is random; in metres what is along it as well.
+    # In chart coordinates only the component orthogonal to the direction is random; in metres both are.
     inverse = (chart.kind == INVERSE_RANGE)[..., None]
     below = np.where(inverse, ahead - (ahead * u0).sum(-1, keepdims=True) * u0, ahead)
     v = z**2 * _form(chart.covariance, side, side)
@@ -468,11 +478,12 @@ def _turn(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[Array, Arr
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.sqrt(np.maximum(mixed**2 + lead * v, 0.0))
         low, high = np.arctan((-mixed - root) / lead), np.arctan((-mixed + root) / lead)
-    # Where the region holds the point without an angle, the centre or straight up, every angle is possible.
+    # If the region contains the centre, or a point straight above it, the angle is undefined there and any value is
+    # possible.
     known = lead > 0.0
     return np.where(known, low, -np.pi), np.where(known, high, np.pi)
 
 
 def _form(matrix: Array, u: Array, v: Array) -> Array:
-    """Return u'M v (...)."""
+    """Return the bilinear form u'M v (...) of vectors (..., d) and a matrix (..., d, d)."""
     return np.asarray((u[..., :, None] * matrix * v[..., None, :]).sum((-1, -2)))

@@ -1,4 +1,4 @@
-"""What is proven of many fixes: certificates in columns, for an object each takes as long as its proof."""
+"""Certificates of many fixes, stored as one array per field. One `Certificate` object per fix would be too slow."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from optloc.base.records import Axes
 from optloc.base.types import Array, Certificate
 
 PROOFS = ("", "unknown", "local", "region", "global")
-"""Names of the proofs by their numbers; the first stands where nobody has tried to prove anything."""
+"""Names of the proofs, in the order of their numbers. The first, "", means that no proof was tried."""
 UNTRIED, UNKNOWN, LOCAL, REGION, GLOBAL = range(5)
 
 _NONE = Certificate("", "", "").bound
@@ -20,26 +20,26 @@ _NONE = Certificate("", "", "").bound
 
 @dataclass(frozen=True, slots=True)
 class Claims:
-    """Certificates of a batch of fixes; each column is a field of `Certificate`, and the proof is told by its number.
+    """Certificates of a batch of fixes. Each column is a field of `Certificate`; the proof is stored as a number.
 
     Parameters
     ----------
     proof : int array (...)
-        Numbers in `PROOFS`.
+        Indices in `PROOFS`.
     reason, method : object array (...)
-        Sentences and words.
+        Reasons, as sentences, and names of the methods.
     bound, gap : array (...)
-        Lower bounds of the costs, and the costs less these; NaN where none was computed.
+        Lower bounds of the costs, and the costs minus these bounds; NaN if no bound was computed.
     unique : bool array (...)
-        Whether there is a gap to other minima.
+        Whether all other minima cost more by a known margin.
     margin : array (...)
-        That gap; 0 where there is none.
+        This margin; 0 without one.
     boxes : int array (...)
-        Boxes looked at.
+        Number of boxes that the proof examined.
     region : object array (...)
-        Corners of the regions of the claims; None where they are not about one.
+        Corners of the region of each proof; None if the proof has no region.
     asked : bool array (...)
-        Whether somebody asked for that region.
+        Whether the caller requested this region.
     """
 
     proof: Annotated[Array, Axes(0, empty=UNTRIED)]
@@ -55,23 +55,23 @@ class Claims:
 
     @property
     def tried(self) -> Array:
-        """Return where somebody has tried to prove something, (...)."""
+        """Return a mask (...) of the fixes for which a proof was tried."""
         return np.asarray(self.proof != UNTRIED)
 
     def write(self, items: Array | int, other: Claims) -> None:
-        """Write others in the place of some, by index or mask: as many (n,), or one () for all."""
-        places = np.atleast_1d(items)  # an object array would take an array () for an object
+        """Overwrite the entries at `items` (indices or a mask) with `other`: n claims (n,), or one () for all."""
+        places = np.atleast_1d(items)  # with a scalar index NumPy would store an array () as an object
         for each in fields(self):
             getattr(self, each.name)[places] = getattr(other, each.name)
 
     def tell(self) -> Array:
-        """Return the certificates as an object array (...), not to be written to; None where nobody has tried."""
+        """Return the certificates as a read-only object array (...); None where no proof was tried."""
         out = np.empty(self.proof.shape, dtype=object)
         names = [each.name for each in fields(self)]
         columns = (getattr(self, name).ravel().tolist() for name in names)
         for i, values in zip(np.ndindex(out.shape), zip(*columns, strict=True), strict=True):
             own = dict(zip(names, values, strict=True))
-            # one NaN, so that certificates without a bound are equal
+            # All missing bounds share one NaN object, so that certificates without a bound compare as equal.
             none = {name: _NONE for name in ("bound", "gap") if isnan(own[name])}
             out[i] = Certificate(**own | none | {"proof": PROOFS[own["proof"]]}) if own["proof"] else None
         out.flags.writeable = False
@@ -88,18 +88,18 @@ def claim(certificate: Certificate) -> Claims:
 
 
 def empty_claims(count: int) -> Claims:
-    """Return claims (count,) about fixes of which nobody has tried to prove anything, to be written."""
+    """Return writable claims (count,) of fixes for which no proof was tried."""
     empty = (UNTRIED, "", "", np.nan, np.nan, False, 0.0, 0, None, False)
     kinds = (np.int8, object, object, float, float, np.bool_, float, np.int64, object, np.bool_)
     return Claims(*(np.full(count, value, dtype=kind) for value, kind in zip(empty, kinds, strict=True)))
 
 
 def repeated_claims(one: Claims, shape: int | tuple[int, ...]) -> Claims:
-    """Return claims (...) that are all the same; nobody can write into them."""
+    """Return read-only claims of the given shape that are all equal to `one`."""
     return Claims(*(np.broadcast_to(getattr(one, each.name), shape) for each in fields(one)))
 
 
 def merged_claims(chosen: Array, one: Claims, other: Claims) -> Claims:
-    """Return claims (N,) of which those chosen are from one, and the rest from another, each (N,) or ()."""
+    """Return claims (N,): `one` where `chosen` is true, otherwise `other`; each has shape (N,) or ()."""
     pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
     return Claims(*(np.where(chosen, *pair) for pair in pairs))

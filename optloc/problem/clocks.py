@@ -1,4 +1,4 @@
-"""Errors that change during a run: walks by their spectral densities or Allan deviations, splines by their knots."""
+"""Biases that change during a run: random walks with spectral densities or Allan deviations, and splines with knots."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from optloc.base.types import Array, Bias
 from optloc.base.units import SPEED_OF_LIGHT
 
 DEGREE = 3
-"""Of the polynomials between knots: cubic ones are smooth, and four of them meet at any time."""
+"""Degree of the polynomials between knots. Cubic splines are smooth, and four coefficients matter at any time."""
 
 
 # Splines: an error that is a smooth function of time.
 
 
 def greville(bias: Bias) -> Array:
-    """Return the times (c,) at which the coefficients of a spline are about its values, seconds.
+    """Return the times (c,), seconds, at which each coefficient of a spline is approximately the value of the spline.
 
-    They are the averages of the knots under each piece (Greville's abscissae).
+    They are averages of consecutive knots (Greville abscissae).
     """
     assert bias.knots is not None
     full = _padded(bias.knots)
@@ -30,19 +30,19 @@ def greville(bias: Bias) -> Array:
 
 
 def coefficients(knots: Array) -> int:
-    """Return how many coefficients a spline over knots (p,) has."""
+    """Return the number of coefficients of a spline over knots (p,)."""
     return len(knots) + DEGREE - 1
 
 
 def spline_weights(knots: Array, times: Array) -> tuple[Array, Array]:
-    """Return which coefficients (n, 4) of a spline count at times (n,), and how much (n, 4).
+    """Return the indices (n, 4) of the spline coefficients that matter at times (n,), and their weights (n, 4).
 
     Parameters
     ----------
     knots : array (p,)
-        Increasing times, seconds; the first and the last are counted four times, so that the spline ends there.
+        Increasing times, seconds. The first and the last knot count four times, so that the spline ends there.
     times : array (n,)
-        Within the knots.
+        Times between the first and the last knot, seconds.
 
     References
     ----------
@@ -59,16 +59,18 @@ def _padded(knots: Array) -> Array:
 
 
 def with_knots(bias: Bias, times: Array, where: str, knots: Any) -> Bias:
-    """Return a bias with the knots of a spline over a run: those given, or so many evenly spaced ones.
+    """Return the bias with the knots of a spline over a run. `knots` gives the times, seconds, or the number of knots.
+
+    If it gives the number, the knots are evenly spaced.
 
     Raises
     ------
     InvalidProblem
-        Where they are not two or more increasing numbers, or the run reaches beyond them.
+        If there are not at least two increasing knots, or if the run extends beyond them.
     """
     place = f"{where}, knots"
     if knots is None:
-        raise InvalidProblem("a spline needs knots", place, "give their times in seconds, or how many there are")
+        raise InvalidProblem("a spline needs knots", place, "give their times in seconds, or their number")
     array = np.asarray(numbers(knots, place))
     if array.ndim == 0 and (array < 2 or array != round(float(array))):
         raise InvalidProblem(f"{knots} knots", place, "give two or more: the first and the last time are knots")
@@ -81,7 +83,7 @@ def with_knots(bias: Bias, times: Array, where: str, knots: Any) -> Bias:
 
 
 def check_spline(bias: Bias, times: Array, where: str) -> None:
-    """Refuse a spline without increasing knots, or over times (k,) beyond them."""
+    """Raise if a spline has no increasing knots, or if the times (k,) extend beyond the knots."""
     knots = bias.knots
     if knots is None or knots.ndim != 1 or len(knots) < 2 or not (np.diff(knots) > 0.0).all():
         raise InvalidProblem("a spline has no increasing knots", where, "give two times or more")
@@ -90,43 +92,43 @@ def check_spline(bias: Bias, times: Array, where: str) -> None:
 
 def _check_knots(knots: Array, times: Array, place: str) -> None:
     if times[0] < knots[0] or times[-1] > knots[-1]:
-        what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, and the knots do not"
+        what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, beyond the knots"
         raise InvalidProblem(what, place, "let the first and the last knot enclose it")
 
 
-# Walks: an error that is the sum of independent steps, or whose rate is.
+# Random walks: the error, or its rate, is a sum of independent steps.
 
 
 def rate_name(name: str) -> str:
-    """Return what the rates of a walk are called, where it has some."""
+    """Return the name of the rate of a walk."""
     return f"{name} rate"
 
 
 def state_of(bias: Bias) -> tuple[str, ...]:
-    """Return the names of the unknowns of a bias: its values, and the rates of a walk that has some."""
+    """Return the names of the unknowns of a bias: its value and, if a walk has one, its rate."""
     return (bias.name, rate_name(bias.name))[: 1 if bias.density is None else bias.density.shape[1]]
 
 
 def process(bias: Bias, times: Array) -> tuple[Array, Array]:
-    """Return how a walk goes from one epoch to the next, and the covariance of what it does besides.
+    """Return the transition matrices of a walk between epochs, and the covariances of its random steps.
 
-    White noise of a spectral density q1 that is added to the rate of the error, and white noise of a density q2 that
-    is added to the rate of its rate: over a time t they add ``q1 t + q2 t^3 / 3`` to the variance of the error and
-    ``q2 t`` to that of its rate, with the covariance ``q2 t^2 / 2``.
+    White noise of spectral density q1 drives the error. White noise of density q2 drives its rate. Over a time t they
+    add ``q1 t + q2 t^3 / 3`` to the variance of the error and ``q2 t`` to the variance of its rate. Their covariance
+    increases by ``q2 t^2 / 2``.
 
     Parameters
     ----------
     bias : Bias
-        A walk of q members, of order o = 1, the error alone, or 2, with its rate.
+        A walk with q members. Its order o is 1 (error only) or 2 (error and rate).
     times : array (k,)
         Seconds of the epochs.
 
     Returns
     -------
     transition : array (k - 1, o, o)
-        State of an epoch to that of the next.
+        Matrices from the state of an epoch to the state of the next.
     covariance : array (k - 1, q, o, o)
-        Of the steps.
+        Covariance of each step.
 
     References
     ----------
@@ -149,19 +151,19 @@ def process(bias: Bias, times: Array) -> tuple[Array, Array]:
 
 
 def with_densities(bias: Bias, times: Array, where: str, density: Any, rate_density: Any) -> Bias:
-    """Return a bias with the spectral densities (q, 1 or 2) of a walk, one line for each member.
+    """Return the bias with the spectral densities (q, 1 or 2) of a walk, one row for each member.
 
     Parameters
     ----------
     bias : Bias
-        Of q members.
+        A walk with q members.
     times : array (k,)
         Seconds of the epochs.
     where : str
-        Place to name.
+        Location that error messages name.
     density, rate_density : float or array (q,), optional
-        Of the noise that the error is the sum of, unit squared per second, and of that which its rate is the sum of,
-        unit squared per second cubed; None: none.
+        Spectral densities of the white noise that drives the error (unit squared per second) and its rate (unit squared
+        per second cubed). None: no such noise.
     """
     members = len(bias.members)
     if density is None and rate_density is None:
@@ -174,40 +176,40 @@ def with_densities(bias: Bias, times: Array, where: str, density: Any, rate_dens
         array = np.asarray(numbers(0.0 if values is None else values, f"{where}, {name}"))
         if array.shape not in {(), (members,)}:
             raise InvalidProblem(f"{name} has shape {array.shape}", where, f"give one, or one for each of {members}")
-        # of two noises one may be nothing; a walk without any is an offset
+        # The first density may be zero if there is a rate density. A walk without any noise is an offset.
         low = 0.0 if name == "density" and rate_density is not None else np.finfo(float).tiny
         if not (np.isfinite(array) & (array >= low)).all():
-            raise InvalidProblem(f"{name} is not positive", where, "an error that stays has the form 'offset'")
+            raise InvalidProblem(f"{name} is not positive", where, "for a constant error use the form 'offset'")
         columns.append(np.broadcast_to(array, (members,)))
     return replace(bias, density=np.stack(columns, axis=1))
 
 
 def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> tuple[float, float]:
-    """Return the spectral densities of a clock from its Allan deviations, for errors in metres.
+    """Return the two spectral densities of a clock from its Allan deviations, for errors in metres.
 
-    White noise of the frequency and a random walk of it give the Allan variance ``h1 / tau + h2 tau / 3``; h1 and h2
-    are the least-squares values that are not negative, each deviation counted by its own size.
+    White noise and a random walk of the frequency give the Allan variance ``h1 / tau + h2 tau / 3``. h1 and h2 are the
+    non-negative least-squares values for the relative errors of the Allan variances.
 
     Parameters
     ----------
     tau : float or array (n,)
         Averaging times, seconds.
     deviation : float or array (n,)
-        Allan deviations of the relative frequency; of a single one the frequency noise is taken to be white.
+        Allan deviations of the relative frequency. With a single value the frequency noise counts as white.
     speed : float
-        Metres that a second stands for.
+        Metres per second that convert clock errors to metres.
 
     Returns
     -------
     density : float
-        ``speed^2 h1``, square metres per second: for `optloc.with_bias` of the form "walk".
+        ``speed^2 h1``, square metres per second: the argument of `optloc.with_bias` for the form "walk".
     rate_density : float
         ``speed^2 h2``, square metres per second cubed.
 
     Raises
     ------
     InvalidProblem
-        Where they are not positive numbers, one deviation for each time.
+        Unless there is one positive deviation for each positive time.
 
     References
     ----------
@@ -225,19 +227,19 @@ def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> 
     if not (np.isfinite(times * sizes) & (times > 0.0) & (sizes > 0.0)).all():
         raise InvalidProblem("a time or a deviation is not positive", "deviation", "give such as 1.0 s and 1e-9")
     design = np.stack([1.0 / times, times / 3.0], axis=1)[:, : min(2, len(times))]
-    # relative to each: what a deviation of 1e-12 says is not lost beside one of 1e-9
+    # Relative errors, so that a deviation of 1e-12 has the same weight as a deviation of 1e-9.
     found, _ = nnls(design / sizes[:, None] ** 2, np.ones(len(sizes)))
     white, wander = (*found.tolist(), 0.0)[:2]
     return speed**2 * white, speed**2 * wander
 
 
 def check_walk(bias: Bias, times: Array, where: str) -> None:
-    """Refuse a walk without densities, or over times (k,) of one epoch."""
+    """Raise if a walk has no valid densities, or if the times (k,) are only one epoch."""
     density = bias.density
     if density is None or density.shape not in {(len(bias.members), 1), (len(bias.members), 2)}:
         advice = f"give an array ({len(bias.members)}, 1), or with rates ({len(bias.members)}, 2)"
         raise InvalidProblem("a walk has no spectral densities", where, advice)
     if not (np.isfinite(density) & (density >= 0.0)).all() or not (density[:, -1:] > 0.0).all():
-        raise InvalidProblem("a spectral density is not positive", where, "an error that stays has the form 'offset'")
+        raise InvalidProblem("a spectral density is not positive", where, "for a constant error use the form 'offset'")
     if len(times) == 1:
         raise InvalidProblem("a walk needs several epochs", where, "use the form offset")

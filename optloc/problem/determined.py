@@ -1,4 +1,4 @@
-"""Knowledge of a position in every status: directions, numbers with intervals, and a curve."""
+"""Facts about a position that the data determine even without a fix: directions, numbers with intervals, a curve."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ WITHOUT_PLACE = (
     Status.UNAVAILABLE,
     Status.NUMERICAL,
 )
-"""Statuses whose position is no place: a direction is shown instead."""
+"""Statuses in which the position of the fix is not usable. Output then shows a direction instead."""
 
-# Angle between corners of an arc, radians: 2 degrees are seen at no scale that shows the whole.
+# Angle between the corners of a drawn arc, radians. At 2 degrees an arc looks smooth at every usual scale.
 _CORNER = np.radians(2.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """One number that the data determine.
+    """One number that the data determine, with its 95 % interval.
 
     Parameters
     ----------
     name : str
-        For instance "distance from line"; lines and planes are those that all stations are on.
+        For instance "distance from line". A line or a plane in a name contains all stations.
     value : float
-        Of the highest likelihood.
+        Value of the highest likelihood.
     low, high : float
         Ends of its 95 % interval; `high` is infinite where the data do not exclude infinity.
     unit : str
@@ -56,30 +56,30 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """A direction with its cone and range, seen from the middle of the stations.
+    """A direction, as seen from the mean of the stations, with its 95 % cone and its range.
 
     Parameters
     ----------
     vector : array (d,)
         Unit vector of the highest likelihood, in the frame of the problem.
     azimuth : tuple of float
-        Angle from the first level axis towards the second and the ends of its 95 % interval, radians; from east
-        towards north in frames on Earth. The ends are not wrapped, and a turn apart where nothing is known.
+        Angle from the first horizontal axis towards the second, and the ends of its 95 % interval, radians. In frames
+        on Earth it counts from east towards north. The ends are not wrapped; they are a full turn apart if every
+        azimuth is possible.
     elevation : tuple of float
-        Angle above the level plane and its ends, radians; empty in the plane.
+        Angle above the horizontal plane and the ends of its interval, radians; empty in two dimensions.
     half_angles : array (d - 1,)
-        Semi-axes of the 95 % cone, radians, the larger first: of the ellipse with the second moments of
+        Semi-axes of the 95 % cone, radians, the larger first. They belong to the ellipse that has the second moments of
         `outline`.
     axes : array (d, d - 1)
         Unit vectors along the semi-axes, in columns.
-    outline : array (k, d)
-        Unit vectors on the edge of the 95 % cone: in space counter-clockwise as seen from outside, in the plane both
-        edges.
+    Unit vectors on the edge of the 95 % cone. In space they are counter-clockwise as seen from outside; in the plane
+    they are the two edges.
     range : tuple of float
-        Distance from the middle of the stations and the ends of its 95 % interval, metres; infinite where the data do
-        not exclude infinity.
+        Distance from the mean of the stations and the ends of its 95 % interval, metres. The far end is infinite if the
+        data do not exclude infinity.
     gap : float
-        Cost above the first direction's.
+        Cost of this direction minus the cost of the first direction.
     """
 
     vector: Array
@@ -93,21 +93,21 @@ class Direction:
 
     @property
     def least_range(self) -> float:
-        """Return the distance from the middle of the stations, metres, that the target exceeds."""
+        """Return the lower end of the range interval, metres from the mean of the stations."""
         return self.range[1]
 
     @property
     def mixed(self) -> bool:
-        """Return whether the range has a far end."""
+        """Return whether the upper end of the range interval is finite."""
         return bool(np.isfinite(self.range[2]))
 
     def covers(self, vectors: Array) -> Array:
-        """Return whether vectors (..., d) point into the cone, (...)."""
+        """Return whether vectors (..., d) are inside the 95 % cone, (...)."""
         return is_in_cone(self.vector, self.outline, vectors)
 
 
 def is_in_cone(axis: Array, outline: Array, vectors: Array) -> Array:
-    """Return whether vectors (..., d) are in the cone about an axis (d,) whose edge goes through an outline (k, d)."""
+    """Return whether vectors (..., d) are in the cone around `axis` (d,) with edge vectors `outline` (k, d)."""
     rim, flat = angles_off_axis(axis, outline), angles_off_axis(axis, np.asarray(vectors, dtype=float))
     if len(axis) == 2:
         return np.asarray((flat[..., 0] >= rim.min()) & (flat[..., 0] <= rim.max()))
@@ -120,41 +120,43 @@ def is_in_cone(axis: Array, outline: Array, vectors: Array) -> Array:
 
 
 def angles_off_axis(axis: Array, vectors: Array) -> Array:
-    """Return the angles (..., d - 1) by which vectors (..., d) are off an axis (d,), along two axes across it."""
+    """Return the angles (..., d - 1), radians, between vectors (..., d) and an axis (d,), along two orthogonal axes."""
     unit = vectors / np.sqrt((vectors**2).sum(-1, keepdims=True))
     across = unit @ basis(axis)
     size = np.sqrt((across**2).sum(-1, keepdims=True))
     angle = np.arctan2(size, (unit @ axis)[..., None])
-    # next to the axis the angle is its own sine
+    # At the axis the angle equals its sine, so the quotient is 1.
     return np.asarray(across * np.where(size > 0.0, angle / np.where(size > 0.0, size, 1.0), 1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Determined:
-    """Directions, numbers and a curve that the data determine of one position, at 95 %.
+    """Directions, numbers and a curve that the data determine about one position, with probability 95 %.
 
     Parameters
     ----------
     origin : array (d,)
-        Middle of the stations that rows are present of, metres: directions and ranges are seen from it.
+        Mean of the stations that have present rows, metres: the origin of directions and ranges.
     level : array (d, d)
-        Rows: the axes of azimuth 0 and of a quarter turn and, in space, the upward axis; east, north and up on Earth.
+        Rows: the axis of azimuth 0, the axis of azimuth 90 degrees and, in space, the upward axis. On Earth: east,
+        north, up.
     north : bool
-        Whether azimuths count from east towards north, so that they are bearings as well.
+        Whether azimuths count from east towards north, so that they convert to bearings.
     directions : tuple of Direction
-        The likeliest first; several where the data fit all of them. Empty where no cone holds the directions.
+        The most likely first; several if the data fit several. Empty if no cone contains the directions.
     quantities : tuple of Quantity
         Numbers with intervals, for instance the distance from a line of stations.
     curve : array (k, d), optional
-        Line on which one measurement puts the target, metres.
+        Points of the line on which one measurement places the target, metres.
     curve_name : str
         For instance "hyperbola about A and B".
     words : str
-        The reason of the fix.
+        The `reason` of the fix.
     axis : array (d,), optional
-        Direction of the line, or normal of the plane, that all stations are on and quantities are about.
+        Direction of the line, or normal of the plane, that contains all stations and to which the quantities refer.
     outside : bool
-        Whether the directions assume a target farther from the middle than all stations: without that any is possible.
+        Whether the directions assume that the target is farther from the mean than all stations. Without this
+        assumption every direction is possible.
     """
 
     origin: Array
@@ -169,24 +171,26 @@ class Determined:
     outside: bool = False
 
     def __bool__(self) -> bool:
-        """Return whether there are directions, numbers or a curve."""
+        """Return whether the data determine a direction, a number or a curve."""
         return bool(self.directions or self.quantities) or self.curve is not None
 
     def wedge(self, one: Direction, reach: float, *, whole: bool = False) -> Array:
-        """Return the plan of a cone from its least to its greatest range, a closed line (k, d), metres, anticlockwise.
+        """Return the horizontal outline of a cone between its least and greatest range: a closed line (k, d), metres.
+
+        The line is anticlockwise.
 
         Parameters
         ----------
         one : Direction
-            Of these.
+            One of `directions`.
         reach : float
-            Where the wedge is cut off if its range has no end, metres.
+            Length of the wedge if the range has no upper end, metres.
         whole : bool
-            Whether it begins in the middle of the stations, whatever its least range.
+            Whether the wedge begins at the mean of the stations instead of at the least range.
         """
         low, high = one.azimuth[1], min(one.azimuth[2], one.azimuth[1] + 2.0 * np.pi)
         near, far = one.range[1], one.range[2] if one.mixed else max(reach, 2.0 * one.range[1])
-        # of slant ranges the plan has the shortest and the longest
+        # Horizontal distance is slant range times cos(elevation): take its least and its greatest value.
         steep = np.cos(np.array(one.elevation[1:])) if one.elevation else np.ones(2)
         level = one.elevation and one.elevation[1] <= 0.0 <= one.elevation[2]
         near, far = 0.0 if whole else near * max(float(steep.min()), 0.0), far * (1.0 if level else float(steep.max()))
@@ -195,12 +199,12 @@ class Determined:
         return np.asarray(self.origin + np.concatenate([far * arc, near * arc[::-1], far * arc[:1]]))
 
     def ray(self, one: Direction, reach: float) -> Array:
-        """Return the line (2, d) from the middle of the stations along a direction, metres; see `wedge`."""
+        """Return the line (2, d), metres, from the mean of the stations along a direction; `reach` as for `wedge`."""
         far = one.range[2] if one.mixed else max(reach, 2.0 * one.range[1])
         return np.stack([self.origin, self.origin + far * one.vector])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all of it as plain numbers, texts and lists: metres and degrees, None for infinity."""
+        """Return all content as plain numbers, texts and lists, in metres and degrees, with None for infinity."""
         return {
             "level": LEVEL,
             "origin": self.origin.tolist(),
@@ -213,17 +217,17 @@ class Determined:
         }
 
     def _direction(self, one: Direction) -> dict[str, Any]:
-        """Return one direction as `to_dict` has it."""
+        """Return one direction as a dictionary for `to_dict`."""
         azimuth, *ends = np.degrees(one.azimuth).tolist()
-        told = {"vector": one.vector.tolist(), "azimuth_deg": azimuth, "azimuth_interval_deg": ends}
+        entries = {"vector": one.vector.tolist(), "azimuth_deg": azimuth, "azimuth_interval_deg": ends}
         if self.north:
             low, high = bearing_of(one.azimuth)[1:]
-            told |= {"bearing_deg": bearing_of(one.azimuth)[0], "bearing_interval_deg": [low, high]}
+            entries |= {"bearing_deg": bearing_of(one.azimuth)[0], "bearing_interval_deg": [low, high]}
         if one.elevation:
             elevation, *ends = np.degrees(one.elevation).tolist()
-            told |= {"elevation_deg": elevation, "elevation_interval_deg": ends}
-        told |= {"half_angles_deg": np.degrees(one.half_angles).tolist(), "outline": one.outline.tolist()}
-        return told | {
+            entries |= {"elevation_deg": elevation, "elevation_interval_deg": ends}
+        entries |= {"half_angles_deg": np.degrees(one.half_angles).tolist(), "outline": one.outline.tolist()}
+        return entries | {
             "range": _finite(one.range[0])[0],
             "range_interval": _finite(*one.range[1:]),
             "least_range": one.least_range,
@@ -232,18 +236,21 @@ class Determined:
 
 
 def _quantity(one: Quantity) -> dict[str, Any]:
-    """Return a number as `Determined.to_dict` has it."""
+    """Return one quantity as a dictionary for `Determined.to_dict`."""
     value, *interval = _finite(one.value, one.low, one.high)
     return {"name": one.name, "value": value, "interval": interval, "unit": one.unit}
 
 
 def _finite(*values: float) -> list[float | None]:
-    """Return numbers as JSON has them: None for what is infinite."""
+    """Return the values as a list for JSON, with None instead of infinity and NaN."""
     return [value if np.isfinite(value) else None for value in values]
 
 
 def bearing_of(azimuth: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return an azimuth with its interval, radians, as a bearing clockwise of north, 0 to 360 degrees, with its."""
+    """Return the bearing and its interval, degrees clockwise from north, of an azimuth with its interval, radians.
+
+    The bearing is from 0 to 360 degrees.
+    """
     middle, low, high = (90.0 - np.degrees(each) for each in azimuth)
     turn = middle - middle % 360.0
     return float(middle - turn), float(high - turn), float(low - turn)
@@ -251,14 +258,14 @@ def bearing_of(azimuth: tuple[float, float, float]) -> tuple[float, float, float
 
 @dataclass(slots=True)
 class Source:
-    """The problem of one fix, and what its data determine once that was computed.
+    """The problem of one fix, and a cache of its `Determined`.
 
     Parameters
     ----------
     problem : Problem
-        Single, or a flat batch of one.
+        A single problem, or a flat batch of one.
     found : Determined, optional
-        None until it is asked for.
+        None until it is computed at the first use.
     """
 
     problem: Problem

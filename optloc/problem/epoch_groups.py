@@ -1,4 +1,4 @@
-"""Epochs of one structure as a batch: which stations measured is data of each problem, not structure."""
+"""Groups of epochs with one structure, as batches. The stations of each epoch are data, so they can differ."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise, gathered, group
 from optloc.problem.problem import Problem, map_numbers
 
-# Signs for private use around the number of a station: no name of a station has them.
+# Private-use characters around the number of a station. No station name contains them.
 _MARK = re.compile("\ue000(\\d+)\ue001")
 
 
 @dataclass(frozen=True, slots=True)
 class EpochGroup:
-    """Epochs that differ in numbers only, and in which stations measured.
+    """Epochs of a run that have the same structure. Only their numbers and their stations differ.
 
     Parameters
     ----------
     epochs : int array (n,)
-        Epochs of the run, increasing.
+        Epochs of the run, in increasing order.
     run : Problem
         The run.
     rows : int array (n, r), optional
-        Rows of each epoch, in the same order of kinds; None where `by_epoch` makes the batch.
+        Row numbers of each epoch, in the same order of kinds; None if `by_epoch` makes the batch.
     ends : int array (2, r), optional
-        Stations at the ends of these rows, as numbers in the batch.
+        First and second stations of these rows, as station numbers in the batch.
     stations : int array (n, s), optional
-        Station of the run that each station of the batch is; None where the batch has the stations of the run.
+        Station number in the run of each station of the batch; None if the batch has the stations of the run.
     """
 
     epochs: Array
@@ -68,11 +68,14 @@ class EpochGroup:
         return EpochGroup(self.epochs[items], self.run, rows, self.ends, stations)
 
     def parts(self, most: int) -> Iterator[EpochGroup]:
-        """Yield groups with at most this number of epochs."""
+        """Yield parts of the group with at most `most` epochs each."""
         yield from (self.take(slice(first, first + most)) for first in range(0, len(self.epochs), most))
 
     def label(self, text: str, item: int) -> str:
-        """Return a text about a problem of the batch with the names that its stations have in the run."""
+        """Return `text`, in which placeholders of stations are replaced by their names in the run.
+
+        `item` is the number of the problem in the batch.
+        """
         if self.stations is None:
             return text
         own = self.stations[item]
@@ -98,10 +101,10 @@ class EpochGroup:
 
 
 def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
-    """Return the epochs of a run that share no unknown in groups of one structure each.
+    """Return groups of the epochs of a run, each with one structure. The epochs share no unknown.
 
-    Epochs of a group have the same numbers of rows of each kind, which link their stations in the same way. Where all
-    of them have the same rows the batch is the batch of `by_epoch`.
+    Epochs of a group have the same number of rows of each kind, and these rows link their stations in the same way. If
+    all epochs have the same rows, the result is the batch of `by_epoch`.
 
     Parameters
     ----------
@@ -110,18 +113,18 @@ def epoch_groups(problem: Problem) -> tuple[EpochGroup, ...]:
     """
     assert separable(problem)
     whole = (EpochGroup(np.arange(problem.epochs), problem),)
-    # Station errors are unknowns with the names of their stations, and axes of stations are constants of a plan.
+    # A plan contains the names of stations with unknown errors, and the axes of stations, so stations must not differ.
     if problem.batch_shape or problem.stations.unknown_for or problem.stations.axes is not None:
         return whole
     table = _RowTable.of(problem)
     found = [_group(problem, table, epochs, rows) for epochs, rows in table.alike()]
     layouts = [one.take(slice(1)).problem.layout if one.rows is not None and one.rows.size else None for one in found]
-    # Epochs without rows, and those that lack an unknown of others, are problems of one batch with the others only.
+    # Epochs without rows, or without an unknown that other epochs have, fit into one common batch only.
     return whole if any(layout != layouts[0] or layout is None for layout in layouts) else tuple(found)
 
 
 def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
-    """Return the problem of one epoch, a flat batch of one, with the names that its stations have in the run."""
+    """Return the problem of one epoch, as a flat batch of one, with the station names of the run."""
     for one in groups:
         item = int(np.searchsorted(one.epochs, epoch))
         if item < len(one.epochs) and one.epochs[item] == epoch:
@@ -132,7 +135,7 @@ def problem_of(groups: Sequence[EpochGroup], epoch: int) -> Problem:
 
 
 def explanations_by_epoch(problem: Problem, explanations: Array) -> Array:
-    """Return explanations (k,) of fixes by `epoch_groups` with their rows numbered as in the batch of `by_epoch`."""
+    """Return explanations (k,) of fixes by `epoch_groups`, with the row numbers of the batch of `by_epoch`."""
     out, place = explanations.copy(), rows_by_epoch(problem)
     for one in epoch_groups(problem):
         if one.rows is not None:
@@ -148,9 +151,10 @@ def _renumbered(one: Explanation, rows: Array) -> Explanation:
 
 @dataclass(frozen=True, slots=True)
 class _RowTable:
-    """The rows (m,) of all kinds by epoch: their block, stations, target, epoch, presence and group of noise.
+    """The rows (m,) of all kinds: block, stations a and b, target, epoch, whether present, and noise group.
 
-    `order` sorts the rows by epoch, then as `by_epoch` does: by the first appearance of kind, stations and target.
+    `order` sorts the rows by epoch, then as `by_epoch` does: by the first appearance of their kind, stations and
+    target.
     """
 
     block: Array
@@ -189,14 +193,14 @@ class _RowTable:
                 yield epochs[pick], members[pick]
 
     def _structure(self, members: Array) -> Array:
-        """Return the structure of each epoch (n, c): epochs of a batch have equal ones."""
+        """Return the structure of each epoch as integers (n, c). Epochs of one batch have equal rows."""
         ends = np.concatenate([self.a[members], self.b[members]], axis=1)
         columns = [self.block[members], self.target[members], self.present[members], _labels(ends)]
         return np.concatenate([*columns, _labels(self.noise[members])], axis=1, dtype=np.int32)
 
 
 def _labels(values: Array) -> Array:
-    """Return the entries (n, r) of each row as numbers in the order of their appearance; negative ones stay."""
+    """Return the entries of each row of values (n, r), numbered in the order of appearance; -1 if negative."""
     out = np.full(values.shape, -1, dtype=np.int32)
     used = np.zeros(len(values), dtype=np.int32)
     for j in range(values.shape[1]):
@@ -211,7 +215,7 @@ def _labels(values: Array) -> Array:
 
 
 def _equal(table: Array) -> list[Array]:
-    """Return the numbers of equal rows of a table (n, c), those that appear first before the others."""
+    """Return the indices of equal rows of a table (n, c), one array per group, in the order of first appearance."""
     varying = table[:, (table != table[:1]).any(0)]
     if not varying.shape[1]:
         return [np.arange(len(table))]
@@ -220,7 +224,7 @@ def _equal(table: Array) -> list[Array]:
 
 
 def _group(problem: Problem, table: _RowTable, epochs: Array, rows: Array) -> EpochGroup:
-    """Return epochs (n,) with rows (n, r) as one group."""
+    """Return epochs (n,) with row numbers (n, r) as one group."""
     ends = np.stack([table.a[rows], table.b[rows]], axis=1)
     if (ends == ends[:1]).all():
         return EpochGroup(epochs, problem, rows, ends[0])
@@ -230,26 +234,26 @@ def _group(problem: Problem, table: _RowTable, epochs: Array, rows: Array) -> Ep
 
 
 def _stations_of(stations: Stations, own: Array) -> Stations:
-    """Return the stations (n, s) of each problem of a batch, named by their numbers."""
+    """Return the stations (n, s) of each problem of a batch. Their names are placeholders with their numbers."""
 
     def pick(array: Array | None) -> Array | None:
         if array is None:
             return None
-        if array.ndim == 3:  # the same place at all epochs
+        if array.ndim == 3:  # all epochs have the same positions
             return np.asarray(array[0][own][:, None])
         return np.asarray(np.take_along_axis(array, own[:, None, :, None], axis=2))
 
     position = pick(stations.position)
     assert position is not None
     names = tuple(f"\ue000{i}\ue001" for i in range(own.shape[1]))
-    # Errors that are noise belong to their stations, as places do.
+    # Covariances of station errors that act as noise belong to the stations, so they are selected too.
     both = (stations.covariance, stations.velocity_covariance)
     errors = [None if each is None else _once(each[own]) for each in both]
     return Stations(position, names, pick(stations.velocity), None, errors[0], stations.span, errors[1])
 
 
 def _rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:
-    """Return chosen rows (n, r) of a kind as rows of a batch; equal numbers have no batch axis."""
+    """Return chosen rows (n, r) of a kind as rows of a batch; arrays that all problems share get no batch axis."""
     zeros = np.zeros(len(a), dtype=np.int64)
     return replace(
         one,
@@ -264,12 +268,12 @@ def _rows(one: Rows, chosen: Array, a: Array, b: Array) -> Rows:
 
 
 def _once(values: Array) -> Array:
-    """Return values (n, ...) without the batch axis where all problems have equal ones."""
+    """Return values (n, ...) without the batch axis if all problems have the same values."""
     return values[0] if (values == values[:1]).all() else values
 
 
 def _noise(noise: Noise, rows: Array) -> Noise:
-    """Return the noise of rows (n, r) for a batch."""
+    """Return the noise of rows (n, r) as noise of a batch of n problems."""
     one = np.full(1 + max(int(block.row.max()) for block in noise.blocks), -1)
     for block in noise.blocks:
         one[block.row] = block.row[:, :1]

@@ -1,4 +1,4 @@
-"""Epochs of a run: as one batch where they share nothing, window by window in constant memory, cut and joined."""
+"""Epochs of a run: convert them to a batch, iterate over windows of constant size, cut a run and join two runs."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from optloc.base.types import Array, Band, Bias, Motion, Polygon, Rows, Stations
 from optloc.problem.noise import Block, Noise, group
 from optloc.problem.problem import Problem
 
-# Epochs that share nothing become one batch of problems with a single epoch each.
+# Epochs without shared unknowns become a batch of problems with one epoch each.
 
 
 def separable(problem: Problem) -> bool:
     """Return whether no unknown is shared between the epochs of a problem."""
     run_long_errors = problem.stations.unknown_for == "run"
-    # A target that is known for the run ties nothing, and counts as free only where its span says so.
+    # A target with a known motion shares no unknown, but it counts as free only if its span is "epoch".
     free = all(motion.span == "epoch" for motion in problem.motions)
     return (
         problem.epochs > 1
@@ -35,8 +35,7 @@ def has_correlated_epochs(problem: Problem) -> bool:
     epoch = problem.epoch
     for block in problem.noise.blocks:
         when = epoch[block.row]
-        # Groups may hold several epochs, as those of one joint covariance do: what counts is correlation that is not
-        # zero.
+        # One group can hold several epochs, for instance with a joint covariance. Only nonzero correlation counts.
         apart = when[:, :, None] != when[:, None, :]
         if apart.any() and np.any(np.where(apart, block.covariance, 0.0)):
             return True
@@ -46,12 +45,13 @@ def has_correlated_epochs(problem: Problem) -> bool:
 def by_epoch(problem: Problem) -> Problem:
     """Return the epochs of a problem as a batch of independent problems.
 
-    Rows of the same kind, stations and target meet in one row of the batch; a row that an epoch lacks has weight zero.
+    Rows with the same kind, stations and target use the same row of the batch. A row that an epoch lacks has weight
+    zero.
 
     Parameters
     ----------
     problem : Problem
-        Leading axes (...), k epochs. Biases must not be shared; the targets' states become those of their epoch.
+        Leading axes (...), k epochs, no biases. The state of each target becomes its state at the epoch.
 
     Returns
     -------
@@ -61,9 +61,9 @@ def by_epoch(problem: Problem) -> Problem:
     Raises
     ------
     InvalidProblem
-        Where biases or the noise tie the epochs together.
+        If the epochs share a bias or correlated noise.
     """
-    # One more batch axis has no room for what several of its problems share.
+    # Problems of a batch are independent, so they cannot share a bias or correlated noise.
     if problem.biases or has_correlated_epochs(problem):
         tie = f"the bias {problem.biases[0].name!r} is" if problem.biases else "correlated noise is"
         raise InvalidProblem(f"{tie} shared by several epochs", "by_epoch", "solve them as one problem")
@@ -72,7 +72,8 @@ def by_epoch(problem: Problem) -> Problem:
     batch, k = problem.batch_shape, problem.epochs
     rows = []
     for old, (keys, place) in zip(problem.rows, places, strict=True):
-        # A row of the batch is one (stations, target, occurrence): twice measured in an epoch, twice in the batch.
+        # A row of the batch is one (stations, target, occurrence): a pair that is measured twice in an epoch has two
+        # rows.
         a, b, target, _ = keys.T
 
         def spread(values: Array, old: Rows = old, place: Array = place, size: int = len(keys)) -> Array:
@@ -97,23 +98,23 @@ def by_epoch(problem: Problem) -> Problem:
 
 
 def rows_by_epoch(problem: Problem) -> Array:
-    """Return the row of the batch of `by_epoch` that each row (m,) of a run becomes."""
+    """Return, for each row (m,) of a run, its row number in the batch of `by_epoch`."""
     return _joined([_places(rows) for rows in problem.rows])[0]
 
 
 def _joined(places: Sequence[tuple[Array, Array]]) -> tuple[Array, int]:
-    """Return the row of the batch of each row (m,) of all kinds, and the number of rows of the batch."""
+    """Return the row number in the batch of each row (m,) of all kinds, and the number of rows of the batch."""
     starts = np.cumsum([0, *(len(keys) for keys, _ in places)])
     return np.concatenate([start + place for (_, place), start in zip(places, starts, strict=False)]), int(starts[-1])
 
 
 def states_by_epoch(problem: Problem) -> Problem:
-    """Return the batch of `by_epoch` without rows and biases: states, stations, priors and constraints of every epoch.
+    """Return the batch of `by_epoch` without rows and biases: states, stations, priors and constraints of each epoch.
 
     Parameters
     ----------
     problem : Problem
-        As of `by_epoch`.
+        A problem as for `by_epoch`.
     """
     motions = tuple(
         replace(m, span="run", known=None if m.known is None else _split(m.known, 3), rise=None)
@@ -152,7 +153,7 @@ def _spread(c: Band | Polygon, rise: Array | None) -> Band | Polygon:
 
 
 def without_epoch_correlation(problem: Problem) -> Problem:
-    """Return the problem with noise blocks of one epoch each; correlation between epochs is dropped."""
+    """Return the problem with noise blocks of one epoch each, without the correlation between epochs."""
     epoch = problem.epoch
     if all((epoch[block.row] == epoch[block.row[:, :1]]).all() for block in problem.noise.blocks):
         return problem
@@ -161,9 +162,9 @@ def without_epoch_correlation(problem: Problem) -> Problem:
 
 
 def _places(rows: Rows) -> tuple[Array, Array]:
-    """Return the distinct rows (q, 4) of all epochs, a, b, target and occurrence, and the place of each row in them."""
+    """Return the distinct rows (q, 4) of all epochs (a, b, target, occurrence), and the index of each row in them."""
     columns = np.stack([rows.a, rows.b, rows.target])
-    # Indices begin at -1: each row and epoch is one number, which sorts faster than four.
+    # Indices begin at -1. One number for each row and epoch sorts faster than four.
     named = np.ravel_multi_index(tuple(columns + 1), tuple(columns.max(axis=1, initial=0) + 2))
     occurrence = _occurrences(named * (1 + rows.epoch.max(initial=0)) + rows.epoch)
     each = named * (1 + occurrence.max(initial=0)) + occurrence
@@ -176,7 +177,7 @@ def _places(rows: Rows) -> tuple[Array, Array]:
 
 
 def _occurrences(values: Array) -> Array:
-    """Return the number of equal values before each (m,)."""
+    """Return, for each entry of values (m,), the number of equal entries before it."""
     order = np.argsort(values, kind="stable")
     number, sorted_ = np.arange(len(values)), values[order]
     begins = np.append(True, sorted_[1:] != sorted_[:-1])[: len(values)]
@@ -186,20 +187,20 @@ def _occurrences(values: Array) -> Array:
 
 
 def _split(array: Array, core: int) -> Array:
-    """Return a per-epoch quantity (..., k or 1, s, ...) as (..., k, 1, s, ...); unchanged where it is one for all."""
-    # One for all epochs and problems broadcasts as it is.
+    """Return a per-epoch array (..., k or 1, s, ...) as (..., k, 1, s, ...); unchanged if all epochs share it."""
+    # A value that all epochs and problems share broadcasts without a new axis.
     if array.ndim == core and array.shape[0] == 1:
         return array
     return np.expand_dims(array, array.ndim - core + 1)
 
 
 def _same(array: Array, core: int) -> Array:
-    """Return a quantity of the run (..., ...) as (..., 1, ...), or unchanged where it is one for the whole batch."""
+    """Return an array of the run with a new axis for the epochs; unchanged if the whole batch shares it."""
     return array if array.ndim == core else np.expand_dims(array, array.ndim - core)
 
 
 def _cut(block: Block, epoch: Array) -> list[Block]:
-    """Return a block as blocks whose groups hold rows of one epoch each."""
+    """Return the block as blocks with groups of rows of one epoch each."""
     when = epoch[block.row]
     if (when == when[:, :1]).all():
         return [block]
@@ -213,12 +214,12 @@ def _cut(block: Block, epoch: Array) -> list[Block]:
 
 
 def _noise(problem: Problem, where: Array, size: int) -> Noise:
-    """Return the noise of the batch: groups of rows that are correlated in some epoch stay together."""
+    """Return the noise of the batch. Rows that are correlated in any epoch form one group."""
     epoch, k = problem.epoch, problem.epochs
     cut = group([part for block in problem.noise.blocks for part in _cut(block, epoch)]).blocks
     if all(block.row.shape[1] == 1 for block in cut):
         return _alone(cut, where, epoch, size, k)
-    # Rows of the batch that are correlated in any epoch end with one label: groups are merged member by member.
+    # Rows of the batch that are correlated in any epoch get the same label, so overlapping groups merge.
     label = np.arange(size)
     for block in cut:
         for members in where[block.row]:
@@ -232,9 +233,9 @@ def _noise(problem: Problem, where: Array, size: int) -> Noise:
 
 
 def _alone(cut: tuple[Block, ...], where: Array, epoch: Array, size: int, k: int) -> Noise:
-    """Return the noise of a batch whose rows are all independent: what long runs mostly have, in one operation."""
+    """Return the noise of a batch of independent rows. This fast path covers most long runs in one operation."""
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in cut))
-    # A row that an epoch lacks has weight zero; a variance of one keeps it regular.
+    # A row that an epoch lacks has weight zero. Its variance of one keeps the matrix regular.
     out = np.ones((*shape, k, size, 1, 1))
     for block in cut:
         rows = block.row[:, 0]
@@ -246,7 +247,7 @@ def _gather(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, 
     slot = {int(row): i for i, row in enumerate(members)}
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in cut))
     out = np.zeros((*shape, k, 1, len(members), len(members)))
-    # A row that an epoch lacks has weight zero; a variance of one keeps its group regular.
+    # A row that an epoch lacks has weight zero. Its variance of one keeps the matrix of its group regular.
     out[..., np.arange(len(members)), np.arange(len(members))] = 1.0
     for block in cut:
         inside = np.flatnonzero(np.isin(where[block.row[:, 0]], members))
@@ -260,23 +261,23 @@ def _gather(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, 
     return Block(members[None], out)
 
 
-# Stretches of epochs: what is summed over a run is worked on window by window.
+# Windows: sums over a run are computed for one stretch of epochs at a time.
 
-# Numbers of a window's Jacobians, 512 kB of doubles: they stay in a cache of the second level, and memory does not
+# Numbers in the Jacobians of a window: 512 kB of doubles. They fit into the second-level cache, and the memory does not
 # grow with the run.
 _NUMBERS = 2**16
 _ROW_ARRAYS = ("z", "a", "b", "epoch", "target", "weight", "correction")
 
 
 def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Problem]]:
-    """Yield the stretches (first, last, problem) of a run whose Jacobians fit into the cache, in order.
+    """Yield the windows (first, last, problem) of a run, in order. The Jacobians of each window fit into the cache.
 
     Parameters
     ----------
     problem : Problem
-        A run of k epochs; where noise ties its epochs, it is one stretch.
+        A run of k epochs. If noise correlates its epochs, the run is one window.
     batch : int
-        Number of problems that are worked on together.
+        Number of problems that are solved together.
     """
     length = epochs_of(problem, batch)
     if length >= problem.epochs:
@@ -288,41 +289,41 @@ def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Proble
 
 
 def is_one_window(problem: Problem, batch: int = 1) -> bool:
-    """Return whether a run is one window."""
+    """Return whether the run is one window."""
     return epochs_of(problem, batch) >= problem.epochs
 
 
 def epochs_of(problem: Problem, batch: int = 1) -> int:
-    """Return the number of epochs whose Jacobians fit into the cache."""
+    """Return the number of epochs whose Jacobians fit into the cache together."""
     if problem.epochs == 1 or problem.count == 0 or has_correlated_epochs(problem):
         return problem.epochs
-    # And one for the residual.
+    # One more column for the residual.
     columns = problem.layout.n_shared + problem.layout.n_local + 1
     return max(1, int(_NUMBERS * problem.epochs / (batch * problem.count * columns)))
 
 
 def window(problem: Problem, first: int, last: int) -> Problem:
-    """Return the problem with the rows of epochs first <= k < last only; times, stations and unknowns stay.
+    """Return the problem with the rows of epochs first <= k < last only. Times, stations and unknowns stay.
 
     Parameters
     ----------
     problem : Problem
-        Noise must not tie its epochs.
+        A run whose noise does not correlate epochs.
     first, last : int
-        Stretch of epochs.
+        First epoch, and the epoch after the last.
     """
     return _with_rows_of(problem, lambda epoch: _inside(epoch, first, last))
 
 
 def _with_rows_of(problem: Problem, inside: Callable[[Array], slice | Array]) -> Problem:
-    """Return the problem with the rows of some epochs only; `inside` maps epochs (n,) to the entries that are kept."""
+    """Return the problem with the rows of some epochs only; `inside` maps epochs (n,) to the selected entries."""
     kept = [inside(block.epoch) for block in problem.rows]
     rows = tuple(_rows(block, own) for block, own in zip(problem.rows, kept, strict=True))
     number = _Numbers.of(problem, kept, [block.count for block in rows])
     blocks = []
     for block in problem.noise.blocks:
         groups = inside(number.epoch(problem, block.row[:, 0]))
-        # Blocks hold groups of one epoch, so that the epoch of the first row is that of all.
+        # Each group has rows of one epoch, so the epoch of its first row is the epoch of all.
         covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
         if len(block.row[groups]):
             blocks.append(Block(number.new(block.row[groups]), covariance))
@@ -332,7 +333,7 @@ def _with_rows_of(problem: Problem, inside: Callable[[Array], slice | Array]) ->
 
 @dataclass(frozen=True, slots=True)
 class _Numbers:
-    """Row numbers of a run and its window: first row of each kind, what is kept of it, its first row in the window."""
+    """Row numbers of a run and its window, per kind: first row in the run, selected rows, first row in the window."""
 
     start: Array
     kept: list[slice | Array]
@@ -343,7 +344,7 @@ class _Numbers:
         return cls(np.array(problem.starts), kept, np.cumsum([0, *counts[:-1]]))
 
     def epoch(self, problem: Problem, rows: Array) -> Array:
-        """Return the epochs of rows of the run."""
+        """Return the epochs of row numbers of the run."""
         if len(self.kept) == 1:
             return problem.rows[0].epoch[rows]
         kind = np.searchsorted(self.start, rows, side="right") - 1
@@ -353,7 +354,7 @@ class _Numbers:
         return out
 
     def new(self, rows: Array) -> Array:
-        """Return the numbers in the window of rows of the run that are in it."""
+        """Return the row numbers in the window of row numbers of the run that are in the window."""
         kind = np.searchsorted(self.start, rows, side="right") - 1
         out = np.empty(rows.shape, dtype=np.int64)
         for i, kept in enumerate(self.kept):
@@ -365,34 +366,34 @@ class _Numbers:
 
 
 def cut(problem: Problem, first: int, last: int) -> Problem:
-    """Return the epochs first <= k < last of a run as a run of its own; states hold at the same time as before.
+    """Return the epochs first <= k < last of a run as a separate run. The reference time of its states is unchanged.
 
     Parameters
     ----------
     problem : Problem
-        Noise must not tie its epochs.
+        A run whose noise does not correlate epochs.
     first, last : int
-        Stretch of epochs, not empty.
+        First epoch, and the epoch after the last; at least one epoch.
 
     Raises
     ------
     InvalidProblem
-        Where no rows belong to these epochs.
+        If no rows belong to these epochs.
     """
     part = window(problem, first, last)
     if part.count == 0:
         raise InvalidProblem(f"epochs {first} to {last} hold no rows", "cut", "take a longer stretch")
-    return _begun_anew(problem, part, slice(first, last))
+    return _as_separate_run(problem, part, slice(first, last))
 
 
 def some_epochs(problem: Problem, epochs: Array) -> Problem:
-    """Return some epochs (n,) of a run as a run of its own; arguments otherwise as of `cut`."""
+    """Return the epochs (n,) of a run as a separate run; otherwise like `cut`."""
     part = _with_rows_of(problem, lambda epoch: np.flatnonzero(np.isin(epoch, epochs)))
-    return _begun_anew(problem, part, epochs)
+    return _as_separate_run(problem, part, epochs)
 
 
-def _begun_anew(problem: Problem, part: Problem, when: slice | Array) -> Problem:
-    """Return the rows of some epochs of a run, increasing, as those of a run that has no others."""
+def _as_separate_run(problem: Problem, part: Problem, when: slice | Array) -> Problem:
+    """Return `part`, the rows of some increasing epochs `when` of a run, as a run that has these epochs only."""
 
     def own(values: Array | None, core: int) -> Array | None:
         if values is None or values.shape[-core] == 1:
@@ -400,7 +401,7 @@ def _begun_anew(problem: Problem, part: Problem, when: slice | Array) -> Problem
         return np.moveaxis(np.moveaxis(values, -core, 0)[when], 0, -core)
 
     s, number = problem.stations, np.arange(problem.epochs)[when]
-    # Station numbers, times and unknowns of the run stay; only what counts epochs begins anew.
+    # Station numbers, reference times and unknowns of the run stay. Only arrays with an epoch axis are cut.
     position = own(s.position, 3)
     assert position is not None
     motions = tuple(
@@ -421,9 +422,9 @@ def _reference(problem: Problem, motion: Motion) -> float | None:
 
 
 def _inside(epoch: Array, first: int, last: int) -> slice | Array:
-    """Return the entries whose epoch lies in a stretch: a slice, and so a view, where they are sorted."""
+    """Return the indices of entries with first <= epoch < last: a slice (hence a view) if the epochs are sorted."""
     if np.all(epoch[1:] >= epoch[:-1]):
-        # Real runs come sorted: views of millions of rows cost nothing, copies would double them.
+        # Real runs are sorted. Views of millions of rows take no memory; copies would double it.
         return slice(*np.searchsorted(epoch, (first, last)).tolist())
     return np.flatnonzero((epoch >= first) & (epoch < last))
 
@@ -437,36 +438,36 @@ def _touches(problem: Problem, bias: Bias, number: _Numbers, inside: Callable[[A
     return replace(bias, row=number.new(bias.row[kept]), member=bias.member[kept], coefficient=bias.coefficient[kept])
 
 
-# Two runs as one.
+# Join two runs.
 
 
 def joined(problem: Problem, more: Problem) -> Problem:
-    """Return one run of two: the epochs of the second follow those of the first.
+    """Return one run with the epochs of both runs; the epochs of `more` are last.
 
     Parameters
     ----------
     problem, more : Problem
-        The same stations, targets, biases and priors; all times of `more` are later. Each may have kinds of its own.
+        Runs with the same stations, targets, biases and priors. All times of `more` are later. The kinds can differ.
 
     Returns
     -------
     Problem
-        States hold at the reference time of the first run.
+        States refer to the reference time of the first run.
 
     Raises
     ------
     InvalidProblem
-        Naming what differs.
+        If the runs do not fit. The message names the difference.
     """
     _check_alike(problem, more)
     k = problem.epochs
     ours, others = _named(problem.rows), _named(more.rows)
     names = list(dict.fromkeys((*ours, *others)))
-    none = [_none_of(kind) for kind, _ in names]
+    none = [_empty_block(kind) for kind, _ in names]
     first = [ours.get(name, block) for name, block in zip(names, none, strict=True)]
     second = [others.get(name, block) for name, block in zip(names, none, strict=True)]
     rows = tuple(_append(one, replace(two, epoch=two.epoch + k)) for one, two in zip(first, second, strict=True))
-    # Where the rows of either run come to stand: kinds stay together, the second run behind the first.
+    # Row numbers of both runs in the result: for each kind the rows of the first run, then the rows of the second.
     counts = [(one.count, two.count) for one, two in zip(first, second, strict=True)]
     starts = dict(zip(names, np.cumsum([0, *(a + b for a, b in counts)]).tolist(), strict=False))
     mine = np.concatenate([starts[name] + np.arange(block.count) for name, block in ours.items()])
@@ -499,13 +500,13 @@ def joined(problem: Problem, more: Problem) -> Problem:
 
 
 def _named(rows: tuple[Rows, ...]) -> dict[tuple[str, int], Rows]:
-    """Return the blocks of a run by their kinds, and which of several blocks of a kind they are."""
+    """Return the blocks of a run by (kind, i), where i counts the blocks of the same kind."""
     kinds = [block.kind for block in rows]
     return {(kind, kinds[:i].count(kind)): block for i, (kind, block) in enumerate(zip(kinds, rows, strict=True))}
 
 
-def _none_of(kind: str) -> Rows:
-    """Return no rows of a kind, which one of two runs has not."""
+def _empty_block(kind: str) -> Rows:
+    """Return an empty block of a kind, for the run that has no rows of this kind."""
     none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
     return Rows(kind, none, numbers, numbers, numbers, numbers, none, none)
 
@@ -549,11 +550,11 @@ def _motions(problem: Problem, more: Problem) -> tuple[Motion, ...]:
 
 
 def _course(one: Array, first: int, two: Array, second: int, core: int) -> Array:
-    """Return what holds at each epoch (..., k, ...) of both runs; unchanged where it never changes."""
+    """Return an array with the values of both runs at each epoch (..., k, ...); unchanged if it is constant in both."""
     if one.shape[-core] == 1 and two.shape[-core] == 1 and np.array_equal(one, two):
         return one
     axis = -core
-    # What stood still in one run and moves in the other is written out for each epoch.
+    # A value that is constant in one run and changes in the other is repeated for each epoch.
     parts = [np.repeat(a, n, axis) if a.shape[axis] == 1 else a for a, n in ((one, first), (two, second))]
     batch = np.broadcast_shapes(*(part.shape[:axis] for part in parts))
     return np.concatenate([np.broadcast_to(part, (*batch, *part.shape[axis:])) for part in parts], axis)
@@ -579,7 +580,7 @@ def _check_alike(problem: Problem, more: Problem) -> None:
             raise InvalidProblem(f"the {what} of the two runs differ", "update", "give the same ones in the same order")
     if two.times[0] <= one.times[-1]:
         raise InvalidProblem(
-            f"its first epoch, at {two.times[0]} s, is not later than the last one, at {one.times[-1]} s",
+            f"its first epoch, at {two.times[0]} s, is not later than the last epoch of the run, at {one.times[-1]} s",
             "update",
             "give epochs in the order of time",
         )

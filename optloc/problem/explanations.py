@@ -1,4 +1,4 @@
-"""Explanations of data that contradict each other: what was left out, and what remains."""
+"""Explanations of contradictory data: the suspects that were left out, and the fix of the remaining data."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ GroupKind = Literal["station", "row", "prior", "offset"]
 
 @dataclass(frozen=True, slots=True)
 class Suspect:
-    """Something that was left out of a fix because it contradicts the rest.
+    """A station, row, prior or offset that was left out of a fix because it contradicts the other data.
 
     Parameters
     ----------
     name : str
-        In words, for instance "station S3" or "prior of position[2]".
+        A phrase, for instance "station S3" or "prior of position[2]".
     group : "station", "row", "prior" or "offset"
-        What was left out: all rows of a station, one measurement, or a prior; or the offset that all lengths of a kind
-        were given.
+        What was left out: all rows of a station, one measurement, a prior, or an offset that all ranges of a kind
+        received.
     rows : tuple of int
-        Global numbers of the rows it takes part in; empty for a prior.
+        Global numbers of its rows; empty for a prior.
     error : array (q,)
-        Estimated error, measured less true: of the station's arrival time times c (positive: late) where the rows
-        combine arrivals, else of each of `rows`; of each coordinate of a prior's mean. Metres, radians (clockwise of
-        compass bearings) or ratios.
+        Estimated error: measured minus true value. If the rows combine arrivals, it is the error of the station's
+        arrival time, times c (positive: late). Otherwise there is one error for each of `rows`, or for each coordinate
+        of the prior mean. Metres, radians (clockwise for compass bearings) or ratios.
     sigma : array (q,)
-        Standard deviations of `error`; infinite where nothing else tells how large it is.
+        Standard deviations of `error`; infinite if no other data determine the error.
     p_with : float
-        Chi-square probability of the fit that has this back in and leaves the other suspects out; NaN without
-        redundancy.
+        P-value of the fit that includes this suspect and leaves out the others; NaN without redundancy.
     p_without : float
-        The same of the fit that leaves all suspects out.
+        P-value of the fit without any of the suspects.
     """
 
     name: str
@@ -47,22 +46,22 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """One way to explain data that contradict each other: who to leave out, and what remains.
+    """One way to explain contradictory data: the suspects to leave out, and the fit to the rest.
 
     Parameters
     ----------
     suspects : tuple of Suspect
-        What was left out; nobody, where all data agree as well as the rest does.
+        What was left out; empty if the complete data agree as well as the rest.
     x : array (size,)
-        Parameter vector of the fix to the rest, in the order of the problem's layout.
+        Parameter vector of the fit to the rest, in the order of the problem's layout.
     cost : float
-        Its weighted sum of squared residuals.
+        Weighted sum of squared residuals of this fit.
     dof : int
-        Its degrees of freedom.
+        Degrees of freedom of this fit.
     p_value : float
-        Its chi-square probability; NaN without redundancy.
+        Chi-square probability of this fit; NaN without redundancy.
     score : float
-        The cost and a price for each suspect, 16 for one row: explanations weigh as exp(-score / 2).
+        The cost plus a penalty for each suspect, 16 for one row. The weight of an explanation is exp(-score / 2).
     """
 
     suspects: tuple[Suspect, ...]
@@ -74,5 +73,5 @@ class Explanation:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of its suspects."""
+        """Return the names of the suspects."""
         return tuple(suspect.name for suspect in self.suspects)

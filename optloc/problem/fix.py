@@ -1,4 +1,4 @@
-"""The answer: estimate, covariance, verdict and the other positions that the data allow."""
+"""The answer to a problem: estimate, covariance, status, certificate, and other positions that fit the data."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from optloc.problem.state_order import components, in_order
 if TYPE_CHECKING:
     import pandas as pd
 
-TOLD = 0.95  # level up to which the regions of a fix with the finding `tails` hold
+TOLD = 0.95  # greatest probability level at which the region of a fix with the finding `tails` is valid
 _STATES = ("position", "velocity", "acceleration")
-# Sizes of stations and target together, beyond which a standard deviation of a position says nothing: a fix is not
-# Gaussian from one on, and what symmetry leaves open is wider by many decades.
+# A standard deviation of a position above 100 times the size of stations and target counts as undetermined. A fix is
+# not Gaussian from 1 on, and coordinates that a symmetry leaves open have deviations that are larger by many decades.
 _OPEN = 100.0
-# The same of all else, by SI unit, and of positions whose stations are not known: light, turns, a hundredfold error of
-# scale, and for lengths the distance of the outer planets.
+# Limits of other unknowns by SI unit, and of positions without known stations: the speed of light, many turns, a
+# hundredfold scale, and for lengths the distance of the outer planets.
 _OPEN_BY_UNIT = {"m/s": 299_792_458.0, "m/s^2": 299_792_458.0, "rad": 1e3, "1": 100.0, "s": 1e4}
 _OPEN_LENGTH = 1e12
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One step on the way to a fix.
+    """One step of the computation of a fix.
 
     Parameters
     ----------
     name : str
         Method, for instance "gtrs" or "lsr".
     detail : str
-        What it did, in a few words.
+        Summary of the step in a few words.
     seconds : float
         Wall-clock time for the whole batch.
     """
@@ -55,15 +55,15 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Active:
-    """A constraint that holds a fix with equality.
+    """A constraint that is active: the fix meets it with equality.
 
     Parameters
     ----------
     name : str
-        Constraint and side, for instance "height upper".
+        Name of the constraint and its side, for instance "height upper".
     multiplier : float
-        The gradient of the cost plus all multipliers times the gradients of their quantities is zero: positive at
-        an upper bound, negative at a lower one, in cost per SI unit of the quantity.
+        Lagrange multiplier, in cost per SI unit of the constrained quantity: positive at an upper bound, negative at a
+        lower bound. The gradient of the cost plus the sum of all multipliers times their gradients is zero.
     """
 
     name: str
@@ -72,14 +72,14 @@ class Active:
 
 @dataclass(frozen=True, slots=True)
 class Alternatives:
-    """Other minima of the cost that were found, cheapest first.
+    """Other minima of the cost, sorted by cost.
 
     Parameters
     ----------
     x : array (..., q, size)
-        Parameter vectors; NaN where there is none.
+        Parameter vectors; NaN in unused entries.
     gap : array (..., q)
-        Their cost less the cost of the fix; infinite where there is none.
+        Cost of each minimum minus the cost of the fix; infinite in unused entries.
     """
 
     x: Annotated[Array, Axes(2, slots=True)]
@@ -87,9 +87,9 @@ class Alternatives:
 
     @property
     def doubt(self) -> Array:
-        """Return the probability (..., q) that an alternative is the right one, if it is this one or the fix.
+        """Return the probability (..., q) that the alternative is correct, given that either it or the fix is correct.
 
-        Each is as likely before the measurement, and the data then weigh them by exp(-cost / 2).
+        Both have the same prior probability, and the likelihood of each is proportional to exp(-cost / 2).
         """
         from scipy.special import expit
 
@@ -97,59 +97,60 @@ class Alternatives:
 
 
 Index: TypeAlias = int | np.integer[Any] | slice | list[int] | Array | tuple[int | slice | Array, ...]
-"""Chooses some fixes of a batch, as NumPy does."""
+"""Index that selects fixes of a batch, as in NumPy."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Fix:
-    """Estimates of a batch of problems; a single problem has no leading axes.
+    """Estimates of a batch of problems, with covariance, status and certificate; a single fix has no batch axes.
 
     Parameters
     ----------
     x : array (..., size)
-        Parameter vector in the order of `layout`; NaN where there is no answer.
+        Parameter vectors in the order of `layout`; NaN without an answer.
     cov : array (..., n, n)
-        Covariance of the shared unknowns; NaN where it does not exist.
+        Covariance of the shared unknowns; NaN if it does not exist.
     layout : Layout
-        What each entry means.
+        Names, order and units of the unknowns.
     frame : Frame
-        What the coordinates mean.
+        Coordinate frame.
     code : int array (...)
-        `Status` numbers.
+        Numbers of `Status`.
     reason : object array (...)
-        Sentence that belongs to the status: the direction, the groups, the count.
+        Sentence that explains the status, for instance with the open direction, the groups or the count.
     claims : Claims
-        What is proven of each, in columns; see `certificate`.
+        Certificates of the fixes as columns; see `certificate`.
     alternatives : Alternatives
-        Other minima.
+        Other minima of the cost.
     cost : array (...)
         Weighted sum of squared residuals, chi-square distributed if the model is right.
     dof : int array (...)
-        Degrees of freedom, or redundancy: rows present less unknowns without a prior. See `unchecked`.
+        Degrees of freedom (redundancy): present rows minus unknowns without a prior. See `unchecked`.
     weights : array (..., m)
-        Row weights that were used.
+        Row weights of the estimate.
     stages : tuple of Stage
-        How it was found.
+        Steps of the computation.
     active : object array (...), optional
-        Constraints that hold each fix with equality, a tuple of `Active`.
+        For each fix, a tuple of `Active`: the constraints that it meets with equality.
     local : array (..., k, p, p), optional
-        Covariance of the states that targets have at each epoch of a run, in the order of the layout; NaN where an
-        epoch leaves them open.
+        Covariance of the states of targets at each epoch of a run, in the order of the layout; NaN where an epoch does
+        not determine them.
     explanations : object array (...), optional
-        Where the data contradict each other, a tuple of `Explanation`: all that come within the gap of the best, which
-        is the first and was taken; an empty tuple elsewhere. None where nobody asked.
+        For each fix with contradictory data, a tuple of `Explanation`, the best first: the fix uses the best, the
+        others are within the gap of it. Empty for other fixes. None if explanations were not requested.
     marks : int array (...), optional
-        All that applies to each fix, a bit for each `Status`; see `findings`.
+        All findings of each fix, as one bit for each `Status`; see `findings`.
     chart : Chart, optional
-        In which coordinates each is Gaussian; None for problems that are not of one position.
+        Coordinates in which the error of each fix is Gaussian; None for problems with other unknowns than one position.
     infinity : array (...), optional
-        Least cost of positions infinitely far away less that of the fix; NaN where nobody has looked.
+        Least cost of positions at infinity minus the cost of the fix; NaN if it was not computed.
     reach : array (...), optional
-        Greatest distance of a station, and of a target without a chart, from the middle of the stations, metres.
+        Greatest distance, metres, of a station from the mean of the stations; also of a target without a chart.
     labels : array (...), optional
-        Labels of the fixes, such as the index of the data frame that they come from.
+        Labels of the fixes, such as the index of the data frame with their measurements.
     source : object array (...), optional
-        A `Source` for `determined`; None for fixes that are `ok`, and where many are not.
+        A `Source` for `determined`; None for fixes with status `ok`, and in batches where many fixes have another
+        status.
     """
 
     x: Annotated[Array, Axes(1)]
@@ -173,7 +174,7 @@ class Fix:
     reach: Annotated[Array, Axes(0)] | None = None
     source: Annotated[Array, Axes(0, empty=None)] | None = None
     labels: Annotated[Array, Axes(0, empty=None)] | None = None
-    # told once: a program may ask for one after the other
+    # Cached at the first use, because a program can read one certificate after the other.
     _certificates: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -186,7 +187,7 @@ class Fix:
         """Return the status of a single fix; raise InvalidProblem for a batch, which has `statuses`."""
         if self.shape:
             advice = "use fix.statuses, or the status of one of them: fix[i].status"
-            raise InvalidProblem(f"these are fixes of shape {self.shape}", "status", advice)
+            raise InvalidProblem(f"a batch of shape {self.shape} has no single status", "status", advice)
         return Status(int(self.code))
 
     @property
@@ -196,7 +197,7 @@ class Fix:
 
     @property
     def certificate(self) -> Certificate:
-        """Return the certificate of a single fix; of a batch the same as `certificates`."""
+        """Return the certificate of a single fix; for a batch the same as `certificates`."""
         return cast("Certificate", self.certificates[()])
 
     @property
@@ -208,20 +209,20 @@ class Fix:
 
     @property
     def position(self) -> Array:
-        """Return the position (..., d) of the only unknown target, or of each epoch (..., k, d), metres."""
+        """Return the position (..., d) of the only unknown target, or (..., k, d) with one per epoch, metres."""
         return self.take("position")
 
     @property
     def velocity(self) -> Array:
-        """Return the velocity like `position`, metres per second."""
+        """Return the velocity in the same shape as `position`, metres per second."""
         return self.take("velocity")
 
     def take(self, name: str) -> Array:
-        """Return a named part of the estimate, for instance "position[1]" or "clock"."""
+        """Return the named unknowns of the estimate, for instance "position[1]" or "clock"."""
         return self.layout.take(self.x, self._slot(name))
 
     def _slot(self, name: str) -> str:
-        """Return the name of a part: "position" is that of the only target whose place is not known beforehand."""
+        """Return the slot name of a part. "position" means the position of the only target with unknown position."""
         slots = [slot.name for slot in (*self.layout.shared, *self.layout.local)]
         numbered = [slot for slot in slots if slot.partition("[")[0] == name]
         return numbered[0] if name in _STATES and len(numbered) == 1 else name
@@ -232,7 +233,7 @@ class Fix:
         Parameters
         ----------
         order : str
-            Names of components in another order, such as "x vx y vy"; all of x y z vx vy vz ax ay az by default.
+            Names of components in the wanted order, such as "x vx y vy". Default: x y z vx vy vz ax ay az.
         """
         parts = [self._slot(name) for name in _STATES]
         slots = [slot for slot in self.layout.shared if slot.name in parts]
@@ -243,55 +244,55 @@ class Fix:
 
     @property
     def bias(self) -> Mapping[str, Array]:
-        """Return the estimates of everything that is not the state of a target, by name."""
+        """Return the estimates of all unknowns except the states of targets, by name."""
         names = (slot.name for slot in (*self.layout.shared, *self.layout.local))
         return {name: self.take(name) for name in names if name.partition("[")[0] not in _STATES}
 
     def members(self, name: str) -> tuple[str, ...]:
-        """Return what the entries of a named part are called, for instance the stations of "clock"."""
+        """Return the names of the entries of a named part, for instance the stations of "clock"."""
         return self.layout.find(name)[0].entries
 
     def covariance(self, name: str = "position") -> Array:
-        """Return the covariance of a named part: (..., q, q), or (..., k, q, q) of a state at each epoch."""
+        """Return the covariance of a named part: (..., q, q), or (..., k, q, q) for a state at each epoch."""
         slot, shared = self.layout.find(self._slot(name))
         part = slice(slot.start, slot.start + slot.size)
         if shared:
             return self.cov[..., part, part]
         if self.local is None or slot.start + slot.size > self.local.shape[-1]:
             raise InvalidProblem(
-                f"{name} is an unknown of each epoch whose covariance is not kept", name, "ask for others"
+                f"the covariance of {name} is not stored, because it is unknown at each epoch", name, "read other names"
             )
         return self.local[..., part, part]
 
     def sigma(self, name: str = "position") -> Array:
-        """Return the standard deviations of a named part: (..., q), or (..., k, q) of a state at each epoch."""
+        """Return the standard deviations of a named part: (..., q), or (..., k, q) for a state at each epoch."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
 
     def undetermined(self, name: str = "position") -> Array:
-        """Return a mark for each entry (..., q) of a named part that the data do not determine.
+        """Return a mask (..., q) of the entries of a named part that the data do not determine.
 
-        The standard deviation of such an entry is more than 100 times the size of stations and target together, that of
-        a speed more than the speed of light. Symmetry causes such entries, such as the height of a target in the plane
-        of the stations. Tables and texts call them "not determined".
+        These entries have a standard deviation above 100 times the size of stations and target together; for a speed,
+        above the speed of light. A symmetry is the usual cause, for instance for the height of a target if all stations
+        are in one plane. Tables and texts show these entries as "not determined".
 
         Parameters
         ----------
         name : str
-            Part of the estimate, as of `sigma`.
+            Part of the estimate, as for `sigma`.
         """
         sigma, limit = self.sigma(name), self.widest(name)
         with np.errstate(invalid="ignore"):
             return np.asarray(sigma > limit.reshape(*limit.shape, *(1,) * (sigma.ndim - limit.ndim)))
 
     def widest(self, name: str = "position") -> Array:
-        """Return the standard deviation (...) beyond which entries of a named part are not determined, SI units."""
+        """Return the limit (...) of the standard deviation above which `undetermined` marks an entry, SI units."""
         slot, _ = self.layout.find(self._slot(name))
         limit = np.full(self.shape, _OPEN_BY_UNIT.get(slot.unit, _OPEN_LENGTH))
         if slot.name.partition("[")[0] != "position" or self.reach is None:
             return limit
         away = 0.0 if self.chart is None else np.nan_to_num(self.chart.distance)
         size = np.nan_to_num(self.reach) + away
-        # a single station that stays has no size, and a target on it no distance
+        # A single fixed station has size zero, and a target at this station has distance zero.
         return np.where(size > 0.0, _OPEN * size, limit)
 
     @property
@@ -316,7 +317,7 @@ class Fix:
         Parameters
         ----------
         probability : float
-            Probability that it contains the target.
+            Probability that the region contains the target.
 
         Returns
         -------
@@ -335,19 +336,19 @@ class Fix:
         return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
 
     def __repr__(self) -> str:
-        """Return what the command line shows of a fix; of a batch how many have which status."""
+        """Return the text that the command line prints for a fix; for a batch the number of fixes of each status."""
         return str(_TELLER[0]().text_of(self)) if _TELLER else object.__repr__(self)
 
     def _repr_html_(self) -> str:
-        """Return the same as HTML, for notebooks."""
+        """Return the same text as HTML, for notebooks."""
         return str(_TELLER[0]().html_of(self)) if _TELLER else ""
 
     @property
     def determined(self) -> Determined | None:
-        """Return the `Determined` of a single fix: directions, ranges and curves that the data know in its status.
+        """Return directions, ranges and curves of a single fix that the data determine, in every status.
 
-        It is computed when it is read. None where the problem is not at hand, as in batches with many refused fixes:
-        `optloc.model_checks.determined(problem, fix)` returns it then.
+        They are computed when you read them. The result is None if the fix does not hold its problem, as in batches
+        with many refused fixes. `optloc.model_checks.determined(problem, fix)` then computes them.
         """
         return cast("Determined | None", _TELLER[0]().determined_of(self))
 
@@ -357,40 +358,43 @@ class Fix:
         Returns
         -------
         dict
-            Status, position, sigma, covariance, alternatives, certificate and more by name, as ``optloc fix --json``
-            has them: metres and degrees, None where there is no number. Of a batch ``{"fixes": [...]}``.
+            Status, position, sigma, covariance, alternatives, certificate and more by name, as in
+            ``optloc fix --json``: metres and degrees, None for missing numbers. For a batch ``{"fixes": [...]}``.
         """
         return dict(_TELLER[0]().dict_of(self))
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return a data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes.
+        """Return a data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes it.
 
         Its index comes from the data frame of the measurements, see `labels`.
 
         Raises
         ------
         InvalidProblem
-            Where pandas is not installed.
+            If pandas is not installed.
         """
         return cast("pd.DataFrame", _TELLER[0]().frame_of(self))
 
     def to_geojson(self, problem: Problem | None = None) -> dict[str, object]:
-        """Return positions and what holds 95 % as a GeoJSON feature collection (RFC 7946).
+        """Return positions and their 95 % regions as a GeoJSON feature collection (RFC 7946).
 
         Parameters
         ----------
         problem : Problem, optional
-            What was solved: its stations are features, too, and so is a curved region.
+            The problem of these fixes. With it the result also contains its stations, and curved regions.
 
         Raises
         ------
         InvalidProblem
-            For positions that are not on Earth.
+            If the positions are not on Earth.
         """
         return dict(_TELLER[0]().geojson_of(self, problem))
 
     def gaussian(self) -> tuple[Array, Array]:
-        """Return mean (..., n) and covariance (..., n, n), cut off by bounds, of the unknowns: a start of a tracker."""
+        """Return the mean (..., n) and covariance (..., n, n) of the shared unknowns, for the start of a tracker.
+
+        The mean accounts for truncation at bounds.
+        """
         mean, cov = self.x[..., : self.layout.n_shared], self.cov
         if self.chart is not None and self.chart.truncated is not None:
             mean = self.chart.mean_of(mean, cov, self.layout.find("position")[0].start)
@@ -400,9 +404,9 @@ class Fix:
 
     @property
     def suspects(self) -> tuple[Suspect, ...]:
-        """Return what was left out of a single fix; of a batch an object array (...) of such tuples.
+        """Return the suspects that were left out of a single fix; for a batch an object array (...) of such tuples.
 
-        They are those of the first of `explanations`: where there are several, others are suspected as much.
+        They belong to the first of `explanations`. If there are several explanations, the others are equally plausible.
         """
         out = np.empty(self.shape, dtype=object)
         for i in np.ndindex(self.shape):
@@ -412,34 +416,34 @@ class Fix:
 
     @property
     def answered(self) -> Array:
-        """Return where there is a position with a covariance, whatever stands against it, (...)."""
-        # that of a run to infinity has none
+        """Return a mask (...) of fixes that have a position with a covariance, with or without findings."""
+        # A run to infinity has no finite estimate.
         return HAS_ANSWER[self.code] & np.isfinite(self.x).any(-1)
 
     def has(self, *statuses: Status) -> Array:
-        """Return where one of some statuses is among the findings, (...)."""
+        """Return a mask (...) of fixes that have at least one of these statuses among their findings."""
         return np.asarray((self._all_marks & sum({one.mark for one in statuses})) != 0)
 
     @property
     def unchecked(self) -> Array | bool:
-        """Return the mask (...) of answered fixes without redundancy, which every measurement fits; a bool of one."""
+        """Return a mask (...) of answered fixes without redundancy, which cannot be tested; a bool for one fix."""
         out = np.asarray(self.answered & (self.dof <= 0))
         return bool(out) if self.shape == () else out
 
     @property
     def _all_marks(self) -> Array:
-        # a fix of a solver from outside may have a status alone
+        # A fix of an external solver can have a status without marks.
         marks = np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
         return np.asarray(marks | np.where(self.unchecked, Status.UNCHECKED.mark, 0))
 
     @property
     def findings(self) -> tuple[Status, ...]:
-        """Return all that stands against a single fix; of a batch an object array (...) of such tuples.
+        """Return all findings of a single fix; for a batch an object array (...) of such tuples.
 
-        The most serious comes first: it is the status. Notes come last: an `ok` fix has nothing but these, `unchecked`
-        where it has no redundancy.
+        The most serious finding is first; it is the status. Notes are last: an `ok` fix has notes only, such as
+        `unchecked` if it has no redundancy.
         """
-        # Many fixes have few different sets of findings.
+        # Many fixes share few different sets of findings.
         marks, index = np.unique(self._all_marks, return_inverse=True)
         sets = np.empty(len(marks), dtype=object)
         for i, found in enumerate(marks.tolist()):
@@ -447,7 +451,7 @@ class Fix:
         return cast("tuple[Status, ...]", sets[index.reshape(self.shape)] if self.shape else sets[0])
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
-        """Return whether points lie in the regions that hold the target with a given probability.
+        """Return whether points are in the regions that contain the target with a given probability.
 
         Parameters
         ----------
@@ -459,58 +463,59 @@ class Fix:
         Returns
         -------
         bool array (...)
-            By the Gaussian in the coordinates where it covers, see `chart`.
+            Computed in the coordinates in which the error is Gaussian, see `chart`.
 
         Raises
         ------
         InvalidProblem
-            Where no Gaussian covers: `optloc.uncertainty.likelihood_region` shows what does.
+            If no Gaussian is valid for the fix. Use `optloc.uncertainty.likelihood_region` for its region.
         """
         return self._gaussian_chart(level).covers(points, level)
 
     def interval(self, extent: Extent, level: float = 0.95) -> tuple[Array, Array]:
-        """Return the ends (...) of an interval that holds one number of the target.
+        """Return the ends (...) of an interval for one coordinate of the target.
 
         Parameters
         ----------
         extent : "range", "bearing", "elevation", "height", "x", "y" or "z"
-            Seen from the middle of the stations; metres or radians, see `optloc.problem.chart.Chart.interval`.
+            Coordinate, seen from the mean of the stations; metres or radians, see
+            `optloc.problem.chart.Chart.interval`.
         level : float
-            Probability that the interval contains it.
+            Probability that the interval contains the true value.
 
         Raises
         ------
         InvalidProblem
-            Where no Gaussian covers: `optloc.uncertainty.likelihood_region` shows what does.
+            If no Gaussian is valid for the fix. Use `optloc.uncertainty.likelihood_region` for its region.
         """
         return self._gaussian_chart(level).interval(extent, level)
 
     def _gaussian_chart(self, level: float) -> Chart:
         if self.chart is None:
-            raise InvalidProblem("a fix that is not of one position has no chart", "fix", "see its covariance")
+            raise InvalidProblem("only a fix of a single position has a chart", "fix", "use its covariance")
         if level > TOLD and bool((self.has(Status.TAILS) & (self.chart.kind == CARTESIAN)).any()):
-            told = f"some regions hold at {TOLD:g} but not at {level:g}"
-            raise InvalidProblem(told, "level", "take fixes without the finding 'tails'")
+            what = f"some regions are valid at level {TOLD:g}, but not at {level:g}"
+            raise InvalidProblem(what, "level", "take fixes without the finding 'tails'")
         return self.chart
 
     def require(self, allow: Iterable[Status | str] = (), *, redundancy: int = 0, level: float = 0.95) -> Fix:
-        """Return the fix if every status in it is `ok` or allowed; raise NoSolution with the first that is not.
+        """Return the fix if all its statuses are `ok` or allowed; otherwise raise NoSolution for the first that is not.
 
         Parameters
         ----------
         allow : iterable of Status or str
-            What passes beside `ok`, for instance ``("curved", "unproven")``.
+            Statuses to accept in addition to `ok`, for instance ``("curved", "unproven")``.
         redundancy : int
-            Least degrees of freedom of a fix that passes: with 1 a wrong measurement is noticed, 0 passes `unchecked`.
+            Required degrees of freedom. With 1, a wrong measurement can be detected; with 0, `unchecked` fixes pass.
         level : float
-            Probability that regions must hold. Above 0.95 a fix with the finding `tails` does not pass.
+            Required probability level of regions. Above 0.95, fixes with the finding `tails` do not pass.
 
         Raises
         ------
         NoSolution
-            With the first fix of another status, of less redundancy, or with `tails`.
+            For the first fix with another status, with less redundancy, or with `tails`.
         InvalidProblem
-            For an unknown status or a redundancy that is no whole number.
+            For an unknown status, or if the redundancy is not a whole number.
         """
         wanted = whole_redundancy(redundancy)
         passing = [Status.OK, *(one if isinstance(one, Status) else status_named(one) for one in allow)]
@@ -529,11 +534,11 @@ class Fix:
         return self.reshape((self.code.size,))
 
     def reshape(self, shape: tuple[int, ...]) -> Fix:
-        """Return the fixes of a flat batch with other batch axes."""
+        """Return the fixes of a flat batch with these batch axes."""
         return change(self, lambda array, core: array.reshape((*shape, *array.shape[array.ndim - core :])))
 
     def __getitem__(self, index: Index) -> Fix:
-        """Return some fixes of a batch."""
+        """Return the selected fixes of a batch."""
         return change(self, lambda array, core: _as_array(array[index]))
 
     def __len__(self) -> int:
@@ -541,12 +546,12 @@ class Fix:
         return int(self.x.shape[0])
 
 
-# Words, tables and maps are made on a higher floor: `optloc` says by whom, once.
+# A module of a higher layer makes texts, tables and maps. The package `optloc` registers it here once.
 _TELLER: list[Callable[[], Any]] = []
 
 
 def set_renderer(teller: Callable[[], Any]) -> None:
-    """Say which module, loaded when it is needed, tells fixes in words and tables: `optloc.show.fixes`."""
+    """Register the loader of the module that makes texts, tables and maps of fixes: `optloc.show.fixes`."""
     _TELLER[:] = [teller]
 
 

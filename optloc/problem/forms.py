@@ -1,4 +1,4 @@
-"""Forms of systematic errors: how each enters rows, what its values are, and how they change in time."""
+"""Forms of systematic errors: how an error enters rows, the unit of its values, and its change in time."""
 
 from __future__ import annotations
 
@@ -34,38 +34,40 @@ def _in_pieces(bias: Bias, times: Array, origin: float, epoch: Array) -> _Effect
 
 @dataclass(frozen=True, slots=True)
 class BiasForm:
-    """A form of systematic errors; `FORMS` holds all of them.
+    """A form of systematic error. `FORMS` lists all forms.
 
     Parameters
     ----------
     noun : str
-        The form in sentences, with its article.
+        Name of the form with its article, for use in sentences.
     enters : "adds", "scales", "turns" or "moves"
-        The effect of a value: it adds to a measurement, multiplies the measured quantity, turns the axes of a station,
+        How a value acts: it is added to a measurement, multiplies the measured quantity, turns the axes of a station,
         or moves a station along its course.
     quantity : Quantity, optional
-        What the values measure; None: what the rows measure.
+        Physical quantity of the values; None: the quantity of the rows.
     rate : bool
         Whether the values are per second.
     effects : callable
-        Arguments: a bias, the times of the epochs (k,), the time of zero drift, and the epoch of each touch (n,).
-        Returns the entries of the bias that each touch adds to its row, and their factors, each (n, c). A scale adds
-        its entries times the measured quantity.
+        Arguments: a bias, the times of the epochs (k,), the time of zero drift, and the epochs (n,) of the n pairs of
+        row and member. Returns, for each pair, the indices of the values that enter the row, and their factors, each
+        (n, c). For a scale, the sum is multiplied by the measured quantity.
     values_at : callable, optional
-        Maps a bias to the times (c,) of the values of a member; None: a member has one value.
+        Maps a bias to the times (c,) of the values of a member; None: each member has one value.
     steps : callable, optional
-        Maps a bias and the times of the epochs to the transitions and covariances of its steps, as
-        `optloc.problem.clocks.process`. Each epoch then has its values as unknowns; None: they are unknowns of the run.
+        Maps a bias and the times of the epochs to the transitions and covariances of its steps, see
+        `optloc.problem.clocks.process`. The values at each epoch are then unknowns. None: the values are unknowns of
+        the run.
     needs : tuple of str
-        Arguments of `optloc.with_bias` that describe the change in time.
+        Names of the arguments of `optloc.with_bias` that describe the change in time.
     complete : callable, optional
-        Arguments: a bias, the times of the epochs, a place to name, and those in `needs`. Returns the bias with them.
+        Arguments: a bias, the times of the epochs, the location for messages, and the arguments in `needs`. Returns the
+        bias with these arguments.
     check : callable, optional
-        Arguments: a bias, the times of the epochs, a place to name. Raises InvalidProblem.
+        Arguments: a bias, the times of the epochs, the location for messages. Raises InvalidProblem.
     straight : callable, optional
-        Maps a bias to the offsets and drifts that replace it in the search for starts; None: nothing replaces it.
+        Maps a bias to offsets and drifts that replace it in the search for starts; None: nothing replaces it.
     beyond_proof : str
-        The reason why the proof does not cover the form, as the end of a sentence about the bias; empty if it does.
+        Why the proof does not cover the form, as the end of a sentence about the bias; empty if the proof covers it.
     """
 
     noun: str
@@ -83,12 +85,12 @@ class BiasForm:
 
     @property
     def changes(self) -> bool:
-        """Return whether the error changes with the seconds of the run."""
+        """Return whether the error changes during the run."""
         return self.rate or self.values_at is not None or self.steps is not None
 
     @property
     def of_readings(self) -> bool:
-        """Return whether values have the sense and the quantity of readings; a time along a course has neither."""
+        """Return whether values have the sign and the quantity of the measurements; False for a time along a course."""
         return self.enters != "moves"
 
     def touches(self, model: Model) -> bool:
@@ -96,41 +98,41 @@ class BiasForm:
         return {"turns": model.axes, "moves": model.stations > 0}.get(self.enters, True)
 
     def signs(self, model: Model) -> tuple[int, int]:
-        """Return the signs with which the error of the first and of the second station of a row enters."""
+        """Return the signs with which the errors of the first and the second station enter a row; 0 for no effect."""
         if self.enters == "turns" or model.stations == 1:
             return (1, 0)
-        # Which of the two stations is further along its course.
+        # A coefficient of 1 moves the first station of the row along its course, -1 the second.
         if self.enters == "moves":
             return (1, -1)
-        # Two stations of a kind that is not a sum of ranges, such as gains, enter as a difference.
+        # In kinds that are not sums of ranges, such as gains, the errors of two stations enter as a difference.
         return model.signs or (1, -1)
 
     def unit(self, rows: str) -> str:
-        """Return the SI unit of the values on rows of a unit; empty for rows of several units."""
+        """Return the SI unit of the values for rows with unit `rows`; empty if the rows have several units."""
         if self.quantity is not None:
             return SI_UNIT[self.quantity]
         return per_second(rows) if self.rate else rows
 
     def shape(self, bias: Bias, dimension: int) -> tuple[int, ...]:
-        """Return the shape of the values: (members,), or (members, angles or coefficients of each)."""
+        """Return the shape of the values: (members,), or (members, number of angles or coefficients)."""
         if self.values_at is not None:
             return (len(bias.members), len(self.values_at(bias)))
         return (len(bias.members), *((3,) if self.enters == "turns" and dimension == 3 else ()))
 
     def members(self, bias: Bias) -> tuple[str, ...]:
-        """Return the names of the members, with the time of each value where a member has several."""
+        """Return the names of the members, with the time of each value if a member has several values."""
         if self.values_at is None:
             return bias.members
         return tuple(f"{member} at {time:.6g} s" for member in bias.members for time in self.values_at(bias))
 
 
 def per_second(unit: str) -> str:
-    """Return the SI unit per second; empty for no unit."""
+    """Return the SI unit per second of a unit; empty for an empty unit."""
     return {"": "", "m/s": "m/s^2"}.get(unit, f"{unit}/s")
 
 
 def _straight_walk(bias: Bias) -> tuple[Bias, ...]:
-    """Return an offset with the prior of the first value of a walk, and a drift where the walk has a rate."""
+    """Return an offset with the prior of the first value of a walk and, if the walk has a rate, a drift."""
     offset, drift = _straight_spline(bias)
     known = replace(offset, sigma=bias.sigma, mean=bias.mean)
     return (known, drift)[: len(clocks.state_of(bias))]
@@ -142,8 +144,8 @@ def _straight_spline(bias: Bias) -> tuple[Bias, ...]:
     return offset, replace(offset, name=clocks.rate_name(bias.name), form="drift")
 
 
-_ADDS = "and the proof takes what is added"
-_MULTIPLIES = f"multiplies what it touches, {_ADDS}"
+_ADDS = "and the proof covers added errors only"
+_MULTIPLIES = f"multiplies the measured quantity, {_ADDS}"
 
 FORMS: dict[str, BiasForm] = {
     "offset": BiasForm("an offset"),
@@ -158,7 +160,7 @@ FORMS: dict[str, BiasForm] = {
         complete=clocks.with_densities,
         check=clocks.check_walk,
         straight=_straight_walk,
-        beyond_proof="is another unknown at each epoch, and the proof takes those of the run",
+        beyond_proof="has unknowns at each epoch, and the proof covers unknowns of the run only",
     ),
     "spline": BiasForm(
         "a spline",
@@ -170,7 +172,7 @@ FORMS: dict[str, BiasForm] = {
         straight=_straight_spline,
     ),
 }
-"""The forms by the names that arguments and files use, the simplest first."""
+"""All forms by the names in arguments and files, the simplest first."""
 
 
 def form_of(bias: Bias) -> BiasForm:
@@ -181,18 +183,18 @@ def form_of(bias: Bias) -> BiasForm:
 
 
 def complete(bias: Bias, times: Array, where: str, **given: Any) -> Bias:
-    """Return a bias with the arguments that its form needs; refuse others that are not None.
+    """Return the bias with the arguments that its form needs; raise if another argument is not None.
 
     Parameters
     ----------
     bias : Bias
-        Without them.
+        A bias without these arguments.
     times : array (k,)
         Seconds of the epochs.
     where : str
-        Place to name.
+        Location that error messages name.
     **given
-        Arguments of `optloc.with_bias` by name.
+        Arguments of `optloc.with_bias`, by name.
     """
     form = form_of(bias)
     for name, value in given.items():

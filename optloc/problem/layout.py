@@ -1,4 +1,4 @@
-"""The parameter vector: which unknown lives where, shared by all epochs or local to one."""
+"""The parameter vector: the position of each unknown in it. Unknowns are shared by all epochs or local to one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from optloc.base.types import Array, Bias, Motion, Stations
 from optloc.problem.clocks import state_of
 from optloc.problem.forms import form_of, per_second
 
-# Units are those of reports: inside all is SI.
+# Units for output. All internal values are SI.
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
 _Part = tuple[str, int, str, tuple[str, ...]]
 
@@ -26,11 +26,11 @@ class Slot:
     name : str
         For instance "position", "velocity[2]", "clock" or "emission".
     start, size : int
-        Place within the shared part, or within the local part of an epoch.
+        Position within the shared part, or within the local part of an epoch, and number of entries.
     unit : str
         SI unit.
     members : tuple of str
-        Who has an equal share of it: the members of a bias, or the stations; empty for the state of a target.
+        Names of the bias members or stations with equal shares of the slot; empty for the state of a target.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Slot:
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """Return what tells the entries apart: a coordinate, a member, or a member and its coordinate."""
+        """Return the names of the entries: a coordinate, a member, or a member and a coordinate."""
         per = self.size // max(len(self.members), 1)
         axes = tuple("xyz"[:per]) if per > 1 else ("",)
         return tuple(f"{member} {axis}".strip() for member in self.members or ("",) for axis in axes)
@@ -54,7 +54,7 @@ class Layout:
     Parameters
     ----------
     shared, local : tuple of Slot
-        Unknowns of the run, and of each epoch.
+        Unknowns of the whole run, and unknowns of each epoch.
     epochs : int
         Number of epochs k.
     """
@@ -79,26 +79,26 @@ class Layout:
         return self.n_shared + self.epochs * self.n_local
 
     def find(self, name: str) -> tuple[Slot, bool]:
-        """Return the slot of a name and whether it is shared; raise InvalidProblem for an unknown name."""
+        """Return the slot with this name and whether it is shared; raise InvalidProblem for an unknown name."""
         for slots, is_shared in ((self.shared, True), (self.local, False)):
             for slot in slots:
                 if slot.name == name:
                     return slot, is_shared
         known = ", ".join(slot.name for slot in (*self.shared, *self.local))
-        raise InvalidProblem(f"no unknown is called {name!r}", "name", f"this problem has {known}")
+        raise InvalidProblem(f"there is no unknown {name!r}", "name", f"this problem has {known}")
 
     def shares(self, name: str) -> bool:
-        """Return whether there is a shared unknown of this name."""
+        """Return whether there is a shared unknown with this name."""
         return any(slot.name == name for slot in self.shared)
 
     def split(self, x: Array) -> tuple[Array, Array]:
         """Return the shared part (..., n) and the local part (..., k, l) of vectors (..., size)."""
         n = self.n_shared
-        # Shared unknowns stand first, so that an arrow of blocks is a split of the vector.
+        # Shared unknowns are first, so the blocks of an arrow-shaped matrix are slices of the vector.
         return x[..., :n], library(x).reshape(x[..., n:], (*x.shape[:-1], self.epochs, self.n_local))
 
     def take(self, x: Array, name: str) -> Array:
-        """Return a named part, (..., q) of the shared unknowns or (..., k, q) of the local ones."""
+        """Return a named part of x: (..., q) for shared unknowns, (..., k, q) for local ones."""
         slot, is_shared = self.find(name)
         shared, local = self.split(x)
         return (shared if is_shared else local)[..., slot.start : slot.start + slot.size]
@@ -109,7 +109,7 @@ class Layout:
 
 
 def state_names(target: int, count: int, order: int) -> tuple[str, ...]:
-    """Return the slot names of a target's state, numbered where there are several targets."""
+    """Return the slot names of a target's state; they contain the target number if there are several targets."""
     suffix = f"[{target}]" if count > 1 else ""
     return tuple(name + suffix for name, _ in _STATE[: order + 1])
 
@@ -132,7 +132,7 @@ def layout(
     Parameters
     ----------
     stations : Stations
-        Gives the dimension, and station offsets where positions or velocities are uncertain.
+        The stations give the dimension. If their positions or velocities are uncertain, their errors are unknowns.
     motions : sequence of Motion
         One for each target.
     biases : sequence of Bias
@@ -142,7 +142,7 @@ def layout(
     epochs : int
         Number of epochs.
     bias_units : sequence of str
-        SI unit of the rows that each bias touches; empty where they have several, or where it does not matter.
+        SI unit of the rows that each bias affects; empty if they have several units, or if the unit is not needed.
     """
     shared: list[_Part] = []
     local: list[_Part] = []
@@ -158,7 +158,7 @@ def layout(
         size, members = prod(form.shape(bias, stations.dimension)), form.members(bias)
         entries = zip(state_of(bias), (form.unit(unit), per_second(unit)), strict=False)
         room.extend((name, size, own, members) for name, own in entries)
-    # Emission times last one epoch by their nature; station errors where their span says so.
+    # Emission times are unknowns of one epoch. Station errors are unknowns of the span that the stations state.
     local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
     if stations.unknown_for:
         room = shared if stations.unknown_for == "run" else local

@@ -1,4 +1,4 @@
-"""Robust losses: how much a residual costs, and how much its row then counts."""
+"""Robust loss functions: the cost of a residual, and the weight of its row in least squares."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from optloc.base.types import Array
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """A loss of residuals u in standard deviations; near zero it is u², far away it grows more slowly.
+    """A loss function of residuals u in standard deviations: about u² near zero, with slower growth for large u.
 
     Parameters
     ----------
     name : str
-        Also the name of the solver stage.
+        Name of the loss and of the solver stage that uses it.
     constant : float
-        Where it leaves u². They are tuned so that the mean square error of an estimate from clean Gaussian data is that
-        of least squares divided by 0.95; that of the truncated loss by 0.99, as with few rows one that is cut off
-        without need costs more than that.
+        Residual above which the loss differs from u². For clean Gaussian data the mean square error is the error of
+        least squares divided by 0.95. For the truncated loss it is divided by 0.99, because with few rows an
+        unnecessary rejection of a row costs more than 5 %.
     cost : callable of (u, constant)
-        rho(u).
+        The loss rho(u).
     importance : callable of (u, constant)
-        The weight psi(u) / u with psi = rho' / 2: in [0, 1], not rising with abs(u).
+        The weight psi(u) / u with psi = rho' / 2. It is in [0, 1] and does not increase with abs(u).
     summary : str
         One line for listings.
     one_sided : bool
-        Whether only positive residuals are doubted. Residuals of either sign of other kinds are then given as abs(u).
+        Whether the loss reduces the weight of positive residuals only. For kinds with errors of either sign, u is then
+        abs(u).
     flat : bool
-        Whether all gross errors cost the same: how many there are is then evidence, and it takes a loss that still
-        rises to lead the way to its minima.
+        Whether the loss is constant for large residuals. The number of outliers is then evidence. The search for minima
+        starts with another loss, because a constant loss has no slope.
     """
 
     name: str
@@ -48,31 +49,34 @@ class Loss:
     flat: bool = False
 
     def rho(self, u: Array) -> Array:
-        """Return the cost of residuals u, in sigma, elementwise: u² for small ones."""
+        """Return the loss of each residual u, in standard deviations; u² for small residuals."""
         return self.cost(np.asarray(u, dtype=float), self.constant)
 
     def weight(self, u: Array) -> Array:
-        """Return the weights in [0, 1] of residuals u, in sigma, elementwise; least squares with them has their psi."""
+        """Return the weight in [0, 1] of each residual u, in standard deviations, for weighted least squares."""
         return self.importance(np.asarray(u, dtype=float), self.constant)
 
     @property
     def psi_squared(self) -> float:
-        """Return E psi(u)² for a standard normal u."""
+        """Return the expectation of psi(u)² for a standard normal u."""
         return _moments(self)[0]
 
     @property
     def slope(self) -> float:
-        """Return E psi'(u) for a standard normal u; by parts it is E u psi(u), which steps of psi leave valid."""
+        """Return the expectation of psi'(u) for a standard normal u.
+
+        It is computed as E u psi(u) (integration by parts), which is valid even if psi has steps.
+        """
         return _moments(self)[1]
 
     @property
     def mean_weight(self) -> float:
-        """Return the expected weight of a standard normal u."""
+        """Return the expected weight for a standard normal u."""
         return _moments(self)[2]
 
     @property
     def efficiency(self) -> float:
-        """Return the mean square error of least squares over that of this loss, for clean Gaussian data.
+        """Return the mean square error of least squares over the error of this loss, for clean Gaussian data.
 
         P. J. Huber, "Robust Statistics" (1981), eq. 3.2.13: (E psi')² / E psi².
         """
@@ -80,24 +84,24 @@ class Loss:
 
     @property
     def spread(self) -> float:
-        """Return by what the inverse of the weighted normal matrix is multiplied for a covariance.
+        """Return the factor that converts the inverse of the weighted normal matrix to the covariance of the estimate.
 
         The covariance of an M-estimate is E psi² / (E psi')² times the inverse normal matrix of least squares (Huber
-        1981, eq. 7.6.2); the expected weight turns the weighted normal matrix into that one.
+        1981, eq. 7.6.2). The expected weight converts the weighted normal matrix to the normal matrix of least squares.
         """
         return self.psi_squared * self.mean_weight / self.slope**2
 
 
-# Nodes of Gauss and Legendre between two kinks, and where the density (e^-72) ends: more of either changes no digit.
+# Number of Gauss-Legendre nodes per panel, and end of the integration (density e^-72). Larger values change no digit.
 _NODES, _REACH = 60, 12.0
 
 
 @lru_cache
 def _moments(loss: Loss) -> tuple[float, float, float]:
-    """Return the expected psi², u psi and weight of a standard normal u, by quadrature between the kinks."""
+    """Return the expectations of psi², u psi and weight for a standard normal u, by quadrature between the kinks."""
     node, share = np.polynomial.legendre.leggauss(_NODES)
-    # Between the kinks at 0 and at the constant everything is smooth; at 6 sigma a panel ends, so that nodes are dense
-    # where the density is.
+    # The integrand is smooth between the kinks at 0 and at the constant. The panel ends at 6 sigma make the nodes dense
+    # where the density is large.
     ends = np.array([-_REACH, -6.0, -loss.constant, 0.0, loss.constant, 6.0, _REACH])
     half, middle = 0.5 * np.diff(ends)[:, None], 0.5 * (ends[1:] + ends[:-1])[:, None]
     u = middle + half * node
@@ -138,37 +142,39 @@ def _late_weight(u: Array, c: float) -> Array:
     return _cauchy_weight(np.maximum(u, 0.0), c)
 
 
-# Late rows as a share of all with delays that are exponential: a loss for every share and mean delay.
+# Loss for late rows: a share of the rows has exponentially distributed delays. It exists for every share and mean
+# delay.
 
 LATE = frozenset(("range", "toa", "range_sum"))
-"""Kinds that a blocked path makes too long: they grow with every path they hold. A difference may be off either way."""
+"""Kinds that a blocked path can only lengthen: each path has a positive sign. Differences can err either way."""
 
-# How a loss of late rows is spelled: the share of them, and the mean delay in sigma.
-_SPELLED = re.compile(r"late\((?P<share>[0-9.eE+-]+),(?P<delay>[0-9.eE+-]+)\)")
-# Where psi over u is its limit, and the step of the difference that is the limit: far above rounding of a logarithm.
+# Name of a loss for late rows: late(share, mean delay in sigma).
+_LATE_NAME = re.compile(r"late\((?P<share>[0-9.eE+-]+),(?P<delay>[0-9.eE+-]+)\)")
+# Residual below which psi / u is replaced by its limit, and the step of the difference quotient for this limit. The
+# step is far above the rounding error of a logarithm.
 _ZERO, _STEP = 1e-6, 1e-3
 
 
 @lru_cache(maxsize=256)
 def late_loss(share: float, delay: float) -> Loss:
-    """Return the loss of rows of which a share is late, by delays that are exponential.
+    """Return the loss for rows of which a share is late, with exponentially distributed delays.
 
-    The residual of a row in its sigma is normal, plus a delay with the probability `share`: its density is
-    (1 - p) phi(u) + p g(u) with g that of an exponential and a normal variable together (Grushka 1972, equation 5), and
-    the loss is twice its negative logarithm above its mode, which is some hundredths of sigma above zero. What is
-    early costs its square.
+    The residual of a row, in sigma, is normal. With probability p = `share` an exponential delay is added. Its density
+    is (1 - p) phi(u) + p g(u). Here g is the density of an exponential plus a normal variable (Grushka 1972, equation
+    5). The loss is twice the negative logarithm of this density, measured from its mode, which is some hundredths of
+    sigma above zero. Early rows cost u².
 
     Parameters
     ----------
     share : float
-        Probability of a row to be late, between 0 and 1.
+        Probability that a row is late, between 0 and 1.
     delay : float
-        Mean delay of those, standard deviations.
+        Mean delay of late rows, standard deviations.
 
     Raises
     ------
     InvalidProblem
-        For a share that is none, or a delay that is not positive.
+        If the share is not between 0 and 1, or the delay is not positive.
     """
     name = f"late({share:.4g},{delay:.4g})"
     if not 0.0 < share < 1.0 or not 0.0 < delay < np.inf:
@@ -189,21 +195,21 @@ def late_loss(share: float, delay: float) -> Loss:
         return np.where(u > 0.0, np.clip(weight, 0.0, 1.0), 1.0)
 
     summary = f"a share of {share:.2g} late by {delay:.2g} sigma on average"
-    # Where a row is as likely late as not the loss leaves the square; quadratures need no more of it.
+    # The constant of this loss is the residual at which the weight is about 0.5. The quadrature needs no precise value.
     grid = np.linspace(0.5, 8.0, 151)
     kink = float(grid[int(np.argmin(np.abs(importance(grid, 0.0) - 0.5)))])
     return Loss(name, kink, cost, importance, summary, one_sided=True)
 
 
 def _late_density(u: Array, share: float, delay: float) -> tuple[Array, Array]:
-    """Return the logarithm of the density of rows some of which are late, and the negative of its derivative."""
+    """Return the logarithm of the density of u with a share of late rows, and minus its derivative."""
     from scipy.special import log_ndtr
 
     late = np.log(share / delay) + 0.5 / delay**2 - u / delay + log_ndtr(u - 1.0 / delay)
     prompt = np.log1p(-share) - 0.5 * u**2 - _LOG_ROOT
     density = np.logaddexp(late, prompt)
     chance = np.exp(late - density)
-    # derivative of the logarithm of the normal distribution: its hazard
+    # Derivative of the logarithm of the normal distribution function: its hazard rate.
     hazard = np.exp(-0.5 * (u - 1.0 / delay) ** 2 - _LOG_ROOT - log_ndtr(u - 1.0 / delay))
     return density, (1.0 - chance) * u + chance * (1.0 / delay - hazard)
 
@@ -212,44 +218,46 @@ _LOG_ROOT = 0.5 * float(np.log(2.0 * np.pi))
 
 
 def _mode(share: float, delay: float) -> float:
-    """Return where the density of rows some of which are late is largest, by bisection."""
+    """Return the mode of the density of residuals with a share of late rows, in sigma, by bisection."""
     low, high = 0.0, 1.0 + 2.0 * delay
-    for _ in range(60):  # down to rounding
+    for _ in range(60):  # 60 halvings reach rounding error
         middle = 0.5 * (low + high)
         rising = float(_late_density(np.array(middle), share, delay)[1]) < 0.0
         low, high = (middle, high) if rising else (low, middle)
     return 0.5 * (low + high)
 
 
-class _Spelled(dict[str, Loss]):
-    """Losses that are made of what their name says."""
+class _NamedLosses(dict[str, Loss]):
+    """Table of losses that also makes losses from names such as "late(0.1,8)"."""
 
     def __missing__(self, name: str) -> Loss:
-        found = _SPELLED.fullmatch(name.replace(" ", ""))
+        found = _LATE_NAME.fullmatch(name.replace(" ", ""))
         if found is None:
             raise KeyError(name)
         return late_loss(float(found["share"]), float(found["delay"]))
 
 
-# Each constant is where `efficiency` says 95 %, for the truncated loss 99 %.
+# Each constant gives an `efficiency` of 95 %, for the truncated loss 99 %.
 _OWN = (
-    Loss("huber", 1.345, _huber, _huber_weight, "Huber's convex loss: gross errors pull no harder than 1.3 sigma"),
-    Loss("cauchy", 2.385, _cauchy, _cauchy_weight, "Cauchy's loss: the larger an error the less it pulls"),
-    Loss("truncated", 3.368, _truncated, _truncated_weight, "least squares without the rows 3.4 sigma off", flat=True),
+    Loss(
+        "huber", 1.345, _huber, _huber_weight, "Huber's convex loss: a gross error has no more influence than 1.3 sigma"
+    ),
+    Loss("cauchy", 2.385, _cauchy, _cauchy_weight, "Cauchy's loss: the larger an error, the smaller its influence"),
+    Loss("truncated", 3.368, _truncated, _truncated_weight, "least squares without rows beyond 3.4 sigma", flat=True),
     Loss(
         "late",
         2.328,
         _late,
         _late_weight,
-        "doubts ranges and arrivals that are too long: blocked paths",
+        "reduces the weight of ranges and arrivals that are too long: blocked paths",
         one_sided=True,
     ),
 )
 LOSSES: Registry[Loss] = Registry(
-    "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN}, _Spelled
+    "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN}, _NamedLosses
 )
 """Losses by name, each a stage of a method: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; Cauchy one-sided.
 
-``LOSSES["late(0.1,8)"]`` is that of `late_loss`. Add one with one entry, or from another package with an entry point of
-``optloc.losses``.
+``LOSSES["late(0.1,8)"]`` is ``late_loss(0.1, 8.0)``. To add a loss, add an entry here, or declare an entry point of the
+group ``optloc.losses`` in another package.
 """

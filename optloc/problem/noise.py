@@ -1,4 +1,4 @@
-"""Measurement noise: a covariance kept as blocks over rows, never as one full matrix."""
+"""Measurement noise: a covariance in blocks over rows, never one full matrix."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from optloc.base import arrays, linalg
 from optloc.base.types import Array
 
 
-@dataclass(frozen=True)  # without slots: what follows from it is kept beside it
+@dataclass(frozen=True)  # without slots, because a cached property needs `__dict__`
 class Block:
-    """Equal-sized groups of rows that are correlated within a group only.
+    """Groups of rows with equal size. Rows are correlated only within a group.
 
     Parameters
     ----------
@@ -29,18 +29,18 @@ class Block:
 
     @cached_property
     def whitening(self) -> Array:
-        """Return whitening matrices (..., g or 1, r, r) of the covariance: a problem is evaluated many times."""
+        """Return whitening matrices (..., g or 1, r, r) of the covariance, cached because they are used often."""
         return linalg.whitening(self.covariance)
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """The covariance of all rows as blocks; every row belongs to exactly one group.
+    """The covariance of all rows as blocks. Each row belongs to exactly one group.
 
     Parameters
     ----------
     blocks : tuple of Block
-        Groups of equal size are kept together.
+        Blocks of groups. Groups of equal size are in one block.
     """
 
     blocks: tuple[Block, ...]
@@ -48,7 +48,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Whitener:
-    """Maps residuals to unit covariance; rows of weight zero map to zero.
+    """Whitening matrices: they map residuals to unit covariance, and rows of weight zero to zero.
 
     Parameters
     ----------
@@ -62,17 +62,17 @@ class Whitener:
     matrix: Array
 
     def take(self, index: Array) -> Whitener:
-        """Return the whitener of some problems of a flat batch."""
+        """Return the whitener of the selected problems of a flat batch."""
         shared = self.matrix.ndim == 3 or self.matrix.shape[0] == 1
         return self if shared else Whitener(self.row, self.matrix[index])
 
     def apply(self, values: Array) -> Array:
-        """Return whitened values (..., g * r, p) of values (..., m, p) for this block's rows."""
+        """Return whitened values (..., g * r, p) of values (..., m, p), for the rows of this block."""
         g, r = self.row.shape
         matrix, count = arrays.as_array_like(self.matrix, values), values.shape[-2]
         whole = self.row.size == count and np.array_equal(self.row.ravel(), np.arange(count))
         white: Array
-        # Independent rows and one group of all rows are the usual cases: they need no gathering and no reshape.
+        # Independent rows, and one group of all rows, are the usual cases. They need no gathering and no reshape.
         if r == 1:
             white = matrix[..., 0] * (values if whole else arrays.gather(values, self.row[:, 0], -2))
         elif g == 1:
@@ -84,7 +84,7 @@ class Whitener:
 
 
 def independent(variance: Array) -> Noise:
-    """Return noise that is independent from row to row.
+    """Return noise with independent rows.
 
     Parameters
     ----------
@@ -96,33 +96,33 @@ def independent(variance: Array) -> Noise:
 
 
 def group_members(key: Array) -> list[Array]:
-    """Return the members (g, r) of equal keys (m,), one array for each size of group r."""
-    # Stable: members keep the order of the rows, on which the covariance is written down.
+    """Return the indices of equal keys (m,): one array (g, r) for each group size r, with one group in each row."""
+    # A stable sort keeps the order of the rows, in which the covariance is given.
     order = np.argsort(key, kind="stable")
     _, first, sizes = np.unique(key[order], return_index=True, return_counts=True)
     return [order[first[sizes == r][:, None] + np.arange(r)] for r in np.unique(sizes)]
 
 
 def arrivals(ends: Sequence[tuple[Array, int | Array]], variance: Array) -> Array:
-    """Return the covariance of groups of rows that combine independent arrivals at stations.
+    """Return the covariance of groups of rows that are sums or differences of independent arrivals at stations.
 
     Parameters
     ----------
     ends : sequence of (int array (g, r), int or int array (g, r))
-        Station of each row at one end, and the sign of its arrival: 0 for none.
+        For each end of a row: the station numbers, and the signs with which its arrival enters; 0 for no arrival.
     variance : array (..., s)
         Variance of each station's arrival.
 
     Returns
     -------
     array (..., g, r, r)
-        Singular where the rows of a group close a loop; the whitener then uses the pseudo-inverse.
+        Singular if the rows of a group form a loop. The whitener then uses the pseudo-inverse.
     """
     used = [(index, np.broadcast_to(sign, index.shape)) for index, sign in ends if np.any(sign)]
     shape = ends[0][0].shape
     covariance = np.zeros((*variance.shape[:-1], *shape, shape[-1]))
-    # An end of a row meets an end of another where they name one station: + for the same end of differences, - for
-    # opposite ones.
+    # Two rows with a common station are correlated: positive if it is at the same end of both differences, negative if
+    # it is at opposite ends.
     for one, sign in used:
         for two, other in used:
             shared = (one[:, :, None] == two[:, None, :]) * (sign[:, :, None] * other[:, None, :])
@@ -131,7 +131,7 @@ def arrivals(ends: Sequence[tuple[Array, int | Array]], variance: Array) -> Arra
 
 
 def group(blocks: Sequence[Block]) -> Noise:
-    """Return noise with groups of equal size and batch shape stacked, so that they are handled in one operation.
+    """Return noise in which groups of equal size and batch shape are stacked, for fewer array operations.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _stack(blocks: list[Block]) -> Block:
 def whiten(noise: Noise, weight: Array) -> tuple[Whitener, ...]:
     """Return the whitening matrices of noise with row weights.
 
-    A weight w adds ``(1/w - 1)`` times its own variance to a row, so that w -> 0 is exactly the row's absence.
+    A weight w adds ``(1/w - 1)`` times the variance of the row to this variance. In the limit w -> 0 the row is absent.
 
     Parameters
     ----------
@@ -171,37 +171,38 @@ def whiten(noise: Noise, weight: Array) -> tuple[Whitener, ...]:
 
 def _whitener(block: Block, weight: Array) -> Whitener:
     picked, xp = arrays.gather(weight, block.row), arrays.library(weight)
-    # All rows as measured: the matrices of the covariance itself, shared by the batch where that is.
+    # With unit weights the whitening matrices of the covariance apply; the batch shares them if it shares the
+    # covariance.
     if bool(xp.all(picked == 1.0)):
-        # what other libraries trace belongs to one trace
+        # Arrays of another library can belong to one trace, so they are not cached.
         own = arrays.is_other_library(block.covariance)
         return Whitener(block.row, linalg.whitening(block.covariance) if own else block.whitening)
     present = picked > 0.0
     variance = xp.linalg.diagonal(block.covariance)
     extra = xp.where(present, (1.0 / xp.where(present, picked, 1.0) - 1.0) * variance, 0.0)
-    # Rows and columns of zeros are absent for `linalg.whitening`, exactly and without a limit.
+    # `linalg.whitening` treats rows and columns of zeros as absent, exactly and without a limit.
     both = present[..., :, None] & present[..., None, :]
     covariance = xp.where(both, block.covariance, 0.0) + extra[..., None] * arrays.eye(block.row.shape[1], weight)
     return Whitener(block.row, linalg.whitening(covariance))
 
 
 def gathered(noise: Noise, members: Array) -> Array:
-    """Return the covariance of groups of rows.
+    """Return the covariance of the given groups of rows.
 
     Parameters
     ----------
     noise : Noise
         Covariance blocks.
     members : int array (g, r)
-        Global row numbers; correlation with rows of other groups is left out.
+        Global row numbers. The result omits correlation between groups.
 
     Returns
     -------
     array (..., g, r, r)
-        In the given order.
+        Covariance of each group, in the given order of rows.
     """
     count = 1 + max(int(members.max()), *(int(block.row.max()) for block in noise.blocks))
-    # Row number to group and place in it, -1 for rows that nobody asked for.
+    # Maps a row number to its group and its index in the group; -1 for rows that are not requested.
     group_of, slot = np.full(count, -1), np.zeros(count, dtype=np.int64)
     group_of[members], slot[members] = np.arange(len(members))[:, None], np.arange(members.shape[1])
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
@@ -216,12 +217,12 @@ def gathered(noise: Noise, members: Array) -> Array:
 
 
 def dense(noise: Noise, rows: Array) -> Array:
-    """Return the covariance (..., q, q) of a few rows (q,) as one matrix, in the given order."""
+    """Return the covariance (..., q, q) of the given rows (q,) as one matrix, in the given order."""
     return np.asarray(gathered(noise, rows[None])[..., 0, :, :])
 
 
 def variances(noise: Noise, count: int) -> Array:
-    """Return the variance of each of `count` rows, (..., m)."""
+    """Return the variances (..., m) of all `count` rows."""
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
     out = np.zeros((*shape, count))
     for block in noise.blocks:
@@ -230,7 +231,7 @@ def variances(noise: Noise, count: int) -> Array:
 
 
 def whiten_rows(noise: tuple[Whitener, ...], values: Array) -> Array:
-    """Return whitened values (..., q, p) of values (..., m, p) of all rows, block under block."""
+    """Return whitened values (..., q, p) of values (..., m, p) of all rows, one block after the other."""
     parts = [whitener.apply(values) for whitener in noise]
     shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
     return np.concatenate([np.broadcast_to(part, (*shape, *part.shape[-2:])) for part in parts], axis=-2)

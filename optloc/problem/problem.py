@@ -1,4 +1,4 @@
-"""One estimation problem: stations, rows, noise and unknowns, possibly a batch of problems of one structure."""
+"""One estimation problem: stations, rows, noise and unknowns. It can be a batch of problems with one structure."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
 
 
-@dataclass(frozen=True)  # without slots: what is asked for at every step is kept beside it
+@dataclass(frozen=True)  # without slots, because the cached properties need `__dict__`
 class Problem:
-    """Everything an estimate depends on; leading axes of its arrays are a batch of independent problems.
+    """All data of an estimation problem. Leading axes of its arrays are a batch of independent problems.
 
     Parameters
     ----------
     stations : Stations
-        Where the stations are.
+        Positions, velocities and errors of the stations.
     rows : tuple of Rows
-        Measurements, one entry for each kind; global row numbers count through them in this order.
+        Measurements, one entry for each kind. Global row numbers count through the entries in this order.
     noise : Noise
-        Covariance over global row numbers.
+        Covariance, indexed by global row numbers.
     times : array (k,)
         Seconds of each epoch.
     motions : tuple of Motion
-        One for each target.
+        Motion models, one for each target.
     biases : tuple of Bias
         Unknown systematic errors.
     priors : tuple of Prior
         Gaussian prior knowledge of named unknowns.
     frame : Frame
-        What the coordinates mean.
+        Coordinate frame.
     constraints : tuple of Band or Polygon
-        What the answer must meet.
+        Conditions that the answer must meet.
     medium : Layers or Atmosphere, optional
-        What the waves of rows of kinds that follow rays come through; see `in_medium`.
+        Medium of the waves, for rows whose kinds follow bent rays; see `in_medium`.
     """
 
     stations: Stations
@@ -61,7 +61,7 @@ class Problem:
 
     @property
     def dimension(self) -> int:
-        """Return 2 or 3."""
+        """Return the dimension, 2 or 3."""
         return self.stations.dimension
 
     @property
@@ -71,7 +71,7 @@ class Problem:
 
     @property
     def origin(self) -> float:
-        """Return the time from which drifts count: the first target's reference, the first epoch by default."""
+        """Return the time of zero drift, seconds: the reference time of the first target, or else the first epoch."""
         reference = self.motions[0].reference
         return float(self.times[0] if reference is None else reference)
 
@@ -82,26 +82,26 @@ class Problem:
 
     @cached_property
     def starts(self) -> tuple[int, ...]:
-        """Return the global number of the first row of each kind."""
+        """Return the global number of the first row of each block of rows."""
         counts = [block.count for block in self.rows]
         return tuple(int(n) for n in np.cumsum([0, *counts])[:-1])
 
     @property
     def emitting(self) -> tuple[int, ...]:
-        """Return the targets whose emission times are unknown."""
-        # An unlabelled row (-1) has an emission time of a target that is found later.
+        """Return the numbers of the targets whose emission times are unknown."""
+        # An unlabelled row (-1) has the emission time of a target that is identified later.
         found = {t for block in self.rows if MODELS[block.kind].emission for t in set(block.target.tolist())}
         return tuple(sorted(found))
 
     @cached_property
     def layout(self) -> Layout:
-        """Return the order of the unknowns."""
-        # A bias has the unit of the rows that it touches, which the layout alone does not know.
+        """Return the layout of the unknowns."""
+        # A bias has the unit of the rows that it affects. `layout` has no access to the rows.
         units = [self._unit(bias.row) for bias in self.biases]
         return layout(self.stations, self.motions, self.biases, self.emitting, self.epochs, units)
 
     def _unit(self, touched: Array) -> str:
-        """Return the SI unit of the rows of given global numbers, empty where they have several."""
+        """Return the SI unit of the rows with these global numbers; empty if they have several units."""
         found = {
             SI_UNIT[MODELS[block.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
             for block, start in zip(self.rows, self.starts, strict=True)
@@ -116,17 +116,17 @@ class Problem:
 
     @property
     def z(self) -> Array:
-        """Return the measurements of all rows as measured, (..., m)."""
+        """Return the measured values of all rows, (..., m), without corrections."""
         return _join([block.z for block in self.rows])
 
     @property
     def correction(self) -> Array:
-        """Return the known amounts by which the measurements of all rows exceed the model, (..., m)."""
+        """Return the known corrections of all rows, (..., m): measured minus modelled."""
         return _join([block.correction for block in self.rows])
 
     @property
     def observed(self) -> Array:
-        """Return the measurements of all rows less their known corrections, (..., m): what h(x) is compared with."""
+        """Return the measured values of all rows minus their known corrections, (..., m), for comparison with h(x)."""
         return _join([block.z - block.correction for block in self.rows])
 
     @property
@@ -136,14 +136,14 @@ class Problem:
 
     @cached_property
     def batch_shape(self) -> tuple[int, ...]:
-        """Return the leading axes that all arrays share."""
-        # few shapes are different: numpy, which takes longer than all the rest, is asked where more than one is left
+        """Return the batch axes, to which the leading axes of all arrays broadcast."""
+        # Most shapes are equal. `numpy.broadcast_shapes` is slow, so it runs only if several shapes differ.
         found = {array.shape[: array.ndim - core] for array, core in _arrays(self)} - {()}
         return np.broadcast_shapes(*found) if len(found) > 1 else next(iter(found), ())
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
-        """Return a hashable key of everything but the numbers; equal keys share compiled and indexed forms."""
+        """Return a hashable key of everything except the numbers. Problems with equal keys share compiled programs."""
         rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
         motions = tuple((m.order, m.span, m.known is None, m.reference, *_course(m)) for m in self.motions)
@@ -151,34 +151,35 @@ class Problem:
             (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes(), *_shape(b))
             for b in self.biases
         )
-        # Numbers are left out: positions, measurements, weights, covariances change from solve to solve.
+        # Positions, measurements, weights and covariances are not part of the key, because they change between solves.
         s = self.stations
         stations: tuple[Any, ...] = (s.count, self.dimension, s.covariance is None, s.span)
         stations += () if s.velocity_covariance is None else ("velocity errors",)
-        # But for courses that a station may be further along: how fast it goes is a factor of an unknown.
+        # Exception: with a time bias of stations, the velocity of a station is a factor of an unknown.
         if any(form_of(b).enters == "moves" for b in self.biases) and s.velocity is not None:
             stations += (s.position.tobytes(), s.velocity.tobytes())
-        # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
+        # Polygons are not part of the key: cached programs depend on the bands of their edges, which their keys
+        # contain.
         bands = [c for c in self.constraints if isinstance(c, Band)]
         constraints = tuple((c.kind, c.target, *_along(c, self.motions[c.target])) for c in bands)
         medium = () if self.medium is None else (self.medium,)
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints, *medium)
 
     def in_medium(self, medium: Medium) -> Problem:
-        """Return the problem with its rows measured along the rays of a medium; the places of all else stay.
+        """Return the problem with its rows measured along the rays of a medium. All positions stay.
 
         Raises
         ------
         InvalidProblem
-            For kinds of which it is not known what rays that bend do to them, a frame that does not fit the medium, and
-            stations outside it.
+            For kinds without a model for bent rays, for a frame that does not fit the medium, and for stations outside
+            the medium.
         """
         made = replace(self, rows=tuple(replace(r, kind=bent(r.kind)) for r in self.rows), medium=medium)
         check_medium(made)
         return made
 
     def straightened(self) -> Problem:
-        """Return the problem as if waves came straight, at one speed: what starts make of it."""
+        """Return the problem with straight rays at one speed, as an approximation for the search for starts."""
         if self.medium is None:
             return self
         rows = []
@@ -208,22 +209,22 @@ class Problem:
         return flat if shape else _map_z(flat, lambda z: z[None])
 
     def placed(self, like: Any) -> Problem:
-        """Return the problem with its numbers as arrays of another array's library, device and float type."""
+        """Return the problem with its arrays converted to the library, device and float type of the array `like`."""
         return map_numbers(self, lambda array, core: as_array_like(array, like))
 
     def take(self, index: Array) -> Problem:
-        """Return the problems of a flat batch at an index or mask; structure stays."""
+        """Return the problems of a flat batch at these indices or this mask. The structure stays."""
         whole = np.arange(self.batch_shape[0])
         numbers = whole[index]
         if np.array_equal(numbers, whole):
             return self
 
         def pick(array: Array, core: int) -> Array:
-            # A batch axis of length one is shared like none at all.
+            # A batch axis of length one means that all problems share the values.
             return array if array.ndim == core or array.shape[0] == 1 else array[index]
 
         taken = map_numbers(self, pick)
-        # Where no array has the batch axis the measurements carry it: problems that are equal stay as many.
+        # If no other array has the batch axis, the measurements get it, so that the number of problems is right.
         if taken.batch_shape == (1,):
             taken = _map_z(taken, lambda z: np.broadcast_to(z, (numbers.size, z.shape[-1])))
         return taken
@@ -239,9 +240,9 @@ class Problem:
 
 
 def at_rest(problem: Problem) -> Problem:
-    """Return the problem with velocities of its stations where a row needs them: stations without stay where they are.
+    """Return the problem with zero station velocities if a row needs velocities and the stations have none.
 
-    Each step from a start to a proof then finds the same zeros.
+    All steps from the start to the proof then use the same zeros.
     """
     stations = problem.stations
     if stations.velocity is not None or not any(MODELS[rows.kind].velocity for rows in problem.rows):
@@ -250,12 +251,12 @@ def at_rest(problem: Problem) -> Problem:
 
 
 def check_medium(problem: Problem) -> None:
-    """Refuse media that the frame does not fit, and stations outside them."""
+    """Raise if the frame does not fit the medium, or if a station is outside it."""
     medium, frame = problem.medium, problem.frame.kind
     if medium is None:
         return
     if problem.dimension != 3:
-        raise InvalidProblem("rays bend in three dimensions, and the stations have two", "medium", "give z or height")
+        raise InvalidProblem("a medium needs three dimensions, and the stations have two", "medium", "give z or height")
     if isinstance(medium, Atmosphere):
         if not problem.frame.geodetic:
             advice = "use the frame geodetic, ecef or enu with an origin"
@@ -273,7 +274,7 @@ def check_medium(problem: Problem) -> None:
         raise InvalidProblem(what, "stations", "widen the table of speeds, or check the sign of z")
 
 
-# Entries of a structure that few problems have, and none that draws of stored studies are keyed by.
+# Parts of a structure that few problems have. Problems without them keep the keys of stored simulations.
 
 
 def _course(motion: Motion) -> tuple[Any, ...]:
@@ -285,7 +286,7 @@ def _along(band: Band, motion: Motion) -> tuple[str, ...]:
 
 
 def _shape(bias: Bias) -> tuple[Any, ...]:
-    """Return what of a walk or a spline decides about columns: how many states it has, and its knots."""
+    """Return the properties of a walk or spline that determine columns: the shape of its densities, and its knots."""
     if bias.density is None and bias.knots is None:
         return ()
     return () if bias.density is None else bias.density.shape, None if bias.knots is None else bias.knots.tobytes()
@@ -293,16 +294,16 @@ def _shape(bias: Bias) -> tuple[Any, ...]:
 
 def _join(parts: list[Array]) -> Array:
     if len(parts) == 1 and isinstance(parts[0], np.ndarray):
-        return parts[0].copy()  # a tenth of the time of a concatenation, and as new
+        return parts[0].copy()  # ten times faster than a concatenation, and also a new array
     xp = library(parts[0])
     if xp is np and all(part.ndim == 1 for part in parts):
-        return np.concatenate(parts)  # nothing is broadcast
+        return np.concatenate(parts)  # without broadcasting
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)
     return joined
 
 
-# The numbers of each part of a problem, and their unbatched ranks. Index arrays are shared by the batch and are none.
+# Numeric arrays of each part of a problem, with their ranks without batch axes. The batch shares all index arrays.
 _NUMBERS: dict[type, dict[str, int]] = {
     Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3, "velocity_covariance": 3},
     Rows: {"z": 1, "weight": 1, "correction": 1},
@@ -327,7 +328,7 @@ def _arrays(problem: Problem) -> list[tuple[Array, int]]:
 
 
 def map_numbers(problem: Problem, change: Any) -> Problem:
-    """Return the problem with every numeric array replaced; `change` gets the array and its unbatched rank."""
+    """Return the problem with every numeric array replaced by ``change(array, rank without batch axes)``."""
 
     def changed(part: Any) -> Any:
         found = [(name, array, change(array, core)) for name, array, core in _numbers(part)]

@@ -1,19 +1,21 @@
-"""Noise that follows from signals: how well delays and gains can be measured at a signal-to-noise ratio.
+"""Noise from signals: the accuracy of measured delays and gains at a given signal-to-noise ratio.
 
-A Gaussian signal with a flat spectrum from zero to W (rad/s) is recorded for T seconds at stations i with ratios rho_i
-of its power to that of independent white noise in the band; P is the sum of the rho_i. With the covariance I + v v' of
-the stations at each frequency, v_i = sqrt(rho_i) exp(-j w tau_i), the Fisher information of the delays is
+A Gaussian signal with a flat spectrum from zero to W (rad/s) is recorded for T seconds at stations i. At each station
+the noise in the band is independent and white; rho_i is the ratio of signal power to noise power, and P is the sum of
+the rho_i. At each frequency the covariance of the stations is I + v v' with v_i = sqrt(rho_i) exp(-j w tau_i). The
+Fisher information of the delays is
 
-    T W^3 / (3 pi (1 + P)) (P diag(rho) - rho rho'),
+    T W^3 / (3 pi (1 + P)) (P diag(rho) - rho rho').
 
-and that of the logarithms of the amplitudes, from which the delays' is separate,
+The Fisher information of the logarithms of the amplitudes, which is independent of the delays, is
 
     T W / (pi (1 + P)) (P diag(rho) + (1 - P) / (1 + P) rho rho').
 
-What is common to all stations drops out of differences, and the errors of the differences are those of independent
-errors of the stations, of variance 3 pi (1 + P) / (T W^3 P rho_i) and pi (1 + P) / (T W P rho_i). At equal ratios the
-first is the paper's equation 31. The paper's equation 38 has less, as it takes the signal's level and the gain of the
-reference for known.
+An error that all stations share cancels in differences. The errors of the differences are therefore equal to
+differences of independent station errors. The variance of these errors is 3 pi (1 + P) / (T W^3 P rho_i) for delays and
+pi (1 + P) / (T W P rho_i) for log-amplitudes. At equal ratios the first is equation 31 of the registration paper
+(docs/papers/registration). Equation 38 of that paper is smaller, because it assumes that the level of the signal and
+the gain of the reference are known.
 
 Sources: W. R. Hahn, S. A. Tretter, "Optimum processing for delay-vector estimation in passive signal arrays", IEEE
 Trans. Information Theory 19 (1973); K. C. Ho, M. Sun, "Passive source localization using time differences of arrival
@@ -33,32 +35,32 @@ from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.models import MODELS
 
-# What a station's own error does to a row: of a gain ratio r_a / r_b, whose logarithm is that of A_b less that of A_a.
+# Signs with which the log-amplitude errors of stations a and b enter a gain ratio r_a / r_b: log A_b - log A_a.
 _RATIO = (-1, 1)
 
 
-@dataclass(frozen=True)  # without slots: what follows from it is kept beside it
+@dataclass(frozen=True)  # without slots, because a cached property needs `__dict__`
 class Signal:
-    """A signal as stations receive it, from which the noise of time differences and gain ratios follows.
+    """A signal as received by the stations. It determines the noise of time differences and gain ratios.
 
     Parameters
     ----------
     snr : array (s,)
-        Signal-to-noise ratio of power at each station, within the band; NaN for a station that does not take part.
+        Signal-to-noise ratio (power) at each station within the band; NaN for a station that does not take part.
     bandwidth : float
-        Hertz, from zero up. Of a signal of bandwidth B about a carrier whose phase is not used it is half of B, and
-        `duration` twice as long: both sidebands count.
+        Width of the band from zero, Hertz. If the signal has bandwidth B around a carrier whose phase is not used, give
+        B / 2, and double `duration`, because both sidebands count.
     duration : float
-        Seconds that are integrated for one measurement.
+        Integration time of one measurement, seconds.
     reference : int, optional
-        Station whose gain is known beside the level of the signal, as in the paper; None: neither is.
+        Station whose gain is known, together with the level of the signal. None: both are unknown.
     speed : float
-        Of propagation, metres per second.
+        Propagation speed, metres per second.
 
     Raises
     ------
     InvalidProblem
-        For numbers that are not positive, and fewer than two stations.
+        For numbers that are not positive, and for fewer than two stations.
     """
 
     snr: Array
@@ -78,12 +80,12 @@ class Signal:
                 raise InvalidProblem(f"it is {value}", name, "give a positive number")
         if self.reference is not None and not (0 <= self.reference < len(snr) and np.isfinite(snr[self.reference])):
             what = f"there is no station {self.reference} with a signal"
-            raise InvalidProblem(what, "reference", "name one that has one")
+            raise InvalidProblem(what, "reference", "name a station with a signal")
         object.__setattr__(self, "snr", snr)
 
     @property
     def _factor(self) -> Array:
-        """Return pi (1 + P) / (T W P rho) of each station, (s,)."""
+        """Return the variance of the log-amplitude of each station (s,), pi (1 + P) / (T W P rho)."""
         total = np.nansum(self.snr)
         return np.asarray(np.pi * (1.0 + total) / (self.duration * self._band * total * self.snr))
 
@@ -93,16 +95,16 @@ class Signal:
 
     @property
     def arrival_sigma(self) -> Array:
-        """Return the standard deviation of each station's arrival (s,), metres: differences have their errors."""
+        """Return the standard deviation of the arrival at each station (s,), metres, for use in differences."""
         return np.asarray(self.speed * np.sqrt(3.0 * self._factor) / self._band)
 
     @cached_property
     def _levels(self) -> Array:
-        """Return the covariance (s, s) of the logarithms of the amplitudes, but for what is common to all."""
+        """Return the covariance (s, s) of the log-amplitudes, without the error that all stations share."""
         levels = np.diag(self._factor)
         if self.reference is None:
             return levels
-        # The inverse of the information without the reference, by Sherman and Morrison.
+        # Inverse of the information without the reference station, by the Sherman-Morrison formula.
         total, own = np.nansum(self.snr), self.snr[self.reference]
         ratio = (1.0 - total) / (1.0 + total) / total
         levels -= np.pi * (1.0 + total) / (self.duration * self._band * total) * ratio / (1.0 + ratio * (total - own))
@@ -110,7 +112,7 @@ class Signal:
         return levels
 
     def covariance(self, kind: str, a: Array, b: Array) -> Array:
-        """Return the covariance (g, r, r) of groups of rows of one epoch and target.
+        """Return the covariance (g, r, r) of groups of rows. Each group is of one epoch and target.
 
         Parameters
         ----------
@@ -122,16 +124,16 @@ class Signal:
         Returns
         -------
         array (g, r, r)
-            Square metres, or of ratios: their relative errors times the ratio of the amplitudes, as `snr` tells it.
+            In square metres for times. For gain ratios, relative errors times the amplitude ratio that `snr` implies.
 
         Raises
         ------
         InvalidProblem
-            For another kind, and a row of a station without a signal.
+            For another kind, and for a row of a station without a signal.
         """
         model = MODELS[kind]
         ratio = kind == "groa"
-        # what is common to all stations, the emission, must drop out of the rows
+        # An error that all stations share must cancel: in the row, or in its unknown emission time.
         if not ratio and not model.emission and model.ranges != (1, -1):
             raise InvalidProblem(f"{kind} is neither a time difference nor a gain ratio", "signal", "give sigma")
         own = self._levels if ratio else np.diag(self.arrival_sigma**2)

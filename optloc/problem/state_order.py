@@ -1,4 +1,4 @@
-"""Orders of the components of a state: [p, v, a] here, and "x vx y vy" where other programs want it."""
+"""Orders of state components: optloc uses [p, v, a], other programs for instance "x vx y vy"."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _DERIVATIVES = ("", "v", "a")
 
 
 def components(dimension: int, size: int) -> list[str]:
-    """Return the names of the components of a state of optloc, such as x, y, vx, vy.
+    """Return the names of the components of a state in the order of optloc, such as x, y, vx, vy.
 
     Parameters
     ----------
@@ -26,18 +26,18 @@ def components(dimension: int, size: int) -> list[str]:
 
 
 def in_order(order: str | Sequence[str], dimension: int, mean: Array, cov: Array) -> tuple[Array, Array]:
-    """Return states and covariances with their components in another order.
+    """Return states and covariances with the named components in the given order.
 
     Parameters
     ----------
     order : str or sequence of str
-        Names of components, such as "x vx y vy". It may leave some out.
+        Names of components, such as "x vx y vy". Other components are omitted.
     dimension : int
         2 or 3.
     mean : array (..., n)
         States [p, v, a].
     cov : array (..., n, n)
-        Their covariances.
+        Covariances of the states.
 
     Returns
     -------

@@ -1,8 +1,9 @@
-"""The truncated normal law of a position whose fix is at a bound or near it.
+"""The truncated normal distribution of a position whose fix is at a bound or near it.
 
-The law of the fix without its bounds is ``N(x + shift, covariance)``. It is limited to the admitted points. The fix x
-is the admitted point of the highest density. Seen from it the law is integrated along rays, each up to the first
-bound. Regions and intervals are of highest density: one with equal tails would never hold a target on the bound.
+Without bounds the distribution is ``N(x + shift, covariance)``. It is truncated to the admitted points. The fix x is
+the admitted point of highest density. The distribution is integrated along rays from the fix, each up to the first
+bound. Regions and intervals have the highest density, because an interval with equal tails never contains a target
+on the bound.
 """
 
 from __future__ import annotations
@@ -19,51 +20,51 @@ from optloc.base.records import Axes, take
 from optloc.base.types import Array
 
 HELD = 1e-13
-"""Share of the largest variance below which a variance is rounding: an equality holds that direction."""
+"""Share of the largest variance below which a variance is rounding error: an equality fixes that direction."""
 
-# Rays by the number of dimensions that the law has: the error of a probability is below 0.2 %, of a moment below 1 %.
+# Number of rays by dimension: the error of a probability is below 0.2 %, the error of a moment below 1 %.
 _RAYS = {2: 360, 3: 2500}
-# Nodes along a ray, and by how much the squared deviation grows along it: 45 leaves out 1e-10.
+# Number of nodes on a ray, and increase of the squared deviation at its end: 45 neglects a probability of 1e-10.
 _NODES, _END = 16, 45.0
-# Nodes along a ray where numbers are sorted, and the share by which these differ from ray to ray (the golden section).
+# Number of nodes on a ray for sorted values, and the share by which they shift from ray to ray (golden section).
 _SPREAD, _GOLDEN = 48, 0.6180339887498949
-# Thresholds at which the mass inside is tabulated: between them it is interpolated.
+# Number of thresholds in the table of enclosed probability, between which it is interpolated.
 _LEVELS = 96
-# Starts of intervals that are compared for the shortest.
+# Number of candidate intervals among which the shortest is selected.
 _STARTS = 200
-# Departure of a surface from its tangent plane, as a share of the distance: the Earth's at 100 km is 0.8 %. And metres
-# that are rounding of coordinates of its size.
+# Departure of a surface from its tangent plane, as a share of the distance: 0.8 % for the Earth at 100 km. Second:
+# metres that are rounding error of coordinates with the size of the Earth.
 _BENT, _ROUNDED = 0.02, 1e-3
-# Rate at which a ray nears a bound, as a share of its step, below which it runs along it.
+# Speed at which a ray approaches a bound, relative to its step, below which the ray counts as parallel.
 _EXACT = 1e-12
-# Share of their width by which intervals may differ and count as alike: what the nodes leave open.
+# Relative difference of widths below which intervals count as equally short: the accuracy of the nodes.
 _ALIKE = 0.01
-# Share of its length by which an edge is lengthened: a ray through a corner meets one of its edges.
+# Relative extension of polygon edges, so that a ray through a corner meets one of the two edges.
 _LONGER = 1e-9
-# Deviations by which a point may lie beyond a plane bound and count as on it: rounding of coordinates.
+# Standard deviations by which a point may exceed a plane bound and still count as admitted: rounding of coordinates.
 _ON = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Truncated:
-    """Normal laws of positions, cut off at h bounds.
+    """Normal distributions of positions, truncated at h bounds.
 
     Parameters
     ----------
     normal : array (..., h, d)
-        Unit vectors out of what each bound admits; zero for none.
+        Unit normals of the bounds, directed to the points that they exclude; zero for unused entries.
     slack : array (..., h)
-        Distance of the fix from each bound along its normal, metres; infinite for none.
+        Distance of the fix from each bound along its normal, metres; infinite for unused entries.
     along : array (..., h, d)
-        Unit vectors along edges of polygons; zero for bounds without ends.
+        Unit vectors along the edges of polygons; zero for bounds without ends.
     span : array (..., h, 2)
-        Ends of the edges along these, metres from the fix; infinite for bounds without ends.
+        Ends of the edges along these vectors, metres from the fix; infinite for bounds without ends.
     give : array (..., h)
-        Distance by which a curved bound departs from its plane, metres.
+        Greatest distance of a curved bound from its plane, metres.
     shift : array (..., d)
-        Mean of the law without bounds, less the fix, metres.
+        Mean of the distribution without bounds minus the fix, metres.
     covariance : array (..., d, d)
-        Of the law without bounds, square metres.
+        Covariance of the distribution without bounds, square metres.
     """
 
     normal: Annotated[Array, Axes(2, slots=True, empty=0.0)]
@@ -76,17 +77,17 @@ class Truncated:
 
     @property
     def cuts(self) -> Array:
-        """Return a flag (...) for each law that a bound cuts off."""
+        """Return a flag (...) for each distribution that a bound truncates."""
         return np.asarray(np.isfinite(self.slack).any(-1) & np.isfinite(self.covariance).all((-1, -2)))
 
     def moments(self) -> tuple[Array, Array]:
-        """Return mean less fix (..., d), metres, and covariance (..., d, d), square metres, of cut-off laws.
+        """Return mean minus fix (..., d), m, and covariance (..., d, d), m^2, of truncated distributions.
 
         References
         ----------
         G. M. Tallis, "The moment generating function of the truncated multi-normal distribution" (1961), for one bound.
         """
-        mean, covariance = _behind_one(self)
+        mean, covariance = _moments_behind_one_bound(self)
         finite = np.isfinite(self.slack)
         several = (finite.sum(-1) != 1) | np.isfinite(np.where(finite[..., None], self.span, np.inf)).any((-1, -2))
         for i in zip(*np.nonzero(np.atleast_1d(several & self.cuts)), strict=True):
@@ -95,7 +96,7 @@ class Truncated:
         return mean, covariance
 
     def moments_by_rays(self) -> tuple[Array, Array]:
-        """Return the moments of one law, whatever its bounds."""
+        """Return the moments of one distribution with any bounds: mean minus fix (d,) and covariance (d, d)."""
         rays = self._rays()
         weight = rays.weight / rays.weight.sum()
         mean = (weight[..., None] * rays.place).sum((0, 1))
@@ -103,9 +104,9 @@ class Truncated:
         return mean, np.einsum("kn,kni,knj->ij", weight, away, away)
 
     def distance_squared(self, points: Array) -> Array:
-        """Return the chi-square value (...) of the region of highest density through points (..., d) from the fix.
+        """Return the chi-square value (...) of the highest-density region whose edge contains points (..., d).
 
-        One law; infinite for points that a bound does not admit.
+        For one distribution; points are in metres from the fix. The value is infinite for points that a bound excludes.
         """
         from scipy.special import gammaincinv
 
@@ -118,23 +119,23 @@ class Truncated:
         return np.where(self.admits(points) & is_along(rays.projector, points), value, np.inf)
 
     def admits(self, points: Array) -> Array:
-        """Return a flag (...) for points (..., d), metres from the fix of one law, that the bounds admit."""
+        """Return a flag (...) for points (..., d), metres from the fix of one distribution, that the bounds admit."""
         sigma = np.sqrt(np.maximum(np.einsum("hi,ij,hj->h", self.normal, self.covariance, self.normal), 0.0))
         beyond = points @ self.normal.T - np.where(np.isfinite(self.slack), self.slack, 0.0)
         outside = np.isfinite(self.slack) & (beyond > self.give + _ON * sigma)
         where = points @ self.along.T
-        # beyond its ends the line of an edge bounds nothing
+        # An edge bounds only the points between its ends.
         return np.asarray(~(outside & (where >= self.span[:, 0]) & (where <= self.span[:, 1])).any(-1))
 
     def interval(self, number: Callable[[Array], Array], level: float) -> tuple[float, float]:
-        """Return the shortest interval that holds a number of one law with a given probability.
+        """Return the shortest interval that contains a quantity of one distribution with a given probability.
 
         Parameters
         ----------
         number : callable
-            Maps points (..., d), metres from the fix, to numbers (...).
+            Maps points (..., d), metres from the fix, to values (...).
         level : float
-            Probability.
+            Probability of the interval.
         """
         rays = self._rays()
         ends = number(np.concatenate([np.zeros((1, len(self.shift))), rays.tip]))
@@ -150,15 +151,15 @@ class Truncated:
         low, high = np.interp(first, shares, inner), np.interp(first + level, shares, inner)
         width = high - low
         best = int(np.argmin(width))
-        for end in (0, -1):  # among alike ones the interval that reaches a bound
+        for end in (0, -1):  # if several are about equally short, take one at a bound
             best = end if width[end] <= (1.0 + _ALIKE) * width.min() and np.isin(inner[end], ends) else best
         return float(low[best]), float(high[best])
 
     def draw(self, n: int, seed: int) -> tuple[Array, Array]:
-        """Return n points (n, d) of one law, metres from the fix, and excesses (n,).
+        """Return n random points (n, d) of one distribution, metres from the fix, and their excesses (n,).
 
-        The excess of a point is its squared deviation minus the squared deviation of the fix. The draw is a systematic
-        resampling of nodes along the rays; `seed` decides its start.
+        The excess of a point is its squared deviation minus the squared deviation of the fix. The points are a
+        systematic resampling of nodes on the rays; `seed` determines its start.
         """
         rays = self._rays()
         place, weight = rays.spread()
@@ -170,16 +171,17 @@ class Truncated:
         return points, (away**2).sum(-1) - (rays.middle**2).sum()
 
     def outline(self, plane: Array, level: float) -> Array:
-        """Return the closed boundary (r, 2) of the region of highest density in a plane, metres from the fix.
+        """Return the closed boundary (r, 2) of the highest-density region in a plane, metres from the fix.
 
-        In space it is the shadow of the region, which holds the two coordinates with more than the probability.
+        In three dimensions it is the projection of the region. It contains the two coordinates with a higher
+        probability.
 
         Parameters
         ----------
         plane : array (2, d)
-            Unit vectors at right angles.
+            Orthogonal unit vectors.
         level : float
-            Probability.
+            Probability of the region.
         """
         from scipy.spatial import ConvexHull
 
@@ -187,7 +189,7 @@ class Truncated:
         excess = float(np.interp(level, *rays.levels()[::-1])) ** 2
         share = np.minimum(1.0, (rays.lean + np.sqrt(rays.lean**2 + excess)) / np.maximum(rays.length, 1e-300))
         points = (rays.tip * share[:, None]) @ plane.T
-        # rays in a plane come in the order of their angles
+        # In two dimensions the rays are sorted by angle.
         line = points if plane.shape[1] == 2 else points[ConvexHull(points).vertices]
         return np.concatenate([line, line[:1]])
 
@@ -197,7 +199,7 @@ class Truncated:
         whitener = np.linalg.solve(factor.T @ factor, factor.T)
         unit, middle = _directions(rank), whitener @ self.shift
         step, lean = unit @ factor.T, unit @ middle
-        # a ray ends where the squared deviation has grown to `_END`
+        # A ray ends where the squared deviation has increased by `_END`.
         length = np.minimum(self.exits(step), lean + np.sqrt(lean**2 + _END))
         node, share = _gauss()
         weight = share * length[:, None] * _density(length[:, None] * node, lean[:, None], rank)
@@ -206,7 +208,7 @@ class Truncated:
         return _Rays(lean, length, rank, middle, whitener, factor @ whitener, place, tip, weight)
 
     def exits(self, step: Array) -> Array:
-        """Return the number (k,) of steps (k, d) from the fix to the first bound; infinite without one."""
+        """Return the number (k,) of steps (k, d) from the fix to the first bound; infinite without a bound."""
         rate, size = step @ self.normal.T, np.sqrt((step**2).sum(-1, keepdims=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             length = np.where(rate > _EXACT * size, np.maximum(self.slack, 0.0) / rate, np.inf)
@@ -217,28 +219,28 @@ class Truncated:
 
 
 class _Rays(NamedTuple):
-    """One law in polar coordinates about its fix, on its k rays.
+    """One truncated distribution in polar coordinates around its fix, on k rays.
 
     Parameters
     ----------
     lean : array (k,)
-        Mean of the law without bounds along each ray, deviations.
+        Mean of the distribution without bounds along each ray, in standard deviations.
     length : array (k,)
-        Of each ray, deviations.
+        Length of each ray, in standard deviations.
     rank : int
-        Dimensions in which the law has a width.
+        Number of dimensions in which the distribution has a width.
     middle : array (rank,)
-        Mean of the law without bounds, deviations.
+        Mean of the distribution without bounds, in standard deviations.
     whitener : array (rank, d)
-        From metres to deviations.
+        Matrix that converts metres to standard deviations.
     projector : array (d, d)
-        Onto the directions in which the law has a width.
+        Projector onto the directions in which the distribution has a width.
     place : array (k, n, d)
         Nodes, metres from the fix.
     tip : array (k, d)
         Ends of the rays, metres from the fix.
     weight : array (k, n)
-        Of the nodes.
+        Weights of the nodes.
     """
 
     lean: Array
@@ -252,9 +254,10 @@ class _Rays(NamedTuple):
     weight: Array
 
     def spread(self) -> tuple[Array, Array]:
-        """Return places (k, n, d), metres from the fix, and their weights (k, n), at other lengths on each ray.
+        """Return other nodes (k, n, d), metres from the fix, and their weights (k, n), at other lengths on each ray.
 
-        Numbers of nodes at the same lengths come in clusters, and a shortest interval would end between these.
+        With the same lengths on all rays, values at the nodes form clusters, and the ends of a shortest interval would
+        be between clusters.
         """
         k = np.arange(len(self.length))[:, None]
         node = (np.arange(_SPREAD) + k * _GOLDEN % 1.0) / _SPREAD
@@ -262,9 +265,9 @@ class _Rays(NamedTuple):
         return self.tip[:, None] * node[..., None], weight
 
     def levels(self) -> tuple[Array, Array]:
-        """Return thresholds (t,) and the probabilities within.
+        """Return thresholds (t,) and the probabilities that they enclose.
 
-        A threshold is the root of a squared deviation less the squared deviation of the fix.
+        A threshold is the square root of a squared deviation minus the squared deviation of the fix.
         """
         grid = np.linspace(0.0, np.sqrt(_END), _LEVELS)
         mass = np.array([self._mass(one) for one in grid**2])
@@ -277,17 +280,17 @@ class _Rays(NamedTuple):
 
 
 def is_along(projector: Array, points: Array) -> Array:
-    """Return a flag for points (..., d), metres from a fix, near the surface of the equalities that hold it, (...).
+    """Return a flag (...) for points (..., d), metres from a fix, near the surface of its equality constraints.
 
-    `projector` (..., d, d) projects onto the tangent plane; a surface may depart from its plane as the Earth does.
+    `projector` (..., d, d) projects onto the tangent plane. The tolerance allows for a surface as curved as the Earth.
     """
     within = (projector * points[..., None, :]).sum(-1)
     off = np.sqrt(((points - within) ** 2).sum(-1))
     return np.asarray(off <= _BENT * np.sqrt((within**2).sum(-1)) + _ROUNDED)
 
 
-def _behind_one(law: Truncated) -> tuple[Array, Array]:
-    """Return mean less fix (..., d) and covariance (..., d, d) of laws that the first of their bounds cuts off."""
+def _moments_behind_one_bound(law: Truncated) -> tuple[Array, Array]:
+    """Return mean minus fix (..., d) and covariance (..., d, d) of distributions truncated at their first bound."""
     from scipy.special import log_ndtr
 
     first = np.isfinite(law.slack).argmax(-1)[..., None]
@@ -297,7 +300,7 @@ def _behind_one(law: Truncated) -> tuple[Array, Array]:
     with np.errstate(invalid="ignore", divide="ignore"):
         sigma = np.sqrt((across * normal).sum(-1))
         away = (slack - (normal * law.shift).sum(-1)) / sigma
-        # density over probability of a standard normal number below `away`
+        # Density divided by probability, of a standard normal variable below `away`.
         hazard = np.exp(-0.5 * away**2 - 0.5 * np.log(2.0 * np.pi) - log_ndtr(away))
         unit = across / sigma[..., None]
         mean = law.shift - hazard[..., None] * unit
@@ -306,24 +309,24 @@ def _behind_one(law: Truncated) -> tuple[Array, Array]:
 
 
 def factor_of(covariance: Array) -> Array:
-    """Return a matrix (d, rank) whose product with its transpose is a covariance (d, d) that may be singular."""
+    """Return a matrix F (d, rank) with F F' = covariance (d, d), which may be singular."""
     lower = factor_semidefinite(covariance)
     return np.asarray(lower[:, np.diagonal(lower) ** 2 > HELD * np.trace(covariance)])
 
 
 def _density(length: Array, lean: Array, rank: int) -> Array:
-    """Return the density along rays at lengths from the fix, in proportion to that at the fix, and its volume."""
+    """Return the density at lengths along rays, relative to the density at the fix, times the volume element."""
     return np.asarray(length ** (rank - 1) * np.exp(length * (lean - 0.5 * length)))
 
 
 @lru_cache(maxsize=1)
 def _gauss() -> tuple[Array, Array]:
-    """Return nodes and weights of Gauss and Legendre between 0 and 1."""
+    """Return the nodes and weights of Gauss-Legendre quadrature between 0 and 1."""
     node, weight = np.polynomial.legendre.leggauss(_NODES)
     return 0.5 * (node + 1.0), 0.5 * weight
 
 
 @lru_cache(maxsize=4)
 def _directions(rank: int) -> Array:
-    """Return unit vectors (k, rank) that are spread evenly."""
+    """Return evenly distributed unit vectors (k, rank)."""
     return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(_RAYS[rank], rank)

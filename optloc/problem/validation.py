@@ -1,4 +1,4 @@
-"""What cannot be a problem: malformed input is refused with a sentence that names the culprit."""
+"""Validation of problems: malformed input raises `InvalidProblem` with a message that names the faulty part."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from optloc.problem.problem import Problem, at_rest, check_medium
 
 
 def checked(problem: Problem) -> Problem:
-    """Return the problem if it is well formed.
+    """Return the problem if it is valid; raise InvalidProblem otherwise.
 
     Parameters
     ----------
     problem : Problem
-        Any problem. NaN measurements pass: they are simulated later, or become a status of their own fix.
+        Any problem. NaN measurements are valid: they are simulated later, or their fix gets a status.
 
     Returns
     -------
     Problem
-        The same; a noise block that holds several uncorrelated epochs is cut, and stations without velocities are at
-        rest where a row is a rate.
+        The same problem, except that a noise block with several uncorrelated epochs is split, and stations without
+        velocities get zero velocities if a row is a rate.
 
     Raises
     ------
     InvalidProblem
-        Naming the station, row or argument and what to do.
+        The message names the station, row or argument, and what to do.
     """
     if not isinstance(problem.frame, Frame):
         raise InvalidProblem(f"{problem.frame!r} is not a frame", "frame", "give an optloc.Frame")
@@ -63,8 +63,8 @@ def checked(problem: Problem) -> Problem:
 
 
 def _cut_noise(problem: Problem) -> Problem:
-    """Return the problem with noise in blocks of one epoch each, as the elimination of local unknowns needs it."""
-    # Correlation between epochs that are independent of each other would couple what is eliminated epoch by epoch.
+    """Return the problem with noise in blocks of one epoch each, which the elimination of local unknowns requires."""
+    # Local unknowns are eliminated epoch by epoch. Correlation between epochs would couple them.
     if not has_correlated_epochs(problem):
         return without_epoch_correlation(problem)
     if problem.layout.n_local:
@@ -74,8 +74,8 @@ def _cut_noise(problem: Problem) -> Problem:
     return problem
 
 
-def _beyond(values: Any) -> tuple[Any, str]:
-    """Return which values are no numbers, or too large for their squares to be any, and what to call the first."""
+def _out_of_range(values: Any) -> tuple[Any, str]:
+    """Return a mask of values that are not finite or whose squares overflow, and words for the first such value."""
     values = np.asarray(values)
     bad = ~(np.abs(values) <= LARGEST)
     return bad, "not finite" if not np.isfinite(values[bad]).all() else f"beyond {LARGEST:g}"
@@ -83,7 +83,7 @@ def _beyond(values: Any) -> tuple[Any, str]:
 
 def _check_stations(problem: Problem) -> None:
     stations: Stations = problem.stations
-    bad, why = _beyond(stations.position)
+    bad, why = _out_of_range(stations.position)
     if bad.any():
         name = stations.names[int(np.argwhere(bad.any(-1))[0][-1])]
         raise InvalidProblem(f"the position of station {name!r} is {why}", "stations", "give metres")
@@ -107,7 +107,7 @@ def _check_stations(problem: Problem) -> None:
 
 
 def _check_moving(problem: Problem) -> None:
-    """Refuse velocities, axes and moving positions that do not fit the stations and epochs."""
+    """Raise if velocities, axes or positions per epoch do not fit the stations and epochs."""
     s, d, count = problem.stations, problem.dimension, problem.stations.count
     for name, array, tail in (
         ("position", s.position, (count, d)),
@@ -122,12 +122,12 @@ def _check_moving(problem: Problem) -> None:
         if array.shape[-core] not in (1, problem.epochs):
             counts = f"{array.shape[-core]} epochs of station {name} for {problem.epochs} epochs of measurements"
             raise InvalidProblem(counts, "stations", "give one, or one for each epoch")
-        bad, why = _beyond(array)
+        bad, why = _out_of_range(array)
         if bad.any():
             label = s.names[int(np.argwhere(bad.any(tuple(range(-core + 2, 0))))[0][-1])]
             raise InvalidProblem(f"the {name} of station {label!r} is {why}", "stations", "give SI units")
     if s.axes is not None:
-        # A microradian: single precision and angles with seven digits pass, degrees in the place of radians do not.
+        # One microradian: it admits single precision and angles with seven digits, but not degrees instead of radians.
         skew = np.abs(s.axes @ np.swapaxes(s.axes, -1, -2) - np.eye(d)).max((-1, -2)) > 1e-6
         if skew.any():
             label = s.names[int(np.argwhere(skew)[0][-1])]
@@ -148,7 +148,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         advice = "give the stations axes, for instance frame.enu_axes(positions)"
         raise InvalidProblem(f"{rows.kind} rows in ECEF need the stations' own axes", rows.kind, advice)
     if model.velocity and model.stations and problem.stations.velocity is None:
-        # At rest is what stations without velocities are taken for; those that are seen to move are not.
+        # Stations without velocities count as fixed. Stations whose positions change do not.
         place = problem.stations.position
         moved = np.argwhere((place != place[..., :1, :, :]).any(-1))
         if len(moved):
@@ -156,7 +156,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
             advice = "give velocities (vx, vy, vz in a file): differences of positions are too coarse for rates"
             raise InvalidProblem(what, "stations", advice)
     if model.straight is not None and problem.medium is None:
-        what = f"{rows.kind} rows need what their waves come through"
+        what = f"{rows.kind} rows need a medium"
         raise InvalidProblem(what, rows.kind, f"state a medium, or use the kind {model.straight}")
     if model.ecef and not problem.frame.geodetic:
         raise InvalidProblem(f"{rows.kind} needs a geodetic frame", "frame", "use frame ecef or enu with an origin")
@@ -170,7 +170,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
     ):
         if index is None:
             continue
-        # -1 is a row that nobody has assigned to a target yet.
+        # In `target`, -1 marks a row that is not yet assigned to a target.
         lowest = -1 if name == "target" else 0
         bad = np.flatnonzero((index < lowest) | (index >= limit))
         if len(bad):
@@ -181,7 +181,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         row = int(np.flatnonzero(rows.a == rows.b)[0])
         raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
     check_values(rows)
-    bad, why = _beyond(rows.correction)
+    bad, why = _out_of_range(rows.correction)
     if bad.any():
         raise InvalidProblem(f"{rows.kind} has a correction that is {why}", "correction", "give 0 where none is known")
     if not ((rows.weight >= 0.0) & (rows.weight <= 1.0)).all():
@@ -189,9 +189,9 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
 
 
 def check_values(rows: Rows) -> None:
-    """Refuse measurements that are infinite, or too large for their squares to be numbers.
+    """Raise if a measurement is infinite, or so large that its square overflows.
 
-    NaN passes: it stands for a measurement that is simulated later, or that rejects its own fix alone.
+    NaN is valid: the measurement is simulated later, or only its own fix is rejected.
     """
     large = np.abs(rows.z) > LARGEST
     if large.any():
@@ -219,67 +219,67 @@ def _check_covariance(covariance: Array, what: str, names: Sequence[str] | Array
     fail(~np.isfinite(covariance).all((-1, -2)), "not finite")
     diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
     fail((diagonal <= 0.0).any(-1), "not positive on its diagonal")
-    # As standard deviations: their inverses square the residuals.
+    # Limits of the standard deviations: residuals are divided by them and squared.
     fail((diagonal > LARGEST**2).any(-1), f"of deviations beyond {LARGEST:g}")
     fail((diagonal < LARGEST**-2).any(-1), f"of deviations below {1.0 / LARGEST:g}")
     if covariance.shape[-1] == 1:
         return
-    # As correlations, so that one tolerance fits metres, radians and ratios.
+    # The check uses correlations, so that the same tolerance fits metres, radians and ratios.
     scale = np.sqrt(diagonal)
     unit = covariance / (scale[..., :, None] * scale[..., None, :])
-    # Nine digits: covariances that went through text pass, and an eigenvalue may be negative by what their rounding
-    # adds up to.
+    # The tolerance is 1e-9, so that covariances from text files pass. An eigenvalue may be negative by the sum of the
+    # rounding errors.
     fail((np.abs(unit - np.swapaxes(unit, -1, -2)) > 1e-9).any((-1, -2)), "not symmetric")
     fail(np.linalg.eigvalsh(unit)[..., 0] < -1e-9 * unit.shape[-1], "not positive semidefinite")
 
 
 def _check_times(problem: Problem) -> None:
     times = problem.times
-    if times.ndim != 1 or _beyond(times)[0].any():
+    if times.ndim != 1 or _out_of_range(times)[0].any():
         raise InvalidProblem("times are not a list of finite seconds", "times", "give one number per epoch")
     if (np.diff(times) <= 0.0).any():
         place = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
-        raise InvalidProblem(f"epoch {place} is not later than the one before", "times", "sort the epochs")
+        raise InvalidProblem(f"epoch {place} is not later than epoch {place - 1}", "times", "sort the epochs")
     if any(rows.epoch.max(initial=0) >= len(times) for rows in problem.rows):
         raise InvalidProblem(f"there are only {len(times)} times", "times", "give one for each epoch")
 
 
 def _check_rates(problem: Problem) -> None:
-    """Refuse range rates between points that nobody says move: all of them are zero, wherever the target is."""
+    """Raise for range rates between fixed points: all of them are zero, wherever the target is."""
     still = problem.stations.velocity is None and all(motion.order == 0 for motion in problem.motions)
     kind = next((rows.kind for rows in problem.rows if MODELS[rows.kind].velocity), None)
     if still and kind is not None:
-        what = f"{kind} of a target that stays needs stations that move, and none has a velocity"
-        advice = "give velocities (vx, vy, vz in a file), or say how the target moves"
+        what = f"{kind} of a fixed target needs stations that move, and no station has a velocity"
+        advice = "give velocities (vx, vy, vz in a file), or state the motion of the target"
         raise InvalidProblem(what, "stations", advice)
 
 
-# What cannot be unknown: malformed motions, biases and priors are refused with a sentence that names them.
+# Checks of unknowns: malformed motions, biases and priors raise an error that names them.
 
 
 def check_unknowns(problem: Problem) -> None:
-    """Refuse motions, biases and priors that cannot be what is meant.
+    """Raise if a motion, bias or prior is invalid.
 
     Parameters
     ----------
     problem : Problem
-        Its stations, rows and times are in order.
+        A problem whose stations, rows and times are valid.
 
     Raises
     ------
     InvalidProblem
-        Naming the motion, bias or prior.
+        The message names the motion, bias or prior.
     """
     for number, motion in enumerate(problem.motions):
         _check_motion(problem, motion, number)
     for bias in problem.biases:
         _check_bias(problem, bias, f"bias {bias.name!r}")
     layout = problem.layout
-    # Vectors are taken apart by name: `layout.find` returns the first of equal ones.
+    # Names identify the parts of the vector, and `layout.find` returns only the first of equal names.
     names = Counter(slot.name for slot in (*layout.shared, *layout.local))
     twice = [name for name, count in names.items() if count > 1]
     if twice:
-        raise InvalidProblem(f"the name {twice[0]!r} is taken twice", "biases", "give every unknown its own name")
+        raise InvalidProblem(f"the name {twice[0]!r} is used twice", "biases", "give every unknown a different name")
     for prior in problem.priors:
         _check_prior(problem, prior)
 
@@ -287,10 +287,10 @@ def check_unknowns(problem: Problem) -> None:
 def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
     where = f"motions[{number}]"
     if motion.order not in (0, 1, 2):
-        raise InvalidProblem(f"a motion of order {motion.order}", where, "use order 0, 1 or 2")
+        raise InvalidProblem(f"the motion has order {motion.order}", where, "use order 0, 1 or 2")
     if motion.span not in ("run", "epoch"):
         raise InvalidProblem(f"unknown span {motion.span!r}", where, "use 'run' or 'epoch'")
-    if motion.reference is not None and _beyond(motion.reference)[0]:
+    if motion.reference is not None and _out_of_range(motion.reference)[0]:
         raise InvalidProblem(f"the reference time is {motion.reference}", where, "give finite seconds")
     _check_course_over(problem, motion, where)
     if motion.known is None:
@@ -298,12 +298,14 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
     shape = motion.known.shape
     if len(shape) < 3 or shape[-1] != problem.dimension:
         raise InvalidProblem(
-            f"known states of shape {shape}", where, f"give (epochs or 1, order + 1, {problem.dimension})"
+            f"the known states have shape {shape}", where, f"give (epochs or 1, order + 1, {problem.dimension})"
         )
     if shape[-3] not in (1, problem.epochs):
         counts = f"{problem.epochs} epoch{'s' if problem.epochs > 1 else ''}"
-        raise InvalidProblem(f"known states for {shape[-3]} epochs, not {counts}", where, "give one, or one an epoch")
-    bad, why = _beyond(motion.known)
+        raise InvalidProblem(
+            f"known states are for {shape[-3]} epochs, not {counts}", where, "give one, or one for each"
+        )
+    bad, why = _out_of_range(motion.known)
     if bad.any():
         raise InvalidProblem(f"a known state is {why}", where, "give metres and metres per second")
     if shape[-3] > 1 and shape[-2] == 1:
@@ -333,7 +335,7 @@ def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
     if motion.rise.shape[-2:] != (problem.epochs, 2):
         what = f"a rise of shape {motion.rise.shape} for {problem.epochs} epochs"
         raise InvalidProblem(what, where, "give height and rate at each epoch, see optloc.constraints.reported")
-    bad, why = _beyond(motion.rise)
+    bad, why = _out_of_range(motion.rise)
     if bad.any():
         raise InvalidProblem(f"a rise is {why}", where, "give metres and metres per second")
 
@@ -343,13 +345,13 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
     sizes = [len(bias.row), len(bias.member), len(bias.coefficient)]
     if len(set(sizes)) > 1:
         raise InvalidProblem(
-            f"row, member and coefficient have {sizes} entries", where, "give one each for every touch"
+            f"row, member and coefficient have {sizes} entries", where, "give one entry of each for every affected row"
         )
     for name, index, limit in (("row", bias.row, problem.count), ("member", bias.member, len(bias.members))):
         bad = (index < 0) | (index >= limit)
         if bad.any():
             raise InvalidProblem(f"there is no {name} {index[bad][0]}", where, f"use 0 to {limit - 1}")
-    bad, why = _beyond(bias.coefficient)
+    bad, why = _out_of_range(bias.coefficient)
     if bad.any():
         raise InvalidProblem(f"a coefficient is {why}", where, "give numbers such as 1 and -1")
     if form.enters == "turns":
@@ -367,7 +369,7 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
                 f"{name} has {np.size(values)} entries, not {wanted}", where, "give one for each unknown"
             )
     sigma = np.asarray(bias.sigma)
-    if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or _beyond(bias.mean)[0].any():
+    if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or _out_of_range(bias.mean)[0].any():
         raise InvalidProblem("sigma is not positive or mean is not finite", where, "give true numbers, or no sigma")
 
 
@@ -382,25 +384,26 @@ def _check_rotation(problem: Problem, bias: Bias, where: str) -> None:
 
 
 def _check_course(problem: Problem, bias: Bias, where: str) -> None:
-    """Refuse a time along a course that stations do not have."""
+    """Raise if a time along the course is invalid for the stations: it needs stations that move."""
     velocity = problem.stations.velocity
     if velocity is None:
         raise InvalidProblem("a time along a course needs velocities of the stations", where, "give vx, vy and vz")
     if np.prod(velocity.shape[:-3]) * np.prod(problem.stations.position.shape[:-3]) > 1:
         raise InvalidProblem("the stations differ from problem to problem", where, "solve them one by one")
     if not np.isin(bias.coefficient, (1.0, -1.0)).all():
-        advice = "give 1 where it moves the row's first station, and -1 where its second"
+        advice = "give 1 if it moves the first station of the row, and -1 if it moves the second"
         raise InvalidProblem("a coefficient is neither 1 nor -1", where, advice)
     ends = (np.concatenate([getattr(rows, name) for rows in problem.rows])[bias.row] for name in ("a", "b"))
     station = np.where(bias.coefficient > 0.0, *ends)
     if len(np.unique(np.stack([bias.row, station]), axis=1).T) < len(bias.row) or (station < 0).any():
-        raise InvalidProblem("a row has no such station, or has it twice", where, "let each row touch a station once")
+        what = "a row does not have this station, or has it twice"
+        raise InvalidProblem(what, where, "let each row name a station once")
     epoch = problem.epoch[bias.row] if velocity.shape[-3] > 1 else np.zeros_like(bias.row)
     moves = velocity.reshape(-1, *velocity.shape[-2:])[epoch, station].any(-1)
     still = np.setdiff1d(np.arange(len(bias.members)), bias.member[moves])
     if len(still):
-        what = f"{bias.members[still[0]]} stays where it is: it has no time along its course"
-        raise InvalidProblem(what, f"{where}, members", "name those that move")
+        what = f"{bias.members[still[0]]} does not move, so it has no time along its course"
+        raise InvalidProblem(what, f"{where}, members", "name the stations that move")
 
 
 def _check_prior(problem: Problem, prior: Prior) -> None:
@@ -412,33 +415,33 @@ def _check_prior(problem: Problem, prior: Prior) -> None:
             where,
             f"give {slot.size} entries",
         )
-    bad, why = _beyond(prior.mean)
+    bad, why = _out_of_range(prior.mean)
     if bad.any():
         raise InvalidProblem(f"the mean is {why}", where, "give SI units, or no prior")
 
 
-# Corners of a polygon: each edge is held against each other one, and is a piece of the region.
+# Limit of corners, because the checks compare each edge with every other edge, and each edge is a piece of the region.
 _CORNERS = 1000
 
-# What cannot be demanded: malformed or contradictory constraints are refused with a sentence that names them.
+# Checks of constraints: malformed or contradictory constraints raise an error that names them.
 
-# Lengths relative to the polygon's size, and areas to its square, below which corners and edges count as meeting: four
-# digits above rounding.
+# Lengths relative to the size of the polygon, and areas relative to its square, below which corners and edges touch:
+# four digits above rounding error.
 _SLIVER = 1e-12
 
 
 def check_constraints(problem: Problem) -> None:
-    """Refuse constraints that cannot be what is meant; that no position meets them is a status, not an error.
+    """Raise if a constraint is invalid. Constraints that no position meets are not an error: they give a status.
 
     Parameters
     ----------
     problem : Problem
-        Its stations, rows and motions are in order.
+        A problem whose stations, rows and motions are valid.
 
     Raises
     ------
     InvalidProblem
-        Naming the constraint.
+        The message names the constraint.
     """
     for constraint in problem.constraints:
         where = f"constraint {constraint.name!r}"
@@ -453,7 +456,7 @@ def check_constraints(problem: Problem) -> None:
 
 
 def bands_by_quantity(constraints: Sequence[Band | Polygon]) -> list[list[Band]]:
-    """Return the bands on one quantity of one target together, in the order of their first."""
+    """Return groups of bands on the same quantity of the same target, in the order of their first members."""
     groups: dict[tuple[str, int, bool, bytes], list[Band]] = {}
     for c in constraints:
         if isinstance(c, Band):
@@ -470,8 +473,8 @@ def _check_target(problem: Problem, constraint: Band | Polygon, where: str) -> N
     if motion.known is not None:
         raise InvalidProblem("the target's motion is known", where, "leave the constraint out")
     if motion.span == "epoch" and problem.epochs > 1 and not separable(problem):
-        advice = "let the target be static or move uniformly, or leave out what ties the epochs together"
-        raise InvalidProblem("the epochs of this free target are tied together by other unknowns", where, advice)
+        advice = "let the target be static or move uniformly, or leave out the unknowns that epochs share"
+        raise InvalidProblem("other unknowns connect the epochs of this free target", where, advice)
 
 
 def _check_plan(problem: Problem, where: str) -> None:
@@ -481,25 +484,26 @@ def _check_plan(problem: Problem, where: str) -> None:
 
 
 def check_polygon(vertices: Array, where: str) -> None:
-    """Refuse corners (v, 2) that do not bound a simple polygon."""
+    """Raise if corners (v, 2) do not form a simple polygon."""
     if vertices.ndim != 2 or vertices.shape[-1] != 2 or len(vertices) < 3:
         count = "no pairs" if vertices.ndim != 2 or vertices.shape[-1] != 2 else f"only {len(vertices)} corners"
         raise InvalidProblem(f"the polygon has {count}", where, "give three corners or more, two coordinates each")
     if len(vertices) > _CORNERS:
         what = f"the polygon has {len(vertices)} corners, {_CORNERS} at most"
-        raise InvalidProblem(what, where, "leave out those that change little")
-    bad, why = _beyond(vertices)
+        raise InvalidProblem(what, where, "leave out corners that change the shape little")
+    bad, why = _out_of_range(vertices)
     if bad.any():
         corner = int(np.flatnonzero(bad.any(-1))[0])
         raise InvalidProblem(f"corner {corner + 1} is {why}", where, "give two numbers")
-    # Centred: corners in metres from a far origin would lose the digits that areas need.
+    # Relative to the mean, because corners in metres from a distant origin would lose the digits that areas need.
     v = vertices - vertices.mean(0)
     size = np.abs(v).max()
     i, j = np.triu_indices(len(v), 1)
     twice = np.flatnonzero((np.abs(v[i] - v[j]) <= _SLIVER * size).all(-1))
     if len(twice):
         one, two = int(i[twice[0]]) + 1, int(j[twice[0]]) + 1
-        raise InvalidProblem(f"corner {two} repeats corner {one}", where, "leave one out; the polygon closes by itself")
+        advice = "leave one out; the last corner connects to the first automatically"
+        raise InvalidProblem(f"corner {two} repeats corner {one}", where, advice)
     if abs(_cross(v, np.roll(v, -1, axis=0)).sum()) <= _SLIVER * size**2:
         raise InvalidProblem("the polygon has no area", where, "give corners in order around the region")
     crossing = _crossing(v, size)
@@ -509,27 +513,27 @@ def check_polygon(vertices: Array, where: str) -> None:
 
 
 def _crossing(v: Array, size: float) -> tuple[int, int] | None:
-    """Return two edges of a polygon that meet elsewhere than at their common corner, or None."""
+    """Return the numbers of two edges of a polygon that meet elsewhere than at a common corner, or None."""
     a, b, n = v, np.roll(v, -1, axis=0), len(v)
     i, j = np.triu_indices(n, 1)
-    # Pairs of edges without a common corner; the last edge is a neighbour of the first.
+    # Pairs of edges without a common corner. The last edge is a neighbour of the first.
     apart = (j - i > 1) & (j - i < n - 1)
     along = b - a
-    # Two segments meet where the ends of each lie on different sides of the other, or on it; for collinear ones their
-    # boxes decide.
+    # Two segments meet if the ends of each are on different sides of the other, or on it. For collinear segments the
+    # bounding boxes decide.
     straddle = np.ones(len(i), dtype=bool)
     for p, q in ((i, j), (j, i)):
         sides = _cross(along[p], a[q] - a[p]), _cross(along[p], b[q] - a[p])
-        straddle &= np.sign(_flat(sides[0], size)) * np.sign(_flat(sides[1], size)) <= 0
+        straddle &= np.sign(_rounded(sides[0], size)) * np.sign(_rounded(sides[1], size)) <= 0
     low, high = np.minimum(a, b), np.maximum(a, b)
     overlap = ((low[i] <= high[j]) & (low[j] <= high[i])).all(-1)
-    # Neighbours always meet at their corner; they run into each other only where one turns straight back.
+    # Neighbours always meet at their corner. They overlap only if one turns straight back.
     back = (np.abs(_cross(along[i], along[j])) <= _SLIVER * size**2) & ((along[i] * along[j]).sum(-1) < 0.0)
     bad = np.flatnonzero(np.where(apart, straddle & overlap, back & ((j - i == 1) | (j - i == n - 1))))
     return (int(i[bad[0]]), int(j[bad[0]])) if len(bad) else None
 
 
-def _flat(area: Array, size: float) -> Array:
+def _rounded(area: Array, size: float) -> Array:
     return np.where(np.abs(area) <= _SLIVER * size**2, 0.0, area)
 
 
@@ -554,11 +558,11 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
     given = np.shape(band.coefficients)[-1:]
     if given != (size,):
         raise InvalidProblem(f"coefficients of shape {np.shape(band.coefficients)}", where, f"give {size} numbers")
-    bad, why = _beyond(band.coefficients)
+    bad, why = _out_of_range(band.coefficients)
     if np.any(bad):
         raise InvalidProblem(f"a coefficient is {why}", where, "give numbers")
     for name, bound, absent in (("lower", band.lower, -np.inf), ("upper", band.upper, np.inf)):
-        bad = _beyond(bound)[0] & (np.asarray(bound) != absent)
+        bad = _out_of_range(bound)[0] & (np.asarray(bound) != absent)
         if np.any(bad):
             raise InvalidProblem(
                 f"the {name} bound is {np.asarray(bound)[bad][0]:g}", where, f"give a number, or {absent:g} for none"
@@ -566,21 +570,21 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
 
 
 def _check_along(motion: Motion, band: Band, where: str) -> None:
-    other = "or let it hold at the reference time with along=False"
+    other = "or apply it at the reference time only, with along=False"
     if (band.kind, motion.over) not in (("height", "ground"), ("plane", "space")):
-        what, advice = f"{band.kind} is not held along a course over {motion.over}", f"use the other course, {other}"
+        what, advice = f"{band.kind} cannot apply along a course over {motion.over}", f"use the other course, {other}"
         if band.kind == "height":
-            what, advice = "a straight course keeps no height above the Earth", f"let it move over='ground', {other}"
+            what, advice = "a straight course has no constant height above the Earth", f"give over='ground', {other}"
         raise InvalidProblem(what, where, advice)
     if motion.order > 1 and not np.all(band.lower == band.upper):
         raise InvalidProblem("bounds along a course of constant acceleration", where, f"give one exact value, {other}")
 
 
 def _check_agreement(bands: Sequence[Band]) -> None:
-    """Refuse bands on one quantity that cannot hold together, and equalities that are given twice."""
+    """Raise if bands on one quantity contradict each other, or if the same equality is given twice."""
     where, unit = f"constraint {bands[0].name!r}", SURFACES[bands[0].kind].unit.replace("1", "")
     exact = [band.lower for band in bands if np.all(band.lower == band.upper)]
-    # Bands on one quantity hold together: the highest lower bound against the lowest upper one.
+    # All bands on one quantity apply: compare the highest lower bound with the lowest upper bound.
     low = np.max(np.broadcast_arrays(*(band.lower for band in bands)), axis=0)
     high = np.min(np.broadcast_arrays(*(band.upper for band in bands)), axis=0)
     clash = np.broadcast_arrays(low, high, low > high)

@@ -1,4 +1,4 @@
-"""What the residuals of many fixes say of the measurements: noise levels, station biases, gross errors."""
+"""Statistics of stations from the residuals of many fixes: noise levels, biases, gross errors, noise structure."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Noise from data: how large the errors of each station, pair or kind are, estimated over many fixes."""
+"""Estimation of noise levels of stations, pairs or kinds from the residuals of many fixes."""
 
 from __future__ import annotations
 
@@ -27,47 +27,49 @@ from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise, gathered, group, group_members
 from optloc.problem.problem import Problem
 
-# Groups that a sentence names; the others are counted.
+# Maximum number of groups that a sentence lists. The others are counted.
 _NAMED = 8
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseLevels:
-    """Noise of groups of errors as the residuals of fixes show it.
+    """Noise levels of groups of errors, estimated from the residuals of fixes.
 
     Parameters
     ----------
     by : "station", "pair" or "kind"
-        What makes a group.
+        What forms a group.
     names : tuple of G str
-        Groups; behind them, where asked for, what the rows of each have in common in an epoch.
+        Names of the groups. If common errors were requested, they follow: the error that all rows of a group share in
+        an epoch.
     stated : array (G,)
-        Standard deviation that the problem states, root mean square, SI units; of what rows have in common, of which it
-        states nothing, that of the rows.
+        Standard deviation that the problem states, root mean square, SI units. For common errors, which the problem
+        does not state, it is that of the rows.
     factor : array (G,)
-        What the stated standard deviations are multiplied by; 1 where the data do not tell, 0 of what rows have in
-        common where the data do not show it.
+        Factors of the stated standard deviations. 1 if the data do not determine a factor; 0 for a common error without
+        evidence.
     error : array (G,)
-        Standard error of the factor; NaN where the data do not tell it for this group alone.
+        Standard error of the factor; NaN if the data do not determine the factor of this group separately.
     low, high : array (G,)
-        Interval of 95 % of the factor: from zero where the data do not tell the noise from none, NaN where they tell
-        nothing. The factor stays off zero all the same: it is the most likely one times a weight (see `noise_levels`).
+        95 % interval of the factor. `low` is zero if the data are compatible with no noise; both are NaN if the data do
+        not determine the factor. The factor itself is never zero: it maximises the likelihood times a weight (see
+        `noise_levels`).
     redundancy : array (G,)
-        Share of each group's errors that shows in the residuals, from 0 to 1.
+        Share of the errors of each group that is visible in the residuals, from 0 to 1.
     count : int array (G,)
-        Errors of each group.
+        Number of errors of each group.
     gross : int array (G,)
-        Those that were left out as gross.
+        Number of errors that were left out as gross.
     before, after : float
-        Chi-square per degree of freedom with the noise as stated and as found, gross errors left out.
+        Chi-square per degree of freedom with the stated and with the estimated noise, without gross errors.
     fixes : int
-        Number of fixes that were used.
+        Number of fixes with redundancy.
     sentences : tuple of str
-        What the data do not tell.
+        Statements about levels that the data do not determine.
     tails : array (G,)
-        Further factor, at least 1, with which a Gaussian bounds the tails of the errors.
+        Additional factors, at least 1, with which a Gaussian bounds the tails of the errors.
     common : "station", "pair" or "kind", optional
-        Whose rows have an error in common in an epoch.
+        Grouping of the errors that rows share in an epoch; None without such errors.
     """
 
     by: By
@@ -89,12 +91,12 @@ class NoiseLevels:
 
     @property
     def used(self) -> Array:
-        """Return the factors (G,) of the stated standard deviations, tails included."""
+        """Return the final factors (G,) of the stated standard deviations, with the factors for tails."""
         return np.asarray(self.factor * self.tails)
 
     @property
     def sigma(self) -> Array:
-        """Return the standard deviations (G,) that were found, SI units; NaN where the data do not tell."""
+        """Return the estimated standard deviations (G,), SI units; NaN if the data do not determine them."""
         return np.where(np.isnan(self.error), np.nan, self.used * self.stated)
 
     @property
@@ -111,39 +113,40 @@ def noise_levels(
     method: str = "auto",
     fix: Fix | None = None,
 ) -> NoiseLevels:
-    """Return how large the errors of groups of rows are, from the residuals of many fixes.
+    """Return the noise levels of groups of rows, estimated from the residuals of many fixes.
 
-    Restricted maximum likelihood of variance components: the covariance of the rows is a sum of the stated one's parts,
-    each times an unknown factor, and the factors maximise the likelihood of what the residuals say that does not depend
-    on the fixes, times each factor of a variance: without that weight, which counts no more than two errors of a group,
-    a level of few errors is often zero. Scoring steps on the logarithms are taken until they vanish; each is Rao's
-    minimum norm quadratic estimate at the factors before. Errors that the rest of their fix shows to be gross are left
-    out one by one, and the scale is that of the others.
+    The method is restricted maximum likelihood of variance components. The covariance of the rows is a sum of parts of
+    the stated covariance, each multiplied by an unknown factor. The factors maximise the likelihood of the part of the
+    residuals that does not depend on the fixes, multiplied by each factor of a variance. This weight counts no more
+    than two errors of a group. Without it, a level from few errors is often zero. Scoring steps on the logarithms are
+    repeated until they vanish; each is Rao's minimum norm quadratic estimate at the previous factors. Errors that are
+    gross compared with the rest of their fix are left out one by one, and the levels describe the other errors.
 
     Parameters
     ----------
     problem : Problem
-        Its epochs, where they share no unknown, or its batch are the fixes; otherwise it is one fix of many rows.
-        Its noise may be wrong; its ratios within a group are kept.
+        Problem whose fixes are its epochs if they share no unknown, or its batch; otherwise it is one fix of many rows.
+        The size of its stated noise may be wrong. Ratios of the noise within a group are kept.
     by : "station", "pair" or "kind"
-        Whether each station has a level (the error of an arrival where rows combine arrivals), each pair or each kind.
+        What has a level: each station (the error of an arrival if rows combine arrivals), each pair or each kind.
     common : "station", "pair" or "kind", optional
-        Whose rows have an error in common in every epoch besides: of an attitude, a place that is taken as known, or
-        refraction; True: as `by`. It is told where a group has several rows in an epoch.
+        Grouping of rows that share an additional error in every epoch. Examples are errors of an attitude, of a
+        position taken as known, or of refraction. True: the same as `by`. The data determine it if a group has several
+        rows in an epoch.
     method : str
-        How to fix; see `solve`.
+        Method of the fixes; see `solve`.
     fix : Fix, optional
-        Fixes of `batch_of(problem)` made before.
+        Existing fixes of `batch_of(problem)`.
 
     Returns
     -------
     NoiseLevels
-        Groups that the data cannot tell apart share one factor or stay as stated, and a sentence says so.
+        Groups that the data do not separate share one factor or keep the stated noise; `sentences` lists them.
 
     Raises
     ------
     InvalidProblem
-        Where no fix has redundancy.
+        If no fix has redundancy.
 
     References
     ----------
@@ -164,24 +167,24 @@ def noise_levels(
 
 
 def shared_grouping(by: By, common: By | bool | None) -> By | None:
-    """Return the grouping of errors in common: `by` itself for True."""
+    """Return the grouping of common errors: `by` if `common` is True, None without common errors."""
     return by if common is True else common or None
 
 
 def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
-    """Return the problem with its noise scaled as the levels say.
+    """Return the problem with its noise scaled by the factors of the levels.
 
     Parameters
     ----------
     problem : Problem
-        The problem that the levels were estimated from, or another one of the same stations and kinds.
+        The problem from which the levels were estimated, or another problem with the same stations and kinds.
     levels : NoiseLevels
-        Of `noise_levels`; groups that it does not have stay as they are.
+        Result of `noise_levels`. Groups that it does not contain keep their noise.
 
     Raises
     ------
     InvalidProblem
-        Where rows have an error in common in an epoch and others that last longer.
+        If there are common errors of epochs, and the noise is also correlated between epochs.
     """
     factor = dict(zip(levels.names, levels.used.tolist(), strict=True))
     present = problem.weight > 0.0
@@ -199,16 +202,16 @@ def _scale(problem: Problem, block: Block, by: By, factor: dict[str, float], pre
     own = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
     scaled = effect * own[:, None, :]
     here = present[..., block.row]
-    # Rows that are absent keep what was stated of them: nothing was learnt there.
+    # Absent rows keep the stated noise, because the levels were not estimated from them.
     both = here[..., :, None] & here[..., None, :]
     return Block(block.row, np.where(both, scaled @ np.swapaxes(scaled, -1, -2), block.covariance))
 
 
 def _with_common(problem: Problem, noise: Noise, by: By, sigma: dict[str, float]) -> Noise:
-    """Return noise with an error of each of some groups that lasts an epoch, of these standard deviations."""
+    """Return the noise plus an error that the rows of a group share in an epoch, of standard deviations `sigma`."""
     if has_correlated_epochs(problem):
         what = "errors of rows of several epochs are correlated"
-        raise InvalidProblem(what, "noise", "leave out what rows of an epoch have in common")
+        raise InvalidProblem(what, "noise", "leave out the errors in common of an epoch")
     effect, _, _ = common_effects(problem, by, sigma)
     blocks = []
     for members in group_members(problem.epoch):
@@ -218,26 +221,26 @@ def _with_common(problem: Problem, noise: Noise, by: By, sigma: dict[str, float]
 
 
 def common_level(problem: Problem, *, method: str = "cauchy", fix: Fix | None = None) -> CommonLevel:
-    """Return whether many fixes accuse measurements, one station, or the noise as it is stated, and its factor.
+    """Return whether many fixes together indicate gross errors, one bad station or a wrong noise level.
 
     Parameters
     ----------
     problem : Problem
-        As in `noise_levels`.
+        As for `noise_levels`.
     method : str
-        How to fix; see `solve`. One that a few liars do not move is best.
+        Method of the fixes; see `solve`. A method that few gross errors do not affect is best.
     fix : Fix, optional
-        Fixes of `batch_of(problem)` made before.
+        Existing fixes of `batch_of(problem)`.
 
     Returns
     -------
     CommonLevel
-        `scale(problem)` is the problem with the noise that was found; that of data that fit it stays as stated.
+        ``scale(problem)`` returns the problem with the estimated noise. If the data fit the stated noise, it stays.
 
     Raises
     ------
     InvalidProblem
-        Where no epoch has a fix.
+        If no epoch has a fix.
     """
     from optloc.solvers.solution import solve
 
@@ -249,12 +252,12 @@ def common_level(problem: Problem, *, method: str = "cauchy", fix: Fix | None = 
 
 
 def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
-    """Return which problems of a flat batch have a fix (n,), and their parameter vectors (n, size).
+    """Return the numbers (n,) of the problems of a flat batch that have a fix, and their parameter vectors (n, size).
 
     Raises
     ------
     InvalidProblem
-        Where there is none.
+        If there is no fix.
     """
     if fix is None:
         size = batch.batch_shape[0]
@@ -267,45 +270,45 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
 
 
 def levels_of(made: Elements, by: By, common: By | None = None, *, tails: bool = True) -> NoiseLevels:
-    """Return the noise levels of linearised fixes, with or without a bound of their tails; see `noise_levels`."""
+    """Return the noise levels of linearised fixes. `tails` adds factors that bound the tails; see `noise_levels`."""
     return replace(_report(made, by, *fitted(made, common), tails=tails), common=common)
 
 
 def fitted(made: Elements, shared_by: By | None) -> tuple[VarianceFit, Array]:
-    """Return the variance factors of groups, and the errors in common (g,) without evidence."""
+    """Return the fit of the variance factors, and a mask (g,) of the common errors without evidence."""
     from threadpoolctl import threadpool_limits
 
     common = made.common[:-1]
-    # Products of small matrices gain nothing from threads, and wait for them on a busy machine: ten times as long.
+    # Threads do not speed up products of small matrices. On a busy machine, waiting for them takes ten times as long.
     with threadpool_limits(1):
         plain = fit(made, common, common)
-        # No noise is stated for errors in common: without evidence they are zero.
-        seen = _with_their_like(visible(made, plain, common), common, shared_by)
+        # The problem states no noise for common errors, so without evidence they are zero.
+        seen = _all_or_none(visible(made, plain, common), common, shared_by)
         found = fit(made, common & ~seen, common) if seen.any() else plain
-        while (fewer := _with_their_like(seen & (found.low > 0.0), common, shared_by)).sum() < seen.sum():
+        while (fewer := _all_or_none(seen & (found.low > 0.0), common, shared_by)).sum() < seen.sum():
             seen = fewer
             found = fit(made, common & ~seen, common) if seen.any() else plain
     return found, common & ~seen
 
 
-def _with_their_like(shown: Array, common: Array, by: By | None) -> Array:
-    """Return which errors in common (G,) are kept: those of one station or pair show that the others have them too.
+def _all_or_none(shown: Array, common: Array, by: By | None) -> Array:
+    """Return a mask (G,) of the common errors to keep: with evidence for one station or pair, all are kept.
 
-    A fix follows as many of these as it has unknowns. Levels of a few that explain the rest say that the others are
-    exact, and so is the fix.
+    A fix can follow as many common errors as it has unknowns. If only a few had a level, the others would count as
+    exact, and the fix too.
     """
     return shown if by == "kind" else common & shown.any()
 
 
 def _report(made: Elements, by: By, found: VarianceFit, none: Array, *, tails: bool) -> NoiseLevels:
-    """Return the levels of all groups with errors, from a fit and the groups (g,) without evidence."""
+    """Return the levels of all groups with errors, from a fit and the mask (g,) of groups without evidence."""
     size = len(made.names)
     count, gross = total(made.of_effect, size), total(made.of_effect, size, found.gross)
     used = np.flatnonzero(count)
-    # T_jj times the variance: what share of an error the residuals show.
+    # T_jj times the variance is the share of an error that the residuals show.
     share = found.tests.size[:, : found.gross.shape[1]] * np.nan_to_num(found.variance)[made.of_effect]
     redundancy, factor = total(made.of_effect, size, share), np.sqrt(found.variance)
-    # Gross errors of the fitted noise are left out of both ratios: else they would differ by these alone.
+    # Errors that are gross for the fitted noise are left out of both ratios, so that the ratios are comparable.
     own = np.append(none, False)[made.of_effect]
     stated = without(tested(made, np.where(own, 0.0, 1.0)), found.gross)
     low, high = (np.where(none, np.nan, np.sqrt(end)) for end in (found.low, found.high))
@@ -325,19 +328,19 @@ def _report(made: Elements, by: By, found: VarianceFit, none: Array, *, tails: b
         _ratio(stated),
         _ratio(found.tests),
         int((stated.dof > 0).sum()),
-        (*_sentences(names, found, redundancy, none), *_tails_in_words(names, wider)),
+        (*_sentences(names, found, redundancy, none), *_tail_sentences(names, wider)),
         wider[used],
     )
 
 
-# Factor of a sigma for its tails that is worth a sentence.
+# Factor for tails above which a sentence reports it.
 _LONG = 1.1
 
 
-def _tails_in_words(names: Array, wider: Array) -> list[str]:
-    """Return a sentence for each group with longer tails than normal errors."""
+def _tail_sentences(names: Array, wider: Array) -> list[str]:
+    """Return a sentence for each group whose errors have longer tails than normal errors."""
     return [
-        f"errors of {name} have long tails: the sigma used is {size:.2g} times the most likely one"
+        f"errors of {name} have long tails: the sigma used is {size:.2g} times the most likely sigma"
         for name, size in zip(names.tolist(), wider.tolist(), strict=True)
         if size > _LONG
     ]
@@ -347,22 +350,22 @@ def _ratio(tests: Tested) -> float:
     return float(tests.cost.sum() / max(int(tests.dof.sum()), 1))
 
 
-# Redundancy of all errors of a group together below which its level is a guess: the sigma of two errors is known to a
-# factor of two, and its weight in a fix is nearly free.
+# Total redundancy of the errors of a group below which its level is unreliable. Two errors determine a standard
+# deviation to a factor of two, and its weight in a fix is nearly arbitrary.
 _SCARCE = 2.0
 
 
 def _sentences(names: Array, found: VarianceFit, redundancy: Array, none: Array) -> tuple[str, ...]:
-    """Return what the data do not tell."""
+    """Return sentences about the levels that the data do not determine."""
     said = []
     if found.shared.any():
-        what = "it stays as stated" if found.stay else "one factor for all of them"
-        apart = "" if found.stay else " apart"
-        said.append(f"the data do not tell the noise of {_list(names[found.shared])}{apart}: {what}")
+        what = "it keeps the stated noise" if found.stay else "all of them share one factor"
+        apart = "" if found.stay else " separately"
+        said.append(f"the data do not determine the noise of {_list(names[found.shared])}{apart}: {what}")
     if (open_ := ~found.shared & (found.low == 0.0)).any():
-        said.append(f"the data do not tell the noise of {_list(names[open_])} from none: what is used is a floor")
+        said.append(f"the noise of {_list(names[open_])} may be zero: the level used is a lower limit")
     if (scarce := np.isfinite(found.low) & (redundancy < _SCARCE)).any():
-        said.append(f"the redundancy of {_list(names[scarce])} is below two: its level is hardly more than a guess")
+        said.append(f"the redundancy of {_list(names[scarce])} is below two: its level is unreliable")
     if none.any():
         said.append(f"the data do not show that rows have an error in common: {_list(names[none])}")
     return tuple(said)
@@ -374,38 +377,40 @@ def _list(names: Array) -> str:
 
 # Late rows.
 
-# Turns of fixes and shares, and the change of the share of late rows that ends them, well below its error from a
-# thousand rows.
+# Maximum number of iterations of fixes and shares, and the relative change of the share of late rows that ends them. It
+# is well below the standard error of the share from a thousand rows.
 _ROUNDS, _SAME = 4, 0.02
 
 
 def late_signals(problem: Problem, *, method: str = "cauchy", fix: Fix | None = None) -> LateSignals:
-    """Return how many ranges and arrivals of many fixes are late, and by how much on average.
+    """Return the share of late ranges and arrivals in many fixes, and their mean delay.
 
-    A row is late with an unknown probability, the same for all, by a delay that is exponential. What the other rows of
-    its fix say of it, those that are late left out, is normal plus that delay; probability and mean delay maximise the
-    product of these densities over all rows (expectation and maximisation), rows that are late rather than not are
-    left out anew, and fixes are made anew with the loss that follows, until they agree.
+    A row is late with an unknown probability, the same for all rows, and its delay is exponential. The other rows of
+    its fix, without late rows, predict it; its residual is normal plus the delay. Probability and mean delay maximise
+    the product of these densities over all rows (expectation maximisation). Then rows that are probably late are
+    selected again, and the fixes are repeated with the resulting loss, until both agree.
 
     Parameters
     ----------
     problem : Problem
-        As in `noise_levels`; differences made of arrivals are taken apart. Its noise is that of rows that are not late.
+        As for `noise_levels`. Differences of arrivals are converted to arrivals. The stated noise is that of rows that
+        are not late.
     method : str
-        How to fix first; see `solve`. One that doubts either side: whether errors are delays is asked of its fixes.
+        Method of the first fixes; see `solve`. It must treat both signs alike, because its fixes show whether errors
+        are delays.
     fix : Fix, optional
-        Fixes of `batch_of(problem)` made before: they are taken as they are.
+        Existing fixes of `batch_of(problem)`, which are used without changes.
 
     Returns
     -------
     LateSignals
-        None late where that explains hardly more than none, where errors of the other sign do as well, or where all
-        rows of a kind are late by one amount: an offset.
+        The share is zero in three cases. Late rows explain the residuals hardly better. Errors of the other sign
+        explain them as well. All rows of a kind are late by the same amount, which is an offset.
 
     Raises
     ------
     InvalidProblem
-        Where no epoch has a fix.
+        If no epoch has a fix.
 
     References
     ----------

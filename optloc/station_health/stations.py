@@ -1,4 +1,4 @@
-"""Health of stations over many fixes: what the others say of each, its offset, noise and gross errors."""
+"""Health of stations over many fixes: offset, noise and gross errors of each, compared with the other stations."""
 
 from __future__ import annotations
 
@@ -19,64 +19,67 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.station_health.levels import NoiseLevels, levels_of, usable
 
-# Where Huber's function turns, in sigmas: 95 % efficient for normal errors (Holland and Welsch 1977).
+# Residual, in sigmas, at which Huber's function becomes linear: 95 % efficient for normal errors (Holland and Welsch
+# 1977).
 _HUBER = 1.345
-# Median of the absolute value of a standard normal variable: turns a median into a sigma.
+# Median of the absolute value of a standard normal variable, which converts a median to a standard deviation.
 _MAD = 0.6744897501960817
-# Reweighted steps, and the move of every offset in its sigmas that ends them: far below what anybody reads.
+# Maximum number of reweighting steps, and the change of every offset, in its sigmas, that ends them: far below any use.
 _STEPS, _STILL = 60, 1e-4
-# Fixes of a station below which a growth with the path is not asked for: it would follow single errors.
+# Minimum number of fixes of a station for an estimate of growth with the path. With fewer it would follow single
+# errors.
 _FEW = 10
-# Eigenvalue of the scaled normal matrix, as a share of the largest, below which a combination of offsets is not seen;
-# and entry of a projector below which two groups have nothing to do with each other. Both are rounding.
+# Eigenvalue of the scaled normal matrix, relative to the largest, below which a combination of offsets is undetermined.
+# Second: entry of a projector below which two groups are unrelated. Both limits are rounding error.
 _UNSEEN, _TIED = 1e-9, 1e-6
-# Share of the largest entry of a direction below which a group takes no part in it, and two entries are equal.
+# Relative size below which an entry of a direction counts as zero, and relative difference below which entries are
+# equal.
 _PART = 1e-3
-# What stands for a scale of zero in a quotient.
+# Replaces a scale of zero in a quotient.
 _TINY = 1e-300
-# Turns of levels and offsets, each found with the other known: the noise is but a weight of the offsets, so few do.
+# Number of alternations of levels and offsets. The noise only weights the offsets, so two are enough.
 _ROUNDS = 2
 
 OUTLIER = 3.0
-"""Size of a test, in standard deviations, from which a measurement is called an outlier."""
+"""Size of a test, in standard deviations, above which a measurement counts as an outlier."""
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What many fixes say of G stations (pairs, kinds), in SI units and radians; NaN where they say nothing.
+    """Health of G stations (pairs, kinds) from many fixes, in SI units and radians; NaN where there is no information.
 
-    Residuals are left-out ones: the measurement less what the rest of its fix, without this station, predicts, with the
-    offsets of the others taken out. A station's error is not absorbed by the fix that it is compared with. Of compass
-    bearings biases and residuals are clockwise.
+    A residual is a left-out residual: the measurement minus its prediction from the rest of its fix, without this
+    station, and with the offsets of the others removed. So the fix does not absorb the error of the station. For
+    compass bearings, biases and residuals are clockwise.
 
     Parameters
     ----------
     by : "station", "pair" or "kind"
-        What makes a group.
+        What forms a group.
     names, units : tuple of G str
-        Groups and the unit of their measurements.
+        Names of the groups, and units of their measurements.
     count : int array (G,)
-        Fixes that it takes part in and that the others can check.
+        Number of fixes with the group in which other stations can check it.
     bias, bias_error : array (G,)
-        Offset, from all stations together, and its standard error.
+        Offset, estimated jointly for all stations, and its standard error.
     scale, scale_error : array (G,)
-        Growth of the offset with the path, metres a metre.
+        Growth of the offset with the path length, metres per metre.
     noise, noise_error : array (G,)
-        Standard deviation of its errors, which a fix takes no part of, and its standard error.
+        Standard deviation of the errors, corrected for the part that fixes absorb, and its standard error.
     outliers : array (G,)
-        Share of its measurements that are outliers: beyond three standard deviations, one at a time.
+        Share of its measurements that are outliers: a test of one measurement exceeds three standard deviations.
     suspect : array (G,)
-        Share of its fixes that name it as a suspect; NaN where the method names none.
+        Share of its fixes in which it is a suspect; NaN if the method does not search for suspects.
     levels : NoiseLevels
-        More about the noise.
+        Details of the noise.
     epoch, group : int array (n,)
-        Problem of the batch and group of each residual.
+        Problem number in the batch, and group number, of each residual.
     residual, sigma : array (n,)
-        Left-out residuals, biases included, and their standard deviations.
+        Left-out residuals, with biases, and their standard deviations.
     outlying : bool array (n,)
-        Which are outliers.
+        Whether each residual is an outlier.
     sentences : tuple of str
-        What the data do not tell.
+        Statements about values that the data do not determine.
     """
 
     by: By
@@ -101,7 +104,7 @@ class Health:
 
     @property
     def least_noticed(self) -> Array:
-        """Return the error (G,) that a search for suspects notices in 95 % of all cases, the median over fixes."""
+        """Return the error (G,) that a search for suspects detects with probability 95 %, as the median over fixes."""
         own = (self.sigma[self.group == g] for g in range(len(self.names)))
         return np.array([NOTICEABLE * np.median(sigma) for sigma in own])
 
@@ -112,24 +115,24 @@ def health(problem: Problem, by: By = "station", *, method: str = "auto", fix: F
     Parameters
     ----------
     problem : Problem
-        Its epochs, or its batch, are the fixes.
+        Problem whose epochs, or batch, are the fixes.
     by : "station", "pair" or "kind"
-        What a bias and a noise belong to.
+        Groups with a bias and a noise level each.
     method : str
-        How to fix, see `solve`; one that resists outliers is best.
+        Method of the fixes, see `solve`. A method that is robust to outliers is best.
     fix : Fix, optional
-        Fixes of `batch_of(problem)` made before.
+        Existing fixes of `batch_of(problem)`.
 
     Returns
     -------
     Health
-        Biases that the data show only relative to each other are relative to their mean over all rows, and a sentence
-        says so.
+        If the data determine biases only relative to each other, they are relative to their mean over all rows, and
+        `sentences` states this.
 
     Raises
     ------
     InvalidProblem
-        Where no epoch has a fix, or none has redundancy.
+        If no epoch has a fix, or no fix has redundancy.
     """
     from optloc.solvers.solution import solve
 
@@ -140,26 +143,26 @@ def health(problem: Problem, by: By = "station", *, method: str = "auto", fix: F
 
 
 def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Array | None = None) -> Health:
-    """Return the health of stations from fixes that were made already.
+    """Return the health of stations from existing fixes.
 
     Parameters
     ----------
     batch : Problem
-        Of `batch_of`.
+        Result of `batch_of`.
     fixed : int array (n,), array (n, size)
-        Which of its problems have a fix, and their parameter vectors; of `usable`.
+        Result of `usable`: numbers of the problems with a fix, and their parameter vectors.
     by : "station", "pair" or "kind"
-        As in `health`.
+        As for `health`.
     explained : object array (N,), optional
-        Explanations of all fixes, where suspects were looked for.
+        Explanations of all fixes, if suspects were searched for.
     """
     kept, x = fixed
     made = elements(batch.take(kept), x, by)
     _check_redundancy(made)
-    # Gross errors are looked for when noise and offsets are known: a bias is not an outlier of every fix.
-    levels, offsets = _settle(made, by)
+    # Gross errors are detected after noise and offsets are known. Otherwise a bias would be an outlier of every fix.
+    levels, offsets = _estimate_jointly(made, by)
     found = snooped(
-        tested(_take_out(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
+        tested(_subtract(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
     )
     item, own = np.nonzero(np.isfinite(found.sigma) & (made.of_offset >= 0))
     group = made.of_offset[item, own]
@@ -195,26 +198,26 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
 
 
 def _check_redundancy(made: Elements) -> None:
-    """Raise InvalidProblem where no measurement of any fix is checked by the others."""
+    """Raise InvalidProblem if no measurement of any fix can be checked by the others."""
     tests = tested(made, np.ones(()))
     size = np.diagonal(tests.matrix[:, tests.errors :, tests.errors :], axis1=-2, axis2=-1)
     if not ((size > 0.0) & (made.of_offset >= 0)).any():
-        what = "no fix has redundancy, so that nothing checks its measurements"
-        raise InvalidProblem(what, "health", "add stations, or state what is known: a height, a bias, a prior")
+        what = "no fix has redundancy, so its measurements cannot be checked"
+        raise InvalidProblem(what, "health", "add stations, or known values such as a height, a bias or a prior")
 
 
-def _settle(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
-    """Return noise levels and offsets that belong together: each is found with the other known."""
-    # Offsets first, with the noise as stated: a bias in the residuals would be taken for noise.
+def _estimate_jointly(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
+    """Return noise levels and offsets that are consistent: each is estimated with the other given."""
+    # Offsets first, with the stated noise, because biases in the residuals would increase the estimated noise.
     offsets = offsets_of(made, tested(made, np.ones(())))
     for _ in range(_ROUNDS):
-        levels = levels_of(_take_out(made, offsets), by, tails=False)
+        levels = levels_of(_subtract(made, offsets), by, tails=False)
         offsets = offsets_of(made, tested(made, _variance(made, levels)))
     return levels, offsets
 
 
-def _take_out(made: Elements, offsets: Offsets) -> Elements:
-    """Return the elements with the offsets taken out of the residuals."""
+def _subtract(made: Elements, offsets: Offsets) -> Elements:
+    """Return the elements with the offsets subtracted from the residuals."""
     value = np.append(np.nan_to_num(offsets.value), 0.0)[made.of_offset]
     return replace(made, residual=made.residual - (made.offset @ value[..., None])[..., 0])
 
@@ -235,64 +238,66 @@ def _units(batch: Problem, by: By, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _suspect_shares(batch: Problem, explained: Array | None, by: By, names: tuple[str, ...]) -> Array:
-    """Return the share (G,) of the fixes with a group that name it, or one of its rows, as a suspect."""
+    """Return, for each group (G,), the share of its fixes in which it, or one of its rows, is a suspect."""
     if explained is None:
         return np.full(len(names), np.nan)
     ends = ends_of(batch, by).name
-    heard, hits = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
+    total, suspected = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
     weight = np.broadcast_to(batch.weight, (len(np.ravel(explained)), batch.count))
     for own, present in zip(np.ravel(explained), weight > 0.0, strict=True):
-        for name in {*ends[present].ravel().tolist()} & heard.keys():
-            heard[name] += 1
+        for name in {*ends[present].ravel().tolist()} & total.keys():
+            total[name] += 1
         suspects = own[0].suspects if own else ()
-        for name in {n for s in suspects for n in _groups_meant(s.name, s.group, ends[list(s.rows)], by)} & hits.keys():
-            hits[name] += 1
-    return np.array([hits[name] / max(heard[name], 1) for name in names])
+        for name in {
+            n for s in suspects for n in _suspect_groups(s.name, s.group, ends[list(s.rows)], by)
+        } & suspected.keys():
+            suspected[name] += 1
+    return np.array([suspected[name] / max(total[name], 1) for name in names])
 
 
-def _groups_meant(name: str, group: str, ends: Array, by: By) -> set[str]:
-    """Return the groups that a suspect means: those of its rows, or of a station those that bear its name."""
+def _suspect_groups(name: str, group: str, ends: Array, by: By) -> set[str]:
+    """Return the groups of a suspect: the groups of its rows or, for a station, the groups with its name."""
     touched = {*ends.ravel().tolist()} - {""}
     if group != "station" or by != "station":
         return touched
-    # A station that measures several kinds makes a group with each.
+    # A station with several kinds of measurements has one group for each kind.
     own = name.removeprefix("station ")
     return {n for n in touched if n == own or n.startswith(f"{own} ")}
 
 
 def _sentences(offsets: Offsets, names: tuple[str, ...], used: Array) -> tuple[str, ...]:
-    """Return one sentence for each combination of offsets that the data do not show."""
+    """Return one sentence for each combination of offsets that the data do not determine."""
     said = []
     for direction in offsets.open:
         share = np.abs(direction[used]) > _PART * np.abs(direction).max()
         who = [names[g] for g in used[share]]
         listed = ", ".join(who[:6]) + (f" and {len(who) - 6} more" if len(who) > 6 else "")
-        if not who:  # of groups that no row is used of, it says nothing of the others
+        if not who:  # the combination involves only groups without used rows
             continue
         if len(who) == 1:
             said.append(f"the data do not show a bias of {listed}")
         elif np.ptp(direction[used][share]) < _PART * np.abs(direction).max():
-            said.append(f"biases of {listed} are relative to their mean over all rows: a common one is not seen")
+            said.append(f"biases of {listed} are relative to their mean over all rows: a common bias cannot be seen")
         else:
-            said.append(f"the data do not show every combination of the biases of {listed}: others are taken as zero")
+            said.append(f"the data do not show every combination of the biases of {listed}: the others are set to zero")
     return tuple(dict.fromkeys(said))
 
 
-# Offsets that many fixes share, from what the rest of each fix says of every station, robustly.
+# Robust estimation of offsets that many fixes share, from the left-out residuals of each station.
 
 
 @dataclass(frozen=True, slots=True)
 class Offsets:
-    """Offsets of G groups, and how much each grows with the length of the path.
+    """Offsets of G groups, and their growth with the length of the path.
 
     Parameters
     ----------
     value, error : array (G,)
-        Offset and its standard error, SI units; NaN of groups without rows.
+        Offset and its standard error, SI units; NaN for groups without rows.
     slope, slope_error : array (G,)
-        Growth in metres a metre and its standard error; NaN where it is not seen.
+        Growth in metres per metre and its standard error; NaN if the data do not determine it.
     open : array (r, G)
-        Combinations of offsets that the data do not show, unit vectors: the offsets have none of them.
+        Unit vectors of the combinations of offsets that the data do not determine. Along them the offsets are zero.
     """
 
     value: Array
@@ -305,18 +310,18 @@ class Offsets:
 def offsets_of(made: Elements, tests: Tested) -> Offsets:
     """Return the offsets that many problems share.
 
-    The test of group g in one problem is w_g = (t_g - sum_h T_gh b_h) / sqrt(T_gg), standard normal at the true offsets
-    b of all groups: its residual against what the others say, their offsets taken out. The b minimise the sum of
-    Huber's function of all w, which is convex, by weighted least squares. Combinations that no w sees, such as a
-    common delay where emission times are unknown, are zero on average over the rows. Standard errors are those of the
-    sandwich form with the problems as clusters, or those of normal tests where these are larger.
+    The test of group g in one problem is w_g = (t_g - sum_h T_gh b_h) / sqrt(T_gg): its left-out residual with the
+    offsets of the others removed. At the true offsets b of all groups it is standard normal. The b minimise the sum of
+    Huber's function of all w, which is convex, by iteratively reweighted least squares. Combinations that do not change
+    any w are zero on average over the rows, for instance a common delay if emission times are unknown. Standard errors
+    are the larger of two: of the sandwich form with the problems as clusters, and of normal tests.
 
     Parameters
     ----------
     made : Elements
         N linearised problems.
     tests : Tested
-        Their tests.
+        Tests of these problems.
 
     References
     ----------
@@ -327,7 +332,7 @@ def offsets_of(made: Elements, tests: Tested) -> Offsets:
     size = np.diagonal(matrix, axis1=-2, axis2=-1)
     item, own = np.nonzero((size > 0.0) & (made.of_offset >= 0))
     scale = np.sqrt(size[item, own])
-    # One equation for every test that the fix allows: unit variance, its own offset and those of the others.
+    # One equation of unit variance for every valid test, in terms of its own offset and the offsets of the others.
     y = vector[item, own] / scale
     other = made.of_offset[item]
     design = _sparse(matrix[item, own] / scale[:, None], other, count)
@@ -338,7 +343,7 @@ def offsets_of(made: Elements, tests: Tested) -> Offsets:
     steep = np.isfinite(spread) & (spread > 0.0) & (number >= _FEW)
     slope, slope_error = np.full(count, np.nan), np.full(count, np.nan)
     if steep.any():
-        # Growth in units of the spread of the paths, so that both kinds of columns are of one size.
+        # Growth in units of the spread of the paths, so that the columns of offsets and growth have similar size.
         units = np.where(steep, spread, 1.0)
         grown = matrix[item, own] / scale[:, None] * np.nan_to_num(away[item] / np.append(units, 1.0)[other])
         more = sparse.hstack([design, _sparse(grown, other, count)]).tocsr()
@@ -349,14 +354,14 @@ def offsets_of(made: Elements, tests: Tested) -> Offsets:
 
 
 def _sparse(values: Array, column: Array, count: int) -> sparse.csr_array:
-    """Return rows with values (n, c) at columns (n, c), -1 for none, as a sparse matrix (n, count)."""
+    """Return a sparse matrix (n, count) with values (n, c) at columns (n, c); column -1 means no entry."""
     kept = (column >= 0) & (values != 0.0)
     row = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
     return sparse.csr_array((values[kept], (row[kept], column[kept])), shape=(len(column), count))
 
 
 def _centre(made: Elements, group: Array, item: Array, own: Array, count: int) -> tuple[Array, Array]:
-    """Return the paths (N, c) less their mean over each group, and the standard deviation (G,) of each."""
+    """Return the paths (N, c) minus their mean over each group, and the standard deviation (G,) of each, metres."""
     path = made.path[item, own]
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.bincount(group, path, count) / number
@@ -365,11 +370,11 @@ def _centre(made: Elements, group: Array, item: Array, own: Array, count: int) -
 
 
 def _regress(design: sparse.csr_array, y: Array, item: Array, number: Array) -> tuple[Array, Array, Array]:
-    """Return coefficients (p,) of Huber's regression, standard errors, and the combinations (r, p) not seen."""
+    """Return coefficients (p,) of Huber's regression, their standard errors, and undetermined combinations (r, p)."""
     value = np.zeros(design.shape[1])
     for _ in range(_STEPS):
         off = y - design @ value
-        # The scale is found anew at every step, from the median: gross errors do not widen it.
+        # Every step estimates the scale from the median, so gross errors do not increase it.
         bound = _HUBER * max(float(np.median(np.abs(off))) / _MAD, 1e-12)
         weight = bound / np.maximum(np.abs(off), bound)
         inverse, lost = _pseudo_inverse((design.T @ (design * weight[:, None])), number)
@@ -377,7 +382,8 @@ def _regress(design: sparse.csr_array, y: Array, item: Array, number: Array) -> 
         value = value + move
         if np.abs(move / np.sqrt(np.maximum(np.diagonal(inverse), _TINY))).max() < _STILL:
             break
-    # Sandwich: bread of the rows within the bound, filling of each problem's pull as a whole, as its tests correlate.
+    # Sandwich form: the bread from rows within the bound, the filling from the total score of each problem, because the
+    # tests of a problem are correlated.
     off = y - design @ value
     inside = (np.abs(off) <= bound).astype(float)
     bread, lost = _pseudo_inverse(design.T @ (design * inside[:, None]), number)
@@ -390,23 +396,23 @@ def _regress(design: sparse.csr_array, y: Array, item: Array, number: Array) -> 
 
 
 def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Array]:
-    """Return the inverse along what the data see, least in the mean square over rows, and what they do not see."""
-    # Scaled so that the shortest solution is the one with the least mean square over rows.
+    """Return the pseudo-inverse with the least mean square over rows, and the combinations that are undetermined."""
+    # With this scaling the shortest solution has the least mean square over rows.
     weigh = 1.0 / np.sqrt(np.maximum(number, 1.0))
     scaled = matrix.toarray() * weigh[:, None] * weigh
     values, vectors = np.linalg.eigh(scaled)
     seen = values > _UNSEEN * max(float(values[-1]), _TINY)
     half = weigh[:, None] * vectors
-    return (half[:, seen] / values[seen]) @ half[:, seen].T, _separate(vectors[:, ~seen], weigh, number > 0.0)
+    return (half[:, seen] / values[seen]) @ half[:, seen].T, _split_by_groups(vectors[:, ~seen], weigh, number > 0.0)
 
 
-def _separate(basis: Array, weigh: Array, used: Array) -> Array:
-    """Return unit vectors (r, p) that span what is not seen (p, r), as many as can be each of a group of its own."""
-    # Any basis of what is not seen is as good: groups that it does not tie are told of one by one.
+def _split_by_groups(basis: Array, weigh: Array, used: Array) -> Array:
+    """Return unit vectors (r, p) that span an undetermined space (p, r), with few groups in each vector."""
+    # Every basis of the space is valid. Groups that the space does not connect get separate vectors.
     projector = basis @ basis.T * np.outer(used, used)
     count, label = connected_components(np.abs(projector) > _TIED, directed=False)
     found = []
-    # The projector restricted to groups that are tied: its eigenvectors of one span what is open among them.
+    # Restricted to connected groups, the projector has eigenvalue one on the undetermined combinations of these groups.
     for part in range(count):
         inside = np.where(label == part, projector, 0.0) * (label == part)[:, None]
         values, vectors = np.linalg.eigh(inside)

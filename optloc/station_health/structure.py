@@ -1,4 +1,4 @@
-"""Structure of the noise: errors of rows, stations, kinds and epochs, and errors that last."""
+"""Structure of the noise: independent errors of rows, stations or kinds, common errors of epochs, lasting errors."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from optloc.station_health.levels import (
     with_noise_levels,
 )
 
-# Standard errors of a correlation from which errors last, and the least correlation that counts: 0.2 widens the
-# interval of a level by 4 %.
+# Number of standard errors above which a correlation is significant, and the least correlation that matters: 0.2 widens
+# the interval of a level by 4 %.
 _SURE, _WORTH = 4.0, 0.2
-# Visible share of an error in common below which fixes follow most of it.
+# Visible share of a common error below which a sentence reports that fixes absorb it.
 _FOLLOWED = 0.5
-# Fewest pairs of successive epochs for a correlation, and the pairs in one part: its matrices take a few megabytes.
+# Minimum number of pairs of successive epochs for a correlation, and pairs per part: its matrices take a few megabytes.
 _PAIRS, _PART = 30, 500
-# Largest correlation: with 1 the interval of a level would be infinite.
+# Upper limit of the correlation, because with 1 the interval of a level would be infinite.
 _LASTS = 0.99
 
 
@@ -43,15 +43,15 @@ class Tried:
     Parameters
     ----------
     by : "station", "pair" or "kind"
-        Groups that have a level each.
+        Groups with one level each.
     common : "station", "pair" or "kind", optional
-        Whose rows have an error in common in an epoch.
+        Grouping of rows that share an error in an epoch; None without such errors.
     levels : int
         Number of levels that the residuals determine.
     deviance : float
         Twice the negative logarithm of the restricted likelihood.
     price : float
-        Price of the levels: the logarithm of the redundancy for each (Schwarz 1978).
+        Penalty for the levels: the logarithm of the redundancy for each (Schwarz 1978).
     """
 
     by: By
@@ -62,13 +62,13 @@ class Tried:
 
     @property
     def total(self) -> float:
-        """Return deviance and price."""
+        """Return the sum of deviance and penalty."""
         return self.deviance + self.price
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseStructure:
-    """The structure of the noise with the best explanation of the residuals of many fixes.
+    """The structure of the noise that explains the residuals of many fixes best.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class NoiseStructure:
     lasting : dict
         Correlation of the errors of each kind from one epoch to the next, where it is significant.
     sentences : tuple of str
-        Findings, and errors that residuals cannot show.
+        Findings, and statements about errors that residuals cannot show.
     """
 
     tried: tuple[Tried, ...]
@@ -86,40 +86,40 @@ class NoiseStructure:
 
     @property
     def by(self) -> By:
-        """Return the groups that have a level each."""
+        """Return the grouping: each group has one level."""
         return self.tried[0].by
 
     @property
     def common(self) -> By | None:
-        """Return the grouping of the errors in common in an epoch; None without them."""
+        """Return the grouping of the common errors of an epoch; None without them."""
         return self.tried[0].common
 
     @property
     def option(self) -> str:
-        """Return the structure as `--noise-from-data` takes it."""
+        """Return the structure in the form of the option `--noise-from-data`."""
         return self.by + ("+epoch" if self.common else "")
 
 
 def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None = None) -> NoiseStructure:
-    """Return the structure of the noise with the least deviance and price, from the residuals of many fixes.
+    """Return the structure of the noise with the least sum of deviance and penalty, from the residuals of many fixes.
 
-    The structures are levels by kind with and without an error in common of each epoch, and levels by station and by
-    pair. Levels by station and by pair assume independent errors. Where errors last, or an epoch has an error in
-    common, such levels are too small for some stations, and fixes with them are wrong: levels are then by kind.
+    The structures are levels by kind, with and without a common error in each epoch, and levels by station and by pair.
+    Levels by station and by pair assume independent errors. If errors last, or if rows share an error in an epoch,
+    these levels are too small for some stations. Fixes with them would be wrong, so levels are then by kind.
 
     Parameters
     ----------
     problem : Problem
-        As in `noise_levels`.
+        As for `noise_levels`.
     method : str
-        How to fix; see `solve`.
+        Method of the fixes; see `solve`.
     fix : Fix, optional
-        Fixes of `batch_of(problem)` made before.
+        Existing fixes of `batch_of(problem)`.
 
     Raises
     ------
     InvalidProblem
-        Where no fix has redundancy.
+        If no fix has redundancy.
 
     References
     ----------
@@ -136,26 +136,27 @@ def noise_structure(problem: Problem, *, method: str = "auto", fix: Fix | None =
 
 
 def _in_order(problem: Problem) -> bool:
-    """Return whether the fixes of a problem are its epochs: a batch has no order in time, and a run is one fix."""
+    """Return whether the fixes of a problem are its epochs. A batch has no order in time, and a run is one fix."""
     return separable(problem) and problem.epochs > 1 and not problem.batch_shape
 
 
 def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> NoiseStructure:
-    """Return the structure of the noise at fixes (N, size) of a flat batch, the problems `number` (N,).
+    """Return the structure of the noise at fixes (N, size) of a flat batch, which are the problems `number` (N,).
 
-    Problems that are not ordered in time may have errors that last although neighbours do not show it.
+    `ordered` states whether the problems are in the order of time. If not, lasting errors are possible even if
+    neighbours do not show them.
     """
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
-        # Noise that several epochs share has no place for an error of each epoch.
-        plain = _try(batch, x, "kind", None)
-        common = plain if has_correlated_epochs(batch) else _try(batch, x, "kind", "kind")
+        # If the noise is correlated between epochs, the model has no separate error of each epoch.
+        plain = _fit_structure(batch, x, "kind", None)
+        common = plain if has_correlated_epochs(batch) else _fit_structure(batch, x, "kind", "kind")
         best = common if common.seen and common.tried.total < plain.tried.total else plain
         lasting = _lasting(batch, x, number, best)
         found = [plain, common] if common.seen else [plain]
         if best is plain and ordered and not lasting:
-            finer = [_try(batch, x, by, None) for by in _groupings(batch)]
+            finer = [_fit_structure(batch, x, by, None) for by in _groupings(batch)]
             found += [structure for structure in finer if structure.tried.levels > plain.tried.levels]
     tried = tuple(sorted((candidate.tried for candidate in found), key=lambda structure: structure.total))
     return NoiseStructure(tried, lasting, tuple(_sentences(tried, lasting, common if best is common else None)))
@@ -163,7 +164,7 @@ def structure_at(batch: Problem, x: Array, number: Array, *, ordered: bool) -> N
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A structure with its elements, its fit, and the groups (g,) without evidence."""
+    """A structure with its elements, its fit, and a mask (g,) of the groups without evidence."""
 
     tried: Tried
     made: Elements
@@ -172,11 +173,11 @@ class _Candidate:
 
     @property
     def seen(self) -> bool:
-        """Return whether there is evidence of an error in common."""
+        """Return whether there is evidence of a common error."""
         return bool((self.made.common[:-1] & ~self.absent).any())
 
 
-def _try(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
+def _fit_structure(batch: Problem, x: Array, by: By, common: By | None) -> _Candidate:
     """Return a structure fitted to the residuals."""
     made = elements(batch, x, by, common)
     fit, absent = fitted(made, common)
@@ -200,7 +201,7 @@ def _groupings(batch: Problem) -> Iterator[By]:
 
 
 def _lasting(batch: Problem, x: Array, number: Array, best: _Candidate) -> dict[str, float]:
-    """Return the correlation of errors of each kind from one epoch to the next, where it is significant."""
+    """Return the correlation of the errors of each kind between successive epochs, if it is significant."""
     made = elements(batch, x, "station", "kind" if best.tried.common else None)
     level = dict(zip(best.made.names, np.nan_to_num(best.fit.variance, nan=1.0).tolist(), strict=True))
     kinds = _kind_of(batch)
@@ -232,8 +233,8 @@ def _kind_of(batch: Problem) -> dict[str, str]:
 def _products(tests: Tested, of: Array, own: Array, variance: Array, first: Array) -> tuple[Array, Array]:
     """Return products of the errors of some groups in successive epochs, and their means at a correlation of one.
 
-    An epoch has the tests t = T e of its errors e, and the next epoch t' = T' e'. The sum of t_g t'_g over groups g is
-    on average the correlation times the sum of T_gh T'_gh theta_h.
+    An epoch has tests t = T e of its errors e, the next epoch t' = T' e'. The expectation of the sum of t_g t'_g over
+    the groups g is the correlation times the sum of T_gh T'_gh theta_h.
     """
     here = of[:, :, None] == own
     vector = np.einsum("nqg,nq->ng", here[first], tests.vector[first, : tests.errors])
@@ -247,7 +248,7 @@ def _products(tests: Tested, of: Array, own: Array, variance: Array, first: Arra
 
 
 def _sentences(tried: tuple[Tried, ...], lasting: dict[str, float], common: _Candidate | None) -> Iterator[str]:
-    """Yield the findings, and the errors that residuals cannot show."""
+    """Yield sentences about the structure, and about errors that residuals cannot show."""
     best = tried[0]
     if len(tried) > 1:
         gain = tried[1].total - best.total
@@ -261,8 +262,8 @@ def _sentences(tried: tuple[Tried, ...], lasting: dict[str, float], common: _Can
         followed = _followed(common)
         if followed:
             what = ", ".join(f"{100.0 * share:.0f} % of {name}" for name, share in followed.items())
-            yield f"fixes follow {what}: known places or more stations would show the rest"
-    yield "residuals cannot show an error that shifts all fixes alike: measure at a known place to find it"
+            yield f"fixes absorb {what}: known positions or more stations would show the rest"
+    yield "residuals cannot show an error that shifts all fixes alike: measure at a known position to find it"
 
 
 def _words(one: Tried) -> str:
@@ -271,7 +272,7 @@ def _words(one: Tried) -> str:
 
 
 def _followed(one: _Candidate) -> dict[str, float]:
-    """Return the share of each error in common that fixes follow, where that is most of it."""
+    """Return the share of each common error that fixes absorb, if it is more than half."""
     q = one.made.of_effect.shape[1]
     found = {}
     for g in np.flatnonzero(one.made.common[:-1] & (np.nan_to_num(one.fit.low) > 0.0)):
@@ -282,57 +283,60 @@ def _followed(one: _Candidate) -> dict[str, float]:
     return found
 
 
-# Fixes and levels that agree.
+# Alternate fixes and levels until they agree.
 
-# Turns of fixes and levels, and the change of all levels that ends them: 2 % is below the standard error that a
-# thousand errors leave (1 / sqrt(2 n)), and each turn fixes every epoch again.
+# Maximum number of iterations, and the relative change of all levels that ends them. 2 % is below the standard error
+# from a thousand errors (1 / sqrt(2 n)). Each iteration repeats the fixes of all epochs.
 _ROUNDS, _CLOSE = 4, 0.02
-# Fixes from which turns use only some: 300 fixes give a level to 4 %. Fixes for structure and levels, and the length of
-# their stretches: a thousand give a level to 2 %, and their time does not grow.
+# Number of fixes above which iterations use only some: 300 fixes determine a level to 4 %. Maximum number of fixes for
+# the structure and the final levels, and the length of their stretches: a thousand determine a level to 2 % in constant
+# time.
 _SOME, _MANY, _STRETCH = 300, 1000, 50
 
 
 def with_estimated_noise(
     problem: Problem, by: By | None = None, *, common: By | bool | None = None, method: str = "auto"
 ) -> tuple[Problem, NoiseLevels]:
-    """Return the problem with its noise from the data, and the levels: fixes and levels are made until they agree.
+    """Return the problem with estimated noise, and the levels. Fixes and levels alternate until they agree.
 
     Parameters
     ----------
     problem : Problem
-        Ratios of its noise within a group are kept; what it states else is only where to begin, but for groups that the
-        data do not tell: they stay as stated.
+        A problem whose stated noise is a starting value. Ratios within a group are kept, and so is the noise of groups
+        that the data do not determine.
     by : "station", "pair" or "kind", optional
-        As in `noise_levels`; None: the result of `noise_structure` at fixes with levels by kind.
+        As for `noise_levels`. None: the result of `noise_structure` at fixes with levels by kind.
     common, method
-        As in `noise_levels`; `common` counts where `by` is given.
+        As for `noise_levels`. `common` is used only if `by` is given.
 
     Raises
     ------
     InvalidProblem
-        As `noise_levels`, and where the data do not tell any level.
+        As for `noise_levels`, and if the data do not determine any level.
     """
     batch = batch_of(problem)
-    learnt = _agree(problem, batch, by or "kind", shared_grouping(by, common) if by else None, method)
+    noise_fixes = _alternate(problem, batch, by or "kind", shared_grouping(by, common) if by else None, method)
     if by is not None:
-        levels = learnt.levels(batch)
+        levels = noise_fixes.levels(batch)
         return with_noise_levels(problem, levels), levels
-    part = _stretches(len(learnt.kept))
+    part = _stretches(len(noise_fixes.kept))
     ordered = _in_order(problem)
-    found = structure_at(batch.take(learnt.kept[part]), learnt.x[part], learnt.kept[part], ordered=ordered)
+    found = structure_at(
+        batch.take(noise_fixes.kept[part]), noise_fixes.x[part], noise_fixes.kept[part], ordered=ordered
+    )
     _check_lasting(found.lasting, {*map(str, kinds_of(batch))})
-    levels = learnt.levels(batch)
+    levels = noise_fixes.levels(batch)
     if (found.by, found.common) != ("kind", None):
-        plain, learnt = levels, _agree(problem, batch, found.by, found.common, method, learnt)
-        levels = _at_least(learnt.levels(batch), plain, found.lasting if ordered else None)
+        plain, noise_fixes = levels, _alternate(problem, batch, found.by, found.common, method, noise_fixes)
+        levels = _at_least(noise_fixes.levels(batch), plain, found.lasting if ordered else None)
     levels = _widened(levels, found.lasting)
     levels = replace(levels, sentences=(*found.sentences, *levels.sentences))
     return with_noise_levels(problem, levels), levels
 
 
 @dataclass(frozen=True, slots=True)
-class _Learnt:
-    """Fixes (n,) of a batch with the noise that their residuals show."""
+class _NoiseFixes:
+    """Fixes (n,) of a batch, and the structure of the noise that was used for them."""
 
     by: By
     common: By | None
@@ -340,58 +344,58 @@ class _Learnt:
     x: Array
 
     def levels(self, batch: Problem) -> NoiseLevels:
-        """Return the levels from stretches of the fixes, or from all where some groups are in none of these."""
+        """Return the levels from stretches of the fixes, or from all fixes if the stretches lack some groups."""
         whole, part = batch.take(self.kept), _stretches(len(self.kept))
         some = whole.take(part)
-        if _present(some, self.by) != _present(whole, self.by):
+        if _present_groups(some, self.by) != _present_groups(whole, self.by):
             some, part = whole, np.arange(len(self.kept))
         return levels_of(elements(some, self.x[part], self.by, self.common), self.by, self.common)
 
 
-def _present(batch: Problem, by: By) -> set[str]:
-    """Return the groups that have rows."""
+def _present_groups(batch: Problem, by: By) -> set[str]:
+    """Return the names of the groups that have present rows."""
     names, weight = ends_of(batch, by).name, np.broadcast_to(batch.weight, (batch.batch_shape[0], batch.count))
     return {*names[(weight > 0.0).any(0)].ravel().tolist()} - {""}
 
 
 def _stretches(count: int) -> Array:
-    """Return the numbers of fixes that show the structure: all, or stretches of successive ones spread over all."""
+    """Return the numbers of the fixes that determine the structure: all, or evenly spaced stretches."""
     if count <= _MANY:
         return np.arange(count)
     first = np.linspace(0, count - _STRETCH, _MANY // _STRETCH).astype(int)
     return np.unique(first[:, None] + np.arange(_STRETCH))
 
 
-def _agree(
-    problem: Problem, batch: Problem, by: By, common: By | None, method: str, before: _Learnt | None = None
-) -> _Learnt:
-    """Return fixes whose noise agrees with their residuals, from earlier fixes or from none."""
+def _alternate(
+    problem: Problem, batch: Problem, by: By, common: By | None, method: str, before: _NoiseFixes | None = None
+) -> _NoiseFixes:
+    """Return fixes whose noise agrees with their residuals; the iteration starts from the fixes `before`, if given."""
     from optloc.solvers.solution import solve
 
     if before is None:
         before_kept, x = usable(batch, solve(batch, method) if batch.layout.size else None)
     else:
         before_kept, x = before.kept, before.x
-    # Turns use some of the fixes, spread over all: their levels are good enough to weigh the next fixes.
+    # Iterations use some of the fixes, evenly spaced. Their levels are accurate enough to weight the next fixes.
     kept, some, factor = before_kept, slice(None, None, max(len(before_kept) // _SOME, 1)), np.ones(1)
-    # Better weights move the fixes, and these the residuals: turns until nothing moves.
+    # Better weights change the fixes, and the fixes change the residuals, so iterate until the levels are stable.
     for turn in range(1 + _ROUNDS):
         made = elements(batch.take(kept[some]), x[some], by, common)
-        # Factors are of the stated noise: a level that the data do not determine stays as stated.
+        # Factors refer to the stated noise. A level that the data do not determine keeps the stated noise.
         levels = levels_of(made, by, common, tails=False)
         if np.isnan(levels.low).all():
             advice = "state a sigma, or add rows, stations or epochs"
-            raise InvalidProblem("the data do not tell the noise", "noise", advice)
+            raise InvalidProblem("the data do not determine the noise", "noise", advice)
         same = factor.shape == levels.factor.shape
         if turn == _ROUNDS or (same and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max()):
             break
         factor = levels.factor
         kept, x = _fix_again(batch_of(with_noise_levels(problem, levels)), method, kept, x)
-    return _Learnt(by, common, kept, x)
+    return _NoiseFixes(by, common, kept, x)
 
 
 def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array, Array]:
-    """Return fixes with other noise: by descent from the earlier fixes, for least squares without bounds."""
+    """Return the fixes with new noise: for least squares without bounds by descent from the earlier fixes."""
     from optloc.solvers.solution import solve
 
     if not now.layout.size:
@@ -403,24 +407,24 @@ def _fix_again(now: Problem, method: str, kept: Array, x: Array) -> tuple[Array,
     return kept[finite], found[finite]
 
 
-# Correlation of errors of rows from which their level is not learnt: two hundred epochs are then ten independent ones.
+# Correlation of errors above which their level is not estimated: two hundred epochs then equal ten independent epochs.
 _TOO_LONG = 0.9
 
 
 def _check_lasting(lasting: dict[str, float], kinds: set[str]) -> None:
-    """Raise InvalidProblem where errors of rows hardly change: fixes follow them, and no residual shows it."""
+    """Raise InvalidProblem if errors hardly change, because fixes follow them and residuals do not show them."""
     for kind in sorted(kinds):
         if lasting.get(kind, 0.0) > _TOO_LONG:
             what = f"errors of {kind} hardly change (correlation {lasting[kind]:.2g} between epochs): residuals do not"
-            advice = "state a sigma, or measure at a known place or for longer"
+            advice = "state a sigma, or measure at a known position or for longer"
             raise InvalidProblem(f"{what} show their size", "noise", advice)
 
 
 def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float] | None) -> NoiseLevels:
-    """Return levels of rows that are at least those without an error in common, where that error lasts or may last.
+    """Return levels of rows that are at least the levels without a common error, if the common error lasts or may last.
 
-    An error in common that lasts is few independent errors. Residuals then do not separate it from errors of rows: of
-    ranges that are 7 % too long, 14 % of the fixes were beyond five sigma.
+    A lasting common error consists of few independent errors, so residuals do not separate it from errors of rows.
+    Without this limit, with ranges that are 7 % too long, 14 % of the fixes had errors beyond five sigma.
     """
     least = {name: i for i, name in enumerate(plain.names) if lasting is None or common_name(name) in lasting}
     low, factor, high = levels.low.copy(), levels.factor.copy(), levels.high.copy()
@@ -431,9 +435,9 @@ def _at_least(levels: NoiseLevels, plain: NoiseLevels, lasting: dict[str, float]
 
 
 def _widened(levels: NoiseLevels, lasting: dict[str, float]) -> NoiseLevels:
-    """Return levels with the intervals of errors that last: squares of neighbours are correlated by r^2.
+    """Return levels with wider intervals for lasting errors: the squares of neighbours are correlated by r^2.
 
-    Their mean has (1 + r^2) / (1 - r^2) times the variance of independent squares (Bartlett 1946).
+    The variance of their mean is (1 + r^2) / (1 - r^2) times the variance of independent squares (Bartlett 1946).
     """
     r = np.array([lasting.get(name, 0.0) for name in levels.names])
     wider = np.sqrt((1.0 + r**2) / (1.0 - r**2))

@@ -148,7 +148,7 @@ def test_decibels_are_no_deviation_of_a_ratio_of_unknown_size():
 
 
 def test_text_in_rows_of_different_lengths_is_refused():
-    with pytest.raises(optloc.InvalidProblem, match="stations: the numbers are not an array"):
+    with pytest.raises(optloc.InvalidProblem, match="stations: the numbers do not form an array"):
         optloc.station_array([["1 km", 0.0], ["2 km"]])
 
 

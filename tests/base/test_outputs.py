@@ -95,7 +95,7 @@ def test_a_place_is_refused_before_a_long_table_is_read(command, place, monkeypa
     (place / "s.csv").write_text("name,x,y\n")
     out = RUN.invoke(app, [command, "t.csv", "--stations", "s.csv", "--sigma", "1", "--unit", "m", "--out", "o.csv"])
     assert out.exit_code == 2
-    assert "there is such a file already" in out.stderr
+    assert "the file already exists" in out.stderr
     assert (place / "o.csv").read_text() == "kept"
 
 
@@ -120,10 +120,14 @@ def test_not_even_with_force_over_what_is_read(link, place):
         target = place / "other.toml"
         getattr(target, link)(place / "site.toml")
     for command in ("fix site.toml --geojson", "simulate site.toml --truth 1,2,3 --out", "fix site.toml --html"):
-        assert "read here" in run(*command.split(), target, "--force", code=2).stderr
+        assert "an input file" in run(*command.split(), target, "--force", code=2).stderr
     assert (place / "site.toml").read_text() == text
-    assert "read here" in run("convert", "toa.csv", "--as", "stations", "--out", "toa.csv", "--force", code=2).stderr
-    assert "read here" in run(*"convert toa.csv --stations rx.csv --sigma 1ns --out".split(), "rx.csv", code=2).stderr
+    assert (
+        "an input file" in run("convert", "toa.csv", "--as", "stations", "--out", "toa.csv", "--force", code=2).stderr
+    )
+    assert (
+        "an input file" in run(*"convert toa.csv --stations rx.csv --sigma 1ns --out".split(), "rx.csv", code=2).stderr
+    )
 
 
 def test_two_outputs_of_one_name_are_refused(place):

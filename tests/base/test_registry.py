@@ -16,7 +16,7 @@ BAD = {
     "does not import": ("raise OSError('no driver')", {"bad": "module"}, ["does not load", "OSError: no driver"]),
     "names nothing": ("", {"bad": "module:kind"}, ["does not load", "AttributeError"]),
     "is missing": ("", {"bad": "elsewhere:kind"}, ["does not load", "elsewhere"]),
-    "is something else": ("kind = 3", {"bad": "module:kind"}, ["int", "does not belong"]),
+    "is something else": ("kind = 3", {"bad": "module:kind"}, ["int", "not valid there"]),
     "is no kind": (
         "import optloc\nkind = optloc.models.Model(abs, 'luminosity', 1, 'x')",
         {"bad": "module:kind"},

@@ -324,7 +324,7 @@ def test_stations_that_move_without_velocities_are_no_stations_of_a_rate():
     with pytest.raises(InvalidProblem, match=r"station 'S0' moves, but has no velocity for fdoa; give velocities"):
         optloc.assemble(place, rows, **options)
     optloc.assemble(place[:1], rows, **options | {"motions": [optloc.Motion(1)]})
-    with pytest.raises(InvalidProblem, match="fdoa of a target that stays needs stations that move"):
+    with pytest.raises(InvalidProblem, match="fdoa of a fixed target needs stations that move"):
         optloc.assemble(place[:1], rows, **options)
     optloc.assemble(optloc.station_array(place, velocity=np.zeros((2, 2, 2))), rows, **options)
 

@@ -218,11 +218,11 @@ SHIPPED = {
         {"change": lambda text: text.replace('"clock"', '"position"')},
         ["registration.toml", "'position' is taken"],
     ),
-    "bias twice": ({"change": lambda text: text + CLOCK.replace('"B", "C"', '"R2"')}, ["'clock' is taken twice"]),
+    "bias twice": ({"change": lambda text: text + CLOCK.replace('"B", "C"', '"R2"')}, ["'clock' is used twice"]),
     "bias of a stranger": ({"change": lambda text: text.replace('"R5"', '"R6"')}, ["'clock'", "'R6'", "did you mean"]),
     "bias of a station that is not there": (
         {"rows": lambda t: t[t["a"] != "R5"]},
-        ["'clock'", "members", "R5 touches no row"],
+        ["'clock'", "members", "R5 affects no row"],
     ),
     "unknown span": ({"change": lambda text: text.replace('"noise"', '"nois"')}, ["span", "did you mean 'noise'"]),
     "station that is lost": ({"stations": lambda t: t[:-1]}, ["'R5'", "no position at epoch"]),

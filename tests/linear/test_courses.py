@@ -215,10 +215,10 @@ def test_free_targets_have_the_height_of_each_epoch():
 
 
 BAD = {
-    "straight": (lambda: problem_of(Motion(1), constraints.height(exactly=1e4)), "keeps no height.*over='ground'"),
+    "straight": (lambda: problem_of(Motion(1), constraints.height(exactly=1e4)), "no constant height.*over='ground'"),
     "box": (
         lambda: problem_of(Motion(1, over="ground"), [replace(constraints.box([0.0] * 3, [1e9] * 3)[0], along=True)]),
-        "plane is not held along",
+        "plane cannot apply along",
     ),
     "turning band": (lambda: problem_of(Motion(2, over="ground"), constraints.height(0.0)), "constant acceleration"),
     "plain frame": (lambda: assemble(PLACES, measured("range", [1.0], a=[0], sigma=1.0),

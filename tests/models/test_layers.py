@@ -170,13 +170,13 @@ def test_the_reference_is_a_unit_alone():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"depth": (0, 0)}, "depth 2, 0 m, is not below the one before"),
+        ({"depth": (0, 0)}, "depth 2, 0 m, is not below depth 1"),
         ({"depth": (10, 0)}, "sort the table downwards"),
         ({"depth": (0, np.nan)}, "depth 2"),
         ({"speed": (1500, -1)}, "speed 2 is -1 m/s"),
         ({"speed": (1500,)}, "2 depths and 1 speeds"),
         ({"depth": (0,), "speed": (1500,)}, "at least 2"),
-        ({"speed": "fast"}, "no list of numbers"),
+        ({"speed": "fast"}, "not a list of numbers"),
         ({"between": "cubic"}, "unknown shape"),
         ({"surface": np.nan}, "surface"),
         ({"reference": 0.0}, "reference"),

@@ -234,7 +234,7 @@ def test_programs_of_ipopt_take_air_and_refuse_layers():
     problem, _ = problem_of(*CASES[-1][1:], trials=2)
     np.testing.assert_allclose(solve(problem, "roots+nlp").x, solve(problem).x, rtol=1e-5)
     problem, _ = problem_of(*CASES[0][1:], trials=2)
-    with pytest.raises(InvalidProblem, match="leave out the stage 'nlp'"):
+    with pytest.raises(InvalidProblem, match="replace the stage 'nlp'"):
         solve(problem, "roots+nlp")
 
 

@@ -25,12 +25,16 @@ def found(**changes):
     ("changes", "status", "words"),
     [
         ({}, "ok", "clean"),
-        ({"gaps": (3.0, 8.0, 40.0)}, "ambiguous", "another place costs only 3.0 more, 2 such in all"),
+        ({"gaps": (3.0, 8.0, 40.0)}, "ambiguous", "another position costs only 3.0 more .2 in total"),
         ({"costs": np.array([60.0, 5.0, 6.5])}, "ambiguous", "2 emitters would cost only 1.5 more"),
         ({"costs": np.array([60.0, 5.0, 6.5]), "wanted": 1}, "ok", "clean"),
         ({"bound": 1.0}, "unproven", "another assignment may cost 4.0 less"),
         ({"fixes": (), "cost": np.inf, "wanted": 2}, "infeasible", "no 2 emitters were found that share no row"),
-        ({"fixes": (), "present": 1}, "too few rows", "rows in 1 channels cannot tell .* an emitter takes 2"),
+        (
+            {"fixes": (), "present": 1},
+            "too few rows",
+            "rows in 1 channels cannot separate an emitter .* an emitter needs 2",
+        ),
     ],
 )
 def test_each_finding_has_its_status_and_sentence(changes, status, words):

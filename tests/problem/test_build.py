@@ -52,7 +52,7 @@ def test_stations_that_stay_have_one_epoch_and_names_of_their_own():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"kind": "bearing", "sigma": 1.0, "a": 0}, "a bearing is degrees from north"),
+        ({"kind": "bearing", "sigma": 1.0, "a": 0}, "a bearing is in degrees from north"),
         ({"kind": "range", "sigma": 1.0}, "range needs station a"),
         ({"kind": "range", "a": 0}, "must be given once"),
         ({"kind": "range", "a": 0, "sigma": 1.0, "covariance": np.eye(1)}, "must be given once"),
@@ -73,5 +73,5 @@ def test_a_problem_needs_measurements_and_places():
         station_array(np.zeros(3))
     with pytest.raises(InvalidProblem, match="joint covariance has shape"):
         assemble(PLACES, measured("range", a=[0, 1], sigma=1.0), covariance=np.eye(3))
-    with pytest.raises(InvalidProblem, match="does not add up what single stations measure"):
+    with pytest.raises(InvalidProblem, match="is not a sum of measurements of single stations"):
         assemble(PLACES, measured("groa", a=1, b=0, arrival_sigma=1.0))

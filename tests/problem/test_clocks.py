@@ -322,7 +322,7 @@ def test_a_file_says_how_clocks_walk(tmp_path):
         ('form = "walk"\ndensity = "1 m^2/s"\nallan = [[1.0, 1e-9]]\n', "in place of densities"),
         ('form = "walk"\nallan = [[1.0]]\n', "not two numbers"),
         ('form = "walk"\n', "needs a spectral density"),
-        ('form = "spline"\nknots = [0.0, 60.0]\n', "the knots do not"),
+        ('form = "spline"\nknots = [0.0, 60.0]\n', "beyond the knots"),
         ("knots = 3\n", "the form offset has no knots"),
     ],
 )

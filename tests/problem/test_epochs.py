@@ -103,7 +103,7 @@ def test_a_cut_keeps_the_time_of_states_and_drifts():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda p: cut(run(10), 0, 5), "is not later than the last one"),
+        (lambda p: cut(run(10), 0, 5), "is not later than the last epoch of the run"),
         (lambda p: replace(p, biases=()), "the biases of the two runs differ"),
         (lambda p: replace(p, motions=(Motion(1),)), "the targets of the two runs differ"),
         (lambda p: replace(p, stations=replace(p.stations, names=tuple("abcde"))), "the stations of the two"),

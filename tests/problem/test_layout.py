@@ -54,5 +54,5 @@ def test_a_single_target_has_names_without_a_number():
 def test_a_name_that_is_not_there_is_refused_with_those_that_are():
     assert BOTH.shares("clock")
     assert not BOTH.shares("stations")
-    with pytest.raises(InvalidProblem, match=r"no unknown is called 'speed'.*clock"):
+    with pytest.raises(InvalidProblem, match=r"there is no unknown 'speed'.*clock"):
         BOTH.find("speed")

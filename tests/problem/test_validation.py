@@ -30,10 +30,10 @@ BAD = {
     "a station": ({"rows": (replace(RANGES, a=np.array([0, 1, 2, 4])),)}, "range row 3 has a = 4"),
     "a weight": ({"rows": (replace(RANGES, weight=np.array([1, 1, 2, 1.0])),)}, "weight outside 0 to 1"),
     "a correction": ({"rows": (replace(RANGES, correction=np.full(4, np.nan)),)}, "correction that is not finite"),
-    "times": ({"times": np.array([1.0, 1.0])}, "epoch 1 is not later than the one before"),
+    "times": ({"times": np.array([1.0, 1.0])}, "epoch 1 is not later than epoch 0"),
     "noise": ({"noise": Noise(GOOD.noise.blocks * 2)}, "does not cover every row exactly once"),
     "a covariance": ({"noise": SKEW}, "the covariance in noise of row 0 is not symmetric"),
-    "an order": ({"motions": (Motion(3),)}, "a motion of order 3"),
+    "an order": ({"motions": (Motion(3),)}, "the motion has order 3"),
     "a prior": ({"priors": (Prior("position", np.zeros(3), np.eye(3)),)}, "do not fit"),
     "a speed": ({"constraints": speed(3.0)}, "speed needs a target that moves"),
     "bounds": (
@@ -63,7 +63,7 @@ def test_a_value_that_is_missing_passes_and_an_infinite_one_does_not():
 
 def test_two_unknowns_of_one_name_are_refused():
     clock = with_bias(GOOD, "clock").biases[0]
-    with pytest.raises(InvalidProblem, match="the name 'position' is taken twice"):
+    with pytest.raises(InvalidProblem, match="the name 'position' is used twice"):
         check_unknowns(replace(GOOD, biases=(replace(clock, name="position"),)))
 
 

@@ -151,7 +151,7 @@ def test_what_the_data_cannot_tell_apart_is_said():
     levels = noise_levels(problem)
     assert np.isnan(levels.sigma).all()
     np.testing.assert_allclose(levels.factor, 2.0, rtol=0.25)
-    assert "do not tell the noise of S0, S1, S2 apart" in levels.sentences[0]
+    assert "do not determine the noise of S0, S1, S2 separately" in levels.sentences[0]
 
 
 def test_no_redundancy_is_an_error_with_advice():
@@ -224,7 +224,7 @@ def test_what_is_not_told_stays_as_stated_in_the_fix_too():
     fixed, levels = with_estimated_noise(problem, "station")
     assert levels.factor[5] == 1.0
     assert np.isnan(levels.error[5])
-    assert "noise of S5: it stays as stated" in " ".join(levels.sentences)
+    assert "noise of S5: it keeps the stated noise" in " ".join(levels.sentences)
     now = variances(fixed.noise, fixed.count)[weight > 0.0]
     other = np.arange(problem.count)[weight > 0.0] % 6 == 5
     np.testing.assert_array_equal(now[other], 100.0)

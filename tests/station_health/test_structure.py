@@ -118,7 +118,7 @@ def test_stations_whose_errors_last_have_no_level_of_their_own():
     found = noise_structure(problem)
     assert found.by == "kind"
     assert found.lasting["azimuth"] > 0.9
-    with pytest.raises(InvalidProblem, match=r"hardly change .* measure at a known place"):
+    with pytest.raises(InvalidProblem, match=r"hardly change .* measure at a known position"):
         with_estimated_noise(problem)
 
 
