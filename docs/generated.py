@@ -311,29 +311,29 @@ def effects() -> dict[str, tuple[str, Any, Any]]:
         return -thin / np.sqrt(1.0 - (6371.0 / (6371.0 + 350.0) * across) ** 2)
 
     table: dict[str, tuple[str, Callable[[Any], Any]]] = {
-        "light time, from the ground up (Sagnac)": ("left", lambda t: scene.light(t, up=True) - scene.range(t)),
-        "light time, from the satellite down": ("left", lambda t: scene.light(t, up=False) - scene.range(t)),
-        "the same, times put earlier by the light time of mid-pass": (
-            "what is left of it",
+        "light time, from the ground up (Sagnac)": ("not modelled", lambda t: scene.light(t, up=True) - scene.range(t)),
+        "light time, from the satellite down": ("not modelled", lambda t: scene.light(t, up=False) - scene.range(t)),
+        "the same, with times earlier by the light time at mid-pass": (
+            "remaining error",
             lambda t: scene.light(t, up=False) - scene.range(t, -late),
         ),
         "UT1 - UTC of 0.1 s": ("modelled (skyfield)", rotated(0.1 * _TURN, 2)),
-        "polar motion of 0.3 seconds of arc": ("left", rotated(float(np.radians(0.3 / 3600.0)), 0)),
-        "place of the satellite along its track, 1 km": (
-            "a bias of the form `time`, or left",
+        "polar motion of 0.3 seconds of arc": ("not modelled", rotated(float(np.radians(0.3 / 3600.0)), 0)),
+        "position of the satellite along its track, 1 km": (
+            "a bias of the form `time`, or not modelled",
             lambda t: scene.range(t, 1e3 / speed) - scene.range(t),
         ),
-        "ionosphere, 30 TECU": ("left", layer),
-        "troposphere, 2.4 m at the zenith": ("left", lambda t: _AIR / scene.sine(t)),
+        "ionosphere, 30 TECU": ("not modelled", layer),
+        "troposphere, 2.4 m at the zenith": ("not modelled", lambda t: _AIR / scene.sine(t)),
     }
     found = {name: (what, excess(t), scene.rate(excess)) for name, (what, excess) in table.items()}
     place = turned(scene.satellite(t), -_TURN * t)
     line = place - scene.emitter
     carried = _TURN * np.einsum("ni,ni->n", line, np.stack([-place[:, 1], place[:, 0], 0.0 * t], -1))
-    turn = ("modelled: velocities in ECEF hold it", np.full(len(t), np.nan), carried / np.linalg.norm(line, axis=-1))
+    turn = ("modelled: velocities in ECEF contain it", np.full(len(t), np.nan), carried / np.linalg.norm(line, axis=-1))
     # Speed makes the satellite's clock slow, height makes it fast.
     clock = (speed**2 / 2.0 + _GM / scene.radius - _GM / np.linalg.norm(scene.emitter)) / _C
-    constant = ("goes into the unknown frequency", np.full(len(t), np.nan), np.full(len(t), clock))
+    constant = ("absorbed by the unknown frequency", np.full(len(t), np.nan), np.full(len(t), clock))
     return {"Earth's rotation in the velocities": turn} | found | {"v²/2c² and gravity (clocks)": constant}
 
 

@@ -16,7 +16,7 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
 from optloc.multi_target.answer import Emitters, Ghost
-from optloc.multi_target.assignment_findings import Assigned, verdict
+from optloc.multi_target.assignment_findings import Assigned, count_in_words, verdict
 from optloc.multi_target.pricing_search import TOLERANCE, PricedRegion, PricingResult, search
 from optloc.multi_target.set_packing import Prices, cheapest_sets, price_rows
 from optloc.multi_target.sets import (

@@ -283,12 +283,14 @@ def test_a_copy_of_the_shipped_files_is_all_it_needs(tmp_path):
     run("demo", "registration", "--plot", tmp_path / "d.png", "-q")
 
 
-PAGE = Path(__file__).parents[2] / "docs" / "registration.md"
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = [DOCS / "registration.md", DOCS / "details" / "registration.md"]
 
 
 def blocks(language):
-    """Return the code blocks of the manual page of registration."""
-    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    """Return the code blocks of both pages about registration, in order."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 def test_the_file_of_the_manual_is_that_which_is_shipped(tmp_path):
@@ -296,7 +298,7 @@ def test_the_file_of_the_manual_is_that_which_is_shipped(tmp_path):
     one, two = load(path), load(DEMO)
     assert one.structure == two.structure
     np.testing.assert_array_equal(one.z, two.z)
-    known = copied(tmp_path, lambda text: text.replace('[target]\nmotion = "static"\n', blocks("toml")[3]))
+    known = copied(tmp_path, lambda text: text.replace('[target]\nmotion = "static"\n', blocks("toml")[1]))
     assert load(known).motions[0].known.tolist() == [[[200e3, 300e3, 0.0]]]
 
 

@@ -207,7 +207,7 @@ def test_what_breaks_a_constraint_has_no_cost_and_wins_against_nobody(tmp_path):
     assert right.to_dict() == {"gtrs+lsr": 4, "scipy from the centre": 0, "truth": 4}
 
 
-NLOPT = files_of_the_page(DOCS / "studies.md")["others.py"]
+NLOPT = files_of_the_page(DOCS / "details" / "studies.md")["others.py"]
 
 
 @pytest.mark.full
