@@ -27,7 +27,7 @@ from optloc.kernels.jit import enabled
 ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in ELSEWHERE]
 # Pages that take seconds.
-LONG = ("recipes", "tutorials", "studies.md", "howto/constraints.md", "howto/layers.md", "maps.md", "placement.md")
+LONG = ("recipes", "tutorials", "studies.md", "details/constraints.md", "howto/layers.md", "maps.md", "placement.md")
 RUN = [
     pytest.param(page, marks=pytest.mark.slow) if page.relative_to(DOCS).as_posix().startswith(LONG) else page
     for page in PAGES
