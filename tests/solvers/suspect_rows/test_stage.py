@@ -232,7 +232,7 @@ def test_too_little_redundancy_is_said():
     unnamed = solve(spoiled(arrivals(stations=5), s2=900.0), "robust")
     assert unnamed.status is Status.CONTRADICTORY
     assert not unnamed.explanations[()]
-    assert "redundancy 1 does not tell" in str(unnamed.reason)
+    assert "redundancy 1 cannot identify" in str(unnamed.reason)
 
 
 @pytest.mark.parametrize("trials", few([150, 300], 1))

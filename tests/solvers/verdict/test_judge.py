@@ -54,7 +54,7 @@ def test_stations_without_a_common_row_are_disconnected():
     problem = assemble(SQUARE[:4], measured("tdoa", [100.0, -50.0], a=a, b=b, sigma=1.0)).flat()
     fix = judge(problem, settled(problem))
     assert fix.code[0] == Status.DISCONNECTED
-    assert fix.reason[0].startswith("no row links {")
+    assert fix.reason[0].startswith("no measurement links {")
 
 
 def test_a_ruling_hides_what_has_no_place():
