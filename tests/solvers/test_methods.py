@@ -128,7 +128,7 @@ def test_contradictions_are_judged_too():
 def test_refusals_name_what_is_missing():
     said = {
         ("3 range", "minimax"): "starts from azimuth and elevation of two stations or more, and these rows are range",
-        ("2 tdoa", "directions"): "relaxes directions in space, and these rows are in a plane",
+        ("2 tdoa", "directions"): "relaxes directions in three dimensions, and these rows are in a plane",
         ("3 toa groa", "wiv"): "starts from azimuths, and these rows are toa and groa",
         ("3 elevation", "roots"): "no closed form gives a start for measurements of elevation: use 'auto'",
         ("3 range azimuth1 elevation1", "directions"): "of two stations or more",
