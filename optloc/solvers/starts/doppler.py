@@ -1,4 +1,4 @@
-"""Starts from Doppler shifts: rows made few enough for the relaxation, with range rows and a known height beside."""
+"""Starts from Doppler shifts: a relaxation with a limited number of rows, range rows, and a known height."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _AXES = WGS84_A * np.array([1.0, 1.0, 1.0 - WGS84_F])
 
 
 def dopplered(problem: Problem) -> bool:
-    """Return whether a single source at rest is sought, and rows tell its range rates."""
+    """Return whether the only target is a source at rest, and rows measure its range rates."""
     if len(problem.motions) != 1 or problem.stations.velocity is None:
         return False
     motion, told = problem.motions[0], any(_rates(rows) != (0, 0) for rows in problem.rows)
@@ -35,8 +35,8 @@ def dopplered(problem: Problem) -> bool:
 def doppler_starts(problem: Problem) -> Array:
     """Return candidates of a flat batch of sources at rest from their Doppler shifts, one by one.
 
-    Rows of range rates and of sums of ranges are used, those of other kinds are the refinement's. Where they are too
-    many, those of the same stations are joined to normal points, or taken at even steps.
+    The relaxation uses rows of range rates and of sums of ranges; the refinement uses all rows. If there are too many
+    rows, rows of the same stations are averaged to normal points, or every other block is taken.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def doppler_starts(problem: Problem) -> Array:
     Returns
     -------
     array (N, q, d) or (N, q, size)
-        Metres; positions where a single one is sought, else full vectors. NaN where there is none.
+        Positions, metres, for problems of one position, else full vectors. NaN in empty slots.
     """
     size, d = problem.batch_shape[0], problem.dimension
     position = np.full((size, 1 + 2 * d, d), np.nan)
@@ -64,20 +64,20 @@ def doppler_starts(problem: Problem) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _DopplerNotes:
-    """The rows that the relaxation takes, of all problems of a batch: numbers (m,) or (N, m) of each.
+    """The rows in the relaxation, for all problems of a batch: numbers (m,) or (N, m) of each.
 
     Parameters
     ----------
     row : int array (m,)
         Number in the problem.
     epoch, a, b : int array (m,)
-        When, and at which stations; b is -1 where there is none.
+        Epoch and stations; b is -1 for a single station.
     group : int array (m,)
         Equal for rows of one kind at the same stations.
     rates, ranges : array (m, 2)
-        What it adds up of both stations' range rates and ranges.
+        Coefficients of the range rates and ranges of both stations.
     design : array (m, n)
-        What the shared unknowns add.
+        Coefficients of the shared unknowns.
     """
 
     row: Array
@@ -106,7 +106,7 @@ def _gather(problem: Problem) -> _DopplerNotes:
 
 
 def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
-    """Yield number, epoch, stations, kind and coefficients of the rows that the relaxation takes."""
+    """Yield number, epoch, stations, kind and coefficients of the rows in the relaxation."""
     for i, (rows, start) in enumerate(zip(problem.rows, problem.starts, strict=True)):
         rates, ranges = _rates(rows), _ranges(rows)
         count = rows.count if rates != (0, 0) or ranges != (0, 0) else 0
@@ -118,13 +118,13 @@ def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
 
 
 def _rates(rows: Rows) -> tuple[int, int]:
-    """Return what rows add up of the range rates of their first and second station."""
+    """Return the coefficients of the range rates at the first and second station of rows; (0, 0) without rates."""
     model = MODELS[rows.kind]
     return model.signs if model.signs is not None and model.nodes == ((1.0, "range_rate"),) else (0, 0)
 
 
 def _ranges(rows: Rows) -> tuple[int, int]:
-    # an unknown emission time is one of an epoch each: those rows are left to the refinement
+    # rows with an unknown emission time in each epoch are used by the refinement only
     model = MODELS[rows.kind]
     return (0, 0) if model.ranges is None or model.emission else model.ranges
 
@@ -155,18 +155,18 @@ def _start(problem: Problem, i: int, every: _DopplerNotes, surface: Ellipsoid | 
 
 
 def _few(problem: Problem, told: _DopplerNotes, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
-    """Return the rows that are used, their values, and standard deviations where they stand for several."""
+    """Return the numbers of the rows used, their values, and standard deviations if they are normal points."""
     if _size(problem, told) <= SIZE:
         return np.arange(len(z)), z, None
     time = problem.times[told.epoch]
     parts = [np.flatnonzero(told.group == group) for group in np.unique(told.group)]
-    # the shortest blocks that are few enough; a row adds an entry of its own at least
+    # the shortest blocks that are few enough; each row adds at least one entry
     for length in range(max(2, len(z) // SIZE), 1 + max(2, *map(len, parts))):
         cut = [part[block] for part in parts for block in blocks(time[part], length)]
         pick = np.array([block[len(block) // 2] for block in cut])
         if _size(problem, told.take(pick)) <= SIZE:
             break
-    # stations that are too many as they are: every other block, every third, ...
+    # for too many stations: every other block, every third block, and so on
     steps = (step for step in range(1, len(cut)) if _size(problem, told.take(pick[::step])) <= SIZE)
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., told.row].reshape(-1, len(z))[0] / weight)
     return normal_points(time, z, sigma, cut[:: next(steps, len(cut))])
@@ -178,7 +178,7 @@ def _size(problem: Problem, told: _DopplerNotes) -> int:
 
 
 def _nodes(problem: Problem, told: _DopplerNotes) -> tuple[Array, Array, Array]:
-    """Return the nodes (M, 2) of rows, epoch and station each, and what rows add up of their ranges and rates."""
+    """Return the nodes (M, 2) of rows, epoch and station, and the coefficients of their ranges and rates."""
     stations = problem.stations
     assert stations.velocity is not None
     stays = stations.position.shape[-3] == 1 and stations.velocity.shape[-3] == 1
@@ -194,7 +194,7 @@ def _nodes(problem: Problem, told: _DopplerNotes) -> tuple[Array, Array, Array]:
 
 
 def _moving(problem: Problem, nodes: Array, geocentric: bool) -> tuple[Array, Array]:
-    """Return places and velocities (M, d) of nodes."""
+    """Return positions and velocities (M, d) of nodes."""
     stations = problem.stations
     assert stations.velocity is not None
     place, speed = (
